@@ -1,6 +1,6 @@
-"""Plans become true here: over SSH, node by node or a whole mesh at one moment, journaled, never stranding a node.
+"""Change nodes over SSH, one by one or a whole mesh at once; what is not confirmed rolls back.
 
-The flow: `access` reaches nodes, `gather` observes the fleet, `planning` makes the plan, `execute` carries it out with
-`node` (configuration), `flash` (firmware), `packages` and `switch` (a whole mesh); `checks` decides whether a change
-has proven itself. `bootstrap`, `replace`, `keep` and `trusting` are the bench's verbs on the same parts.
+`prepare` makes the plan from the inventory and the observed fleet. `executor` runs it with `commit_confirm`
+(configuration), `sysupgrade` (firmware), `packages` and `mesh_commit` (a whole mesh), and journals every step.
+`health_checks` decides whether a change is confirmed. `bootstrap`, `replace` and `backup` use the same parts.
 """

@@ -1,8 +1,8 @@
-"""A node's whole state, kept outside of it: fetched as one archive, put back under the dead-man's switch.
+"""Back up a node's state as one archive, and restore it under the dead-man's switch.
 
-`fetch` takes `sysupgrade -b`'s archive (configuration, keys, accounts, what packages declare as theirs), checks it
-(`read_backup`, pure) and adds what it was taken from. `put_back` makes a change of it like any other: undone by itself
-unless the node proves that it can be reached with it.
+`fetch` gets the archive of `sysupgrade -b` (configuration, keys, accounts, the conffiles of packages), checks it
+(`read_backup`, pure) and adds the node, board and packages it was taken from. `restore` applies it as any other
+change: it rolls back unless the node proves reachable with it.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 from types import MappingProxyType
 
-from meshctl.apply.change_in_progress import Attempt
+from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
-from meshctl.apply.commit_confirm import carry
-from meshctl.apply.context import Job
+from meshctl.apply.commit_confirm import run_change
+from meshctl.apply.context import NodeContext
 from meshctl.archive import TarMember
 from meshctl.device import openwrt
 from meshctl.device.connection import OwnKey
@@ -32,27 +32,27 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
 from meshctl.plan.lockout import lockout
-from meshctl.plan.preconditions import Objection
-from meshctl.plan.radios import NO_RADIOS, Radios, restarted
+from meshctl.plan.preconditions import FailedPrecondition
+from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
-# Far above a router's /etc, far below what would hurt: bounds a hostile or broken archive.
+# Far above the size of a router's /etc; bounds a hostile or broken archive.
 MAX_FILES, MAX_BYTES = 4000, 64 << 20
-# What the dead-man's switch takes: absolute paths of at least two parts, of plain characters, and not its own state.
+# The dead-man's switch accepts absolute paths of at least two parts and plain characters, except its own state.
 _PATH = re.compile(r"(/[A-Za-z0-9._+@-]+){2,}")
 _OWN = ("/etc/meshctl/change", "/etc/meshctl/last", "/tmp/", "/var/", "/dev/", "/proc/", "/sys/")
-# From 24.10 on sysupgrade puts a script into every archive that disables, at the next boot, what was disabled when it
-# was taken (base-files, sbin/sysupgrade). It is no file of the node's, nothing would undo what it does, and the boot
-# hook of the dead-man's switch may be among what it names: it is told, not put back. So is whatever else waits there.
+# From 24.10 on sysupgrade adds a script to every archive that disables, at the next boot, the services that were
+# disabled when it was taken (base-files, sbin/sysupgrade). A rollback would not undo that, and the script may name the
+# boot hook of the dead-man's switch. So files in this directory are not restored; the services are only reported.
 _ONCE_AT_BOOT = "/etc/uci-defaults/"
 _DISABLES = re.compile(r"^\s*/etc/init\.d/(\S+) disable\s*$", re.MULTILINE)
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A node's files by absolute path, and what they were taken from."""
+    """A node's files by absolute path, and the node, board and packages they were taken from."""
 
     node: str
     board: str
@@ -60,12 +60,12 @@ class Backup:
     taken_s: float
     packages: tuple[str, ...]
     files: Mapping[str, NewFile] = field(repr=False)
-    # services that did not start at boot then
+    # services that were disabled at the time
     disabled: tuple[str, ...] = ()
 
 
 def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
-    """The node's backup as one tar.gz file. Raises NodeError when what came is no such archive."""
+    """The node's backup as one tar.gz file. Raises NodeError when the node sends something else."""
     info = {
         "node": node,
         "board": seen.board.board_name if seen.board else "",
@@ -75,17 +75,17 @@ def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
     }
     archive = openwrt.backup(connection)
     try:
-        # sysupgrade keeps no file of ours; the marker tells later which configuration this was
+        # sysupgrade does not save meshctl's own files; the marker identifies the configuration
         own = openwrt.fetch_files(connection, [f"/{MARKER_PATH}"])
         whole = with_info(archive, info, {path: file.content for path, file in own.items()})
         read_backup(whole, node)
     except InputError as error:
-        raise NodeError(f"{node}: what it sent is no backup: {error}") from error
+        raise NodeError(f"{node}: expected a backup archive: {error}") from error
     return whole
 
 
 def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, bytes] = MappingProxyType({})) -> bytes:
-    """The archive of `sysupgrade -b` with what it was taken from in front, and further public files by absolute path.
+    """The archive of `sysupgrade -b` with `info` prepended, and further public files by absolute path.
 
     Raises InputError for a damaged archive.
     """
@@ -104,7 +104,7 @@ def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, by
 
 
 def read_backup(data: bytes, file: str) -> Backup:
-    """What `fetch` wrote. Raises InputError naming the file and what is wrong with it."""
+    """Read an archive that `fetch` made. Raises InputError with the file name and the fault."""
     files: dict[str, NewFile] = {}
     disabled: list[str] = []
     info: dict[str, object] | None = None
@@ -118,9 +118,9 @@ def read_backup(data: bytes, file: str) -> Backup:
             elif _PATH.fullmatch(path) and ".." not in path.split("/") and not path.startswith(_OWN):
                 files[path] = NewFile(content, member.mode & 0o7777)
     if info is None:
-        raise InputError(f"{file}: no {INFO_NAME} in it", hint="expected a file that `meshctl backup` wrote")
+        raise InputError(f"{file}: contains no {INFO_NAME}", hint="expected a file that `meshctl backup` wrote")
     if not any(path.startswith("/etc/config/") for path in files):
-        raise InputError(f"{file}: no configuration in it")
+        raise InputError(f"{file}: contains no configuration")
     packages = info.get("packages")
     taken = info.get("taken_s")
     return Backup(
@@ -136,12 +136,12 @@ def read_backup(data: bytes, file: str) -> Backup:
 
 def _info(content: bytes, file: str) -> dict[str, object]:
     try:
-        told = json.loads(content)
+        document = json.loads(content)
     except ValueError as error:
         raise InputError(f"{file}: {INFO_NAME} is damaged: {error}") from error
-    if not isinstance(told, dict):
+    if not isinstance(document, dict):
         raise InputError(f"{file}: {INFO_NAME} is damaged: expected an object")
-    return told
+    return document
 
 
 def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
@@ -152,7 +152,7 @@ def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
             for member in tar:
                 room -= member.size
                 if len(found) >= MAX_FILES or room < 0:
-                    raise InputError(f"{file}: more than {MAX_FILES} files or {MAX_BYTES >> 20} MiB in it")
+                    raise InputError(f"{file}: contains more than {MAX_FILES} files or {MAX_BYTES >> 20} MiB")
                 stream = tar.extractfile(member) if member.isreg() else None
                 found.append((member, stream.read() if stream is not None else b""))
     except (tarfile.TarError, OSError, EOFError, zlib.error) as error:
@@ -160,39 +160,39 @@ def _members(data: bytes, file: str) -> list[tuple[tarfile.TarInfo, bytes]]:
     return found
 
 
-def put_back(job: Job, connection: SshConnection, backup: Backup) -> Outcome:
-    """Make the node what the backup has, under its dead-man's switch. Owns `connection`.
+def restore_backup(ctx: NodeContext, connection: SshConnection, backup: Backup) -> Outcome:
+    """Write the backup's files to the node, under its dead-man's switch. Owns `connection`.
 
     Raises NodeError only when nothing was changed on the node.
 
-    Files that the node has now and the backup has not stay: `sysupgrade -b` does not name what it left out.
+    Files that the backup lacks stay on the node: `sysupgrade -b` does not list what it left out.
     """
-    live = job.before.uci or {}
+    live = ctx.before.uci or {}
     files = {path: new for path, new in backup.files.items() if _differs(path, new, live)}
     if not files:
-        job.work.access.keep(job.name, connection)
-        return Outcome(job.name, Result.UNCHANGED)
-    change = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
+        ctx.run.connections.release(ctx.name, connection)
+        return Outcome(ctx.name, Result.UNCHANGED)
+    payload = Change(new_change_id(), files, reload_script({path.lstrip("/") for path in files}, ()))
     address = _address(backup)
-    attempt = Attempt(
-        job,
-        change,
+    change = ChangeInProgress(
+        ctx,
+        payload,
         new_nonce(),
-        job.node.confirm_window_s,
+        ctx.node.confirm_window_s,
         connection.endpoint,
-        job.work.access.places(job.node, address),
-        radios=_radios(files, job.before),
+        ctx.run.connections.candidates(ctx.node, address),
+        radios=_radios(files, ctx.before),
     )
-    return carry(attempt, connection)
+    return run_change(change, connection)
 
 
 def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:
-    """Which radios start anew with these files."""
+    """The radios that restart with these files."""
     wireless = files.get(f"/{WIRELESS}")
     if wireless is None:
         return NO_RADIOS
     after = parsed(wireless.content.decode("utf-8", "replace"), "wireless")
-    return restarted(packages_seen([WIRELESS], before)["wireless"], after)
+    return restarting_radios(packages_seen([WIRELESS], before)["wireless"], after)
 
 
 def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
@@ -201,7 +201,7 @@ def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
 
 
 def _address(backup: Backup) -> IPv4Address | None:
-    """The management address that the backup brings."""
+    """The management address in the backup."""
     network = backup.files.get("/etc/config/network")
     tree = None if network is None else parsed(network.content.decode("utf-8", "replace"), "network")
     lan = None if tree is None else tree.section("lan")
@@ -209,21 +209,21 @@ def _address(backup: Backup) -> IPv4Address | None:
     return IPv4Address(text) if text else None
 
 
-def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> Objection | None:
-    """The objection against a backup after which none of our keys would be let in, or None."""
+def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> FailedPrecondition | None:
+    """The failed precondition of a backup with which none of our keys could log in, or None."""
     return lockout(node, {path.lstrip("/"): new.content for path, new in backup.files.items()}, own)
 
 
-def objection_to(backup: Backup, node: str, seen: Observation) -> str:
-    """Why a backup must not go onto this device; empty when it may."""
+def incompatibility(backup: Backup, node: str, seen: Observation) -> str:
+    """Why a backup does not fit this device; empty when it fits."""
     board = seen.board.board_name if seen.board else ""
     if backup.board and board != backup.board:
-        return f"the backup is of board {backup.board}, {node} is {board or 'of an unknown one'}"
+        return f"the backup is of board {backup.board}; the board of {node} is {board or 'unknown'}"
     if backup.node and backup.node != node:
-        return f"the backup is of {backup.node}, not of {node}"
+        return f"the backup is of node {backup.node}, not {node}"
     return ""
 
 
-def lacking_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
+def uninstalled_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
     """Packages that were installed when the backup was taken and are not now."""
     return tuple(name for name in backup.packages if name not in (seen.packages or {}))

@@ -1,8 +1,8 @@
-"""Take factory devices into the fleet: they all answer at 192.168.1.1, with no password and nobody's keys.
+"""Provision factory devices: each answers at 192.168.1.1, without a password and with an unknown host key.
 
-`bootstrap`: for each place where one device answers (a port of the bench, an interface), connect, look, find out which
-node it is (`identify`, pure), refuse the wrong one, pin its host key, and then provision it like any other node: the
-change goes there over the bench, is confirmed over its new address, and undone if that never answers.
+For each bench target (an address, a forwarded port, an interface): connect, observe, identify the node (`identify`,
+pure), refuse a wrong device, pin the host key (`discover`). Then plan as for any other node (`plan_discovered`): the
+change is sent over the bench connection, confirmed over the new address, and rolled back if that never answers.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from meshctl.apply.neighbor_query import look_around as look_at_neighbours
-from meshctl.apply.prepare import Choices, Prepared, assemble, other_paths
+from meshctl.apply.neighbor_query import observe_neighbors
+from meshctl.apply.prepare import PlanOptions, Prepared, assemble, other_paths
 from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection, connect
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import Seen, observe_cleared
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, observe_cleared
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 from meshctl.topology import alternate_macs
 
@@ -30,9 +30,9 @@ FACTORY_ADDRESS = "192.168.1.1"
 
 
 @dataclass(frozen=True, slots=True)
-class BenchPlace:
-    """Where one device answers; `node` is whom the operator says it is, empty when the device has to tell; `interface`
-    the interface of this machine that it is plugged into, empty where only one device has the address."""
+class BenchTarget:
+    """Where one device answers. `node` is the name the operator gave, empty to identify it by MAC; `interface` the
+    local interface it is plugged into, empty where only one device has the address."""
 
     host: str = FACTORY_ADDRESS
     port: int = 22
@@ -49,10 +49,10 @@ class BenchPlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """A device on the bench: which node it is, what it told, its host key, and the keys that were pinned before."""
+class FoundDevice:
+    """A device on the bench: its node, observation and host key, and the keys pinned before."""
 
-    place: BenchPlace
+    target: BenchTarget
     node: Node
     seen: Observation
     key: HostKey
@@ -60,7 +60,7 @@ class Found:
 
 
 def find_node(fleet: Fleet, word: str) -> Node:
-    """The managed node that a name, label, serial number or MAC means. Raises InputError when none or several do."""
+    """The managed node with this name, label, serial number or MAC. Raises InputError for none or several."""
     folded = word.lower()
     found = [
         node
@@ -71,21 +71,21 @@ def find_node(fleet: Fleet, word: str) -> Node:
     if len(found) != 1:
         names = ", ".join(node.name for node in found)
         raise InputError(
-            f"{word!r} means {names if found else 'no node of the fleet'}",
+            f"{word!r} matches {names if found else 'no node of the fleet'}",
             hint="give a node's name, label, serial number or MAC",
         )
     return found[0]
 
 
-def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = ()) -> Node:
-    """Which node this device is. Its MACs decide; where the inventory knows none, the operator's word does.
+def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[str] = ()) -> Node:
+    """The node this device is: by MAC, or by the operator's word (`said`) where the inventory has no MAC.
 
-    Raises NodeError for a device that is not the one it is said to be, or that nothing identifies.
+    Raises NodeError for a device that is another node than `said`, or that cannot be identified.
     """
     macs = {mac.lower() for mac in (seen.macs or {}).values()}
     if seen.board is not None and seen.board.label_mac:
         macs.add(seen.board.label_mac.lower())
-    # a radio that is recorded by the address it had in the mesh shows another one now
+    # a radio may be recorded by its address in the mesh, which differs from the factory one
     others = {other for link in seen.links or () for other in alternate_macs(link.mac)}
     by_mac = [node for node in fleet.managed() if _macs(node) & (macs | others)]
     shown = ", ".join(sorted(macs)) or "none"
@@ -94,19 +94,19 @@ def identify(fleet: Fleet, seen: Observation, said: str, taken: Iterable[str] = 
     if said:
         node = find_node(fleet, said)
         if by_mac and by_mac[0].name != node.name:
-            raise NodeError(f"wrong device: said to be {node.name}, its MAC is that of {by_mac[0].name}")
+            raise NodeError(f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}")
         if _macs(node) and not by_mac:
             expected = ", ".join(sorted(_macs(node)))
-            raise NodeError(f"wrong device: {node.name} has {expected}, this one has {shown}")
+            raise NodeError(f"wrong device: {node.name} has MAC {expected}, this one has {shown}")
     elif by_mac:
         node = by_mac[0]
     else:
         raise NodeError(
-            f"nothing tells which node it is: no node of the inventory has one of its MACs ({shown})",
-            hint="say it (`meshctl bootstrap NODE`), or write its MAC into the inventory",
+            f"cannot identify the node: no node of the inventory has one of its MACs ({shown})",
+            hint="name the node (`meshctl bootstrap NODE`), or add its MAC to the inventory",
         )
-    if node.name in set(taken):
-        raise NodeError(f"{node.name} was found at another place already")
+    if node.name in set(identified):
+        raise NodeError(f"{node.name} was already found at another address or interface")
     return node
 
 
@@ -115,70 +115,78 @@ def _macs(node: Node) -> set[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Arrivals:
-    """`found`: node -> device. `outcomes`: what came of the places where nothing could be taken in."""
+class Discovered:
+    """`found`: node -> device. `outcomes`: of the targets where no device was accepted."""
 
-    found: Mapping[str, Found]
+    found: Mapping[str, FoundDevice]
     outcomes: tuple[Outcome, ...]
 
 
-def look_around(
+def discover(
     renderer: Renderer,
-    access: Access,
+    connections: ConnectionPool,
     trust: TrustStore,
-    places: Sequence[BenchPlace],
+    targets: Sequence[BenchTarget],
     *,
     parallel: int,
     replace_keys: bool = False,
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
-) -> Arrivals:
-    """See who is where. Host keys are pinned, connections kept with `access` under the nodes' names."""
-    found: dict[str, Found] = {}
+) -> Discovered:
+    """Identify the device at each target, pin its host key, and keep its connection in the pool."""
+    found: dict[str, FoundDevice] = {}
     lock = threading.Lock()
     signal = interrupt or Interrupt()
-    by_name = {str(place): place for place in places}
+    by_name = {str(target): target for target in targets}
 
-    def meet(name: str) -> Outcome:
-        place = by_name[name]
-        recorder = Recorder()
-        connection = _connect(access, renderer.fleet, place, recorder)
+    def identify_one(name: str) -> Outcome:
+        target = by_name[name]
+        host_key_policy = AcceptAnyKey()
+        connection = _connect(connections, renderer.fleet, target, host_key_policy)
         try:
             with lock:
-                taken = tuple(found)
-            seen = observe_cleared(connection, _paths(renderer, place), signal)
-            node = identify(renderer.fleet, seen, place.node, taken)
-            assert recorder.key is not None
+                identified = tuple(found)
+            seen = observe_cleared(connection, _paths(renderer, target), signal)
+            node = identify(renderer.fleet, seen, target.node, identified)
+            assert host_key_policy.key is not None
             old_pins = trust.pinned(node.name)
-            _pin(trust, node.name, recorder.key, replace_keys=replace_keys)
+            _pin(trust, node.name, host_key_policy.key, replace_keys=replace_keys)
         except BaseException:
             connection.close()
             raise
         with lock:
-            found[node.name] = Found(place, node, seen, recorder.key, old_pins)
-            access.newcomers[node.name] = replace(connection.endpoint, identity=node.name)
-            if place.interface:
-                access.interfaces[node.name] = place.interface
-        access.keep(node.name, connection)
+            found[node.name] = FoundDevice(target, node, seen, host_key_policy.key, old_pins)
+            connections.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
+            if target.interface:
+                connections.interfaces[node.name] = target.interface
+        connections.release(node.name, connection)
         return Outcome(name, Result.DONE)
 
-    ended = run(by_name, meet, parallel=parallel, interrupt=signal, observer=observer)
-    return Arrivals(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
+    ended = run(by_name, identify_one, parallel=parallel, interrupt=signal, observer=observer)
+    return Discovered(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
 
 
-def _connect(access: Access, fleet: Fleet, place: BenchPlace, recorder: Recorder) -> SshConnection:
-    """Log in with no password, or with the fleet's keys where an earlier attempt has come half way."""
+def _connect(
+    connections: ConnectionPool, fleet: Fleet, target: BenchTarget, host_key_policy: AcceptAnyKey
+) -> SshConnection:
+    """Log in without a password, or with the fleet's keys where an earlier run was cut short."""
     some = next(fleet.managed())
-    credentials = replace(access.credentials(some), empty_password=True)
-    release = find_node(fleet, place.node).release if place.node else None
-    return connect(place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=release)
+    credentials = replace(connections.credentials(some), empty_password=True)
+    release = find_node(fleet, target.node).release if target.node else None
+    return connect(
+        target.endpoint,
+        credentials=credentials,
+        trust=host_key_policy,
+        deadlines=connections.deadlines,
+        release=release,
+    )
 
 
-def _paths(renderer: Renderer, place: BenchPlace) -> tuple[str, ...]:
-    """The files to look at; which node it is may not be known yet, and the paths are much the same for all."""
+def _paths(renderer: Renderer, target: BenchTarget) -> tuple[str, ...]:
+    """The files to observe. The node may not be identified yet, but the paths hardly differ between nodes."""
     fleet = renderer.fleet
-    node = find_node(fleet, place.node) if place.node else next(fleet.managed())
-    return other_paths(renderer.wanted(node))
+    node = find_node(fleet, target.node) if target.node else next(fleet.managed())
+    return other_paths(renderer.desired(node))
 
 
 def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> None:
@@ -187,34 +195,43 @@ def _pin(trust: TrustStore, name: str, key: HostKey, *, replace_keys: bool) -> N
         return
     if pinned and not replace_keys:
         raise NodeError(
-            f"{name} is pinned with another host key ({pinned[0].fingerprint}), this device shows {key.fingerprint}",
-            hint="if the device was reset or is a new one, run again with --replace-key",
+            f"host key mismatch: {name} is pinned with {pinned[0].fingerprint}, this device has {key.fingerprint}",
+            hint="if the device was reset or replaced, run again with --replace-key",
         )
     trust.replace(name, key)
 
 
-def restore_pins(trust: TrustStore, arrivals: Arrivals, names: Iterable[str]) -> None:
-    """Trust the keys of before for these nodes: a device that was refused is not the node it was taken for."""
+def restore_pins(trust: TrustStore, discovered: Discovered, names: Iterable[str]) -> None:
+    """Pin the previous keys of these nodes again, because their devices were refused."""
     for name in names:
-        trust.replace(name, *arrivals.found[name].old_pins)
+        trust.replace(name, *discovered.found[name].old_pins)
 
 
-def plan_arrivals(
+def plan_discovered(
     renderer: Renderer,
-    access: Access,
-    arrivals: Arrivals,
+    connections: ConnectionPool,
+    discovered: Discovered,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
     owner: str,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
     interrupt: Interrupt | None = None,
 ) -> Prepared:
-    """The plan that provisions the devices that were found. Whoever may know their radios is looked at, too: a spare
-    may have been in the mesh, and a device that was reset was in it before."""
-    first = {name: renderer.wanted(item.node) for name, item in arrivals.found.items()}
-    found = {name: item.seen for name, item in arrivals.found.items()}
+    """The plan that provisions the discovered devices. Their possible neighbors are observed, too: a spare, or a device
+    that was reset, may have been in the mesh before."""
+    rendered = {name: renderer.desired(item.node) for name, item in discovered.found.items()}
+    found = {name: item.seen for name, item in discovered.found.items()}
     made = assemble(
-        renderer, access, first, Seen(found, {}), known, salt=salt, owner=owner, choices=choices or Choices()
+        renderer,
+        connections,
+        rendered,
+        FleetObservation(found, {}),
+        known,
+        salt=salt,
+        owner=owner,
+        choices=choices or PlanOptions(),
     )
-    return replace(made, around=look_at_neighbours(access, renderer.fleet, found, known, interrupt=interrupt))
+    return replace(
+        made, neighbor_observations=observe_neighbors(connections, renderer.fleet, found, known, interrupt=interrupt)
+    )

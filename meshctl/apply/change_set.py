@@ -1,4 +1,4 @@
-"""A node's plan as a change for its dead-man's switch: files with what must be there before, and the reload. Pure."""
+"""A node's plan as a change for its dead-man's switch: files, their expected previous hashes, the reload. Pure."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
-from meshctl.plan import NodePlan, Wanted
+from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.seen import file_info, package_of, text_of
 
-# An id is part of a file's name on the node; a nonce has to be unguessable for a window of minutes.
+# The id is part of a file name on the node; the nonce must be unguessable for a confirm window of minutes.
 ID_BYTES, NONCE_BYTES = 5, 16
 
 
@@ -25,10 +25,12 @@ def new_nonce() -> Secret:
     return Secret(secrets.token_hex(NONCE_BYTES))
 
 
-def change_of(change_id: str, plan: NodePlan, wanted: Wanted, before: Observation, services: tuple[str, ...]) -> Change:
-    """The change that makes the files of `plan` what `wanted` has; the node refuses it if it is not as observed."""
+def change_of(
+    change_id: str, plan: NodePlan, desired: DesiredState, before: Observation, services: tuple[str, ...]
+) -> Change:
+    """The change that writes the files of `plan`; the node refuses it if they differ from what was observed."""
     touched = {change.path for change in plan.files}
-    files = {f"/{file.path}": NewFile(file.content, file.mode) for file in wanted.files if file.path in touched}
+    files = {f"/{file.path}": NewFile(file.content, file.mode) for file in desired.files if file.path in touched}
     return Change(
         change_id=change_id,
         files=files,
@@ -38,7 +40,7 @@ def change_of(change_id: str, plan: NodePlan, wanted: Wanted, before: Observatio
 
 
 def _is_exact(path: str, before: Observation) -> bool:
-    """Whether the bytes of a file are known: text with bytes that are no UTF-8 has lost them on the way."""
+    """Whether a file's bytes are known: decoding replaces those that are not UTF-8."""
     return file_info(path, before) is not None or "\ufffd" not in (text_of(path, before) or "")
 
 
@@ -50,16 +52,16 @@ def _sha256_seen(path: str, before: Observation) -> str | None:
     return None if text is None else hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-# A bat0 that was created again speaks once a second for so long: loop avoidance holds broadcasts for half a minute, and
-# the batman-adv of others answers ARP requests for the node out of memory for 5 minutes (BATADV_DAT_ENTRY_TIMEOUT,
-# net/batman-adv/main.h), so that no request reaches it either.
+# How many frames, one per second, a recreated bat0 sends: loop avoidance holds its broadcasts for 30 s, and other nodes
+# answer ARP requests for it from their cache for 5 minutes (BATADV_DAT_ENTRY_TIMEOUT, net/batman-adv/main.h), so no
+# request makes it answer.
 SPEAK_FRAMES = 60
 
 
 def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
-    """POSIX sh that makes the node take up changed files and ends when the effects on who can log in are in force.
+    """POSIX sh that reloads the changed files and returns once their effects on logins are in force.
 
-    `paths` have no leading slash; `services` are restarted besides. See scripts/reload.sh.
+    `paths` have no leading slash; `services` are restarted in addition. See scripts/reload.sh.
     """
     packages = sorted(package for path in paths if (package := package_of(path)) is not None)
     values = {"PACKAGES": " ".join(packages), "SERVICES": " ".join(services), "SPEAK_FRAMES": str(SPEAK_FRAMES)}
@@ -67,7 +69,7 @@ def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
 
 
 def services_of(fleet: Fleet, node: Node) -> tuple[str, ...]:
-    """The services of back ends that bring their own: nothing but a restart is known to reload those."""
+    """The services of back ends with their own daemon; only a restart is known to reload them."""
     meshes = (fleet.meshes[name] for name in node.meshes)
     named = (mesh.operator_parts.service for mesh in meshes if mesh.backend is Backend.MESHMERIZE)
     return tuple(dict.fromkeys(service for service in named if service))

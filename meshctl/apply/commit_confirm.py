@@ -1,9 +1,8 @@
-"""Change one node's configuration so that every way out but a proof leads back to what it had.
+"""Commit-confirm for one node: a change is confirmed after it has proven itself, or the node rolls it back.
 
-`configure` sends the change over the connection at hand and begins it, then follows the node's own dead-man's switch
-over new connections (`follow`) until the change is confirmed or undone. A cut at any point ends in the same loop: it
-asks the node what is, and does what is next. While the node is silent, and once it is back, its neighbours are asked to
-forget the radio it had (`forgetting`).
+`run_change` arms and starts the change over the existing connection, then polls the node's dead-man's switch over new
+connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop goes on: it
+reads the node's state and takes the next action. Meanwhile `station_flush` removes stale station entries.
 """
 
 from __future__ import annotations
@@ -12,157 +11,157 @@ from contextlib import suppress
 from dataclasses import replace
 
 from meshctl.apply.change_in_progress import (
-    Attempt,
-    attempt_of,
-    begin,
+    ChangeInProgress,
+    abort,
+    arm,
     confirm,
-    look,
-    prepare,
-    reach,
-    release,
-    take_back,
+    connect,
+    new_change,
+    observe_and_decide,
+    start,
+    unlock,
 )
-from meshctl.apply.context import Job
-from meshctl.apply.next_action import Move, why_it_went_back
+from meshctl.apply.context import NodeContext
+from meshctl.apply.next_action import Action, rollback_reason
 from meshctl.device.errors import NodeRefused
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
-from meshctl.nodes.backoff import Pace
+from meshctl.nodes.backoff import Backoff
 
-# After the window: the node puts its files back, reloads, and its mesh finds it again; a reboot when that fails.
+# After the window the node restores its files, reloads and rejoins its mesh, or reboots where that fails.
 GRACE_AFTER_WINDOW_S = 60.0
-# A link that breaks again and again before anything began is given up after so many starts.
-STARTS = 3
+# Give up on a link that breaks this often before the change starts.
+MAX_STARTS = 3
 
 
-def configure(job: Job, connection: SshConnection) -> Outcome:
-    """Carry out the file changes of a node's plan. Owns `connection`, and keeps one to the node if all went well.
-
-    Raises NodeError only when nothing was changed on the node.
-    """
-    # a device that was met on the bench is known by its name from now on
-    return carry(attempt_of(job, replace(connection.endpoint, identity=job.name)), connection)
-
-
-def carry(attempt: Attempt, connection: SshConnection) -> Outcome:
-    """Carry a change to its end. Owns `connection`, and keeps one to the node if all went well.
+def configure(ctx: NodeContext, connection: SshConnection) -> Outcome:
+    """Apply the file changes of a node's plan. Owns `connection`; a confirmed node's connection goes to the pool.
 
     Raises NodeError only when nothing was changed on the node.
     """
-    job = attempt.job
+    # a bench device is identified by its node name from now on
+    return run_change(new_change(ctx, replace(connection.endpoint, identity=ctx.name)), connection)
+
+
+def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
+    """Run a change to its end. Owns `connection`; a confirmed node's connection goes to the pool.
+
+    Raises NodeError only when nothing was changed on the node.
+    """
+    ctx = change.ctx
     try:
-        prepare(attempt, connection)
-        if attempt.radios:
-            attempt.forgetting.watch_itself(connection, for_s=_limit_s(attempt))
-            attempt.forgetting.beforehand(for_s=_limit_s(attempt))
-        begin(attempt, connection)
+        arm(change, connection)
+        if change.radios:
+            change.flush.watch_own_entries(connection, for_s=_limit_s(change))
+            change.flush.watch_neighbors(for_s=_limit_s(change))
+        start(change, connection)
     except Unreachable as error:
-        # how far it came, the node itself will tell
-        attempt.trouble = str(error)
+        # the node's status shows how far it got
+        change.last_error = str(error)
     except NodeRefused as refusal:
-        release(attempt, connection)
-        return Outcome(job.name, Result.REFUSED, str(refusal), hint=refusal.hint)
+        unlock(change, connection)
+        return Outcome(ctx.name, Result.REFUSED, str(refusal), hint=refusal.hint)
     except NodeError:
-        release(attempt, connection)
+        unlock(change, connection)
         raise
     finally:
         connection.close()
-    with job.step("prove"):
-        return follow(attempt)
+    with ctx.step("prove"):
+        return poll(change)
 
 
-def follow(attempt: Attempt) -> Outcome:
-    """Ask and do what is next until the change has ended one way or the other."""
-    work = attempt.job.work
-    pace = Pace(_limit_s(attempt), work.interrupt)
-    work.interrupt.wait(attempt.settle_s)
-    while not pace.is_over:
-        with attempt.forgetting.beside():
-            connection = reach(attempt)
+def poll(change: ChangeInProgress) -> Outcome:
+    """Observe and act until the change has ended."""
+    run_context = change.ctx.run
+    backoff = Backoff(_limit_s(change), run_context.interrupt)
+    run_context.interrupt.wait(change.settle_s)
+    while not backoff.is_over:
+        with change.flush.flush_if_slow():
+            connection = connect(change)
         if connection is not None:
             try:
-                outcome = _move(attempt, connection)
+                outcome = _act(change, connection)
             except Unreachable as error:
-                attempt.trouble, outcome = str(error), None
+                change.last_error, outcome = str(error), None
             finally:
                 connection.close()
-            if attempt.last is not None:
-                work.saw(attempt.job.name, attempt.last)
+            if change.last is not None:
+                run_context.record(change.ctx.name, change.last)
             if outcome is not None:
-                _have_its_radio_forgotten(attempt, outcome)
+                _flush_stations(change, outcome)
                 return outcome
         else:
-            attempt.forgetting.while_silent()
-        if work.interrupt.leaving:
+            change.flush.unreachable()
+        if run_context.interrupt.leaving:
             break
-        pace.pause()
-    return _out_of_sight(attempt)
+        backoff.pause()
+    return _uncertain(change)
 
 
-def _move(attempt: Attempt, connection: SshConnection) -> Outcome | None:
-    """Look at the node once and make the next move; an outcome when it was the last."""
-    name = attempt.job.name
-    match look(attempt, connection):
-        case Move.CONFIRM:
-            return Outcome(name, Result.DONE) if confirm(attempt) else None
-        case Move.ABORT:
-            take_back(attempt, connection)
-        case Move.KEPT:
-            release(attempt, connection)
+def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
+    """Observe the node once and take the next action; the outcome once the change has ended."""
+    name = change.ctx.name
+    match observe_and_decide(change, connection):
+        case Action.CONFIRM:
+            return Outcome(name, Result.DONE) if confirm(change) else None
+        case Action.ABORT:
+            abort(change, connection)
+        case Action.KEPT:
+            unlock(change, connection)
             return Outcome(name, Result.DONE)
-        case Move.WENT_BACK:
-            release(attempt, connection)
-            why = why_it_went_back(attempt.status, attempt.gaps, attempt.shut_out, attempt.unreached)
+        case Action.WENT_BACK:
+            unlock(change, connection)
+            why = rollback_reason(change.status, change.unmet, change.login_refused, change.connect_error)
             return Outcome(name, Result.ROLLED_BACK, why)
-        case Move.FOREIGN:
-            status = attempt.status
-            return Outcome(name, Result.REFUSED, f"a change of {status.owner} is {status.state} on it")
-        case Move.START | Move.BEGIN as move:
-            return _go_on(attempt, connection, move)
-        case Move.WAIT:
+        case Action.FOREIGN:
+            status = change.status
+            return Outcome(name, Result.REFUSED, f"{status.owner} has a change {status.state} on it")
+        case Action.START | Action.BEGIN as move:
+            return _resend(change, connection, move)
+        case Action.WAIT:
             pass
     return None
 
 
-def _go_on(attempt: Attempt, connection: SshConnection, move: Move) -> Outcome | None:
-    """The node has nothing of ours that would begin by itself: send what is missing again, a few times."""
-    name = attempt.job.name
-    if attempt.starts >= STARTS:
+def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -> Outcome | None:
+    """Arm or start again, a few times: nothing of ours will start by itself on the node."""
+    name = change.ctx.name
+    if change.starts >= MAX_STARTS:
         with suppress(NodeError):
-            take_back(attempt, connection)
-        release(attempt, connection)
-        return Outcome(name, Result.FAILED, f"its link breaks before the change is there: {attempt.trouble}")
+            abort(change, connection)
+        unlock(change, connection)
+        return Outcome(name, Result.FAILED, f"its link breaks before the change is armed: {change.last_error}")
     try:
-        if move is Move.START:
-            prepare(attempt, connection)
+        if move is Action.START:
+            arm(change, connection)
         else:
-            attempt.starts += 1
-        begin(attempt, connection)
+            change.starts += 1
+        start(change, connection)
     except NodeRefused as refusal:
-        take_back(attempt, connection)
-        release(attempt, connection)
+        abort(change, connection)
+        unlock(change, connection)
         return Outcome(name, Result.REFUSED, str(refusal), hint=refusal.hint)
     return None
 
 
-def _limit_s(attempt: Attempt) -> float:
-    """Within this time the change has been confirmed or undone."""
-    return attempt.settle_s + attempt.extra_s + attempt.window_s + GRACE_AFTER_WINDOW_S
+def _limit_s(change: ChangeInProgress) -> float:
+    """The time within which the change is confirmed or rolled back."""
+    return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
-def _have_its_radio_forgotten(attempt: Attempt, outcome: Outcome) -> None:
+def _flush_stations(change: ChangeInProgress, outcome: Outcome) -> None:
     if outcome.result in (Result.DONE, Result.ROLLED_BACK):
-        attempt.forgetting.when_back(
-            attempt.last,
+        change.flush.ended(
+            change.last,
             went_back=outcome.result is Result.ROLLED_BACK,
-            rebooted=attempt.last is not None and attempt.last.boot_id != attempt.job.before.boot_id,
+            rebooted=change.last is not None and change.last.boot_id != change.ctx.before.boot_id,
         )
 
 
-def _out_of_sight(attempt: Attempt) -> Outcome:
-    if attempt.job.work.interrupt.leaving:
-        why = f"left while its change was under way; it goes back by itself within {attempt.window_s} s"
+def _uncertain(change: ChangeInProgress) -> Outcome:
+    if change.ctx.run.interrupt.leaving:
+        why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:
-        why = f"not seen since its change began ({attempt.trouble}); by its own timer it has gone back"
-    return Outcome(attempt.job.name, Result.UNCERTAIN, why, hint="`meshctl resume` looks at it again")
+        why = f"unreachable since its change started ({change.last_error}); its timer has rolled it back"
+    return Outcome(change.ctx.name, Result.UNCERTAIN, why, hint="run `meshctl resume` to check it again")

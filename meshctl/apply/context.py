@@ -1,4 +1,4 @@
-"""One node in work: what is known of it, who is to hear of its steps, and where they are written down."""
+"""The context of a run (`RunContext`) and of one node in it (`NodeContext`): fleet, connections, journal, plan."""
 
 from __future__ import annotations
 
@@ -14,65 +14,66 @@ from meshctl.device.upload import Progress
 from meshctl.fleet import Event, EventKind, Interrupt, Observer
 from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
-from meshctl.nodes.connections import Access
-from meshctl.plan import NodePlan, Wanted
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.plan import DesiredState, NodePlan
 from meshctl.topology import mesh_macs
 
 if TYPE_CHECKING:
-    from meshctl.apply.station_flush import Forgetting
+    from meshctl.apply.station_flush import StationFlush
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
-    """What all nodes of a run share. `owner` names this process to the locks on the nodes; `remember` keeps what a
-    node told, for later; `around` is what the nodes of their meshes told before anything was changed, `names` tells
-    whose the MACs of mesh radios are, `bases` which are the base's; `later` collects what is to be asked in the end.
+class RunContext:
+    """What all nodes of a run share. `owner` identifies this process in the nodes' locks. `remember` stores a node's
+    facts for later runs. `observations` were made before any change, of the plan's nodes and their meshes.
+    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base. `unfinished_flushes` are retried
+    at the end of the run.
 
-    `macs` are those by which the mesh has known each node's radios during the run: OpenWrt 24.10 and 25.12 give a radio
-    interface that is created again another one.
+    `macs` are the MACs each node's radios have had during the run: OpenWrt 24.10 and 25.12 give a recreated radio
+    interface a new one.
     """
 
     fleet: Fleet
-    access: Access
-    run: Run
+    connections: ConnectionPool
+    journal_run: Run
     observer: Observer
     interrupt: Interrupt
     owner: str
     remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
-    around: Mapping[str, Observation] = field(default_factory=dict)
-    names: Mapping[str, str] = field(default_factory=dict)
-    bases: Sequence[str] = ()
-    later: list[Forgetting] = field(default_factory=list)
+    observations: Mapping[str, Observation] = field(default_factory=dict)
+    mac_owners: Mapping[str, str] = field(default_factory=dict)
+    base_macs: Sequence[str] = ()
+    unfinished_flushes: list[StationFlush] = field(default_factory=list)
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
-    def saw(self, name: str, seen: Observation) -> None:
-        """Keep what a node reported, for the rest of the run and for later ones."""
+    def record(self, name: str, seen: Observation) -> None:
+        """Record an observation for the rest of this run and for later ones."""
         self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(seen))
         self.remember(name, seen)
 
-    def current_names(self) -> dict[str, str]:
-        """MAC -> node, with those that were learned during the run."""
-        return {**self.names, **{mac: name for name, macs in self.macs.items() for mac in macs}}
+    def current_mac_owners(self) -> dict[str, str]:
+        """MAC -> node, including MACs learned during the run."""
+        return {**self.mac_owners, **{mac: name for name, macs in self.macs.items() for mac in macs}}
 
-    def current_bases(self) -> frozenset[str]:
-        """The MACs of the base's mesh radios: those of before the run, and those seen since."""
+    def current_base_macs(self) -> frozenset[str]:
+        """The MACs of the base's mesh radios, before the run and since."""
         base = self.fleet.base_node
         seen = frozenset[str]() if base is None else self.macs.get(base.name, frozenset())
-        return frozenset(mac.lower() for mac in self.bases) | seen
+        return frozenset(mac.lower() for mac in self.base_macs) | seen
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One node: its plan, what it shall be, what it was before, what has to be there again afterwards."""
+class NodeContext:
+    """One node of a run: its plan, its desired state, its state before the change, the health it must regain."""
 
-    work: Work
+    run: RunContext
     node: Node
     plan: NodePlan
-    wanted: Wanted
+    desired: DesiredState
     before: Observation
     expected: Expectation
 
@@ -82,12 +83,12 @@ class Job:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Tell and journal a step."""
-        self.work.observer(Event(EventKind.STEP, self.name, time.time(), name))
-        with self.work.run.step(self.name, name):
+        """Report and journal a step."""
+        self.run.observer(Event(EventKind.STEP, self.name, time.time(), name))
+        with self.run.journal_run.step(self.name, name):
             yield
 
-    def progress(self, told: Progress) -> None:
-        """For uploads: how much is on the node."""
-        fraction = told.verified / told.total if told.total else 1.0
-        self.work.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))
+    def progress(self, uploaded: Progress) -> None:
+        """Report an upload's progress."""
+        fraction = uploaded.verified / uploaded.total if uploaded.total else 1.0
+        self.run.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))

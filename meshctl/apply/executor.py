@@ -1,7 +1,7 @@
-"""Carry out a plan, stage by stage: every node of it ends with exactly one outcome, in the journal as it happens.
+"""Execute a plan stage by stage; every node ends with one outcome, journaled at once.
 
-`carry_out` runs each stage's nodes together (`_one_node`: firmware, or packages and then files), a switch as one. A
-failed canary, a spent failure budget or Ctrl-C stops what has not begun; what is in work comes to its own end.
+`execute` runs the nodes of a stage in parallel (`_change_node`: firmware, or packages and then files) and a mesh change
+as one. A failed canary, an exhausted failure budget or Ctrl-C prevents further starts; nodes in progress finish.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from meshctl.apply.commit_confirm import configure
-from meshctl.apply.context import Job, Work
+from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import expectation
-from meshctl.apply.mesh_commit import switch
-from meshctl.apply.neighbor_query import look_around
+from meshctl.apply.mesh_commit import commit_mesh
+from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.packages import install
 from meshctl.apply.prepare import Prepared, base_macs
-from meshctl.apply.stale_stations import booted_unforgotten_s
-from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest, make_up_for
+from meshctl.apply.stale_stations import unflushed_boot_s
+from meshctl.apply.station_flush import UNFLUSHED, flush_later, retry_unanswered
 from meshctl.apply.sysupgrade import checked_image, flash
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
@@ -38,133 +38,137 @@ from meshctl.fleet import (
 from meshctl.fleet.journal import Journal, Run
 from meshctl.model import Fleet, NodeState
 from meshctl.nodes.collect import facts_of, known_macs
-from meshctl.nodes.connections import Access
-from meshctl.nodes.last_seen import ask_around
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.last_seen import query_neighbors
 from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """Where and for whom a plan is carried out."""
+class RunSettings:
+    """The settings of a run: fleet, connections, journal, owner, observers."""
 
     fleet: Fleet
-    access: Access
+    connections: ConnectionPool
     journal: Journal
-    run: Run
+    journal_run: Run
     owner: str
     interrupt: Interrupt
     observer: Observer
     rate_bytes_per_s: float | None = None
 
 
-def carry_out(prepared: Prepared, setting: Setting) -> dict[str, Outcome]:
-    """Apply the plan. Raises InputError and InvalidInput before anything is changed: an image or package file that is
-    not what the inventory says."""
-    plan, fleet = prepared.plan, setting.fleet
+def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
+    """Apply the plan. Raises InputError and InvalidInput, before any change, for an image that does not match the
+    inventory."""
+    plan, fleet = prepared.plan, settings.fleet
     images = {
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    unforgotten = _unforgotten(prepared, setting)
-    work = _work(prepared, setting, unforgotten)
-    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _without_work(fleet, made))}
+    unflushed = _unflushed(prepared, settings)
+    run_context = _run_context(prepared, settings, unflushed)
+    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
-        _tell(setting, outcome)
-    jobs = _jobs(prepared, work)
-    for name, since_s in unforgotten.items():
-        make_up_for(_job(prepared, work, name), max(0.0, time.time() - since_s))
+        _finish(settings, outcome)
+    contexts = _node_contexts(prepared, run_context)
+    for name, since_s in unflushed.items():
+        flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
-        # a canary that was left in the middle is no canary that failed
-        reason = "interrupted before its turn" if setting.interrupt.stopping else stopped
+        # an interrupted canary is not a failed one
+        reason = "interrupted before it started" if settings.interrupt.stopping else stopped
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
-                _tell(setting, outcome)
+                _finish(settings, outcome)
         else:
-            ended = _stage(stage, jobs, plan, work, setting, budget, images)
+            ended = _run_stage(stage, contexts, plan, run_context, settings, budget, images)
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
-    outcomes.update(_searched(prepared, setting, jobs, outcomes))
-    outcomes.update(_with_those_not_asked(work, outcomes))
+    outcomes.update(_with_last_seen(prepared, settings, contexts, outcomes))
+    outcomes.update(_with_unflushed_neighbors(run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
-def _unforgotten(prepared: Prepared, setting: Setting) -> dict[str, float]:
-    """The nodes that answered whose radios may have started anew without their neighbours having been told, and since
-    when (Unix time): of a change's beginning the end was not seen, or they have booted since they were last known."""
-    seen = prepared.seen.observations
-    lost = setting.journal.lost_sight_of(setting.fleet.name)
-    booted = {name: booted_unforgotten_s(name, seen) for name in prepared.plan.nodes}
-    since = {name: at_s for name, at_s in booted.items() if at_s is not None} | lost
-    return {name: at_s for name, at_s in since.items() if name in prepared.plan.nodes and name in seen}
+def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
+    """Node -> since when (Unix time) its radios may have restarted without a station flush: the end of a change was not
+    observed, or the node has booted since. Only nodes that answered."""
+    seen = prepared.observed.observations
+    missing = settings.journal.unfinished_changes(settings.fleet.name)
+    booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
+    since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | missing
+    return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
 
 
-def _work(prepared: Prepared, setting: Setting, unforgotten: Iterable[str]) -> Work:
-    fleet, seen = setting.fleet, prepared.seen.observations
-    known = setting.journal.last_known(fleet.name)
-    around = {**seen, **prepared.around}
-    if again := {name: seen[name] for name in unforgotten}:
-        around = look_around(setting.access, fleet, again, known, told=around, interrupt=setting.interrupt)
-    return Work(
+def _run_context(prepared: Prepared, settings: RunSettings, unflushed: Iterable[str]) -> RunContext:
+    fleet, seen = settings.fleet, prepared.observed.observations
+    known = settings.journal.last_known(fleet.name)
+    observations = {**seen, **prepared.neighbor_observations}
+    if again := {name: seen[name] for name in unflushed}:
+        observations = observe_neighbors(
+            settings.connections, fleet, again, known, observations=observations, interrupt=settings.interrupt
+        )
+    return RunContext(
         fleet,
-        setting.access,
-        setting.run,
-        setting.observer,
-        setting.interrupt,
-        setting.owner,
-        remember=lambda name, told: setting.run.remember(fleet.name, name, facts_of(told), told.answered_at_s),
-        rate_bytes_per_s=setting.rate_bytes_per_s,
-        around=around,
-        names=known_macs(fleet, known),
-        bases=base_macs(fleet, seen, known),
+        settings.connections,
+        settings.journal_run,
+        settings.observer,
+        settings.interrupt,
+        settings.owner,
+        remember=lambda name, seen: settings.journal_run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
+        rate_bytes_per_s=settings.rate_bytes_per_s,
+        observations=observations,
+        mac_owners=known_macs(fleet, known),
+        base_macs=base_macs(fleet, seen, known),
     )
 
 
-# Results of a node that was in work and is out of sight.
+# Results of a node that was in progress and is unreachable now.
 _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
-def _searched(
-    prepared: Prepared, setting: Setting, jobs: Mapping[str, Job], outcomes: Mapping[str, Outcome]
+def _with_last_seen(
+    prepared: Prepared, settings: RunSettings, contexts: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
-    """The outcomes of nodes that did not return, with what was last seen of them, and by whom."""
-    lost = [name for name in jobs if outcomes[name].result in _LOST]
-    if not lost or setting.interrupt.leaving:
+    """The outcomes of nodes that did not come back, with their last known state and who still hears them."""
+    missing = [name for name in contexts if outcomes[name].result in _LOST]
+    if not missing or settings.interrupt.leaving:
         return {}
-    fleet = setting.fleet
-    known = setting.journal.last_known(fleet.name)
-    found = ask_around(setting.access, fleet, lost, prepared.seen, known, interrupt=setting.interrupt)
-    told = {}
+    fleet = settings.fleet
+    known = settings.journal.last_known(fleet.name)
+    found = query_neighbors(
+        settings.connections, fleet, missing, prepared.observed, known, interrupt=settings.interrupt
+    )
+    updated = {}
     for name, place in found.items():
         text = place.text(time.time())
         outcome = outcomes[name]
-        told[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
-        setting.run.finish_node(told[name])
-        setting.observer(Event(EventKind.NOTE, name, time.time(), text))
-    return told
+        updated[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
+        settings.journal_run.finish_node(updated[name])
+        settings.observer(Event(EventKind.NOTE, name, time.time(), text))
+    return updated
 
 
-def _with_those_not_asked(work: Work, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
-    """The outcomes of nodes that some neighbour may not hear for a while, with who that is."""
-    told = {}
-    for name, silent in ask_the_rest(work).items():
-        told[name] = replace(outcomes[name], facts={**outcomes[name].facts, NOT_ASKED: " ".join(silent)})
-        work.run.finish_node(told[name])
-    return told
+def _with_unflushed_neighbors(run_context: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+    """The outcomes of nodes of which some neighbors may still hold a stale station entry, with these neighbors."""
+    updated = {}
+    for name, unflushed in retry_unanswered(run_context).items():
+        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(unflushed)})
+        run_context.journal_run.finish_node(updated[name])
+    return updated
 
 
-def _tell(setting: Setting, outcome: Outcome) -> None:
-    setting.run.finish_node(outcome)
-    setting.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+def _finish(settings: RunSettings, outcome: Outcome) -> None:
+    settings.journal_run.finish_node(outcome)
+    settings.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
 
 
-def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
-    """The outcome of a node that nothing is done to; None for one that is changed."""
+def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
+    """The outcome of a node that is not changed; None for one that is."""
     match plan.verdict:
         case Verdict.SAME:
             return Outcome(plan.node, Result.UNCHANGED)
@@ -177,39 +181,39 @@ def _without_work(fleet: Fleet, plan: NodePlan) -> Outcome | None:
             return None
 
 
-def _jobs(prepared: Prepared, work: Work) -> dict[str, Job]:
+def _node_contexts(prepared: Prepared, run_context: RunContext) -> dict[str, NodeContext]:
     changing = (name for name, plan in prepared.plan.nodes.items() if plan.verdict is Verdict.CHANGE)
-    return {name: _job(prepared, work, name) for name in changing}
+    return {name: _node_context(prepared, run_context, name) for name in changing}
 
 
-def _job(prepared: Prepared, work: Work, name: str) -> Job:
-    seen, wanted = prepared.seen.observations[name], prepared.wanted[name]
-    expected = expectation(wanted, seen, work.bases)
-    return Job(work, work.fleet.nodes[name], prepared.plan.nodes[name], wanted, seen, expected)
+def _node_context(prepared: Prepared, run_context: RunContext, name: str) -> NodeContext:
+    seen, desired = prepared.observed.observations[name], prepared.desired[name]
+    expected = expectation(desired, seen, run_context.base_macs)
+    return NodeContext(run_context, run_context.fleet.nodes[name], prepared.plan.nodes[name], desired, seen, expected)
 
 
-def _stage(
+def _run_stage(
     stage: Stage,
-    jobs: Mapping[str, Job],
+    contexts: Mapping[str, NodeContext],
     plan: Plan,
-    work: Work,
-    setting: Setting,
+    run_context: RunContext,
+    settings: RunSettings,
     budget: FailureBudget,
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
-    observer = Tee((_journaling(setting.run), setting.observer))
+    observer = Tee((_journaling(settings.journal_run), settings.observer))
     if stage.kind is StageKind.SWITCH:
-        ended = _switch_stage(stage, jobs, plan, work, observer)
+        ended = _switch_stage(stage, contexts, plan, run_context, observer)
         for outcome in ended.values():
             budget.count(outcome)
         return ended
     return run(
         stage.nodes,
-        lambda name: _one_node(jobs[name], images),
-        # a stage says who may be down together, the policy how many we can work on at once
-        parallel=max(1, work.fleet.apply.parallel),
+        lambda name: _change_node(contexts[name], images),
+        # the stage limits which nodes may be down together, the policy how many are worked on at once
+        parallel=max(1, run_context.fleet.apply.parallel),
         budget=budget,
-        interrupt=setting.interrupt,
+        interrupt=settings.interrupt,
         observer=observer,
     )
 
@@ -222,65 +226,69 @@ def _journaling(journal_run: Run) -> Observer:
     return write
 
 
-def _one_node(job: Job, images: Mapping[str, Path]) -> Outcome:
-    """Firmware, or packages and then files. NodeError means that nothing was changed."""
-    if job.plan.firmware is not None:
-        return flash(job, _connection(job), images[job.node.hardware.name])
-    outcome = Outcome(job.name, Result.DONE)
-    if job.plan.packages is not None:
-        outcome = install(job, _connection(job), job.plan.packages)
-    if not job.plan.files or not outcome.result.is_good:
+def _change_node(ctx: NodeContext, images: Mapping[str, Path]) -> Outcome:
+    """Change firmware, or packages and then files. NodeError means that nothing was changed."""
+    if ctx.plan.firmware is not None:
+        return flash(ctx, _connection(ctx), images[ctx.node.hardware.name])
+    outcome = Outcome(ctx.name, Result.DONE)
+    if ctx.plan.packages is not None:
+        outcome = install(ctx, _connection(ctx), ctx.plan.packages)
+    if not ctx.plan.files or not outcome.result.is_good:
         return outcome
     try:
-        return configure(job, _connection(job))
+        return configure(ctx, _connection(ctx))
     except NodeError as error:
-        if job.plan.packages is None:
+        if ctx.plan.packages is None:
             raise
-        # its packages are there to stay, and a resume has only the files left to do
-        failed = outcome_of_error(job.name, error)
-        return replace(failed, result=Result.FAILED, reason=f"its packages are installed, its files not: {error}")
+        # its packages stay installed, so a resume only has to apply the files
+        failed = outcome_of_error(ctx.name, error)
+        return replace(
+            failed, result=Result.FAILED, reason=f"its packages are installed, but its files are not applied: {error}"
+        )
 
 
-def _connection(job: Job) -> SshConnection:
-    """The kept connection, or a new one to where the node is now: on the bench, if it was met there."""
-    access = job.work.access
-    return access.take(job.name) or access.open(job.node, endpoint=access.newcomers.get(job.name))
+def _connection(ctx: NodeContext) -> SshConnection:
+    """The pooled connection, or a new one to where the node is now: on the bench, if it was discovered there."""
+    connections = ctx.run.connections
+    return connections.acquire(ctx.name) or connections.open(
+        ctx.node, endpoint=connections.bench_endpoints.get(ctx.name)
+    )
 
 
 def _switch_stage(
-    stage: Stage, jobs: Mapping[str, Job], plan: Plan, work: Work, observer: Observer
+    stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
-    """Packages first, which cut nothing; then everybody at one moment."""
+    """Install packages first, which interrupts nothing; then change all nodes simultaneously."""
     began = time.monotonic()
     for name in stage.nodes:
         observer(Event(EventKind.STARTED, name, time.time()))
-    failed = _packages_first(stage, jobs)
+    failed = _packages_first(stage, contexts)
     if failed:
-        reason = f"the switch was called off: {', '.join(failed)} was not ready"
+        reason = f"the mesh change was cancelled: packages could not be installed on {', '.join(failed)}"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
-        ended = switch(
-            work,
-            [jobs[name] for name in stage.nodes],
-            quorum=work.fleet.apply.quorum,
-            parallel=work.fleet.apply.parallel,
+        ended = commit_mesh(
+            run_context,
+            [contexts[name] for name in stage.nodes],
+            quorum=run_context.fleet.apply.quorum,
+            parallel=run_context.fleet.apply.parallel,
             entry=plan.entry,
         )
     took_s = round(time.monotonic() - began, 3)
-    told = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
-    for outcome in told.values():
+    updated = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
+    for outcome in updated.values():
         observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
-    return told
+    return updated
 
 
-def _packages_first(stage: Stage, jobs: Mapping[str, Job]) -> dict[str, Outcome]:
+def _packages_first(stage: Stage, contexts: Mapping[str, NodeContext]) -> dict[str, Outcome]:
     failed: dict[str, Outcome] = {}
     for name in stage.nodes:
-        step = jobs[name].plan.packages
+        step = contexts[name].plan.packages
         if step is None:
             continue
         try:
-            outcome = install(jobs[name], _connection(jobs[name]), step)
+            outcome = install(contexts[name], _connection(contexts[name]), step)
         except NodeError as error:
             outcome = outcome_of_error(name, error)
         if not outcome.result.is_good:

@@ -1,7 +1,8 @@
-"""Whether a change has proven itself: what was seen of the node before and after it -> what is still missing. Pure.
+"""Health checks after a change: observations before and after it -> the conditions not met yet. Pure.
 
-A node may keep its new configuration only when its services took it (`_reload`), its LAN is there (`_lan`), its radios
-are in their cells (`_radios`), the neighbours it had are back (`_neighbours`) and the base can be reached (`_base`).
+A change is confirmed only when its services have reloaded (`_reload`), packages are installed (`_packages`), the LAN is
+up (`_lan`), radios have joined their cells (`_radios`), enough mesh neighbors are heard (`_neighbors`) and the base is
+reachable (`_base`).
 """
 
 from __future__ import annotations
@@ -11,53 +12,53 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from meshctl.device.observation import Observation
-from meshctl.plan import Wanted
+from meshctl.plan import DesiredState
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 
-# Robots move: of the neighbours a node had, so many have to be heard again.
-NEIGHBOURS_BACK = 0.5
+# The share of its former neighbors a node must hear again; not all, because robots move.
+MIN_NEIGHBOR_SHARE = 0.5
 RELOADING = "its services are still reloading"
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What has to be there again. `neighbours` are the MACs heard before, `bases` those of the base's mesh radios;
-    empty when there were none, e.g. on the bench; `needs` are packages, where the change was about them."""
+    """What must hold after the change. `neighbors` are the MACs heard before, `base_macs` the MACs of the base's mesh
+    radios, both empty on the bench; `needs` are packages, for a change of packages."""
 
     wireless: Package | None = None
     network: Package | None = None
-    neighbours: frozenset[str] = frozenset()
-    bases: frozenset[str] = frozenset()
+    neighbors: frozenset[str] = frozenset()
+    base_macs: frozenset[str] = frozenset()
     needs: Needs = NO_NEEDS
 
-    def with_bases(self, current: frozenset[str]) -> Expectation:
-        """The same, where the base may be reached by any of these MACs; a node that did not reach it need not now."""
-        return replace(self, bases=self.bases | current) if self.bases else self
+    def with_base_macs(self, current: frozenset[str]) -> Expectation:
+        """The same, with further MACs of the base; a node that did not reach the base before need not now."""
+        return replace(self, base_macs=self.base_macs | current) if self.base_macs else self
 
 
-def expectation(wanted: Wanted, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
-    """What this node had and must have again; the base counts only if it was reached through the mesh before."""
-    trees = {file.package.name: file.package for file in wanted.files if file.package is not None}
+def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
+    """What this node must have after the change; the base only if it was reachable through the mesh before."""
+    trees = {file.package.name: file.package for file in desired.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
     return Expectation(
         trees.get("wireless"),
         trees.get("network"),
-        heard(before),
+        heard_neighbors(before),
         frozenset(mac.lower() for mac in base_macs) & originators,
     )
 
 
-def heard(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
-    """The MACs of the mesh neighbours heard lately."""
+def heard_neighbors(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
+    """The MACs of the mesh neighbors heard recently."""
     return frozenset(n.mac.lower() for n in seen.neighbours or () if n.last_seen_ms <= fresh_ms)
 
 
-def missing(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
-    """What is not there yet, each as half a sentence; empty when the change has proven itself.
+def unmet(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:
+    """The conditions not met yet, one clause each; empty when the change has proven itself.
 
-    `since_s` is how long the change has stood: what was heard before it does not count.
+    `since_s` is how long the change has been applied: what was heard before does not count.
     """
     fresh_ms = NEIGHBOUR_FRESH_MS if since_s is None else min(NEIGHBOUR_FRESH_MS, since_s * 1000)
     return (
@@ -65,7 +66,7 @@ def missing(expected: Expectation, after: Observation, *, since_s: float | None 
         *_packages(expected, after),
         *_lan(expected, after),
         *_radios(expected, after),
-        *_neighbours(expected, after, fresh_ms),
+        *_neighbors(expected, after, fresh_ms),
         *_base(expected, after, fresh_ms),
     )
 
@@ -76,7 +77,7 @@ def _reload(after: Observation) -> tuple[str, ...]:
     status = after.change.reload_status
     if status is None:
         return (RELOADING,)
-    return (f"reloading its services failed with status {status}",) if status != 0 else ()
+    return (f"reloading its services failed with exit status {status}",) if status != 0 else ()
 
 
 def _packages(expected: Expectation, after: Observation) -> tuple[str, ...]:
@@ -114,24 +115,24 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
     if expected.wireless is None or after.links is None:
         return ()
     devices = {section.name: section for section in expected.wireless.of_type("wifi-device")}
-    told = []
+    problems = []
     for iface in expected.wireless.of_type("wifi-iface"):
         device = devices.get(iface.get("device"))
         if device is None or "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
             continue
-        told += _radio(iface, device.get("channel"), after)
-    return tuple(told)
+        problems += _radio(iface, device.get("channel"), after)
+    return tuple(problems)
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     name = iface.get("ifname")
     link = next((found for found in after.links or () if found.ifname == name), None)
     if link is None:
-        return [f"{name} is not there"]
-    # `up` in netifd does not prove that a cell was joined (openwrt-facts.md section 5)
+        return [f"{name} does not exist"]
+    # `up` in netifd does not mean that the cell was joined (openwrt-facts.md section 5)
     if link.joined is False:
         return [f"{name} has not joined its cell"]
-    # 23.05 and later join a mesh in the open where the supplicant cannot (wifi-scripts, mac80211.sh)
+    # 23.05 and later join a mesh unencrypted where the supplicant cannot (wifi-scripts, mac80211.sh)
     if iface.get("encryption", "none") != "none" and after.supplicants is not None and name not in after.supplicants:
         return [f"{name} is not encrypted: wpa_supplicant does not run it"]
     if link.channel is not None and channel.isdigit() and link.channel != int(channel):
@@ -142,17 +143,17 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     return []
 
 
-def _neighbours(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
-    needed = math.ceil(len(expected.neighbours) * NEIGHBOURS_BACK)
-    # by number, not by name: a neighbour may have moved on, another come near
-    found = len(heard(after, fresh_ms))
+def _neighbors(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
+    needed = math.ceil(len(expected.neighbors) * MIN_NEIGHBOR_SHARE)
+    # by number, not by name: robots move
+    found = len(heard_neighbors(after, fresh_ms))
     if found >= needed:
         return ()
-    return (f"it hears {found} mesh neighbour{'s' if found != 1 else ''} of the {len(expected.neighbours)} it had",)
+    return (f"it hears {found} mesh neighbor{'s' if found != 1 else ''} of the {len(expected.neighbors)} it had",)
 
 
 def _base(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:
-    if not expected.bases:
+    if not expected.base_macs:
         return ()
     reached = {entry.mac.lower() for entry in after.originators or () if entry.last_seen_ms <= fresh_ms}
-    return () if expected.bases & reached else ("it has no way to the base",)
+    return () if expected.base_macs & reached else ("it has no route to the base",)

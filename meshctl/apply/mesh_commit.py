@@ -1,9 +1,9 @@
-"""Change a whole mesh at one moment: all of it, or none.
+"""Change a whole mesh simultaneously, all or nothing: arm, schedule, prove, then confirm or roll back.
 
-`switch`: every node is prepared and armed (`_prepare`); each is given the same moment, as its own uptime measured just
-before (`_schedule`), so no clock has to be right; then all are looked for in the new cell (`_gather_again`). When all
-have proven themselves they are confirmed; at the last moment a quorum of each mesh with the base among it is enough.
-Otherwise those that can be reached are taken back, the farthest first, and the others go back by their own timers.
+`commit_mesh` arms every participant (`_arm`) and schedules the same moment on all, as the uptime of each node measured
+just before (`_schedule`), so no clock has to be set. Then it looks for all of them in the new cell (`_decide`). When
+all have proven themselves they are confirmed; at the deadline a quorum of each mesh that includes the base is enough.
+Otherwise the reachable nodes are rolled back, the farthest first, and the others by their own timers.
 """
 
 from __future__ import annotations
@@ -16,287 +16,309 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from meshctl.apply.change_in_progress import (
-    Attempt,
-    attempt_of,
-    begin,
+    ChangeInProgress,
+    abort,
+    arm,
     confirm,
-    look,
-    prepare,
-    reach,
-    release,
-    take_back,
+    connect,
+    new_change,
+    observe_and_decide,
+    start,
+    unlock,
 )
-from meshctl.apply.commit_confirm import follow
-from meshctl.apply.context import Job, Work
-from meshctl.apply.next_action import Move
-from meshctl.device.openwrt import Clocked, measure_uptime
+from meshctl.apply.commit_confirm import poll
+from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.next_action import Action
+from meshctl.device.openwrt import UptimeSample, measure_uptime
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.nodes.backoff import Pace
+from meshctl.nodes.backoff import Backoff
 
-# The moment lies this many of the slowest node's round trips ahead, for each turn of the parallel sending, and at
-# least LEAD_S, within which a start-stop-daemon and two shells have started on the slowest board.
+# The scheduled moment is this many round trips of the slowest node ahead, for each batch of parallel commands, and at
+# least LEAD_S: the slowest board needs that to start a start-stop-daemon and two shells.
 LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
-# So much of the window is kept for confirming.
+# The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
-# The fact beside the outcome of a node that did not make it: what parts it from its mesh now.
+# The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
 LEFT_BEHIND = "left_behind"
 
 
 @dataclass(slots=True)
-class Member:
-    """One node of the switch. `failure` is why it cannot take part."""
+class Participant:
+    """One node of the mesh change. `failure` is why it cannot take part."""
 
-    job: Job
-    attempt: Attempt | None = None
-    clock: Clocked | None = None
+    ctx: NodeContext
+    change: ChangeInProgress | None = None
+    clock: UptimeSample | None = None
     failure: Outcome | None = None
     is_scheduled: bool = False
-    is_silent: bool = False
+    is_unreachable: bool = False
     is_proven: bool = False
     is_confirmed: bool = False
 
     @property
     def name(self) -> str:
-        return self.job.name
+        return self.ctx.name
 
     @property
     def meshes(self) -> tuple[str, ...]:
-        """The meshes whose cell it changes."""
-        return self.job.plan.parted_from
+        """The meshes whose cell this node changes."""
+        return self.ctx.plan.parted_from
 
 
 @dataclass(slots=True)
-class _Switch:
-    """The switch under way. `members` are in the order in which they may be lost: farthest first, the entry last."""
+class _MeshCommit:
+    """A mesh change in progress. `participants` are ordered farthest first, the entry node last."""
 
-    work: Work
-    members: Sequence[Member]
+    run: RunContext
+    participants: Sequence[Participant]
     window_s: int
     parallel: int
     entry: str
     pool: ThreadPoolExecutor = field(repr=False)
 
-    def each(self, members: Iterable[Member], act: Callable[[Member], None]) -> None:
-        """Do it for all, `parallel` at a time, and wait; a bug is raised."""
-        for future in [self.pool.submit(act, member) for member in members]:
+    def each(self, participants: Iterable[Participant], act: Callable[[Participant], None]) -> None:
+        """Run `act` for all, `parallel` at a time, and wait; an unexpected exception is raised."""
+        for future in [self.pool.submit(act, participant) for participant in participants]:
             future.result()
 
 
-def switch(work: Work, jobs: Sequence[Job], *, quorum: float, parallel: int, entry: str) -> dict[str, Outcome]:
-    """Carry out the jobs' file changes at one moment. Returns each node's outcome; nothing is raised for a node."""
-    members = [Member(job) for job in jobs]
-    window_s = max(job.node.confirm_window_s for job in jobs)
+def commit_mesh(
+    run_context: RunContext, contexts: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
+) -> dict[str, Outcome]:
+    """Apply the file changes of these nodes simultaneously. Returns each node's outcome; raises nothing for a node."""
+    participants = [Participant(ctx) for ctx in contexts]
+    window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
-        run = _Switch(work, members, window_s, max(1, parallel), entry, pool)
-        run.each(members, lambda member: _prepare(run, member))
-        if any(member.failure for member in members) or work.interrupt.stopping:
-            return _call_off(run, "the switch was called off: not every node was ready")
-        _schedule(run)
-        if not all(member.is_scheduled for member in members):
-            return _call_off(run, "the switch was called off: not every node took the moment")
-        needed = needed_of(members, quorum)
-        told = ", ".join(f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items())
-        work.note(f"{len(members)} nodes change at one moment; {told} of them have to meet again")
-        return _settle(run, needed)
+        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
+        commit.each(participants, lambda participant: _arm(commit, participant))
+        if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
+            return _cancel(commit, "the mesh change was cancelled: not every node could be armed")
+        _schedule(commit)
+        if not all(participant.is_scheduled for participant in participants):
+            return _cancel(commit, "the mesh change was cancelled: not every node could be scheduled")
+        needed = quorum_of(participants, quorum)
+        quorum_text = ", ".join(
+            f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
+        )
+        run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must rejoin")
+        return _decide(commit, needed)
 
 
-def needed_of(members: Iterable[Member], quorum: float) -> dict[str, int]:
-    """How many nodes of each changing mesh have to meet again."""
-    counts = Counter(mesh for member in members for mesh in member.meshes)
+def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
+    """How many nodes of each changing mesh must rejoin it."""
+    counts = Counter(mesh for participant in participants for mesh in participant.meshes)
     return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
 
 
-def missing_of(proven: Iterable[Member], needed: Mapping[str, int]) -> str:
-    """Which meshes are short of nodes; empty when each has as many as it needs."""
-    there = Counter(mesh for member in proven for mesh in member.meshes)
+def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int]) -> str:
+    """Which meshes are below their quorum; empty when none is."""
+    there = Counter(mesh for participant in proven for mesh in participant.meshes)
     short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
-    return "; ".join(f"{there[mesh]} of mesh {mesh} met again, {count} needed" for mesh, count in short.items())
+    return "; ".join(f"{there[mesh]} of mesh {mesh} rejoined, {count} required" for mesh, count in short.items())
 
 
-def _prepare(run: _Switch, member: Member) -> None:
-    job = member.job
+def _arm(commit: _MeshCommit, participant: Participant) -> None:
+    ctx = participant.ctx
     try:
-        with run.work.access.lease(job.node) as connection:
-            member.attempt = attempt_of(job, connection.endpoint, window_s=run.window_s)
-            prepare(member.attempt, connection)
-            member.clock = measure_uptime(connection)
+        with commit.run.connections.borrow(ctx.node) as connection:
+            participant.change = new_change(ctx, connection.endpoint, window_s=commit.window_s)
+            arm(participant.change, connection)
+            participant.clock = measure_uptime(connection)
     except NodeError as error:
-        member.failure = Outcome(job.name, Result.FAILED, str(error), hint=error.hint)
+        participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)
 
 
-def _schedule(run: _Switch) -> None:
-    """Tell every node the moment, in its own uptime."""
-    slowest_s = max((2 * member.clock.error_s for member in run.members if member.clock is not None), default=0.0)
-    turns = math.ceil(len(run.members) / run.parallel)
+def _schedule(commit: _MeshCommit) -> None:
+    """Schedule the change on every node, in its own uptime."""
+    slowest_s = max(
+        (2 * participant.clock.error_s for participant in commit.participants if participant.clock is not None),
+        default=0.0,
+    )
+    turns = math.ceil(len(commit.participants) / commit.parallel)
     moment = time.monotonic() + max(LEAD_S, LEAD_ROUND_TRIPS * slowest_s * turns)
 
-    def tell(member: Member) -> None:
-        if member.attempt is None or member.clock is None:
+    def start_one(participant: Participant) -> None:
+        if participant.change is None or participant.clock is None:
             return
         try:
-            with run.work.access.lease(member.job.node) as connection:
-                begin(member.attempt, connection, at_uptime_s=member.clock.uptime_at(moment))
-            member.is_scheduled = True
+            with commit.run.connections.borrow(participant.ctx.node) as connection:
+                start(participant.change, connection, at_uptime_s=participant.clock.uptime_at(moment))
+            participant.is_scheduled = True
         except NodeError as error:
-            member.failure = Outcome(member.name, Result.FAILED, str(error), hint=error.hint)
+            participant.failure = Outcome(participant.name, Result.FAILED, str(error), hint=error.hint)
 
-    run.each(run.members, tell)
-    if all(member.is_scheduled for member in run.members):
-        for member in run.members:
-            run.work.access.drop(member.name)
+    commit.each(commit.participants, start_one)
+    if all(participant.is_scheduled for participant in commit.participants):
+        for participant in commit.participants:
+            commit.run.connections.drop(participant.name)
         time.sleep(max(0.0, moment - time.monotonic()))
 
 
-def _call_off(run: _Switch, reason: str) -> dict[str, Outcome]:
-    """Nothing has changed yet, or is about to: drop it everywhere."""
+def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
+    """Cancel the change on every node before it starts."""
 
-    def drop(member: Member) -> None:
-        attempt = member.attempt
-        if attempt is None:
+    def cancel_one(participant: Participant) -> None:
+        change = participant.change
+        if change is None:
             return
-        attempt.is_given_up = True
+        change.is_abandoned = True
         try:
-            with run.work.access.lease(member.job.node) as connection:
-                take_back(attempt, connection)
-                release(attempt, connection)
+            with commit.run.connections.borrow(participant.ctx.node) as connection:
+                abort(change, connection)
+                unlock(change, connection)
         except NodeError as error:
-            attempt.trouble = str(error)
-        if member.is_scheduled or attempt.trouble:
-            # it may have begun before it could be dropped
-            outcome = follow(attempt)
+            change.last_error = str(error)
+        if participant.is_scheduled or change.last_error:
+            # it may have started before it was aborted
+            outcome = poll(change)
             if not outcome.result.is_good:
-                member.failure = member.failure or outcome
+                participant.failure = participant.failure or outcome
 
-    run.each(run.members, drop)
-    return {member.name: member.failure or Outcome(member.name, Result.PENDING, reason) for member in run.members}
+    commit.each(commit.participants, cancel_one)
+    return {
+        participant.name: participant.failure or Outcome(participant.name, Result.PENDING, reason)
+        for participant in commit.participants
+    }
 
 
-def _settle(run: _Switch, needed: Mapping[str, int]) -> dict[str, Outcome]:
-    """Look for everybody in the new cell until all are there or it is time to decide; then decide, once."""
-    pace = Pace(run.window_s * (1 - CONFIRM_SHARE), run.work.interrupt)
-    run.work.interrupt.wait(max(member.attempt.settle_s for member in run.members if member.attempt is not None))
-    while True:
-        run.each([member for member in run.members if not member.is_proven], _prove)
-        proven = [member for member in run.members if member.is_proven]
-        if len(proven) == len(run.members) or pace.is_over or run.work.interrupt.leaving:
-            break
-        _have_forgotten(run, proven)
-        pace.pause()
-    has_entry = (
-        not run.entry or any(m.name == run.entry for m in proven) or all(m.name != run.entry for m in run.members)
+def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome]:
+    """Observe the participants in the new cell until all have proven themselves or time is up; then decide, once."""
+    backoff = Backoff(commit.window_s * (1 - CONFIRM_SHARE), commit.run.interrupt)
+    commit.run.interrupt.wait(
+        max(participant.change.settle_s for participant in commit.participants if participant.change is not None)
     )
-    why = missing_of(proven, needed) if has_entry else "the base did not come back"
+    while True:
+        commit.each([participant for participant in commit.participants if not participant.is_proven], _prove)
+        proven = [participant for participant in commit.participants if participant.is_proven]
+        if len(proven) == len(commit.participants) or backoff.is_over or commit.run.interrupt.leaving:
+            break
+        _flush_unreachable(commit, proven)
+        backoff.pause()
+    has_entry = (
+        not commit.entry
+        or any(m.name == commit.entry for m in proven)
+        or all(m.name != commit.entry for m in commit.participants)
+    )
+    why = short_of_quorum(proven, needed) if has_entry else "the base did not come back"
     if not why:
-        return _keep(run)
-    run.work.note(f"{why}; rolling back: {'; '.join(gap_of(member) for member in run.members if not member.is_proven)}")
-    return _undo(run, why)
+        return _confirm_all(commit)
+    unproven = [unmet_of(participant) for participant in commit.participants if not participant.is_proven]
+    commit.run.note(f"{why}; rolling back: {'; '.join(unproven)}")
+    return _roll_back(commit, why)
 
 
-def gap_of(member: Member) -> str:
-    """`b01: it has no way to the base`: what kept a member from proving itself when it was last looked for."""
-    attempt = member.attempt
-    if attempt is None or member.is_silent or not attempt.gaps:
-        last_error = "" if attempt is None else attempt.trouble
-        return f"{member.name}: it does not answer{f' ({last_error})' if last_error else ''}"
-    return f"{member.name}: {', '.join(attempt.gaps)}"
+def unmet_of(participant: Participant) -> str:
+    """`b01: it has no route to the base`: why a participant had not proven itself in its latest observation."""
+    change = participant.change
+    if change is None or participant.is_unreachable or not change.unmet:
+        last_error = "" if change is None else change.last_error
+        return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
+    return f"{participant.name}: {', '.join(change.unmet)}"
 
 
-def _have_forgotten(run: _Switch, proven: Sequence[Member]) -> None:
+def _flush_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
     """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
-    come to know its old radio."""
-    names = {member.name for member in proven}
+    create a station entry of the radio before its restart."""
+    names = {participant.name for participant in proven}
 
-    def ask(member: Member) -> None:
-        if member.attempt is not None and member.is_silent:
-            member.attempt.forgetting.while_silent(names)
+    def flush_one(participant: Participant) -> None:
+        if participant.change is not None and participant.is_unreachable:
+            participant.change.flush.unreachable(names)
 
-    run.each(run.members, ask)
+    commit.each(commit.participants, flush_one)
 
 
-def _prove(member: Member) -> None:
-    attempt = member.attempt
-    connection = None if attempt is None else reach(attempt)
-    member.is_silent = connection is None
-    if attempt is None or connection is None:
+def _prove(participant: Participant) -> None:
+    change = participant.change
+    connection = None if change is None else connect(change)
+    participant.is_unreachable = connection is None
+    if change is None or connection is None:
         return
     try:
-        member.is_proven = look(attempt, connection) is Move.CONFIRM
-        if attempt.last is not None:
-            member.job.work.saw(member.name, attempt.last)
+        participant.is_proven = observe_and_decide(change, connection) is Action.CONFIRM
+        if change.last is not None:
+            participant.ctx.run.record(participant.name, change.last)
     except NodeError as error:
-        attempt.trouble = str(error)
+        change.last_error = str(error)
     finally:
         connection.close()
 
 
-def _keep(run: _Switch) -> dict[str, Outcome]:
-    """Confirm those that are there, and those that come late, again and again until the window's end; the others are
-    left behind."""
+def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
+    """Confirm the proven participants, and late ones until the window ends; the others are left behind."""
 
-    def keep(member: Member) -> None:
-        if not member.is_proven:
-            _prove(member)
-        if member.attempt is None or not member.is_proven:
+    def confirm_one(participant: Participant) -> None:
+        if not participant.is_proven:
+            _prove(participant)
+        if participant.change is None or not participant.is_proven:
             return
         try:
-            member.is_confirmed = confirm(member.attempt)
+            participant.is_confirmed = confirm(participant.change)
         except NodeError as error:
-            member.attempt.trouble = str(error)
+            participant.change.last_error = str(error)
 
-    pace = Pace(run.window_s * CONFIRM_SHARE, run.work.interrupt)
-    while not pace.is_over:
-        run.each([member for member in run.members if not member.is_confirmed], keep)
-        if all(member.is_confirmed for member in run.members) or run.work.interrupt.leaving:
+    backoff = Backoff(commit.window_s * CONFIRM_SHARE, commit.run.interrupt)
+    while not backoff.is_over:
+        commit.each([participant for participant in commit.participants if not participant.is_confirmed], confirm_one)
+        if all(participant.is_confirmed for participant in commit.participants) or commit.run.interrupt.leaving:
             break
-        pace.pause()
-    return {member.name: _kept_outcome(member) for member in run.members}
+        backoff.pause()
+    return {participant.name: _confirmed_outcome(participant) for participant in commit.participants}
 
 
-def _kept_outcome(member: Member) -> Outcome:
-    if member.is_confirmed:
-        return Outcome(member.name, Result.DONE)
-    gaps = "; ".join(member.attempt.gaps) if member.attempt is not None and member.attempt.gaps else "it was not seen"
+def _confirmed_outcome(participant: Participant) -> Outcome:
+    if participant.is_confirmed:
+        return Outcome(participant.name, Result.DONE)
+    unmet = (
+        "; ".join(participant.change.unmet)
+        if participant.change is not None and participant.change.unmet
+        else "it was not observed"
+    )
     return Outcome(
-        member.name,
+        participant.name,
         Result.UNCERTAIN,
-        f"left behind: the others are in the new cell, it goes back to the old one ({gaps})",
-        hint="reach it by cable and `meshctl resume`, or take the mesh back to the old cell",
-        facts={LEFT_BEHIND: ", ".join(member.job.plan.splits)},
+        f"left behind: the others are in the new cell, it rolls back to the old one ({unmet})",
+        hint="connect it by cable and run `meshctl resume`, or change the mesh back to the old cell",
+        facts={LEFT_BEHIND: ", ".join(participant.ctx.plan.splits)},
     )
 
 
-def _undo(run: _Switch, why: str) -> dict[str, Outcome]:
-    """Take back whoever can be reached, the farthest first, so that the way to the others lasts; then see them back."""
-    gaps = {member.name: gap_of(member) for member in run.members if not member.is_proven}
-    for member in run.members:
-        if member.attempt is None:
+def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
+    """Roll the reachable nodes back, the farthest first so that the path to the others lasts; then poll them all."""
+    unmet = {
+        participant.name: unmet_of(participant) for participant in commit.participants if not participant.is_proven
+    }
+    for participant in commit.participants:
+        if participant.change is None:
             continue
-        member.attempt.is_given_up = True
-        connection = reach(member.attempt)
+        participant.change.is_abandoned = True
+        connection = connect(participant.change)
         if connection is None:
             continue
         try:
-            take_back(member.attempt, connection)
+            abort(participant.change, connection)
         except NodeError as error:
-            member.attempt.trouble = str(error)
+            participant.change.last_error = str(error)
         finally:
             connection.close()
     ended: dict[str, Outcome] = {}
 
-    def see(member: Member) -> None:
-        if member.attempt is not None:
-            ended[member.name] = follow(member.attempt)
+    def poll_one(participant: Participant) -> None:
+        if participant.change is not None:
+            ended[participant.name] = poll(participant.change)
 
-    run.each(run.members, see)
+    commit.each(commit.participants, poll_one)
     return {
-        member.name: _told(ended.get(member.name), member.name, why, gaps.get(member.name, ""))
-        for member in run.members
+        participant.name: _rolled_back_outcome(
+            ended.get(participant.name), participant.name, why, unmet.get(participant.name, "")
+        )
+        for participant in commit.participants
     }
 
 
-def _told(outcome: Outcome | None, name: str, why: str, gap: str) -> Outcome:
+def _rolled_back_outcome(outcome: Outcome | None, name: str, why: str, gap: str) -> Outcome:
     if outcome is None:
         return Outcome(name, Result.PENDING, why)
     if outcome.result is Result.ROLLED_BACK:

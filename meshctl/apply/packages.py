@@ -1,8 +1,8 @@
-"""Install the packages a node lacks, from files: it has no internet. Under its dead-man's switch, like every change.
+"""Install missing packages from local files (nodes have no internet), under the dead-man's switch.
 
-The files are brought to the node's memory; then its own process removes what conflicts and installs, and that is
-confirmed over a new connection once nothing is lacking and the neighbours it had are heard again. Otherwise the node
-removes what it installed and puts back what it removed. Its files change afterwards, in a change of their own.
+The files are uploaded into the node's memory. A process on the node removes conflicting packages and installs the new
+ones; the change is confirmed over a new connection once nothing is missing and the node hears its neighbors again.
+Otherwise the node rolls back to its previous packages. Files are applied afterwards, as a change of their own.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from meshctl.apply.change_in_progress import Attempt, await_flash
+from meshctl.apply.change_in_progress import ChangeInProgress, await_flash
 from meshctl.apply.change_set import new_change_id, new_nonce
-from meshctl.apply.commit_confirm import carry
-from meshctl.apply.context import Job
+from meshctl.apply.commit_confirm import run_change
+from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.device import deadman
 from meshctl.device.deadman import Change
@@ -29,74 +29,76 @@ from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
 from meshctl.plan.seen import CONFIG
 
 DIRECTORY = "/tmp/meshctl/packages"
-# Unpacking packages into jffs2 takes a minute on the slowest boards, and as much again to keep what is removed.
-INSTALL_S = 300.0
-# What conflicts is the radios' supplicant: netifd sets each radio up with the one there is now.
-_WITH_THE_OTHER_SUPPLICANT = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
-# A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst): taken up, or put back.
-_TAKE_UP = "reload_config\n"
+# Unpacking packages into jffs2 takes a minute on the slowest boards, and saving the removed ones as long again.
+INSTALL_TIMEOUT_S = 300.0
+# The conflicting package is the radios' supplicant: netifd sets each radio up with the new one.
+_RESTART_RADIOS = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
+# A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst), which needs a reload.
+_RELOAD = "reload_config\n"
 
 
-def install(job: Job, connection: SshConnection, step: PackageStep) -> Outcome:
-    """Install the step's packages. Owns `connection`, and keeps one to the node if all went well.
+def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
+    """Install the step's packages. Owns `connection`; a confirmed node's connection goes to the pool.
 
-    Raises NodeError when nothing but its memory was changed on the node, InputError for a file that is not there.
+    Raises NodeError when only the node's memory has changed, InputError for a missing file.
     """
     try:
-        files = [_local(job, file) for file in step.files]
-        tool = job.before.package_tool
+        files = [_local(ctx, file) for file in step.files]
+        tool = ctx.before.package_tool
         if tool is None:
-            raise NodeError(f"{job.name}: it did not tell whether it has opkg or apk")
-        with job.step("packages"):
-            # first, because files in memory do not outlive a boot that is yet to come to its end
-            await_flash(job, connection)
-            script = deadman.packages(tool, _bring(job, connection, files), step.remove)
+            raise NodeError(f"{ctx.name}: expected opkg or apk, found no package manager")
+        with ctx.step("packages"):
+            # first, because files in memory do not survive the end of a first boot
+            await_flash(ctx, connection)
+            script = deadman.packages(tool, _upload(ctx, connection, files), step.remove)
     except BaseException:
         connection.close()
         raise
-    return carry(_attempt(job, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    return run_change(_new_change(ctx, connection, script, has_other_supplicant=bool(step.remove)), connection)
 
 
-def _bring(job: Job, connection: SshConnection, files: Sequence[Path]) -> list[str]:
+def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
     there = []
-    # of an earlier attempt with other files, which would only fill the memory
+    # files of an earlier attempt would only fill the memory
     names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
     connection.run(
         f"for f in {DIRECTORY}/* {DIRECTORY}/.*; do case ${{f##*/}} in {names}) ;; *) rm -f $f ;; esac; done"
     )
     for file in files:
         path = f"{DIRECTORY}/{file.name}"
-        upload(connection, file, path, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress)
+        upload(connection, file, path, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress)
         there.append(path)
     return there
 
 
-def _attempt(job: Job, connection: SshConnection, script: str, *, has_other_supplicant: bool) -> Attempt:
-    """A change of packages alone: the node stays where it is, and has to hear whom it heard."""
-    here = replace(connection.endpoint, identity=job.name)
-    expected = Expectation(neighbours=job.expected.neighbours, bases=job.expected.bases, needs=job.wanted.needs)
-    reload = _TAKE_UP + (_WITH_THE_OTHER_SUPPLICANT if has_other_supplicant else "exit 0\n")
-    return Attempt(
-        replace(job, expected=expected),
-        Change(new_change_id(), {}, reload, extra=script, covered=_configuration(job.before)),
+def _new_change(
+    ctx: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
+) -> ChangeInProgress:
+    """A change of packages alone: the node keeps its address, and must hear its neighbors again."""
+    here = replace(connection.endpoint, identity=ctx.name)
+    expected = Expectation(neighbors=ctx.expected.neighbors, base_macs=ctx.expected.base_macs, needs=ctx.desired.needs)
+    reload = _RELOAD + (_RESTART_RADIOS if has_other_supplicant else "exit 0\n")
+    return ChangeInProgress(
+        replace(ctx, expected=expected),
+        Change(new_change_id(), {}, reload, extra=script, covered=_configuration(ctx.before)),
         new_nonce(),
-        job.node.confirm_window_s,
+        ctx.node.confirm_window_s,
         here,
         (here,),
-        extra_s=INSTALL_S,
+        extra_s=INSTALL_TIMEOUT_S,
         radios=EVERY_RADIO if has_other_supplicant else NO_RADIOS,
     )
 
 
 def _configuration(before: Observation) -> tuple[str, ...]:
-    """The files below /etc/config, whatever a package's scripts do to them."""
+    """The files below /etc/config, which a package's scripts may change."""
     return tuple(f"/{CONFIG}{package}" for package in sorted(before.uci or {}))
 
 
-def _local(job: Job, file: str) -> Path:
-    """A package file's path here; relative ones stand beside the inventory."""
+def _local(ctx: NodeContext, file: str) -> Path:
+    """A package file's local path; a relative one is relative to the inventory."""
     path = Path(file).expanduser()
-    path = path if path.is_absolute() else Path(job.work.fleet.base) / path
+    path = path if path.is_absolute() else Path(ctx.run.fleet.base) / path
     if not path.is_file():
         raise InputError(f"{path}: package file not found", hint="correct package_files in the hardware profile")
     return path

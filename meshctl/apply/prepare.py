@@ -1,7 +1,7 @@
-"""From an inventory and the fleet as it is to a plan, with everything that carrying it out will need.
+"""Make a plan from the inventory and the observed fleet, with everything its execution needs.
 
-`prepare`: render -> gather -> one plan per node -> the rest of their meshes, where those are cut -> the fleet's order;
-the journal remembers what every node told.
+`prepare`: render -> collect -> one plan per node -> observe the other members of meshes that are cut -> fleet plan.
+The journal stores the facts of every observed node.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from meshctl.errors import InputError
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.nodes.collect import Seen, facts_of, gather, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
-from meshctl.nodes.last_seen import WITNESSES, whereabouts
-from meshctl.plan import Cut, NodePlan, Plan, Verdict, Wanted, fleet_plan, node_plan
+from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
+from meshctl.plan import Cut, DesiredState, NodePlan, Plan, Verdict, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.seen import package_of
 from meshctl.topology import mesh_macs
 
 
 @dataclass(frozen=True, slots=True)
-class Choices:
-    """What a person decided about a plan."""
+class PlanOptions:
+    """The operator's options for a plan."""
 
     with_firmware: bool = True
     leave_behind: tuple[str, ...] = ()
@@ -39,64 +39,64 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A plan, and what was rendered and seen for it; `around` is what others told who may know these nodes' radios."""
+    """A plan, with the desired and observed states it was made from; `neighbor_observations` are of nodes that may hold
+    station entries of these."""
 
     plan: Plan
-    wanted: Mapping[str, Wanted] = field(repr=False)
-    seen: Seen = field(repr=False)
+    desired: Mapping[str, DesiredState] = field(repr=False)
+    observed: FleetObservation = field(repr=False)
     salt: bytes = b""
-    around: Mapping[str, Observation] = field(default_factory=dict, repr=False)
+    neighbor_observations: Mapping[str, Observation] = field(default_factory=dict, repr=False)
 
 
 def prepare(
     renderer: Renderer,
-    access: Access,
+    connections: ConnectionPool,
     nodes: Iterable[Node],
     journal: Journal,
     *,
     salt: bytes,
     owner: str,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
 ) -> Prepared:
     """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
 
-    Where a running mesh is cut by it, the rest of that mesh is looked at, too: who is far, and who cuts off whom, does
-    not show in a part of it.
+    Where the plan cuts a running mesh, the whole mesh is observed: distances and cut vertices need all of it.
     """
     fleet = renderer.fleet
     chosen = tuple(nodes)
-    first = {node.name: renderer.wanted(node) for node in chosen}
-    seen = gather(
-        access,
+    rendered = {node.name: renderer.desired(node) for node in chosen}
+    seen = collect(
+        connections,
         chosen,
         parallel=fleet.apply.parallel,
-        paths=lambda node: other_paths(first[node.name]),
+        paths=lambda node: other_paths(rendered[node.name]),
         interrupt=interrupt,
         observer=observer,
     )
     _remember(journal, fleet, seen)
-    decided = choices or Choices()
-    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=decided)
-    rest = _rest_of_their_meshes(fleet, single.plans.values()) or _witnesses(
+    decided = choices or PlanOptions()
+    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=decided)
+    rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
     if rest and not (interrupt is not None and interrupt.stopping):
-        around = gather(access, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
-        _remember(journal, fleet, around)
-        seen = replace(seen, observations={**seen.observations, **around.observations})
-        single = replace(single, around=_plans_around(renderer, around, salt, owner))
-    return _in_order(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
+        others = collect(connections, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        _remember(journal, fleet, others)
+        seen = replace(seen, observations={**seen.observations, **others.observations})
+        single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
+    return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
 
 
-def _remember(journal: Journal, fleet: Fleet, seen: Seen) -> None:
+def _remember(journal: Journal, fleet: Fleet, seen: FleetObservation) -> None:
     facts = {name: facts_of(observation) for name, observation in seen.observations.items()}
     journal.remember_all(fleet.name, facts, time.time())
 
 
-def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
-    """The deployed nodes beside these that share a mesh which one of these would cut, leave or come back to."""
+def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
+    """The other deployed nodes of meshes that one of these would cut, leave or rejoin."""
     planned = {plan.node: plan for plan in plans}
     meshes = {
         mesh
@@ -108,8 +108,8 @@ def _rest_of_their_meshes(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node
     return tuple(node for name, node in members.items() if name not in planned and node.state is NodeState.DEPLOYED)
 
 
-def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
-    """Who may tell of those that do not answer: the neighbours they had when they were last seen, and the base."""
+def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
+    """Nodes that may hear the unreachable ones: their last known neighbors, and the base."""
     chosen = {plan.node: plan for plan in plans}
     macs = known_macs(fleet, known)
     away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
@@ -122,111 +122,111 @@ def _witnesses(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, Last
     ]
     base = [fleet.base_node.name] if away and fleet.base_node is not None else []
     names = [name for name in dict.fromkeys((*near, *base)) if name not in chosen]
-    return tuple(fleet.nodes[name] for name in names[:WITNESSES])
+    return tuple(fleet.nodes[name] for name in names[:MAX_QUERIED])
 
 
-def _plans_around(renderer: Renderer, around: Seen, salt: bytes, owner: str) -> dict[str, NodePlan]:
-    """What would be done to these, had they been chosen, as far as it tells which cell they run."""
+def _unchanged_plans(renderer: Renderer, others: FleetObservation, salt: bytes, owner: str) -> dict[str, NodePlan]:
+    """Plans of nodes that were not selected, to know which cell they run."""
     plans = {}
-    for name, observation in around.observations.items():
-        # a node that was not asked for may not be the reason why nothing can be done to the others
+    for name, observation in others.observations.items():
+        # a node that was not selected must not prevent the plan for the others
         with suppress(InvalidInput, InputError):
-            wanted = renderer.wanted(renderer.fleet.nodes[name], observation)
-            plans[name] = node_plan(wanted, observation, Fingerprints(salt), owner=owner, with_firmware=False)
+            desired = renderer.desired(renderer.fleet.nodes[name], observation)
+            plans[name] = node_plan(desired, observation, Fingerprints(salt), owner=owner, with_firmware=False)
     return plans
 
 
 def assemble(
     renderer: Renderer,
-    access: Access,
-    first: Mapping[str, Wanted],
-    seen: Seen,
+    connections: ConnectionPool,
+    rendered: Mapping[str, DesiredState],
+    seen: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
     owner: str,
-    choices: Choices,
+    choices: PlanOptions,
 ) -> Prepared:
-    """The plan for what was rendered without the devices' facts (`first`) and what was seen."""
-    single = _node_plans(renderer, access, first, seen, salt=salt, owner=owner, choices=choices)
-    return _in_order(renderer.fleet, single, seen, known, salt=salt, choices=choices)
+    """The plan from what was rendered without device facts (`rendered`) and what was observed."""
+    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=choices)
+    return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
 
 
 @dataclass(frozen=True, slots=True)
-class _Single:
-    """Each node for itself; `around`: others of their meshes, to which nothing is done."""
+class _NodePlans:
+    """The plan of each node; `unchanged`: plans of the other members of their meshes."""
 
     plans: Mapping[str, NodePlan]
-    wanted: Mapping[str, Wanted] = field(repr=False)
-    around: Mapping[str, NodePlan] = field(default_factory=dict)
+    desired: Mapping[str, DesiredState] = field(repr=False)
+    unchanged: Mapping[str, NodePlan] = field(default_factory=dict)
 
 
 def _node_plans(
     renderer: Renderer,
-    access: Access,
-    first: Mapping[str, Wanted],
-    seen: Seen,
+    connections: ConnectionPool,
+    rendered: Mapping[str, DesiredState],
+    seen: FleetObservation,
     *,
     salt: bytes,
     owner: str,
-    choices: Choices,
-) -> _Single:
+    choices: PlanOptions,
+) -> _NodePlans:
     fingerprints = Fingerprints(salt)
-    wanted: dict[str, Wanted] = {}
+    desired: dict[str, DesiredState] = {}
     plans: dict[str, NodePlan] = {}
-    for name, want in first.items():
+    for name, want in rendered.items():
         observation = seen.observations.get(name)
-        wanted[name] = want if observation is None else renderer.wanted(want.node, observation)
+        desired[name] = want if observation is None else renderer.desired(want.node, observation)
         made = node_plan(
-            wanted[name],
+            desired[name],
             observation,
             fingerprints,
-            away=seen.away.get(name, ""),
+            unreachable=seen.unreachable.get(name, ""),
             owner=owner,
             with_firmware=choices.with_firmware,
-            own_keys=None if observation is None else access.own_keys(want.node),
+            own_keys=None if observation is None else connections.own_keys(want.node),
         )
         error = seen.refused.get(name)
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
-    return _Single(plans, wanted)
+    return _NodePlans(plans, desired)
 
 
-def _in_order(
+def _with_fleet_plan(
     fleet: Fleet,
-    single: _Single,
-    seen: Seen,
+    single: _NodePlans,
+    seen: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
-    choices: Choices,
+    choices: PlanOptions,
 ) -> Prepared:
     plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
-    for name, place in whereabouts(fleet, away, seen.observations, known).items():
+    for name, place in last_seen_of(fleet, away, seen.observations, known).items():
         plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
     plan = fleet_plan(
         fleet,
         plans,
         seen.graph(fleet, known),
         now_s=time.time(),
-        around=single.around,
+        unchanged=single.unchanged,
         entry=choices.entry,
         leave_behind=choices.leave_behind,
         accept_cuts=choices.accept_cuts,
         never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
-    return Prepared(plan, single.wanted, seen, salt)
+    return Prepared(plan, single.desired, seen, salt)
 
 
-def other_paths(wanted: Wanted) -> tuple[str, ...]:
-    """The absolute paths of a node's files that are no UCI packages."""
-    return tuple(f"/{file.path}" for file in wanted.files if package_of(file.path) is None)
+def other_paths(desired: DesiredState) -> tuple[str, ...]:
+    """The absolute paths of a node's files other than UCI packages."""
+    return tuple(f"/{file.path}" for file in desired.files if package_of(file.path) is None)
 
 
 def base_macs(fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]) -> tuple[str, ...]:
-    """The mesh MACs of the base's radio, seen now or known from before."""
+    """The mesh MACs of the base, observed now or last known."""
     base = fleet.base_node
     if base is None:
         return ()

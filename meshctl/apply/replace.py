@@ -1,8 +1,8 @@
-"""Give a node's identity to another device: same name, address, role and place in the fleet, other hardware.
+"""Replace a node's hardware: another device takes over its name, address and role.
 
-The old node is dead or gone; the new device is a spare that meshctl knows, or one on the bench. Its host key is pinned
-for the old name, the old node's configuration goes there as any other change, and the inventory learns the new MAC,
-serial number and label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
+The new device is a spare of the inventory, or one on the bench. `adopt` pins its host key under the old name; the old
+node's configuration is then applied as any other change, and the inventory gets the new MAC, serial number and label
+(`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
 """
 
 from __future__ import annotations
@@ -11,58 +11,62 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import connect
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.collect import observe_cleared
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 
 
 @dataclass(frozen=True, slots=True)
-class Successor:
-    """The device that takes over: `spare` is its node in the inventory, None for a stranger on the bench."""
+class Replacement:
+    """The device that takes over: `spare` is its node in the inventory, None for a device on the bench."""
 
-    arrivals: Arrivals
+    discovered: Discovered
     spare: Node | None
     old_pins: tuple[HostKey, ...]
 
 
-def succeed(
+def adopt(
     renderer: Renderer,
-    access: Access,
+    connections: ConnectionPool,
     trust: TrustStore,
     old: Node,
     *,
     spare: Node | None,
-    place: BenchPlace | None,
+    target: BenchTarget | None,
     interrupt: Interrupt,
-) -> Successor:
-    """Meet the new device and pin its key under the old node's name.
+) -> Replacement:
+    """Connect to the new device and pin its key under the old node's name.
 
-    Raises NodeError when the old node still answers as itself, or the new device does not.
+    Raises NodeError when the old node still answers, or the new device does not.
     """
-    _must_be_silent(access, old)
-    recorder = Recorder()
-    if place is not None:
-        credentials = replace(access.credentials(old), empty_password=True)
+    _require_unreachable(connections, old)
+    recorder = AcceptAnyKey()
+    if target is not None:
+        credentials = replace(connections.credentials(old), empty_password=True)
         connection = connect(
-            place.endpoint, credentials=credentials, trust=recorder, deadlines=access.deadlines, release=old.release
+            target.endpoint,
+            credentials=credentials,
+            trust=recorder,
+            deadlines=connections.deadlines,
+            release=old.release,
         )
         key = recorder.key
     elif spare is not None:
-        # known by name, so its own pin has to fit
-        connection = access.open(spare)
+        # checked against its own pin
+        connection = connections.open(spare)
         key = connection.host_key
     else:
-        raise InputError("expected a spare of the inventory, or a place on the bench")
+        raise InputError("expected a spare of the inventory, or a device on the bench")
     try:
-        seen = observe_cleared(connection, other_paths(renderer.wanted(old)), interrupt)
+        seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
             raise NodeError(f"{connection.endpoint.label}: showed no host key")
     except BaseException:
@@ -70,43 +74,43 @@ def succeed(
         raise
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
-    access.newcomers[old.name] = replace(connection.endpoint, identity=old.name)
+    connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:
-        access.interfaces[old.name] = connection.endpoint.interface
-    access.keep(old.name, connection)
-    where = place or BenchPlace(connection.endpoint.host, connection.endpoint.port, old.name)
-    return Successor(Arrivals({old.name: Found(where, old, seen, key)}, ()), spare, pins)
+        connections.interfaces[old.name] = connection.endpoint.interface
+    connections.release(old.name, connection)
+    where = target or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
+    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key)}, ()), spare, pins)
 
 
-def _must_be_silent(access: Access, old: Node) -> None:
-    """Two devices with one address and one name would fight: the old one has to be off."""
+def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
+    """The old device must be off: two devices with the same address conflict."""
     try:
-        access.open(old).close()
+        connections.open(old).close()
     except NodeError:
         return
     raise NodeError(
-        f"{old.name} still answers at {access.endpoint(old).address}: two nodes with one address would fight",
-        hint="switch the old one off first",
+        f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address conflict",
+        hint="switch the old device off first",
     )
 
 
-def give_up(trust: TrustStore, old: Node, successor: Successor) -> None:
-    """The change failed: believe what was believed before."""
-    trust.replace(old.name, *successor.old_pins)
+def restore_old_pins(trust: TrustStore, old: Node, replacement: Replacement) -> None:
+    """Pin the previous keys again after a failed change."""
+    trust.replace(old.name, *replacement.old_pins)
 
 
-def heir_of(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
-    """The fleet in which the old node carries the spare's label and serial number, as far as they are rendered."""
+def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
+    """The fleet with the spare's label and serial number on the old node, because templates may render them."""
     if spare is None:
         return fleet
-    heir = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
-    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: heir}))
+    adopted = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
+    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: adopted}))
 
 
 def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:
-    """What the inventory shall say afterwards: of the old node's entry, and of the spare's (empty for none).
+    """The keys to set in the inventory: in the old node's entry, and in the spare's (empty for none).
 
-    Only keys that the inventory uses are written: a fleet that identifies nodes by label need not know MACs.
+    A MAC is written only where the inventory has one: a fleet may identify its nodes by label.
     """
     mine: dict[str, str] = {}
     label_mac = seen.board.label_mac if seen.board is not None else ""

@@ -1,4 +1,4 @@
-"""What became of the nodes that an earlier run left uncertain: its outcomes and a fresh look -> a line for each."""
+"""What became of the nodes an earlier run left uncertain: its outcomes and a new plan -> one line per node."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from meshctl.fleet import Outcome, Result
 from meshctl.plan import Verdict
 
 
-def settled(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
-    """Node -> what became of it, for each that ended as UNCERTAIN. Pure."""
-    told = {}
+def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[str, str]:
+    """Node -> what became of it, for each that ended UNCERTAIN. Pure."""
+    resolved = {}
     for outcome in earlier:
         plan = now.plan.nodes.get(outcome.node)
         if outcome.result is not Result.UNCERTAIN or plan is None:
             continue
-        seen = now.seen.observations.get(outcome.node)
+        seen = now.observed.observations.get(outcome.node)
         match plan.verdict:
             case Verdict.SAME:
-                what = "it is as wanted"
+                what = "it is as desired"
             case Verdict.CHANGE:
-                what = f"it runs what it ran before{_why(None if seen is None else seen.change)}, and is changed again"
+                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and is changed again"
             case Verdict.REFUSED:
-                what = f"it answers, and is refused: {plan.reason}"
+                what = f"it answers and is refused: {plan.reason}"
             case Verdict.AWAY:
-                what = "it is still not seen" + _left(outcome)
-        told[outcome.node] = f"uncertain after run {run_id}; now {what}"
-    return told
+                what = "it is still unreachable" + _left(outcome)
+        resolved[outcome.node] = f"uncertain after run {run_id}; now {what}"
+    return resolved
 
 
 def _why(change: ChangeStatus | None) -> str:
@@ -43,4 +43,4 @@ def _left(outcome: Outcome) -> str:
     parted = outcome.facts.get(LEFT_BEHIND)
     if not parted:
         return ""
-    return f": it stayed in its mesh's old cell ({parted}), where only a cable, or a node taken back to it, reaches it"
+    return f": it is still in the old cell of its mesh ({parted}); reach it by cable or from another node in that cell"

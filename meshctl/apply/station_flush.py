@@ -1,14 +1,13 @@
-"""Have a node's neighbors remove their stale station entries of its radios: what `forget` says, over SSH.
+"""Flush stale station entries: neighbors remove them over SSH while a node's radios restart.
 
-    plan -> those known to hold an entry, and those that may and did not say so (`Forgetting`)
-    before the radio goes: those behind it, and the node itself, watch their entries (`beforehand`)
-    while it is silent: the others, ever more seldom (`while_silent`); when it answers again: all that do not watch,
-    those that did not answer before, and those that it hears now (`when_back`)
-    when all nodes have ended: once more those that did not answer; the operator is shown the rest (`ask_the_rest`)
-    a change that an earlier run lost sight of, or a reboot: the same, as soon as the node is seen again (`make_up_for`)
+    armed: nodes reached through the node, and the node itself, start to watch their entries (`watch_neighbors`)
+    unreachable: the other holders are queried, with growing pauses (`unreachable`)
+    ended: all holders that do not watch, and the nodes it hears now, are queried (`ended`)
+    end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
+    next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
 
-Asking does no harm where nothing restarted: each neighbor observes whether its entry is stale before it removes it. All
-are asked at once, each within `ASK_S`. Nothing here is a reason for failure: a neighbor that does not answer, or cannot
+A query is harmless where no radio restarted: each neighbor verifies that its entry is stale before it removes it. All
+are queried in parallel, each for at most `QUERY_TIMEOUT_S`. A neighbor that does not answer, or cannot remove its entry
 (19.07), changes no outcome; a note names it.
 """
 
@@ -23,111 +22,120 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeAlias
 
-from meshctl.apply.context import Job, Work
+from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.stale_stations import (
     GONE,
     KEPT,
-    MOST_ASKED,
+    MAX_QUERIED,
     UNKNOWN,
-    Entry,
-    behind,
+    StationEntry,
     by_holder,
+    current_neighbors,
     entries_of,
     flush_script,
-    neighbours_now,
-    next_ask_s,
+    next_query_s,
     own_entries,
+    possible_holders,
     radio_macs,
-    silent_holders,
+    routed_through,
     watch_script,
 )
 from meshctl.device.connection import Deadlines
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
-from meshctl.plan.radios import EVERY_RADIO, Radios, seen_to_restart, started_within
+from meshctl.plan.radios import EVERY_RADIO, Radios, observed_restarts, started_within
 
-# A neighbor's answer: it waits up to 3 s for an echo, once for each of a node's two radios.
-ASK_S = 10.0
-# It is no disaster when one cannot be asked, so a new connection may take less time than elsewhere.
-_DEADLINES = Deadlines(connect_s=5.0, handshake_s=10.0, auth_s=10.0, channel_s=ASK_S, run_s=ASK_S, silence_s=ASK_S)
-# A node whose connection is not there by then is silent: an SSH login takes a board two seconds.
-SILENT_S = 5.0
-# The fact beside an outcome: who may still go on with the numbers of the radio that was there before.
-NOT_ASKED = "not_asked"
-# What becomes of that, for an operator (docs/provisioning.md).
-MAY_LOSE = ": what it sends them may be lost for minutes"
+# A neighbor waits up to 3 s for an echo, once for each of a node's two radios.
+QUERY_TIMEOUT_S = 10.0
+# A failed query does no damage, so these deadlines are shorter than elsewhere.
+_DEADLINES = Deadlines(
+    connect_s=5.0,
+    handshake_s=10.0,
+    auth_s=10.0,
+    channel_s=QUERY_TIMEOUT_S,
+    run_s=QUERY_TIMEOUT_S,
+    silence_s=QUERY_TIMEOUT_S,
+)
+# A node that takes longer to connect counts as unreachable: an SSH login takes a board two seconds.
+SLOW_CONNECT_S = 5.0
+# The fact in an outcome: the neighbors that may still hold a stale station entry.
+UNFLUSHED = "not_asked"
+# The consequence, for the operator (docs/provisioning.md).
+MAY_LOSE = ": unicast frames to them may be lost for minutes"
 
 
-# What a neighbour is to run, written only once it can be sent: ages count up to then, and a login takes seconds, in
-# which an entry that was made anew would grow older than the change seems to be.
+# Makes the script for a neighbor once it is connected: ages count up to then, and during a login of seconds a new entry
+# would seem older than the change.
 Script: TypeAlias = Callable[[], str]
 
 
 @dataclass(slots=True)
-class Forgetting:
-    """What has been asked of the neighbours of one node since these `radios` of it were about to start anew."""
+class StationFlush:
+    """The station flush of one node whose `radios` restart: which neighbors watch, were queried, or did not answer."""
 
-    job: Job
+    ctx: NodeContext
     radios: Radios = EVERY_RADIO
-    _holders: dict[str, tuple[Entry, ...]] = field(init=False, repr=False)
-    # those who do it by themselves, and may not be reached while the node is silent
+    _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
+    # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
-    _asked_s: list[float] = field(default_factory=list)
-    # what has been told: a node that is flashed is silent for minutes, and asked about again and again
-    _told_steps: set[str] = field(default_factory=set)
-    _told_names: set[str] = field(default_factory=set)
-    # since when its radio may have started anew: for the first time, and because it went back
-    _began_s: float | None = None
-    _kept_until_s: float | None = None
-    # who did not answer when all were asked, and since when an entry is as it should be
-    _left: dict[str, tuple[Entry, ...]] = field(default_factory=dict)
+    _queried_s: list[float] = field(default_factory=list)
+    # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
+    _journaled_steps: set[str] = field(default_factory=set)
+    _reported: set[str] = field(default_factory=set)
+    # since when its radio may have restarted: first by the change, then by its rollback
+    _started_s: float | None = None
+    _observed_s: float | None = None
+    # the holders that did not answer at the end, and since when an entry is not stale
+    _unanswered: dict[str, tuple[StationEntry, ...]] = field(default_factory=dict)
     _since_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self._holders = by_holder(entries_of(self.job.name, self.job.work.around, self.radios))
+        self._holders = by_holder(entries_of(self.ctx.name, self.ctx.run.observations, self.radios))
 
     @property
     def node(self) -> str:
-        return self.job.name
+        return self.ctx.name
 
-    def beforehand(self, *, for_s: float) -> None:
-        """Have those behind the node watch it; call it while the node still carries their frames."""
-        work = self.job.work
-        hidden = behind(self.node, work.around, work.bases)
+    def watch_neighbors(self, *, for_s: float) -> None:
+        """Start watches on the nodes reached through this one; call it while the node still forwards their frames."""
+        run_context = self.ctx.run
+        hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
         names = [name for name in self._holders if name in hidden]
-        answers = self._ask(
-            "neighbours watch it",
+        answers = self._query(
+            "watch neighbor station entries",
             {name: partial(watch_script, self.node, self._holders[name], for_s=for_s) for name in names},
         )
         self._watching = frozenset(name for name, answer in answers.items() if answer)
         unwatched = [name for name in names if name not in self._watching]
         if unwatched:
-            work.note(f"{_listed(unwatched)} did not answer, and cannot watch for its radio's restart", self.node)
+            run_context.note(
+                f"{_listed(unwatched)} did not answer and cannot watch their entries of its radio", self.node
+            )
 
-    def watch_itself(self, connection: SshConnection, *, for_s: float) -> None:
-        """Have the node watch its own entries: should a neighbor remove its entry although the radio did not restart,
-        the node removes its own, and both count from 0. Raises Unreachable."""
-        entries = own_entries(self.node, self.job.before, self.radios)
+    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+        """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
+        node removes its own, and both count from 0. Raises Unreachable."""
+        entries = own_entries(self.node, self.ctx.before, self.radios)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
 
-    def begins(self) -> None:
-        """From now on its radio may start anew."""
-        self._began_s = time.monotonic()
+    def started(self) -> None:
+        """The change starts: from now on its radio may restart."""
+        self._started_s = time.monotonic()
 
-    def began(self, ago_s: float) -> None:
-        """Its radio may have started anew at any time within the last `ago_s`."""
-        self._began_s = time.monotonic() - ago_s
+    def started_ago(self, ago_s: float) -> None:
+        """The change started `ago_s` ago: its radio may have restarted since."""
+        self._started_s = time.monotonic() - ago_s
 
-    def stands(self) -> None:
-        """It answers, and has not gone back yet."""
-        self._kept_until_s = time.monotonic()
+    def observed(self) -> None:
+        """The node answered, and the change is still applied."""
+        self._observed_s = time.monotonic()
 
     @contextmanager
-    def beside(self) -> Iterator[None]:
-        """Ask beside what is tried meanwhile, if that takes so long that the node must be silent."""
-        timer = threading.Timer(SILENT_S, self.while_silent)
+    def flush_if_slow(self) -> Iterator[None]:
+        """Query the neighbors in the background if the block takes so long that the node must be unreachable."""
+        timer = threading.Timer(SLOW_CONNECT_S, self.unreachable)
         timer.daemon = True
         timer.start()
         try:
@@ -136,20 +144,20 @@ class Forgetting:
             timer.cancel()
             timer.join()
 
-    def while_silent(self, among: Container[str] | None = None) -> None:
-        """Ask if it is time to; call it whenever the node did not answer. `among`: only these can be reached."""
+    def unreachable(self, among: Container[str] | None = None) -> None:
+        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable."""
         now_s = time.monotonic()
-        if self._began_s is None or now_s < next_ask_s(self._asked_s):
+        if self._started_s is None or now_s < next_query_s(self._queried_s):
             return
         names = [name for name in self._holders if name not in self._watching and (among is None or name in among)]
         if names:
-            self._asked_s.append(now_s)
-            self._flush({name: self._holders[name] for name in names}, self._began_s)
+            self._queried_s.append(now_s)
+            self._flush({name: self._holders[name] for name in names}, self._started_s)
 
-    def when_back(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
-        """Ask all that do not watch, once the node answers for good. `now` is what it tells then; who has `rebooted`
-        has started all of its radios anew."""
-        since_s = self._kept_until_s if went_back and self._kept_until_s is not None else self._began_s
+    def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
+        """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
+        `rebooted` has restarted all of its radios."""
+        since_s = self._observed_s if went_back and self._observed_s is not None else self._started_s
         if rebooted:
             self.radios = EVERY_RADIO
         if since_s is None or not self.radios:
@@ -160,147 +168,153 @@ class Forgetting:
         unsure = [name for name, said in answers.items() if UNKNOWN in said.split()]
         if unsure and now is not None:
             self._flush_seen(unsure, asked, now, since_s)
-        self._left = {name: entries for name, entries in asked.items() if name not in answers}
-        if self._left:
-            self.job.work.later.append(self)
+        self._unanswered = {name: entries for name, entries in asked.items() if name not in answers}
+        if self._unanswered:
+            self.ctx.run.unfinished_flushes.append(self)
 
     def _flush_seen(
-        self, unsure: Sequence[str], asked: Mapping[str, tuple[Entry, ...]], now: Observation, since_s: float
+        self, unsure: Sequence[str], asked: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float
     ) -> None:
-        """Those that cannot find out whether their entry is stale remove it for the radios that the node was seen to
-        have restarted."""
-        restarted = seen_to_restart(self.job.before, now, time.monotonic() - since_s)
+        """Holders that cannot verify their entries remove those of the radios that were observed to restart."""
+        restarted = observed_restarts(self.ctx.before, now, time.monotonic() - since_s)
         if not restarted:
             return
-        macs = frozenset(radio_macs(self.job.before, restarted)) | frozenset(radio_macs(now, restarted))
+        macs = frozenset(radio_macs(self.ctx.before, restarted)) | frozenset(radio_macs(now, restarted))
         entries = {name: tuple(e for e in asked[name] if e.mac.lower() in macs) for name in unsure}
         self._flush({name: some for name, some in entries.items() if some}, since_s, has_restarted=True)
 
-    def _possible_holders(self, now: Observation | None) -> dict[str, tuple[Entry, ...]]:
-        """Who holds an entry as they told; then, on any of their interfaces, those who did not tell, and those who came
-        to know it since."""
-        work, job = self.job.work, self.job
-        asked = by_holder(entries_of(self.node, work.around, self.radios))
-        told = {mac: name for name, seen in work.around.items() for mac in radio_macs(seen, EVERY_RADIO)}
-        names = {**work.current_names(), **told}
-        fellows = [node.name for mesh in job.node.meshes for node in work.fleet.members(mesh)]
-        others = (*silent_holders(self.node, work.around, names, fellows), *(neighbours_now(now, names) if now else ()))
-        # the radio may have been another one's the last time, or another MAC: whatever is known of it
-        own = [radio_macs(seen, self.radios) for seen in (work.around.get(self.node), now) if seen is not None]
+    def _possible_holders(self, now: Observation | None) -> dict[str, tuple[StationEntry, ...]]:
+        """Nodes known to hold a station entry, then nodes that may hold one on any interface: those not observed, and
+        new neighbors."""
+        run_context, ctx = self.ctx.run, self.ctx
+        asked = by_holder(entries_of(self.node, run_context.observations, self.radios))
+        observed_macs = {
+            mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
+        }
+        names = {**run_context.current_mac_owners(), **observed_macs}
+        mesh_nodes = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
+        others = (
+            *possible_holders(self.node, run_context.observations, names, mesh_nodes),
+            *(current_neighbors(now, names) if now else ()),
+        )
+        # the radio's MAC may have changed: use all that are known
+        own = [
+            radio_macs(seen, self.radios) for seen in (run_context.observations.get(self.node), now) if seen is not None
+        ]
         macs = tuple(dict.fromkeys(mac for some in own for mac in some))
         for name in others:
-            if name != self.node and name in work.fleet.nodes:
-                asked.setdefault(name, tuple(Entry(name, "", mac) for mac in macs))
-        return {name: asked[name] for name in list(asked)[:MOST_ASKED] if name not in self._watching and asked[name]}
+            if name != self.node and name in run_context.fleet.nodes:
+                asked.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
+        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if name not in self._watching and asked[name]}
 
     def _flush(
-        self, asked: Mapping[str, Sequence[Entry]], since_s: float, *, has_restarted: bool = False
+        self, asked: Mapping[str, Sequence[StationEntry]], since_s: float, *, has_restarted: bool = False
     ) -> dict[str, str]:
-        """Have them remove stale entries; what each said that answered."""
+        """Have these holders remove stale entries; returns the answers."""
         scripts = {
             name: partial(_flush_since, entries, since_s, has_restarted=has_restarted)
             for name, entries in asked.items()
         }
-        answers = self._ask("neighbours forget it", scripts)
-        self.tell(answers)
+        answers = self._query("flush neighbor station entries", scripts)
+        self.report(answers)
         return answers
 
-    def tell(self, answers: Mapping[str, str]) -> None:
-        """Note who removed a stale entry and who could not, each once."""
+    def report(self, answers: Mapping[str, str]) -> None:
+        """Report which holders removed a stale entry and which could not, each once."""
         for word, text in (
             (GONE, "removed a stale entry of its radio"),
             (KEPT, "cannot remove its stale entry" + MAY_LOSE),
         ):
-            news = [name for name, said in answers.items() if word in said.split() and name not in self._told_names]
+            news = [name for name, said in answers.items() if word in said.split() and name not in self._reported]
             if news:
-                self._told_names.update(news)
-                self.job.work.note(f"{_listed(news)} {text}", self.node)
+                self._reported.update(news)
+                self.ctx.run.note(f"{_listed(news)} {text}", self.node)
 
-    def said_of_it(self, answer: str) -> str:
-        """The lines of an answer that are about its radios."""
-        macs = {entry.mac for entries in self._left.values() for entry in entries}
+    def own_lines(self, answer: str) -> str:
+        """The lines of an answer that concern this node's radios."""
+        macs = {entry.mac for entries in self._unanswered.values() for entry in entries}
         return "\n".join(line for line in answer.splitlines() if line.partition(" ")[2] in macs)
 
-    def left(self) -> dict[str, Script]:
-        """Whom to ask once more, and with what."""
-        return {name: partial(_flush_since, entries, self._since_s) for name, entries in self._left.items()}
+    def retries(self) -> dict[str, Script]:
+        """The holders to query again, and their scripts."""
+        return {name: partial(_flush_since, entries, self._since_s) for name, entries in self._unanswered.items()}
 
-    def _ask(self, step: str, scripts: Mapping[str, Script]) -> dict[str, str]:
-        """Run each node's script, all at once; what each printed that answered. The step is told once."""
-        if not scripts or self.job.work.interrupt.leaving:
+    def _query(self, step: str, scripts: Mapping[str, Script]) -> dict[str, str]:
+        """Run each node's script in parallel; returns the answers. The step is journaled once."""
+        if not scripts or self.ctx.run.interrupt.leaving:
             return {}
-        telling = nullcontext() if step in self._told_steps else self.job.step(step)
-        self._told_steps.add(step)
+        telling = nullcontext() if step in self._journaled_steps else self.ctx.step(step)
+        self._journaled_steps.add(step)
         with telling:
-            return _ask_all(self.job.work, scripts)
+            return _query_all(self.ctx.run, scripts)
 
 
-def ask_the_rest(work: Work) -> dict[str, tuple[str, ...]]:
-    """Ask once more who did not answer when a node was back, each of them for all nodes at once.
+def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
+    """Query the neighbors that did not answer again, each once for all nodes.
 
-    Returns node -> who still has not; the operator is told.
+    Returns node -> neighbors that still did not answer, and reports them.
     """
-    waiting = [(forgetting, forgetting.left()) for forgetting in work.later]
-    if not waiting or work.interrupt.leaving:
+    unfinished = [(flush, flush.retries()) for flush in run_context.unfinished_flushes]
+    if not unfinished or run_context.interrupt.leaving:
         return {}
-    names = dict.fromkeys(name for _, scripts in waiting for name in scripts)
-    of_each = {name: [scripts[name] for _, scripts in waiting if name in scripts] for name in names}
-    answers = _ask_all(work, {name: partial(_together, scripts) for name, scripts in of_each.items()})
-    rest: dict[str, tuple[str, ...]] = {}
-    for forgetting, scripts in waiting:
-        forgetting.tell({name: forgetting.said_of_it(answers[name]) for name in scripts if name in answers})
-        silent = tuple(name for name in scripts if name not in answers)
-        if silent:
-            rest[forgetting.node] = silent
-            work.note(
-                f"{_listed(silent)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", forgetting.node
+    names = dict.fromkeys(name for _, scripts in unfinished for name in scripts)
+    of_each = {name: [scripts[name] for _, scripts in unfinished if name in scripts] for name in names}
+    answers = _query_all(run_context, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
+    unflushed: dict[str, tuple[str, ...]] = {}
+    for flush, scripts in unfinished:
+        flush.report({name: flush.own_lines(answers[name]) for name in scripts if name in answers})
+        unanswered = tuple(name for name in scripts if name not in answers)
+        if unanswered:
+            unflushed[flush.node] = unanswered
+            run_context.note(
+                f"{_listed(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", flush.node
             )
-    return rest
+    return unflushed
 
 
-def make_up_for(job: Job, ago_s: float) -> None:
-    """A change was begun on the node that long ago and its end not seen, or it booted then: whichever of its radios
-    have started since, their neighbours are asked to forget those that were there before."""
-    forgetting = Forgetting(job, started_within(job.before, ago_s))
-    if job.before.uptime_s is not None:
-        ago_s = min(ago_s, job.before.uptime_s + time.time() - job.before.asked_at_s)
-    forgetting.began(ago_s)
-    forgetting.when_back(job.before)
+def flush_later(ctx: NodeContext, ago_s: float) -> None:
+    """Flush the entries of radios that have restarted within `ago_s`, since a change whose end was not observed, or
+    since a boot."""
+    flush = StationFlush(ctx, started_within(ctx.before, ago_s))
+    if ctx.before.uptime_s is not None:
+        ago_s = min(ago_s, ctx.before.uptime_s + time.time() - ctx.before.asked_at_s)
+    flush.started_ago(ago_s)
+    flush.ended(ctx.before)
 
 
-def _flush_since(entries: Sequence[Entry], since_s: float, *, has_restarted: bool = False) -> str:
+def _flush_since(entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False) -> str:
     return flush_script(entries, older_than_s=time.monotonic() - since_s, has_restarted=has_restarted)
 
 
-def _together(scripts: Iterable[Script]) -> str:
+def _joined(scripts: Iterable[Script]) -> str:
     return "".join(script() for script in scripts)
 
 
-def _ask_all(work: Work, scripts: Mapping[str, Script]) -> dict[str, str]:
-    """What each printed that answered in time."""
-    with ThreadPoolExecutor(max_workers=min(len(scripts), MOST_ASKED), thread_name_prefix="forget") as pool:
-        answers = pool.map(lambda name: _ask_one(work, name, scripts[name]), scripts)
+def _query_all(run_context: RunContext, scripts: Mapping[str, Script]) -> dict[str, str]:
+    """The output of each node that answered in time."""
+    with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="forget") as pool:
+        answers = pool.map(lambda name: _query_one(run_context, name, scripts[name]), scripts)
         return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
 
 
-def _ask_one(work: Work, name: str, script: Script) -> str | None:
-    access = work.access
+def _query_one(run_context: RunContext, name: str, script: Script) -> str | None:
+    connections = run_context.connections
     try:
-        connection = access.take(name) or access.open(work.fleet.nodes[name], deadlines=_DEADLINES)
+        connection = connections.acquire(name) or connections.open(run_context.fleet.nodes[name], deadlines=_DEADLINES)
     except NodeError:
         return None
-    # a kept connection has longer deadlines of its own, and may lead through the very node that is silent
-    patience = threading.Timer(ASK_S, connection.close)
+    # a pooled connection has longer deadlines, and may lead through the unreachable node
+    patience = threading.Timer(QUERY_TIMEOUT_S, connection.close)
     patience.daemon = True
     patience.start()
     try:
-        done = connection.run(script(), timeout_s=ASK_S)
+        done = connection.run(script(), timeout_s=QUERY_TIMEOUT_S)
     except NodeError:
         connection.close()
         return None
     finally:
         patience.cancel()
-        access.keep(name, connection)
+        connections.release(name, connection)
     return done.stdout.strip()
 
 

@@ -1,8 +1,9 @@
-"""Replace one node's firmware: everything that can fail is tried before anything is stopped, success is proven.
+"""Flash one node's firmware: check everything that can fail before any service stops, then prove the result.
 
-`flash`: image checked here (`checked_image`), memory on the node, upload, `sysupgrade -T`, the recovery recipe told,
-then `sysupgrade -n -f` detached, with the rendered configuration, the node's own host keys, the dead-man's switch and a
-marker in the archive (`archive`, pure). Proof of success is a new boot id, the wanted revision, the board, the marker.
+`flash`: check the image (`checked_image`) and the node's memory, upload, `sysupgrade -T`, print the recovery recipe,
+start `sysupgrade -n -f` detached. The archive for the new system (`archive`, pure) holds the rendered configuration,
+the node's host keys, the dead-man's switch and a marker. Success means a new boot id, the desired revision, the board
+and the marker.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.change_in_progress import LOCK_SLACK_S, install_switch
-from meshctl.apply.context import Job
-from meshctl.apply.station_flush import Forgetting
+from meshctl.apply.context import NodeContext
+from meshctl.apply.station_flush import StationFlush
 from meshctl.archive import TarMember, tar_of
 from meshctl.device import deadman, openwrt
 from meshctl.device.observation import Observation
@@ -28,23 +29,23 @@ from meshctl.errors import InputError, NodeError
 from meshctl.firmware import check, image_path, is_revision
 from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
-from meshctl.nodes.backoff import Pace
-from meshctl.plan import Wanted
+from meshctl.nodes.backoff import Backoff
+from meshctl.plan import DesiredState
 
 IMAGE_PATH = "/tmp/meshctl/firmware.bin"
 ARCHIVE_PATH = "/tmp/meshctl/firmware.tgz"
 MARKER_PATH = "/etc/meshctl/flashed"
 HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
-# sysupgrade's own copy of busybox and what it runs in RAM; less and the kernel kills it half way.
+# For sysupgrade's copy of busybox and what it runs in RAM; with less, the kernel kills it half way.
 HEADROOM_BYTES = 4 << 20
-# Writing 16 MB of NOR takes up to 3 minutes, the first boot 2 more, and making keys or joining the mesh its own.
-RETURN_S = 900.0
-# sysupgrade that has not taken the node down by then has given up.
-START_S = 120.0
+# Writing 16 MB of NOR takes up to 3 minutes and the first boot 2 more; then keys are made and the mesh is joined.
+RETURN_TIMEOUT_S = 900.0
+# If the node has not rebooted by then, sysupgrade has failed.
+START_TIMEOUT_S = 120.0
 
 
 def checked_image(profile: HardwareProfile) -> Path:
-    """The profile's image, once it has passed every check that needs no device. Raises InvalidInput, InputError."""
+    """The profile's image, after every check that needs no device. Raises InvalidInput, InputError."""
     path = image_path(profile)
     if path is None:
         raise InputError(f"hardware {profile.name}: the inventory names no firmware image")
@@ -54,52 +55,52 @@ def checked_image(profile: HardwareProfile) -> Path:
     return path
 
 
-def flash(job: Job, connection: SshConnection, image: Path) -> Outcome:
-    """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing on the node has stopped."""
-    forgetting = Forgetting(job)
+def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
+    """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing is stopped on the node."""
+    flush = StationFlush(ctx)
     try:
-        marker = _send(job, connection, image, forgetting)
+        marker = _upload_and_start(ctx, connection, image, flush)
     except NodeError:
         with suppress(NodeError):
-            deadman.unlock(connection, job.work.owner)
+            deadman.unlock(connection, ctx.run.owner)
         raise
     finally:
         connection.close()
-    with job.step("flash"):
-        return _await_return(job, marker, forgetting)
+    with ctx.step("flash"):
+        return _await_return(ctx, marker, flush)
 
 
-def _send(job: Job, connection: SshConnection, image: Path, forgetting: Forgetting) -> str:
-    """Everything up to the moment sysupgrade starts; returns the marker that the new system will hold."""
+def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, flush: StationFlush) -> str:
+    """All steps up to the start of sysupgrade; returns the marker that the new system will have."""
     size = image.stat().st_size
-    with job.step("check"):
-        _check_memory(job.before, size)
-        # for its lock: a device fresh from its box has none
-        install_switch(job, connection)
-        deadman.lock(connection, job.work.owner, ttl_s=int(RETURN_S) + LOCK_SLACK_S)
-    with job.step("upload"):
+    with ctx.step("check"):
+        _check_memory(ctx.before, size)
+        # for its lock: a factory device has none
+        install_switch(ctx, connection)
+        deadman.lock(connection, ctx.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
+    with ctx.step("upload"):
         upload(
-            connection, image, IMAGE_PATH, rate_bytes_per_s=job.work.rate_bytes_per_s, progress=job.progress, mode=0o600
+            connection, image, IMAGE_PATH, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress, mode=0o600
         )
-    with job.step("test"):
+    with ctx.step("test"):
         tested = openwrt.check_firmware(connection, IMAGE_PATH)
         if not tested.valid:
-            raise NodeError(f"{job.name}: its own sysupgrade refuses the image: {tested.reason}")
+            raise NodeError(f"{ctx.name}: its sysupgrade rejects the image: {tested.reason}")
         if tested.available_bytes is not None and tested.available_bytes < HEADROOM_BYTES:
             raise NodeError(
-                f"{job.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
+                f"{ctx.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
                 f"{HEADROOM_BYTES >> 20} needed",
                 hint="stop services on it, or flash it by cable",
             )
         keys = openwrt.fetch_files(connection, [HOST_KEYS])
         if not keys:
-            raise NodeError(f"{job.name}: its host keys cannot be read, so they could not be kept")
+            raise NodeError(f"{ctx.name}: cannot read its host keys, so they would be lost")
         marker = secrets.token_hex(16)
-        upload(connection, archive(job.wanted, keys, marker), ARCHIVE_PATH, mode=0o600)
-    recipe = job.node.hardware.recovery or "none is written down in its hardware profile"
-    job.work.note(f"if it does not come back: {recipe}", job.name)
-    forgetting.beforehand(for_s=RETURN_S)
-    forgetting.begins()
+        upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
+    recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
+    ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
+    flush.watch_neighbors(for_s=RETURN_TIMEOUT_S)
+    flush.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
@@ -113,9 +114,9 @@ def _check_memory(before: Observation, size: int) -> None:
         )
 
 
-def archive(wanted: Wanted, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
-    """The tar.gz that the new system unpacks at its first boot: same in, same bytes out."""
-    files = [(f"/{file.path}", file.content, file.mode) for file in wanted.files]
+def archive(desired: DesiredState, host_keys: Mapping[str, FetchedFile], marker: str) -> bytes:
+    """The tar.gz that the new system unpacks at its first boot, deterministic."""
+    files = [(f"/{file.path}", file.content, file.mode) for file in desired.files]
     files += [(path, file.content, file.mode) for path, file in host_keys.items()]
     files += [(path, content, mode) for path, (mode, content) in deadman.installed_files().items()]
     files.append((MARKER_PATH, f"{marker}\n".encode(), 0o644))
@@ -125,50 +126,53 @@ def archive(wanted: Wanted, host_keys: Mapping[str, FetchedFile], marker: str) -
     return gzip.compress(tar_of(members), mtime=0)
 
 
-def _await_return(job: Job, marker: str, forgetting: Forgetting) -> Outcome:
-    """Look for the node until it is back and proven, or it is clear that it will not be."""
-    pace = Pace(RETURN_S, job.work.interrupt)
-    trouble = ""
-    while not pace.is_over and not job.work.interrupt.leaving:
+def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome:
+    """Poll the node until it is back and verified, or the timeout."""
+    backoff = Backoff(RETURN_TIMEOUT_S, ctx.run.interrupt)
+    last_error = ""
+    while not backoff.is_over and not ctx.run.interrupt.leaving:
         try:
-            connection = job.work.access.open(job.node)
+            connection = ctx.run.connections.open(ctx.node)
             try:
                 seen = observe(connection, extra_paths=[MARKER_PATH])
             finally:
                 connection.close()
         except NodeError as error:
-            trouble = str(error)
-            forgetting.while_silent()
+            last_error = str(error)
+            flush.unreachable()
         else:
-            job.work.saw(job.name, seen)
-            if seen.boot_id != job.before.boot_id:
-                forgetting.when_back(seen, rebooted=True)
-                return _verdict(job, seen, marker)
-            if pace.elapsed_s > START_S:
+            ctx.run.record(ctx.name, seen)
+            if seen.boot_id != ctx.before.boot_id:
+                flush.ended(seen, rebooted=True)
+                return _verdict(ctx, seen, marker)
+            if backoff.elapsed_s > START_TIMEOUT_S:
                 return Outcome(
-                    job.name, Result.FAILED, "sysupgrade did not take it down; it runs what it ran", hint="see its log"
+                    ctx.name,
+                    Result.FAILED,
+                    "sysupgrade did not reboot it; it runs the previous firmware",
+                    hint="see its log",
                 )
-        pace.pause()
+        backoff.pause()
     return Outcome(
-        job.name,
+        ctx.name,
         Result.UNCERTAIN,
-        f"not back after it was flashed ({trouble})",
-        hint=job.node.hardware.recovery or "`meshctl resume` looks at it again",
+        f"not back after it was flashed ({last_error})",
+        hint=ctx.node.hardware.recovery or "run `meshctl resume` to check it again",
     )
 
 
-def _verdict(job: Job, seen: Observation, marker: str) -> Outcome:
-    """Whether the node that came back is the one that was meant to, piece by piece."""
+def _verdict(ctx: NodeContext, seen: Observation, marker: str) -> Outcome:
+    """The outcome of a node that came back: revision, board and marker must match."""
     running = seen.release.revision if seen.release else "unknown"
     board = seen.board.board_name if seen.board else "unknown"
-    wanted = job.plan.firmware.to_revision if job.plan.firmware is not None else running
+    desired = ctx.plan.firmware.to_revision if ctx.plan.firmware is not None else running
     info = seen.files.get(MARKER_PATH)
     problems = [
-        "" if is_revision(running, wanted) else f"it runs {running}, not {wanted}",
-        "" if board == job.node.hardware.board else f"its board is {board}, not {job.node.hardware.board}",
+        "" if is_revision(running, desired) else f"it runs {running}, not {desired}",
+        "" if board == ctx.node.hardware.board else f"its board is {board}, not {ctx.node.hardware.board}",
         "" if info is not None and (info.text or "").strip() == marker else "its configuration is not the flashed one",
     ]
-    told = "; ".join(problem for problem in problems if problem)
-    if told:
-        return Outcome(job.name, Result.FAILED, f"it came back, but {told}")
-    return Outcome(job.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})
+    problem_text = "; ".join(problem for problem in problems if problem)
+    if problem_text:
+        return Outcome(ctx.name, Result.FAILED, f"it came back, but {problem_text}")
+    return Outcome(ctx.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})

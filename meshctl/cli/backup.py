@@ -10,12 +10,20 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.backup import Backup, fetch, lacking_packages, lockout_by, objection_to, put_back, read_backup
-from meshctl.apply.context import Job, Work
+from meshctl.apply.backup import (
+    Backup,
+    fetch,
+    incompatibility,
+    lockout_by,
+    read_backup,
+    restore_backup,
+    uninstalled_packages,
+)
+from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import Expectation
-from meshctl.apply.neighbor_query import look_around
+from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.prepare import base_macs
-from meshctl.apply.station_flush import NOT_ASKED, ask_the_rest
+from meshctl.apply.station_flush import UNFLUSHED, retry_unanswered
 from meshctl.cli.context import (
     AsJson,
     InventoryPath,
@@ -58,7 +66,7 @@ def backup(
             raise InputError(f"cannot create {out}: {error.strerror}") from error
 
         def work(name: str) -> Outcome:
-            with opened.access.lease(wanted[name]) as connection:
+            with opened.access.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, (), opened.interrupt)
                 data = fetch(connection, name, seen)
             path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(seen.answered_at_s))}.tgz"
@@ -129,45 +137,45 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
         ):
             known = opened.journal.last_known(opened.fleet.name)
             around: dict[str, Observation] = {}
-            work = Work(
+            work = RunContext(
                 opened.fleet,
                 opened.access,
                 journal_run,
                 progress,
                 opened.interrupt,
                 opened.owner,
-                around=around,
-                names=known_macs(opened.fleet, known),
-                bases=base_macs(opened.fleet, around, known),
+                observations=around,
+                mac_owners=known_macs(opened.fleet, known),
+                base_macs=base_macs(opened.fleet, around, known),
             )
 
             def one(only: str) -> Outcome:
                 connection = opened.access.open(node)
                 try:
                     seen = observe_cleared(connection, (), opened.interrupt)
-                    problem = objection_to(saved, name, seen)
+                    problem = incompatibility(saved, name, seen)
                     if problem:
                         raise PlanRefused(problem)
                     lockout = lockout_by(saved, node, opened.access.own_keys(node))
                     if lockout is not None:
                         raise PlanRefused(lockout.reason, hint=lockout.hint)
                     around.update(
-                        look_around(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
+                        observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
                     )
-                    for package in lacking_packages(saved, seen):
+                    for package in uninstalled_packages(saved, seen):
                         work.note(f"package {package} is in the backup but no longer installed", name)
                     if saved.disabled:
                         work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
                     plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-                    job = Job(work, node, plan, opened.renderer.wanted(node, seen), seen, Expectation())
+                    job = NodeContext(work, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
                 except BaseException:
                     connection.close()
                     raise
-                return put_back(job, connection, saved)
+                return restore_backup(job, connection, saved)
 
             ended = run([name], one, parallel=1, interrupt=opened.interrupt, observer=progress)
-            for silent in ask_the_rest(work).values():
-                ended[name] = replace(ended[name], facts={NOT_ASKED: " ".join(silent)})
+            for silent in retry_unanswered(work).values():
+                ended[name] = replace(ended[name], facts={UNFLUSHED: " ".join(silent)})
             journal_run.finish_node(ended[name])
     finally:
         journal_run.end(ended[name].result.value if ended else "could not run")

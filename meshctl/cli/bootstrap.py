@@ -15,14 +15,14 @@ import typer
 
 from meshctl.apply.bootstrap import (
     FACTORY_ADDRESS,
-    BenchPlace,
-    Found,
+    BenchTarget,
+    FoundDevice,
+    discover,
     find_node,
-    look_around,
-    plan_arrivals,
+    plan_discovered,
     restore_pins,
 )
-from meshctl.apply.replace import give_up, heir_of, identity_edits, succeed
+from meshctl.apply.replace import adopt, identity_edits, restore_old_pins, with_identity
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
 from meshctl.cli.journaled_run import SALT_BYTES, choices_of, confirm_and_execute
 from meshctl.cli.output import echo, echo_error
@@ -81,7 +81,7 @@ def bootstrap(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         places = _expected_places(opened, nodes or [], _named_places(at or [], interface or []))
         with opened.interrupt.on_signals(echo_error):
-            arrivals = look_around(
+            arrivals = discover(
                 opened.renderer,
                 opened.access,
                 opened.trust,
@@ -94,10 +94,10 @@ def bootstrap(
             _print_failure(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
-                echo(f"{name}: found at {item.place.endpoint.label}, host key {item.key.fingerprint}")
+                echo(f"{name}: found at {item.target.endpoint.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
-        prepared = plan_arrivals(
+        prepared = plan_discovered(
             opened.renderer,
             opened.access,
             arrivals,
@@ -127,7 +127,7 @@ def _print_failure(outcome: Outcome) -> None:
         echo(f"  hint: {hint}", err=True)
 
 
-def _named_places(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
+def _named_places(at: list[str], interfaces: list[str]) -> list[BenchTarget]:
     """The bench places given by --at or --interface."""
     if at and interfaces:
         raise InputError("expected --at or --interface, found both")
@@ -137,17 +137,17 @@ def _named_places(at: list[str], interfaces: list[str]) -> list[BenchPlace]:
     for name in interfaces:
         if name not in known:
             raise InputError(f"--interface {name}: no such interface, found {', '.join(sorted(known))}")
-    return [_parse_place(text) for text in at] + [BenchPlace(interface=name) for name in interfaces]
+    return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
 
 
-def _expected_places(opened: Session, words: list[str], at: list[BenchPlace]) -> list[BenchPlace]:
+def _expected_places(opened: Session, words: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
     """Which node is expected at which place."""
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
         names = [find_node(opened.fleet, word).name for word in words]
         names = names or [node.name for node in opened.fleet.managed() if node.name in known]
         ends = {name: opened.lab.bench_endpoint(name) for name in names}
-        return [BenchPlace(end.host, end.port, name) for name, end in ends.items()]
+        return [BenchTarget(end.host, end.port, name) for name, end in ends.items()]
     expected = [find_node(opened.fleet, word).name for word in words]
     if not at:
         if len(expected) > 1:
@@ -155,21 +155,21 @@ def _expected_places(opened: Session, words: list[str], at: list[BenchPlace]) ->
                 f"{len(expected)} nodes cannot share one address",
                 hint="bootstrap one at a time, or give each interface: --interface eth1 --interface eth2",
             )
-        return [BenchPlace(node=expected[0] if expected else "")]
+        return [BenchTarget(node=expected[0] if expected else "")]
     if expected and len(expected) != len(at):
         raise InputError(f"expected one --at or --interface per node, found {len(at)} for {len(expected)} nodes")
     names = expected or [""] * len(at)
     return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _parse_place(text: str) -> BenchPlace:
+def _parse_place(text: str) -> BenchTarget:
     """Parse `HOST`, `HOST:PORT` or `[IPv6]:PORT`; a bare IPv6 address has no port."""
     host, colon, port = text.rpartition(":")
     if not colon or (text.count(":") > 1 and not text.startswith("[")):
-        return BenchPlace(text)
+        return BenchTarget(text)
     if not port.isdecimal() or not 0 < int(port) < 65536:
         raise InputError(f"--at {text}: expected HOST or HOST:PORT")
-    return BenchPlace(host.strip("[]"), int(port))
+    return BenchTarget(host.strip("[]"), int(port))
 
 
 def replace(
@@ -195,29 +195,29 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         node = find_node(opened.fleet, old)
         spare = _spare(opened, node, new)
-        spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchPlace()][: spare is None]
+        spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
-        fleet = heir_of(opened.fleet, node, spare)
+        fleet = with_identity(opened.fleet, node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[node.name]
         with opened.interrupt.on_signals(echo_error):
-            successor = succeed(
+            successor = adopt(
                 opened.renderer,
                 opened.access,
                 opened.trust,
                 node,
                 spare=spare,
-                place=place,
+                target=place,
                 interrupt=opened.interrupt,
             )
         if not as_json:
-            echo(_replacement_text(node, spare, new, successor.arrivals.found.get(node.name)))
+            echo(_replacement_text(node, spare, new, successor.discovered.found.get(node.name)))
         status = int(ExitCode.FINDINGS)
         try:
-            prepared = plan_arrivals(
+            prepared = plan_discovered(
                 opened.renderer,
                 opened.access,
-                successor.arrivals,
+                successor.discovered,
                 opened.journal.last_known(opened.fleet.name),
                 salt=secrets.token_bytes(SALT_BYTES),
                 owner=opened.owner,
@@ -229,16 +229,16 @@ def replace(
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
-                give_up(opened.trust, node, successor)
+                restore_old_pins(opened.trust, node, successor)
         if status == ExitCode.OK:
-            changes = _record_identity(opened, inventory, node, spare, successor.arrivals.found[node.name])
+            changes = _record_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
 
-def _replacement_text(node: Node, spare: Node | None, new: str, found: Found | None) -> str:
+def _replacement_text(node: Node, spare: Node | None, new: str, found: FoundDevice | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
-    there = f", found at {found.place.endpoint.label}," if found is not None else ""
+    there = f", found at {found.target.endpoint.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
     left = f"; {spare.name} is retired" if spare is not None else ""
     return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"
@@ -257,7 +257,7 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     return spare
 
 
-def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: Found) -> Changes:
+def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     mine, theirs = identity_edits(node, spare, found.seen)
     if spare is not None:
@@ -274,7 +274,12 @@ def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node |
 
 
 def _write_identity(
-    inventory: Path, node: Node, spare: Node | None, found: Found, mine: Mapping[str, Any], theirs: Mapping[str, Any]
+    inventory: Path,
+    node: Node,
+    spare: Node | None,
+    found: FoundDevice,
+    mine: Mapping[str, Any],
+    theirs: Mapping[str, Any],
 ) -> Changes:
     editor = Editor.open(inventory, environ=os.environ)
     # the spare's entry first: two nodes must not share a MAC

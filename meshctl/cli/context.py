@@ -30,7 +30,7 @@ from meshctl.model import Fleet, Node
 if TYPE_CHECKING:
     from meshctl.device.trust import TrustStore
     from meshctl.fleet.journal import Journal
-    from meshctl.nodes.connections import Access, Locate
+    from meshctl.nodes.connections import ConnectionPool, Locate
     from meshctl.nodes.desired import Renderer
     from meshctl.report.progress import Progress
 
@@ -68,7 +68,7 @@ class Session:
 
     fleet: Fleet
     renderer: Renderer
-    access: Access
+    access: ConnectionPool
     journal: Journal
     trust: TrustStore
     owner: str
@@ -85,7 +85,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     from meshctl.fleet.process import lock_owner
     from meshctl.inventory import load_fleet
     from meshctl.inventory.secrets import SecretStore
-    from meshctl.nodes.connections import Access
+    from meshctl.nodes.connections import ConnectionPool
     from meshctl.nodes.desired import Renderer
 
     fleet = load_fleet(inventory, environ=os.environ)
@@ -95,9 +95,9 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
         Journal(default_path(os.environ), lab=lab_directory) as journal,
-        Access(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
+        ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
-        journal.separate(fleet.name, lab_of)
+        journal.move_lab_runs(fleet.name, lab_of)
         yield Session(
             fleet,
             Renderer.of(fleet, SecretStore(os.environ, Path(fleet.base)).get),

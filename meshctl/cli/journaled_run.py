@@ -9,8 +9,8 @@ from pathlib import Path
 
 import typer
 
-from meshctl.apply.executor import Setting, carry_out
-from meshctl.apply.prepare import Choices, Prepared, prepare
+from meshctl.apply.executor import RunSettings, execute
+from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.cli.context import Session, confirm, exit_for, line_width, progress_for, selected_nodes
 from meshctl.cli.output import console, echo, echo_error, echo_json, ignore_broken_pipe
 from meshctl.errors import ExitCode, InputError, MeshctlError
@@ -28,15 +28,15 @@ class PlanRefused(MeshctlError):
     exit_code = ExitCode.FINDINGS
 
 
-def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> Choices:
-    return Choices(not no_firmware, _names(leave_behind), _names(accept_cut))
+def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> PlanOptions:
+    return PlanOptions(not no_firmware, _names(leave_behind), _names(accept_cut))
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def prepare_plan(opened: Session, nodes: list[str] | None, choices: Choices, salt: bytes | None = None) -> Prepared:
+def prepare_plan(opened: Session, nodes: list[str] | None, choices: PlanOptions, salt: bytes | None = None) -> Prepared:
     with opened.interrupt.on_signals(echo_error):
         prepared = prepare(
             opened.renderer,
@@ -85,7 +85,7 @@ def confirm_and_execute(
     opened: Session,
     prepared: Prepared,
     command: str,
-    choices: Choices,
+    choices: PlanOptions,
     *,
     yes: bool,
     as_json: bool,
@@ -109,13 +109,13 @@ def execute_plan(
     *,
     as_json: bool,
     rate: float | None,
-    choices: Choices | None = None,
+    choices: PlanOptions | None = None,
 ) -> None:
     """Execute the plan, journal it, print the totals, exit."""
     plan = prepared.plan
     if plan.refusal:
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
-    choices = choices or Choices(with_firmware)
+    choices = choices or PlanOptions(with_firmware)
     run = opened.journal.begin(
         command,
         fleet=opened.fleet.name,
@@ -131,7 +131,7 @@ def execute_plan(
             progress_for(len(plan.nodes), as_json=as_json) as progress,
             opened.interrupt.on_signals(progress.stopping),
         ):
-            setting = Setting(
+            setting = RunSettings(
                 opened.fleet,
                 opened.access,
                 opened.journal,
@@ -141,12 +141,12 @@ def execute_plan(
                 progress,
                 None if rate is None else rate * 1000,
             )
-            outcomes = carry_out(prepared, setting)
+            outcomes = execute(prepared, setting)
     finally:
         run.end(str(totals(outcomes.values())) if outcomes else "could not run")
-    if run.trouble:
+    if run.error:
         with ignore_broken_pipe():
-            echo(f"the journal is incomplete: {run.trouble}", err=True)
+            echo(f"the journal is incomplete: {run.error}", err=True)
             echo("hint: `meshctl resume` checks the missing nodes again", err=True)
     # a closed pipe or terminal must not change the exit code
     with ignore_broken_pipe():

@@ -11,8 +11,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.prepare import Choices
-from meshctl.apply.resume import settled
+from meshctl.apply.prepare import PlanOptions
+from meshctl.apply.resume import resolutions
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
 from meshctl.cli.journaled_run import (
     choices_of,
@@ -94,7 +94,7 @@ def apply(
             raise InputError(
                 f"{plan_file} is for fleet {saved.plan.fleet}, but the inventory is of {opened.fleet.name}"
             )
-        fresh = prepare_plan(opened, list(saved.plan.nodes), Choices(saved.with_firmware), saved.salt)
+        fresh = prepare_plan(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
         agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
         execute_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
 
@@ -158,7 +158,7 @@ def resume(
             echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
         recorded = json.loads(record.plan).get("choices", {}) if record.plan else {}
         added = choices_of(False, leave_behind, accept_cut)
-        choices = Choices(
+        choices = PlanOptions(
             bool(recorded.get("with_firmware", True)),
             (*recorded.get("leave_behind", ()), *added.leave_behind),
             (*recorded.get("accept_cuts", ()), *added.accept_cuts),
@@ -166,7 +166,7 @@ def resume(
         prepared = prepare_plan(opened, names, choices)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
-        for name, text in settled(record.id, opened.journal.outcomes(record.id), prepared).items():
+        for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
         confirm_and_execute(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
@@ -185,7 +185,7 @@ def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
 
 def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRecord, tuple[str, ...]]:
     """The run to resume, and its unfinished nodes."""
-    left = journal.left(fleet)
+    left = journal.unfinished_runs(fleet)
     number = run_id if run_id is not None else next(iter(left), None)
     if number is None:
         latest = next(iter(journal.runs(fleet=fleet, limit=1)), None)

@@ -20,7 +20,7 @@ from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
 from meshctl.model import Node
-from meshctl.nodes.host_keys import Shown, shown_keys
+from meshctl.nodes.host_keys import HostKeyState, fetch_host_keys
 
 
 def trust(
@@ -37,7 +37,7 @@ def trust(
     Example: meshctl trust b03
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        shown = shown_keys(
+        shown = fetch_host_keys(
             opened.access, opened.trust, selected_nodes(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
         )
         if as_json:
@@ -50,7 +50,7 @@ def trust(
             raise typer.Exit(ExitCode.UNREACHABLE if silent else ExitCode.FINDINGS)
 
 
-def _key_object(item: Shown) -> dict[str, str]:
+def _key_object(item: HostKeyState) -> dict[str, str]:
     return {
         "node": item.node.name,
         "state": item.state,
@@ -59,7 +59,7 @@ def _key_object(item: Shown) -> dict[str, str]:
     }
 
 
-def _pin_key(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
+def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
     """Show, confirm and pin the key; whether it is pinned in the end."""
 
     def say(text: str) -> None:
@@ -68,7 +68,7 @@ def _pin_key(opened: Session, item: Shown, *, may_replace: bool, yes: bool, quie
 
     name = item.node.name
     if item.key is None:
-        say(f"{name}: {item.trouble}")
+        say(f"{name}: {item.error}")
         return False
     line = f"{name}: {item.key.fingerprint} ({item.key.key_type})"
     if item.is_pinned:
@@ -127,7 +127,7 @@ def run(
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
-            with opened.access.lease(wanted[name]) as connection:
+            with opened.access.borrow(wanted[name]) as connection:
                 done = connection.run(command, timeout_s=timeout)
             facts = {"exit_status": str(done.exit_status), "stdout": done.stdout, "stderr": done.stderr}
             with out:

@@ -22,7 +22,7 @@ from meshctl.model import Secret
 
 
 @dataclass(frozen=True, slots=True)
-class Attempt:
+class LoginAttempt:
     """One try: `name` for messages, and one of a key, a password, or neither (no authentication at all)."""
 
     name: str
@@ -40,22 +40,22 @@ class Attempt:
 
 
 @contextmanager
-def attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tuple[Attempt, ...]]:
+def login_attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tuple[LoginAttempt, ...]]:
     """All attempts, while the agent's socket is open. Raises InputError for a key file that cannot be used."""
     agent = paramiko.Agent() if credentials.use_agent else None
     try:
-        found: list[Attempt] = []
+        found: list[LoginAttempt] = []
         if credentials.empty_password:
-            found.append(Attempt("no password"))
+            found.append(LoginAttempt("no password"))
         for path in credentials.key_files:
             key = load_key(path, credentials.passphrase)
-            found.append(Attempt(f"key {path}", with_sha1(key) if legacy_rsa_sha1 else key))
+            found.append(LoginAttempt(f"key {path}", with_sha1(key) if legacy_rsa_sha1 else key))
         if agent is not None:
-            found += [Attempt(f"agent key {key.comment or key.get_name()}", key) for key in agent.get_keys()]
+            found += [LoginAttempt(f"agent key {key.comment or key.get_name()}", key) for key in agent.get_keys()]
         if credentials.password is not None:
-            found.append(Attempt("password", password=credentials.password))
+            found.append(LoginAttempt("password", password=credentials.password))
         if credentials.empty_password:
-            found.append(Attempt("empty password", password=Secret("")))
+            found.append(LoginAttempt("empty password", password=Secret("")))
         yield tuple(found)
     finally:
         if agent is not None:
@@ -64,8 +64,8 @@ def attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tup
 
 def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
     """The public parts of all keys that would be tried. Raises InputError for a key file that cannot be used."""
-    with attempts(credentials, legacy_rsa_sha1=False) as tries:
-        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in tries if one.key is not None)
+    with login_attempts(credentials, legacy_rsa_sha1=False) as found:
+        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
 
 
 def load_key(path: Path, passphrase: Secret | None) -> PKey:

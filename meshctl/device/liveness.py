@@ -23,20 +23,20 @@ from paramiko.message import Message
 # The name OpenSSH asks under (ServerAliveInterval); dropbear refuses every such request, which is a sign, too.
 _REQUEST = "keepalive@openssh.com"
 # A process that was stopped, or had no processor for a while, reads what came meanwhile within this time.
-OWN_SLUMBER_S = 1.0
+MAX_OWN_PAUSE_S = 1.0
 
 
-class Heard:
+class ActivityStream:
     """A stream that remembers, in `at_s` of the monotonic clock, when it last gave anything."""
 
     def __init__(self, stream: socket.socket | paramiko.Channel) -> None:
         self._stream = stream
-        self.at_s = time.monotonic()
+        self.last_received_s = time.monotonic()
 
     def recv(self, count: int) -> bytes:
         data = self._stream.recv(count)
         if data:
-            self.at_s = time.monotonic()
+            self.last_received_s = time.monotonic()
         return data
 
     def __getattr__(self, name: str) -> Any:
@@ -45,11 +45,11 @@ class Heard:
 
 
 @contextmanager
-def asking(transport: paramiko.Transport, every_s: float, idle_s: float) -> Iterator[None]:
+def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> Iterator[None]:
     """Within this block the server is asked for a sign whenever nothing was read or written for `every_s`; afterwards
     it is sent a keepalive that wants no answer, every `idle_s`. The transport's own thread does it."""
 
-    def ask() -> None:
+    def send_request() -> None:
         request = Message()
         request.add_byte(cMSG_GLOBAL_REQUEST)
         request.add_string(_REQUEST)
@@ -57,7 +57,7 @@ def asking(transport: paramiko.Transport, every_s: float, idle_s: float) -> Iter
         # paramiko's own global_request waits for the answer in the thread that would have to read it
         transport._send_user_message(request)  # type: ignore[attr-defined]
 
-    transport.packetizer.set_keepalive(every_s, ask)
+    transport.packetizer.set_keepalive(every_s, send_request)
     try:
         yield
     finally:
@@ -66,17 +66,22 @@ def asking(transport: paramiko.Transport, every_s: float, idle_s: float) -> Iter
             transport.set_keepalive(int(idle_s))
 
 
-class Watch:
+class Watchdog:
     """Closes `transport` when `seconds` have passed (`passed`), or when `heard` has been silent for `silence_s`
     (`silent`) within this block."""
 
     def __init__(
-        self, transport: paramiko.Transport, seconds: float, *, heard: Heard | None = None, silence_s: float = 0.0
+        self,
+        transport: paramiko.Transport,
+        seconds: float,
+        *,
+        activity: ActivityStream | None = None,
+        silence_s: float = 0.0,
     ) -> None:
-        self.passed = self.silent = False
+        self.timed_out = self.silent = False
         self._transport = transport
         self._seconds = seconds
-        self._heard = heard
+        self._activity = activity
         self._silence_s = silence_s
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -87,21 +92,21 @@ class Watch:
             now_s = time.monotonic()
             left_s = began_s + self._seconds - now_s
             if left_s <= 0:
-                self.passed = True
+                self.timed_out = True
                 break
-            if self._heard is not None:
+            if self._activity is not None:
                 # what was silent before we began to wait had nothing to say
-                patience_s = max(self._heard.at_s, began_s) + self._silence_s - now_s
-                if patience_s <= -OWN_SLUMBER_S:
+                patience_s = max(self._activity.last_received_s, began_s) + self._silence_s - now_s
+                if patience_s <= -MAX_OWN_PAUSE_S:
                     self.silent = True
                     break
                 # past its time it gets one more look: it may be we who slept, and the answer lies there unread
-                left_s = min(left_s, patience_s if patience_s > 0 else OWN_SLUMBER_S)
+                left_s = min(left_s, patience_s if patience_s > 0 else MAX_OWN_PAUSE_S)
             if self._over.wait(left_s):
                 return
         self._transport.close()
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> Watchdog:
         self._thread.start()
         return self
 

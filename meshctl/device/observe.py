@@ -159,15 +159,17 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
 
 
 def _board(reader: _Reader) -> tuple[BoardInfo | None, ReleaseInfo | None]:
-    told, release = reader.read("ubus.board", ubus.parse_board) or (None, None)
+    ubus_board, release = reader.read("ubus.board", ubus.parse_board) or (None, None)
     if release is None:
         release = reader.read("openwrt_release", system.parse_openwrt_release)
-    board_name = (reader.read("board_name", str.strip, required=False) or "") or (told.board_name if told else "")
-    if not board_name and told is None:
+    board_name = (reader.read("board_name", str.strip, required=False) or "") or (
+        ubus_board.board_name if ubus_board else ""
+    )
+    if not board_name and ubus_board is None:
         return None, release
     model = reader.read("model", str.strip, required=False) or ""
     written = reader.read("board.json", ubus.parse_board_json) or BoardInfo("")
-    board = told or BoardInfo(board_name="")
+    board = ubus_board or BoardInfo(board_name="")
     return replace(
         written,
         board_name=board_name,

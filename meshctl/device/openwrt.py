@@ -26,13 +26,13 @@ _PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
 # sysupgrade's own lines have the date before them from 21.02 on (lib/upgrade/common.sh, v).
 _STAMP = re.compile(r"^.{,60} upgrade: ")
 # its advice to flash such an image all the same
-_FORCE_IT = "Use sysupgrade -F"
+_FORCE_ADVICE = "Use sysupgrade -F"
 # Between the answer and the deed, so that the answer arrives.
-ACT_AFTER_S = 1
+DETACHED_DELAY_S = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Clocked:
+class UptimeSample:
     """The node's uptime at `at_s` of the observer's monotonic clock, right to within `error_s` on either side."""
 
     boot_id: str
@@ -47,12 +47,12 @@ class Clocked:
 
 def measure_uptime(
     connection: Connection, *, samples: int = 3, monotonic: Callable[[], float] = time.monotonic
-) -> Clocked:
+) -> UptimeSample:
     """The node's uptime against our clock: the quickest of some round trips bounds the error by half of itself.
 
     This is what a switch at one moment counts from; the node's wall clock plays no part.
     """
-    best: Clocked | None = None
+    best: UptimeSample | None = None
     for _ in range(max(samples, 1)):
         asked = monotonic()
         done = connection.run("cat /proc/uptime /proc/sys/kernel/random/boot_id")
@@ -62,7 +62,7 @@ def measure_uptime(
         boot_id = parse_boot_id(lines[1]) if len(lines) > 1 else None
         if uptime is None or boot_id is None:
             raise CommandFailed(f"{connection.endpoint.label}: no uptime or boot id in {lines!r}", exit_status=0)
-        seen = Clocked(boot_id, uptime, (asked + answered) / 2, (answered - asked) / 2)
+        seen = UptimeSample(boot_id, uptime, (asked + answered) / 2, (answered - asked) / 2)
         best = seen if best is None or seen.error_s < best.error_s else best
     assert best is not None
     return best
@@ -144,18 +144,18 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
     lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
     said = [_STAMP.sub("", line[5:]).strip() for line in lines if line.startswith("said ")]
-    told = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
+    validation = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
     # procd refuses `-f` for such an image, only after `sysupgrade` has begun; -T does not look at it
-    bare = told.get("allow_backup") is False
-    passed = "status 0" in lines and (not told or truth(told.get("valid"))) and not bare
-    reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_IT)) or "sysupgrade -T failed"
+    bare = validation.get("allow_backup") is False
+    passed = "status 0" in lines and (not validation or truth(validation.get("valid"))) and not bare
+    reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
         reason = "it takes over no configuration from the running system"
     return FirmwareCheck(
         valid=passed,
         reason="" if passed else reason,
-        tests={name: truth(value) for name, value in mapping(told.get("tests")).items()},
+        tests={name: truth(value) for name, value in mapping(validation.get("tests")).items()},
         available_bytes=None if memory is None else memory.available,
     )
 
@@ -183,7 +183,7 @@ def reload_config(connection: Connection) -> None:
 def _detached(connection: Connection, name: str, act: str) -> None:
     # matched by a pid file that is not there: -x alone would find any running shell and start nothing
     pid_file = f"/tmp/meshctl/{name}.pid"
-    daemon = quoted(f"sleep {ACT_AFTER_S}; {act}")
+    daemon = quoted(f"sleep {DETACHED_DELAY_S}; {act}")
     start = f"start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"
     started = f"mkdir -p /tmp/meshctl && rm -f {pid_file} && {start}"
     connection.run(started).check(f"{connection.endpoint.label}: start {name}")

@@ -16,7 +16,7 @@ from types import TracebackType
 
 import paramiko
 
-from meshctl.device.authentication import Attempt, attempts
+from meshctl.device.authentication import LoginAttempt, login_attempts
 from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
 from meshctl.device.errors import (
     AuthenticationRefused,
@@ -30,7 +30,7 @@ from meshctl.device.errors import (
 )
 from meshctl.device.framing import framed
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
-from meshctl.device.liveness import Heard, Watch, asking
+from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.model import Release
@@ -38,11 +38,11 @@ from meshctl.model import Release
 __all__ = ["SshConnection", "connect"]
 
 # OpenWrt's dropbear closes after three refusals (MaxAuthTries in /etc/init.d/dropbear).
-TRIES_PER_CONNECTION = 3
+MAX_LOGINS_PER_CONNECTION = 3
 # What one command may say; more than any observation, less than what would hurt the host with 200 nodes at once.
 MAX_OUTPUT_BYTES = 16 << 20
 # Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread of its own.
-INLINE_STDIN_BYTES = 8 << 10
+MAX_INLINE_STDIN_BYTES = 8 << 10
 _READ_BYTES = 32 << 10
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
@@ -68,13 +68,13 @@ def connect(
     """
     limits = deadlines or Deadlines()
     legacy = legacy_rsa_sha1
-    with attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as wanted:
-        left = list(wanted)
+    with login_attempts(credentials, legacy_rsa_sha1=legacy or release is Release.V19_07) as attempts:
+        remaining = list(attempts)
         tried: list[str] = []
         allowed: tuple[str, ...] = ()
         while True:
             try:
-                transport, heard = _handshake(endpoint, limits, trust, via, legacy=legacy)
+                transport, activity = _handshake(endpoint, limits, trust, via, legacy=legacy)
             except _OnlySha1 as error:
                 if legacy or release is not Release.V19_07:
                     raise IncompatibleServer(
@@ -84,17 +84,17 @@ def connect(
                 legacy = True
                 continue
             try:
-                accepted, refused = _login(endpoint, transport, left[:TRIES_PER_CONNECTION], limits)
+                accepted, refused = _login(endpoint, transport, remaining[:MAX_LOGINS_PER_CONNECTION], limits)
             except BaseException:
                 transport.close()
                 raise
             if accepted:
-                return SshConnection(endpoint, transport, limits, heard)
+                return SshConnection(endpoint, transport, limits, activity)
             transport.close()
-            tried += [attempt.name for attempt in left[:TRIES_PER_CONNECTION]]
+            tried += [attempt.name for attempt in remaining[:MAX_LOGINS_PER_CONNECTION]]
             allowed = refused or allowed
-            left = left[TRIES_PER_CONNECTION:]
-            if not left:
+            remaining = remaining[MAX_LOGINS_PER_CONNECTION:]
+            if not remaining:
                 given = ", ".join(tried) or "no credentials at all"
                 raise AuthenticationRefused(
                     f"{endpoint.label}: let {endpoint.user} in with none of: {given}",
@@ -109,51 +109,51 @@ class _OnlySha1(Exception):
 
 
 @contextmanager
-def _translated(
+def _translating_errors(
     endpoint: Endpoint,
     transport: paramiko.Transport,
     seconds: float,
     phase: str,
     *,
-    heard: Heard | None = None,
+    activity: ActivityStream | None = None,
     silence_s: float = 0.0,
 ) -> Iterator[None]:
     """Foreign exceptions become ours here; a wait that took too long is told as such whatever it made paramiko raise.
 
     With `heard`, a connection that is silent for `silence_s` meanwhile is lost.
     """
-    with Watch(transport, seconds, heard=heard, silence_s=silence_s) as watch:
+    with Watchdog(transport, seconds, activity=activity, silence_s=silence_s) as watchdog:
         try:
             yield
         except (paramiko.SSHException, OSError, EOFError) as error:
-            if watch.passed or watch.silent:
-                raise _waited(endpoint, watch, seconds, silence_s, phase) from error
+            if watchdog.timed_out or watchdog.silent:
+                raise _timeout_error(endpoint, watchdog, seconds, silence_s, phase) from error
             if transport.is_active():
                 raise ChannelClosed(f"{endpoint.label}: {phase} was refused or cut: {error}") from error
             raise ConnectionLost(f"{endpoint.label}: the connection broke during {phase}: {error}") from error
-    if watch.passed or watch.silent:
-        raise _waited(endpoint, watch, seconds, silence_s, phase)
+    if watchdog.timed_out or watchdog.silent:
+        raise _timeout_error(endpoint, watchdog, seconds, silence_s, phase)
 
 
-def _waited(endpoint: Endpoint, watch: Watch, seconds: float, silence_s: float, phase: str) -> Unreachable:
-    if watch.passed:
+def _timeout_error(endpoint: Endpoint, watchdog: Watchdog, seconds: float, silence_s: float, phase: str) -> Unreachable:
+    if watchdog.timed_out:
         return Timeout(f"{endpoint.label}: no answer to {phase} within {seconds:g} s", phase=phase)
     return ConnectionLost(f"{endpoint.label}: silent for {silence_s:g} s during {phase}")
 
 
 def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
-) -> tuple[paramiko.Transport, Heard]:
+) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    heard = Heard(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
-    transport = (LegacyTransport if legacy else paramiko.Transport)(heard)  # type: ignore[arg-type]
+    activity = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
     transport.auth_timeout = limits.auth_s * 2
     transport.clear_to_send_timeout = limits.run_s
     _prefer(transport, known, legacy=legacy)
     try:
-        with _translated(endpoint, transport, limits.handshake_s, "the SSH handshake"):
+        with _translating_errors(endpoint, transport, limits.handshake_s, "the SSH handshake"):
             try:
                 transport.start_client(timeout=limits.handshake_s * 2)
             except paramiko.ssh_exception.IncompatiblePeer as error:
@@ -170,7 +170,7 @@ def _handshake(
         transport.close()
         raise
     transport.set_keepalive(limits.keepalive_s)
-    return transport, heard
+    return transport, activity
 
 
 def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy: bool) -> None:
@@ -186,12 +186,12 @@ def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy
 
 
 def _login(
-    endpoint: Endpoint, transport: paramiko.Transport, wanted: list[Attempt], limits: Deadlines
+    endpoint: Endpoint, transport: paramiko.Transport, attempts: list[LoginAttempt], limits: Deadlines
 ) -> tuple[bool, tuple[str, ...]]:
     """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
     allowed: tuple[str, ...] = ()
-    for attempt in wanted:
-        with _translated(endpoint, transport, limits.auth_s, "authentication"):
+    for attempt in attempts:
+        with _translating_errors(endpoint, transport, limits.auth_s, "authentication"):
             try:
                 attempt.run(transport, endpoint.user)
             except paramiko.BadAuthenticationType as error:
@@ -201,7 +201,7 @@ def _login(
                     # it hung up on the refusal, as dropbear does after the last one it allows
                     return False, allowed
             except (paramiko.SSHException, EOFError):
-                if not transport.is_active() and attempt is wanted[-1]:
+                if not transport.is_active() and attempt is attempts[-1]:
                     return False, allowed
                 raise
             if transport.is_authenticated():
@@ -212,11 +212,13 @@ def _login(
 class SshConnection(Connection):
     """See `Connection`. Also carries tunnels to nodes behind this one."""
 
-    def __init__(self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, heard: Heard) -> None:
+    def __init__(
+        self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, activity: ActivityStream
+    ) -> None:
         self._endpoint = endpoint
         self._transport = transport
         self._limits = limits
-        self._heard = heard
+        self._activity = activity
 
     @property
     def endpoint(self) -> Endpoint:
@@ -243,7 +245,9 @@ class SshConnection(Connection):
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""
-        with _translated(target, self._transport, self._limits.connect_s, f"a tunnel through {self._endpoint.label}"):
+        with _translating_errors(
+            target, self._transport, self._limits.connect_s, f"a tunnel through {self._endpoint.label}"
+        ):
             try:
                 return self._transport.open_channel("direct-tcpip", (target.host, target.port), ("127.0.0.1", 0))
             except paramiko.ChannelException as error:
@@ -253,13 +257,13 @@ class SshConnection(Connection):
         sent = framed(script)
         seconds = self._limits.run_s if timeout_s is None else timeout_s
         pieces = (stdin,) if isinstance(stdin, bytes) else stdin
-        with asking(self._transport, self._limits.ask_s, self._limits.keepalive_s):
+        with keepalives(self._transport, self._limits.ask_s, self._limits.keepalive_s):
             with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
                 channel = self._transport.open_session()
             try:
                 with self._waiting(seconds, "a command"):
                     channel.exec_command(sent.command)
-                    with _fed(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
+                    with _sending_stdin(channel, sent.preamble, pieces, inline=isinstance(stdin, bytes)) as feeder:
                         out, err = _collect(channel, self._endpoint.label)
                     status = channel.recv_exit_status()
                     if status < 0:
@@ -267,13 +271,15 @@ class SshConnection(Connection):
                 if feeder is not None and feeder.failure is not None:
                     raise feeder.failure
             finally:
-                with _quiet():
+                with _ignoring_closed():
                     channel.close()
         return Completed(out, err, status)
 
     def _waiting(self, seconds: float, phase: str) -> AbstractContextManager[None]:
         silence_s = self._limits.silence_s
-        return _translated(self._endpoint, self._transport, seconds, phase, heard=self._heard, silence_s=silence_s)
+        return _translating_errors(
+            self._endpoint, self._transport, seconds, phase, activity=self._activity, silence_s=silence_s
+        )
 
     def close(self) -> None:
         self._transport.close()
@@ -290,7 +296,7 @@ class SshConnection(Connection):
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _ignoring_closed() -> Iterator[None]:
     """Closing what is already gone is no error."""
     try:
         yield
@@ -323,19 +329,19 @@ class _Feeder(threading.Thread):
                 # The command ended without reading all of it, as its exit status says, or the link was cut, as the
                 # reader finds out.
                 return
-        with _quiet():
+        with _ignoring_closed():
             self._channel.shutdown_write()
 
 
 @contextmanager
-def _fed(
+def _sending_stdin(
     channel: paramiko.Channel, preamble: bytes, pieces: Iterable[bytes], *, inline: bool
 ) -> Iterator[_Feeder | None]:
     """Send `preamble` and `pieces` to the command: at once when they fit its window, else beside the reading."""
     if inline:
         text = preamble + b"".join(pieces)
-        if len(text) <= INLINE_STDIN_BYTES:
-            with _quiet():
+        if len(text) <= MAX_INLINE_STDIN_BYTES:
+            with _ignoring_closed():
                 channel.sendall(text)
                 channel.shutdown_write()
             yield None
@@ -347,7 +353,7 @@ def _fed(
     try:
         yield feeder
     finally:
-        with _quiet():
+        with _ignoring_closed():
             channel.shutdown_write()
         feeder.join(timeout=5.0)
 

@@ -262,7 +262,7 @@ class AfterFlash:
             self._store.replace(self._name, key)
 
 
-class Recorder:
+class AcceptAnyKey:
     """Believes any host key, and keeps it: on the bench a cable is the proof, and the key is pinned right after."""
 
     def __init__(self) -> None:

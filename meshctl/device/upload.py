@@ -23,12 +23,12 @@ from meshctl.errors import InputError
 # a chunk takes two seconds.
 CHUNK_BYTES = 256 << 10
 # A link slower than this is as good as gone; it bounds how long one chunk may take.
-SLOWEST_BYTES_PER_S = 4 << 10
+MIN_BYTES_PER_S = 4 << 10
 # Pieces a rate limit is held with.
 _PIECE_BYTES = 4 << 10
-_PATIENCE_S = 60.0
+_COMMAND_TIMEOUT_S = 60.0
 # How often a chunk that arrived damaged is surveyed anew; a leftover writer of a cut connection can cause one.
-_SURVEYS = 3
+MAX_SURVEYS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,17 +95,17 @@ def upload(
     """
     content = Content(source)
     partial = _partial(path, content)
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     sent = 0
     kept_at_first: int | None = None
-    for _ in range(_SURVEYS):
+    for _ in range(MAX_SURVEYS):
         survey = _survey(connection, path, partial, content)
         if survey.done:
-            tell(Progress(content.size, content.size))
+            report(Progress(content.size, content.size))
             return Uploaded(path, content.sha256, content.size, sent, content.size - sent)
         good = survey.good_chunks
         kept_at_first = good * CHUNK_BYTES if kept_at_first is None else kept_at_first
-        tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+        report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
         while good < content.chunks:
             data = content.chunk(good)
             arrived = _send_chunk(connection, partial, good, data, rate_bytes_per_s, sleep)
@@ -113,7 +113,7 @@ def upload(
             if not arrived:
                 break
             good += 1
-            tell(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+            report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
         if good == content.chunks and _put_in_place(connection, partial, path, content, mode):
             return Uploaded(path, content.sha256, content.size, sent, min(kept_at_first, content.size))
     raise UploadFailed(f"{connection.endpoint.label}: {path}: the bytes that arrive are not those sent")
@@ -152,7 +152,9 @@ done
 
 def _survey(connection: Connection, path: str, partial: str, content: Content) -> _Survey:
     script = _SURVEY.format(target=quoted(path), partial=quoted(partial), size=content.size, chunk=CHUNK_BYTES)
-    answer = connection.run(script, timeout_s=_PATIENCE_S * 2).check(f"{connection.endpoint.label}: look at {path}")
+    answer = connection.run(script, timeout_s=_COMMAND_TIMEOUT_S * 2).check(
+        f"{connection.endpoint.label}: look at {path}"
+    )
     chunks: list[str] = []
     for line in answer.stdout.splitlines():
         match line.split():
@@ -190,11 +192,11 @@ def _send_chunk(
     sleep: Callable[[float], None],
 ) -> bool:
     script = _CHUNK.format(partial=quoted(partial), start=index * CHUNK_BYTES, length=len(data))
-    slowest = min(SLOWEST_BYTES_PER_S, (rate_bytes_per_s or SLOWEST_BYTES_PER_S) / 2)
+    slowest = min(MIN_BYTES_PER_S, (rate_bytes_per_s or MIN_BYTES_PER_S) / 2)
     answer = connection.run(
         script,
         stdin=data if rate_bytes_per_s is None else _paced(data, rate_bytes_per_s, sleep),
-        timeout_s=_PATIENCE_S + len(data) / slowest,
+        timeout_s=_COMMAND_TIMEOUT_S + len(data) / slowest,
     )
     if answer.exit_status != 0:
         raise UploadFailed(f"{connection.endpoint.label}: {partial}: cannot be written: {answer.stderr.strip()}")
@@ -225,7 +227,7 @@ def _put_in_place(connection: Connection, partial: str, path: str, content: Cont
     script = _FINISH.format(
         partial=quoted(partial), target=quoted(path), size=content.size, sha256=content.sha256, mode=mode
     )
-    answer = connection.run(script, timeout_s=_PATIENCE_S * 2).check(
+    answer = connection.run(script, timeout_s=_COMMAND_TIMEOUT_S * 2).check(
         f"{connection.endpoint.label}: put {path} in place"
     )
     return answer.stdout.strip() == "placed"

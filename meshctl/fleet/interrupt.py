@@ -26,7 +26,7 @@ class Interrupt:
     def __init__(self) -> None:
         self._stop = threading.Event()
         self._leave = threading.Event()
-        self._said: Callable[[str], None] = lambda text: None
+        self._say: Callable[[str], None] = lambda text: None
 
     @property
     def stopping(self) -> bool:
@@ -40,18 +40,18 @@ class Interrupt:
         """Ask once to stop, twice to leave."""
         if self._stop.is_set():
             self._leave.set()
-            self._tell(
+            self._report(
                 "leaving: what is armed on a node goes back by itself; `meshctl resume` takes it up again "
                 "(a third time to end without waiting for any connection)"
             )
         else:
             self._stop.set()
-            self._tell("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
+            self._report("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         # whoever closed the terminal hears nothing more, and the work still has to come to its end
         with suppress(OSError):
-            self._said(text)
+            self._say(text)
 
     def wait(self, timeout_s: float) -> bool:
         """Sleep until the second request, at most `timeout_s`; True when it came."""
@@ -60,7 +60,7 @@ class Interrupt:
     @contextmanager
     def on_signals(self, say: Callable[[str], None]) -> Iterator[None]:
         """Within this block SIGINT, SIGTERM and SIGHUP are requests. Only in the main thread."""
-        self._said = say
+        self._say = say
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGHUP and self.stopping:

@@ -33,7 +33,7 @@ STEP_TIMEOUT_S = 1.0
 _LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 # Outcomes of a node that leave open what became of a change begun before.
-_END_NOT_SEEN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
+_END_UNKNOWN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
 _SCHEMA = """
 CREATE TABLE runs (
     id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
@@ -139,7 +139,7 @@ class Journal:
             try:
                 self._database.execute("PRAGMA journal_mode = WAL")
             except sqlite3.OperationalError as error:
-                if not _is_held(error) or time.monotonic() > deadline:
+                if not _is_locked(error) or time.monotonic() > deadline:
                     raise
                 time.sleep(0.01)
             else:
@@ -244,7 +244,7 @@ class Journal:
         """The nodes of a run that a resume has to take up, in the run's order."""
         return tuple(outcome.node for outcome in self.outcomes(run_id) if not outcome.result.is_settled)
 
-    def left(self, fleet: str) -> dict[int, tuple[str, ...]]:
+    def unfinished_runs(self, fleet: str) -> dict[int, tuple[str, ...]]:
         """Run -> the nodes that it left unfinished and no later run took up; the newest run first.
 
         Runs of `robots` and those of radios do not count as each other's successors.
@@ -257,15 +257,15 @@ class Journal:
             " ORDER BY run DESC, outcomes.rowid",
             (self._key(fleet),),
         )
-        left: dict[int, tuple[str, ...]] = {}
+        unfinished: dict[int, tuple[str, ...]] = {}
         for run_id, node, result in rows:
             if not Result(result).is_settled:
-                left[run_id] = (*left.get(run_id, ()), node)
-        return left
+                unfinished[run_id] = (*unfinished.get(run_id, ()), node)
+        return unfinished
 
-    def lost_sight_of(self, fleet: str) -> dict[str, float]:
+    def unfinished_changes(self, fleet: str) -> dict[str, float]:
         """The nodes on which a change was begun that no run saw the end of, and when the first such was (Unix time)."""
-        ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_NOT_SEEN)
+        ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)
         rows = self._read(
             "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
             " AND command NOT LIKE 'robots %' AND step IN ('apply', 'flash') AND NOT EXISTS"
@@ -283,14 +283,14 @@ class Journal:
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
         with self._write() as database:
             database.executemany(
-                _REMEMBER, [_sighting(self._key(fleet), node, told, seen_s) for node, told in facts.items()]
+                _REMEMBER, [_sighting(self._key(fleet), node, known, seen_s) for node, known in facts.items()]
             )
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
         rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),))
         return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
 
-    def separate(self, fleet: str, lab_of: Callable[[str], str]) -> None:
+    def move_lab_runs(self, fleet: str, lab_of: Callable[[str], str]) -> None:
         """Give each lab its runs of `fleet` that an earlier version kept under the real fleet's name.
 
         `lab_of` gives the lab's directory by a run's inventory, empty for a real one. What was known of the nodes goes
@@ -330,25 +330,25 @@ class Run:
     def __init__(self, journal: Journal, run_id: int) -> None:
         self._journal = journal
         self._guard = threading.Lock()
-        self._owed: list[tuple[str, tuple[object, ...]]] = []
+        self._pending: list[tuple[str, tuple[object, ...]]] = []
         self.id = run_id
         # why the journal lacks something; what it lacks counts as not done to a resume
-        self.trouble = ""
+        self.error = ""
 
     def _put(self, statement: str, *values: object, wait_s: float = STEP_TIMEOUT_S) -> None:
         with self._guard:
             # whoever could not write waits no second time before the end
-            patience_s = 0.0 if self._owed and wait_s <= STEP_TIMEOUT_S else wait_s
-            self._owed.append((statement, values))
+            timeout_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
+            self._pending.append((statement, values))
             try:
-                with self._journal._write(patience_s) as database:
-                    for owed in self._owed:
-                        database.execute(*owed)
+                with self._journal._write(timeout_s) as database:
+                    for pending in self._pending:
+                        database.execute(*pending)
             except MeshctlError as error:
-                self.trouble = str(error)
+                self.error = str(error)
             else:
-                self._owed.clear()
-                self.trouble = ""
+                self._pending.clear()
+                self.error = ""
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Keep what a node told in the course of this run."""
@@ -404,8 +404,8 @@ def _sighting(fleet: str, node: str, facts: Mapping[str, str], seen_s: float) ->
 
 # SQLite's primary result codes (sqlite.org/rescode.html); the bits above these eight tell more about the same.
 _PRIMARY = 0xFF
-_HELD = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
-_NO_ROOM = (
+_LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+_UNWRITABLE = (
     *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN),
     *(sqlite3.SQLITE_IOERR, sqlite3.SQLITE_PERM),
 )
@@ -415,15 +415,15 @@ def _primary(error: Exception) -> int:
     return int(getattr(error, "sqlite_errorcode", 0)) & _PRIMARY
 
 
-def _is_held(error: Exception) -> bool:
-    return _primary(error) in _HELD
+def _is_locked(error: Exception) -> bool:
+    return _primary(error) in _LOCKED
 
 
 def _hint(error: Exception) -> str:
     """What to do when the file cannot be used; empty when the file itself is at fault."""
-    if _is_held(error):
+    if _is_locked(error):
         return "another process holds it: `fuser` with its path names that process"
-    if isinstance(error, OSError) or _primary(error) in _NO_ROOM:
+    if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
         return "XDG_STATE_HOME=DIR keeps it elsewhere, on a disk with room that can be written"
     return ""
 

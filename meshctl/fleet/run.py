@@ -66,7 +66,7 @@ def run(
         raise ValueError(f"parallel {parallel} is below 1")
     waiting = list(dict.fromkeys(nodes))
     order = tuple(waiting)
-    allowance = budget or FailureBudget(0)
+    failure_budget = budget or FailureBudget(0)
     signal = interrupt or Interrupt()
     outcomes: dict[str, Outcome] = {}
     in_work: dict[Future[Outcome], str] = {}
@@ -80,13 +80,13 @@ def run(
         except NodeError as error:
             outcome = outcome_of_error(node, error)
         outcome = replace(outcome, duration_s=round(time.monotonic() - began, 3))
-        allowance.count(outcome)
+        failure_budget.count(outcome)
         observer(Event(EventKind.FINISHED, node, time.time(), outcome.reason, outcome=outcome))
         return outcome
 
     with ThreadPoolExecutor(max_workers=parallel, thread_name_prefix="node") as pool:
         while waiting or in_work:
-            while waiting and len(in_work) < parallel and not (signal.stopping or allowance.spent or bugs):
+            while waiting and len(in_work) < parallel and not (signal.stopping or failure_budget.spent or bugs):
                 node = waiting.pop(0)
                 in_work[pool.submit(one, node)] = node
             if not in_work:
@@ -101,7 +101,7 @@ def run(
                     outcomes[node] = future.result()
     if bugs:
         raise bugs[0]
-    why = "interrupted before its turn" if signal.stopping else allowance.reason
+    why = "interrupted before it started" if signal.stopping else failure_budget.reason
     for node in waiting:
         outcomes[node] = Outcome(node, Result.PENDING, why)
         observer(Event(EventKind.FINISHED, node, time.time(), why, outcome=outcomes[node]))

@@ -1,4 +1,4 @@
-"""Polling without hurry and without waste: short pauses first, longer ones later, an end, and an ear for Ctrl-C."""
+"""Exponential backoff for polling, with a time limit; Ctrl-C ends a pause."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 from meshctl.fleet import Interrupt
 
-# A virtual or near node answers within the first pause; a far one costs a few connections more.
-FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.2, 2.0, 1.5
+# A virtual or near node answers within the first pause.
+FIRST_PAUSE_S, MAX_PAUSE_S, GROWTH = 0.2, 2.0, 1.5
 
 
 @dataclass(slots=True)
-class Pace:
-    """`pause` sleeps; `is_over` once `limit_s` have passed since the pace was made."""
+class Backoff:
+    """`pause` sleeps; `is_over` becomes true `limit_s` after creation."""
 
     limit_s: float
     interrupt: Interrupt
@@ -29,6 +29,6 @@ class Pace:
         return self.elapsed_s >= self.limit_s
 
     def pause(self) -> None:
-        """Sleep a while, less when somebody wants to leave."""
+        """Sleep for the current pause, or until the second Ctrl-C."""
         self.interrupt.wait(min(self._pause_s, max(0.0, self.limit_s - self.elapsed_s)))
-        self._pause_s = min(self._pause_s * GROWTH, LONGEST_PAUSE_S)
+        self._pause_s = min(self._pause_s * GROWTH, MAX_PAUSE_S)

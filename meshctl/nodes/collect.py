@@ -1,7 +1,7 @@
-"""Observe many nodes: who answers and what they tell, who does not and why, and the mesh as they see it.
+"""Observe many nodes: their observations, why others gave none, and the mesh graph.
 
-`gather` looks at every node in parallel over connections it keeps; what a dead meshctl of this machine left behind on a
-node (a lock, an armed change) is cleared away first, because nobody else ever will before it runs out.
+`collect` observes nodes in parallel over pooled connections. A lock or an armed change that a dead meshctl process of
+this machine left on a node is cleared first, because nothing else removes it before it expires.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node
-from meshctl.nodes.backoff import Pace
-from meshctl.nodes.connections import Access
+from meshctl.nodes.backoff import Backoff
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
-# How long a node may take to put back what a dead process had armed: its files, and a reload.
+# How long a node may take to roll back a change of a dead process: its files, and a reload.
 CLEARING_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """`observations` of the nodes that answered; `away` and `refused`: why others gave none (silence, or a host key or
-    login that does not fit)."""
+class FleetObservation:
+    """`observations` of the nodes that answered; why others gave none: `unreachable`, or `refused` (a host key or login
+    that does not match)."""
 
     observations: Mapping[str, Observation]
-    away: Mapping[str, str]
+    unreachable: Mapping[str, str]
     refused: Mapping[str, NodeError] = field(default_factory=dict)
 
     @property
@@ -43,7 +43,7 @@ class Seen:
         return tuple(report_of(name, seen) for name, seen in self.observations.items())
 
     def graph(self, fleet: Fleet, known: Mapping[str, LastKnown]) -> Graph:
-        """The mesh as these nodes see it. A robot's radios on its switch count as wired together."""
+        """The mesh as these nodes observe it. The radios of a robot are wired together."""
         wires = [
             (first, second)
             for robot in fleet.robots.values()
@@ -55,8 +55,7 @@ class Seen:
 
 
 def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
-    """MAC -> node, from the inventory, from what nodes reported when they were last seen, and the other addresses by
-    which their radios may be heard now."""
+    """MAC -> node: from the inventory, from the journal, and alternate MACs of these radios."""
     macs = {
         mac.lower(): name
         for name, last in known.items()
@@ -68,25 +67,25 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     return with_alternates(macs)
 
 
-def gather(
-    access: Access,
+def collect(
+    connections: ConnectionPool,
     nodes: Iterable[Node],
     *,
     parallel: int,
     paths: Callable[[Node], Iterable[str]] = lambda node: (),
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
-) -> Seen:
-    """Observe these nodes; `paths` names the files beside UCI's to look at. Connections stay with `access`."""
+) -> FleetObservation:
+    """Observe these nodes; `paths` names further files to read. Connections stay in the pool."""
     wanted = {node.name: node for node in nodes}
     found: dict[str, Observation] = {}
     errors: dict[str, NodeError] = {}
     lock = threading.Lock()
     signal = interrupt or Interrupt()
 
-    def look(name: str) -> Outcome:
+    def observe_one(name: str) -> Outcome:
         try:
-            with access.lease(wanted[name]) as connection:
+            with connections.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:
@@ -96,35 +95,35 @@ def gather(
             found[name] = seen
         return Outcome(name, Result.DONE)
 
-    outcomes = run(wanted, look, parallel=parallel, interrupt=signal, observer=observer)
-    away = {
+    outcomes = run(wanted, observe_one, parallel=parallel, interrupt=signal, observer=observer)
+    unreachable = {
         name: outcome.reason
         for name, outcome in outcomes.items()
         if name not in found and (name not in errors or isinstance(errors[name], Unreachable))
     }
     refused = {name: error for name, error in errors.items() if not isinstance(error, Unreachable)}
-    return Seen({name: found[name] for name in wanted if name in found}, away, refused)
+    return FleetObservation({name: found[name] for name in wanted if name in found}, unreachable, refused)
 
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
-    """One observation, after clearing away what a dead meshctl of this machine left on the node."""
+    """One observation, after clearing the lock and change of a dead meshctl process of this machine."""
     seen = observe(connection, extra_paths=paths)
     change = seen.change
     if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
         return seen
-    pace = Pace(CLEARING_S, interrupt)
-    while not pace.is_over and not interrupt.leaving:
+    backoff = Backoff(CLEARING_S, interrupt)
+    while not backoff.is_over and not interrupt.leaving:
         _clear(connection, change)
         seen = observe(connection, extra_paths=paths)
         change = seen.change
         if change is None or not is_dead(change.owner) or change.state in ("idle", "staged"):
             break
-        pace.pause()
+        backoff.pause()
     return seen
 
 
 def _clear(connection: SshConnection, change: ChangeStatus) -> None:
-    # what the node refuses here it will tell in its next status
+    # if the node refuses, its next status shows why
     with suppress(NodeRefused):
         if is_dead(change.owner) and change.change_id and change.state not in ("idle", "restoring"):
             deadman.abort(connection, change.owner, change.change_id)
@@ -134,7 +133,7 @@ def _clear(connection: SshConnection, change: ChangeStatus) -> None:
 
 
 def facts_of(seen: Observation) -> dict[str, str]:
-    """What the journal keeps of a node: enough to find it again and to say how it was."""
+    """The facts of a node that the journal stores: how to find it again, and its last known state."""
     facts = {
         "macs": " ".join(mesh_macs(seen)),
         "boot_id": seen.boot_id or "",

@@ -1,6 +1,6 @@
-"""How meshctl gets at the nodes of a fleet: where they are, with which keys, over which kept connection.
+"""SSH connections to the nodes of a fleet: endpoints, credentials, and a pool.
 
-`Access.open` makes a new connection, which is what proves a changed node reachable; `Access.lease` uses one again.
+`ConnectionPool.open` makes a new connection, which proves a changed node reachable; `ConnectionPool.borrow` reuses one.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.model import Fleet, Node
 
-# Closing waits for the connection's thread, up to two seconds where the other side is gone: a fleet's wait together.
-CLOSED_AT_ONCE = 32
+# Closing waits up to two seconds for a connection whose other side is gone, so a fleet's are closed in parallel.
+MAX_PARALLEL_CLOSES = 32
 
 
 class Locate(Protocol):
-    """Where a node answers while it has this address: host and port as seen from here."""
+    """The host and port at which a node with this address is reached."""
 
     def __call__(self, node: Node, address: IPv4Address) -> tuple[str, int]: ...
 
@@ -38,11 +38,12 @@ def as_written(node: Node, address: IPv4Address) -> tuple[str, int]:
 
 
 @dataclass(slots=True)
-class Access:
-    """Everything needed to reach any node. Safe for many threads; each connection belongs to one at a time.
+class ConnectionPool:
+    """Opens connections to nodes and keeps them for reuse. Thread-safe; each connection belongs to one thread at a
+    time.
 
-    `key_files` come before those the inventory names. `trust` is the file of pins; `policy` judges host keys and may
-    ask about unknown ones, by default the file alone.
+    `key_files` come before those of the inventory. `trust` is the file of pinned host keys; `policy`, if set, judges
+    host keys instead and may ask about unknown ones.
     """
 
     fleet: Fleet
@@ -52,9 +53,9 @@ class Access:
     deadlines: Deadlines = field(default_factory=Deadlines)
     policy: HostKeyPolicy | None = None
     locate: Locate = as_written
-    # devices on the bench, by node: they answer there, and let in whoever comes
-    newcomers: dict[str, Endpoint] = field(default_factory=dict)
-    # nodes met through one interface of this machine, by node: their new address is looked for there first
+    # node -> endpoint of a device on the bench, which may accept a login without a password
+    bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
+    # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
@@ -66,20 +67,20 @@ class Access:
         host, port = self.locate(node, address or node.address.ip)
         return Endpoint(host, port, node.ssh.user, identity=node.name, interface=self.interfaces.get(node.name, ""))
 
-    def places(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
-        """Where a node is looked for: through its own interface, if it has one, then wherever the routes lead."""
+    def candidates(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
+        """The endpoints to try for a node: through its local interface, if known, then by the routing table."""
         first = self.endpoint(node, address)
         return (first, replace(first, interface="")) if first.interface else (first,)
 
     def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:
-        """What we log in with: keys, and on the bench alone no password. At a node's own address only a key proves
-        that the operators have not locked themselves out."""
+        """The credentials for a node: keys, and no password only on the bench. At its own address only a login with a
+        key proves that the operators are not locked out."""
         named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
-        is_new = endpoint is not None and endpoint == self.newcomers.get(node.name)
+        is_new = endpoint is not None and endpoint == self.bench_endpoints.get(node.name)
         return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent, empty_password=is_new)
 
     def own_keys(self, node: Node) -> tuple[OwnKey, ...]:
-        """What we can log in to this node with once it is provisioned. Raises InputError for an unusable key file."""
+        """The keys that can log in to this node once it is provisioned. Raises InputError for an unusable key file."""
         credentials = self.credentials(node)
         with self._lock:
             if credentials not in self._own_keys:
@@ -96,7 +97,7 @@ class Access:
         deadlines: Deadlines | None = None,
     ) -> SshConnection:
         """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
-        places = (endpoint,) if endpoint is not None else self.places(node)
+        places = (endpoint,) if endpoint is not None else self.candidates(node)
         while True:
             where, *places_left = places
             try:
@@ -118,30 +119,30 @@ class Access:
             return None
         through = self.fleet.nodes.get(node.ssh.jump)
         if through is None:
-            raise InputError(f"node {node.name}: ssh.jump names {node.ssh.jump!r}, which is no node of the fleet")
+            raise InputError(f"node {node.name}: ssh.jump names {node.ssh.jump!r}, which is not in the fleet")
         with self._jump_lock:
             kept = self._jumps.get(through.name)
             if kept is None or not kept.is_open:
-                # a jump is one hop: its own jump is not followed
+                # only one hop: the jump node's own ssh.jump is ignored
                 kept = self._jumps[through.name] = self.open(replace(through, ssh=replace(through.ssh, jump="")))
             return kept
 
     @contextmanager
-    def lease(self, node: Node) -> Iterator[SshConnection]:
-        """The kept connection to a node, or a new one, which is kept afterwards unless it broke."""
-        connection = self.take(node.name) or self.open(node)
+    def borrow(self, node: Node) -> Iterator[SshConnection]:
+        """A pooled connection to a node, or a new one; it returns to the pool unless it broke."""
+        connection = self.acquire(node.name) or self.open(node)
         try:
             yield connection
         except ConnectionLost:
             connection.close()
             raise
         except BaseException:
-            self.keep(node.name, connection)
+            self.release(node.name, connection)
             raise
-        self.keep(node.name, connection)
+        self.release(node.name, connection)
 
-    def take(self, name: str) -> SshConnection | None:
-        """The kept connection, if it still stands; the caller owns it now."""
+    def acquire(self, name: str) -> SshConnection | None:
+        """Take the pooled connection if it is still open; the caller owns it."""
         with self._lock:
             kept = self._kept.pop(name, None)
         if kept is not None and not kept.is_open:
@@ -149,8 +150,8 @@ class Access:
             return None
         return kept
 
-    def keep(self, name: str, connection: SshConnection) -> None:
-        """Give a connection back for later use."""
+    def release(self, name: str, connection: SshConnection) -> None:
+        """Return a connection to the pool."""
         if not connection.is_open:
             connection.close()
             return
@@ -161,13 +162,13 @@ class Access:
             old.close()
 
     def drop(self, name: str) -> None:
-        """Close the kept connection to a node."""
-        kept = self.take(name)
+        """Close the pooled connection to a node."""
+        kept = self.acquire(name)
         if kept is not None:
             kept.close()
 
     def close(self) -> None:
-        """Close every connection side by side, those through another node before what they go through."""
+        """Close all connections in parallel, those through a jump node before the jump itself."""
         with self._lock:
             kept, jumps = list(self._kept.values()), list(self._jumps.values())
             self._kept.clear()
@@ -175,7 +176,7 @@ class Access:
         _close(kept)
         _close(jumps)
 
-    def __enter__(self) -> Access:
+    def __enter__(self) -> ConnectionPool:
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -183,7 +184,7 @@ class Access:
 
 
 def _close(connections: Iterable[SshConnection]) -> None:
-    with ThreadPoolExecutor(CLOSED_AT_ONCE, "close") as pool:
+    with ThreadPoolExecutor(MAX_PARALLEL_CLOSES, "close") as pool:
         for _ in pool.map(lambda connection: connection.close(), connections):
             pass
 

@@ -1,4 +1,4 @@
-"""What the inventory wants of each node, rendered with what only the device knows."""
+"""The desired state of each node: the inventory, rendered with facts only the device has."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, Secret, SecretRef
-from meshctl.plan import Wanted
+from meshctl.plan import DesiredState
 from meshctl.plan.packages import Needs
 from meshctl.plan.seen import packages_seen
 from meshctl.render import DeviceFacts, Templates, render, with_switch
@@ -16,7 +16,7 @@ from meshctl.resolve import package_needs, resolve
 
 @dataclass(frozen=True, slots=True)
 class Renderer:
-    """Renders nodes of one fleet; `secrets` fetches what its references name."""
+    """Renders the nodes of one fleet; `secrets` resolves its secret references."""
 
     fleet: Fleet
     secrets: Callable[[SecretRef], Secret]
@@ -26,11 +26,11 @@ class Renderer:
     def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:
         return cls(fleet, secrets, Templates.of(fleet))
 
-    def wanted(self, node: Node, seen: Observation | None = None) -> Wanted:
-        """One node's files and packages. Raises InvalidInput for values that cannot be written down."""
+    def desired(self, node: Node, seen: Observation | None = None) -> DesiredState:
+        """One node's files and packages. Raises InvalidInput for values that cannot be rendered."""
         intent = resolve(self.fleet, node, self.secrets)
         rendered = render(intent, self.templates, device_facts(node, seen))
-        return Wanted(
+        return DesiredState(
             node,
             rendered.files,
             tuple(secret.reveal() for secret in intent.secrets),
@@ -39,9 +39,9 @@ class Renderer:
 
 
 def device_facts(node: Node, seen: Observation | None) -> DeviceFacts:
-    """What has to be carried over from the device (`meshctl.render.facts`).
+    """The facts to keep from the device (`meshctl.render.facts`).
 
-    Where its ports are VLANs of a switch (eth0.1) whose layout its configuration has lost, its board tells.
+    Where its ports are VLANs of a switch (eth0.1) that its configuration no longer defines, the board's are used.
     """
     if seen is None:
         return DeviceFacts()
@@ -54,7 +54,7 @@ def device_facts(node: Node, seen: Observation | None) -> DeviceFacts:
 
 
 def _groups(fleet: Fleet, node: Node, packages: Iterable[str]) -> tuple[tuple[str, ...], ...]:
-    """Each package to install with what would do as well (`batctl-full` for `batctl-default`)."""
+    """Each package to install, with its alternatives (`batctl-full` for `batctl-default`)."""
     needs = package_needs(fleet, node)
     chosen = [
         next(((name, *(o for o in need.any_of if o != name)) for need in needs if name in need.any_of), (name,))

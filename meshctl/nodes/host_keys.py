@@ -1,4 +1,4 @@
-"""Which host keys nodes show, against those that are pinned: what `meshctl trust` asks about."""
+"""The nodes' host keys compared with the pinned ones, for `meshctl trust`."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from meshctl.device.errors import AuthenticationRefused
-from meshctl.device.trust import HostKey, Recorder, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """A node's key as it shows it; None with `trouble` when it does not answer. `pinned` are fingerprints."""
+class HostKeyState:
+    """A node's current host key; None, with `error`, when it does not answer. `pinned` are fingerprints."""
 
     node: Node
     key: HostKey | None
     pinned: tuple[str, ...] = ()
-    trouble: str = ""
+    error: str = ""
 
     @property
     def is_pinned(self) -> bool:
@@ -38,27 +38,29 @@ class Shown:
         return "pinned" if self.is_pinned else "changed" if self.is_changed else "new"
 
 
-def shown_keys(access: Access, trust: TrustStore, nodes: Iterable[Node], *, parallel: int) -> tuple[Shown, ...]:
-    """Ask every node for its host key, believing nothing."""
-    wanted = {node.name: node for node in nodes}
-    found: dict[str, Shown] = {}
+def fetch_host_keys(
+    connections: ConnectionPool, trust: TrustStore, nodes: Iterable[Node], *, parallel: int
+) -> tuple[HostKeyState, ...]:
+    """Fetch the host key of every node, trusting none."""
+    by_name = {node.name: node for node in nodes}
+    found: dict[str, HostKeyState] = {}
     lock = threading.Lock()
 
-    def look(name: str) -> Outcome:
-        node = wanted[name]
-        recorder = Recorder()
-        trouble = ""
+    def fetch_one(name: str) -> Outcome:
+        node = by_name[name]
+        host_key_policy = AcceptAnyKey()
+        last_error = ""
         try:
-            access.open(node, policy=recorder).close()
+            connections.open(node, policy=host_key_policy).close()
         except AuthenticationRefused:
-            # the key was shown before the login was refused, and it is the key that was asked for
+            # the host key is known before the login is refused
             pass
         except NodeError as error:
-            trouble = str(error)
+            last_error = str(error)
         pinned = tuple(key.fingerprint for key in trust.pinned(name))
         with lock:
-            found[name] = Shown(node, recorder.key, pinned, trouble)
+            found[name] = HostKeyState(node, host_key_policy.key, pinned, last_error)
         return Outcome(name, Result.DONE)
 
-    run(wanted, look, parallel=parallel)
-    return tuple(found[name] for name in wanted)
+    run(by_name, fetch_one, parallel=parallel)
+    return tuple(found[name] for name in by_name)

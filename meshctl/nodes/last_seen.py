@@ -1,7 +1,7 @@
-"""What is known of a node that does not answer: what it told when it was last seen, and who still hears it.
+"""The last known state of an unreachable node, and which nodes still hear it.
 
-`ask_around` looks at the nodes that may hear it, `whereabouts` (pure) puts together what they and the journal know,
-`Whereabouts.text` says it in one line.
+`query_neighbors` observes the nodes that may hear it, `last_seen_of` (pure) combines their observations with the
+journal, `LastSeen.text` is one line for the operator.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ from meshctl.device.observation import Observation
 from meshctl.fleet import Interrupt
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
-from meshctl.nodes.collect import Seen, gather, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, collect, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
 
-# batman-adv forgets whom it has not heard for 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
+# batman-adv purges an originator after 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
 REMEMBERED_MS = 200_000
-# Neighbours come first; so many nodes tell enough, and looking at more would hold up a big fleet's end.
-WITNESSES = 12
-# How many of those that hear it are named.
-NAMED = 3
+# Neighbors come first; observing more nodes than this would delay the end of a large fleet's run.
+MAX_QUERIED = 12
+# How many of the nodes that hear it are named.
+MAX_NAMED = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Whereabouts:
-    """`heard` by direct neighbours, `routed` by nodes that had a way to it, both latest first; `asked` is how many
-    nodes told."""
+class LastSeen:
+    """`heard` by direct neighbors, `routed` by nodes with a route to it, both latest first; `asked` is the number of
+    nodes observed."""
 
     last: LastKnown | None
     heard: tuple[Sighting, ...]
@@ -38,43 +38,43 @@ class Whereabouts:
 
     def text(self, now_s: float) -> str:
         """`last seen 40 s ago (12:03:05 UTC), up 2 h, r24106; heard by b02 0.4 s ago (-61 dBm)`."""
-        return "; ".join(part for part in (self._last(now_s), self._witnesses()) if part)
+        return "; ".join(part for part in (self._last_text(now_s), self._heard_text()) if part)
 
-    def _last(self, now_s: float) -> str:
+    def _last_text(self, now_s: float) -> str:
         if self.last is None:
             return "never seen before"
         moment = datetime.fromtimestamp(self.last.seen_s, UTC)
         age_s = max(0.0, now_s - self.last.seen_s)
-        # the time of day alone misleads about another day
+        # the time of day alone is ambiguous after half a day
         shown = moment.strftime("%H:%M:%S UTC" if age_s < 12 * 3600 else "%Y-%m-%d %H:%M UTC")
-        told = [f"last seen {_span(age_s)} ago ({shown})"]
+        parts = [f"last seen {_span(age_s)} ago ({shown})"]
         uptime = self.last.facts.get("uptime_s", "")
         if uptime.isdigit():
-            told.append(f"up {_span(float(uptime))} then")
-        told += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
-        return ", ".join(told)
+            parts.append(f"up {_span(float(uptime))} then")
+        parts += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
+        return ", ".join(parts)
 
-    def _witnesses(self) -> str:
+    def _heard_text(self) -> str:
         if self.heard:
-            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:NAMED])
+            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:MAX_NAMED])
         if self.routed:
-            return "no neighbour that answers hears it; a way to it was known by " + ", ".join(
-                _sighting(one) for one in self.routed[:NAMED]
+            return "no reachable neighbor hears it; a route to it is known by " + ", ".join(
+                _sighting(one) for one in self.routed[:MAX_NAMED]
             )
         if not self.asked:
-            return "no other node could be asked"
+            return "no other node is reachable"
         return f"heard by none of the {self.asked} node{'s' if self.asked != 1 else ''} that answered"
 
     @property
     def facts(self) -> dict[str, str]:
         """For scripts, beside an outcome."""
-        told = {
+        facts = {
             "last_seen_s": "" if self.last is None else f"{self.last.seen_s:.0f}",
             "heard_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.heard),
             "routed_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.routed),
             "asked": str(self.asked),
         }
-        return {key: value for key, value in told.items() if value}
+        return {key: value for key, value in facts.items() if value}
 
 
 def _sighting(one: Sighting) -> str:
@@ -90,21 +90,21 @@ def _span(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
-def whereabouts(
+def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
-) -> dict[str, Whereabouts]:
-    """What is known of each of `names` from what other nodes were seen to hear and from the journal."""
-    lost = tuple(names)
-    told = {name: seen for name, seen in observations.items() if name not in lost}
-    reports = [report_of(name, seen) for name, seen in told.items()]
+) -> dict[str, LastSeen]:
+    """What the other nodes' observations and the journal say about each of `names`."""
+    missing = tuple(names)
+    others = {name: seen for name, seen in observations.items() if name not in missing}
+    reports = [report_of(name, seen) for name, seen in others.items()]
     macs = known_macs(fleet, known)
     heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
-    routed = _routed(told, names_by_mac(reports, macs))
-    return {name: Whereabouts(known.get(name), heard.get(name, ()), routed.get(name, ()), len(told)) for name in lost}
+    routed = _routed(others, names_by_mac(reports, macs))
+    return {name: LastSeen(known.get(name), heard.get(name, ()), routed.get(name, ()), len(others)) for name in missing}
 
 
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
-    """Who has an originator's entry of whom, the latest of each."""
+    """Node -> the nodes with an originator entry of it, latest first."""
     latest: dict[str, dict[str, int]] = {}
     for by, seen in observations.items():
         for entry in seen.originators or ():
@@ -118,27 +118,29 @@ def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -
     }
 
 
-def ask_around(
-    access: Access,
+def query_neighbors(
+    connections: ConnectionPool,
     fleet: Fleet,
     names: Iterable[str],
-    before: Seen,
+    before: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     interrupt: Interrupt,
-) -> dict[str, Whereabouts]:
-    """The same, from a new look at those who heard them before, at the base, and at some others that answered then."""
-    lost = tuple(names)
+) -> dict[str, LastSeen]:
+    """The same, from new observations of former neighbors, the base, and some other nodes that answered before."""
+    missing = tuple(names)
     graph = before.graph(fleet, known)
-    near = [other for name in lost for other in graph.neighbours.get(name, ())]
+    neighbors = [other for name in missing for other in graph.neighbours.get(name, ())]
     base = [fleet.base_node.name] if fleet.base_node is not None else []
     witnesses = [
-        name for name in dict.fromkeys((*near, *base, *before.observations)) if name in fleet.nodes and name not in lost
+        name
+        for name in dict.fromkeys((*neighbors, *base, *before.observations))
+        if name in fleet.nodes and name not in missing
     ]
-    seen = gather(
-        access,
-        [fleet.nodes[name] for name in witnesses[:WITNESSES]],
+    seen = collect(
+        connections,
+        [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
         parallel=max(1, fleet.apply.parallel),
         interrupt=interrupt,
     )
-    return whereabouts(fleet, lost, seen.observations, known)
+    return last_seen_of(fleet, missing, seen.observations, known)

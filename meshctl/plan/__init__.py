@@ -1,11 +1,11 @@
-"""What has to happen, to which node, in which order, and what is cut while it happens: intent x observation -> plan.
+"""Plans: desired state x observation -> what changes on which node, in which order, and what it interrupts. Pure.
 
-Pure: `node_plan` compares one node's rendered files with what was seen of it, `fleet_plan` puts the nodes in order by
-the observed mesh, `saved` writes the plan to JSON and reads it back. Nothing here holds or prints a secret.
+`node_plan` compares one node's rendered files with its observation, `fleet_plan` orders the nodes by the observed mesh,
+`saved` writes the plan to JSON and reads it back. A plan contains no secret.
 """
 
 from meshctl.plan.build import fleet_plan
-from meshctl.plan.node import Wanted, node_plan
+from meshctl.plan.node import DesiredState, node_plan
 from meshctl.plan.values import (
     Cut,
     Effect,
@@ -21,6 +21,7 @@ from meshctl.plan.values import (
 
 __all__ = [
     "Cut",
+    "DesiredState",
     "Effect",
     "FileChange",
     "FirmwareStep",
@@ -30,7 +31,6 @@ __all__ = [
     "Stage",
     "StageKind",
     "Verdict",
-    "Wanted",
     "fleet_plan",
     "node_plan",
 ]

@@ -1,4 +1,4 @@
-"""All nodes' plans and the observed mesh in, the fleet's plan out: its stages, and what forbids applying it."""
+"""The fleet's plan from the nodes' plans and the observed mesh: its stages, and what prevents applying it."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from meshctl.model import Fleet
-from meshctl.plan.order import Surroundings, stages_of
-from meshctl.plan.switch import Switches, switches
+from meshctl.plan.order import MeshContext, stages_of
+from meshctl.plan.switch import MeshSwitches, switches
 from meshctl.plan.values import NodePlan, Plan, StageKind, Verdict
 from meshctl.topology import Graph
 
@@ -18,36 +18,35 @@ def fleet_plan(
     graph: Graph,
     *,
     now_s: float,
-    around: Mapping[str, NodePlan] = MappingProxyType({}),
+    unchanged: Mapping[str, NodePlan] = MappingProxyType({}),
     entry: str = "",
     leave_behind: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
     accept_cuts: Iterable[str] = (),
 ) -> Plan:
-    """The order of work for these nodes. `entry` is the node we reach the mesh through (default: the base).
+    """The stages for these nodes. `entry` is the node through which the mesh is reached (default: the base).
 
-    `around` are members of their meshes that nothing is done to; they tell which cell the mesh runs.
-    `leave_behind` acknowledges nodes that are off during a switch of their mesh, `accept_cuts` cut vertices that may
-    be flashed; `all` stands for any.
+    `unchanged` are other members of their meshes, which show the cell that the mesh runs. `leave_behind` acknowledges
+    nodes that are off during a change of their mesh, `accept_cuts` cut vertices that may be flashed; `all` means any.
     """
     base = fleet.base_node
     stand_on = entry or (base.name if base is not None else "")
-    found = switches(fleet, plans, around=around, acknowledged=leave_behind, never_meshed=never_meshed)
-    surroundings = Surroundings(
+    found = switches(fleet, plans, unchanged=unchanged, acknowledged=leave_behind, never_meshed=never_meshed)
+    surroundings = MeshContext(
         graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
     stages = stages_of(todo, surroundings, found.nodes)
     refusal, hint = _refusal(found, plans, graph, stand_on, frozenset(accept_cuts))
     notes = [
-        f"{name}: alone in its cell; it comes back to its mesh by itself ({', '.join(plans[name].splits)})"
+        f"{name}: alone in its cell; it rejoins its mesh ({', '.join(plans[name].splits)})"
         for name in plans
         if plans[name].verdict is Verdict.CHANGE
         and plans[name].splits
         and not any(name in nodes for nodes in found.nodes.values())
     ]
     notes += [
-        f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} cannot be reached meanwhile"
+        f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} will be unreachable meanwhile"
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
     ]
@@ -55,16 +54,16 @@ def fleet_plan(
 
 
 def _refusal(
-    found: Switches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
+    found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         return (
-            f"mesh {mesh} changes its cell, and not every member can take part: {'; '.join(why)}",
-            "change firmware first (with the cell as it is), and mend what is refused",
+            f"mesh {mesh} changes its cell, but not every member can take part: {'; '.join(why)}",
+            "change firmware first, without changing the cell, and fix the refused nodes",
         )
     for mesh, names in found.left_behind.items():
         return (
-            f"mesh {mesh} changes its cell, and would leave behind {', '.join(names)}: they do not answer or are not "
+            f"mesh {mesh} changes its cell and would leave behind {', '.join(names)}: unreachable, or not "
             "part of this plan",
             f"switch them on, or acknowledge with --leave-behind {','.join(names)}",
         )
@@ -72,7 +71,7 @@ def _refusal(
     for name, plan in plans.items():
         if plan.firmware is not None and plan.is_meshed and cuts.get(name) and not accepted & {name, "all"}:
             return (
-                f"flashing {name} cuts off {', '.join(cuts[name])}, for good if it does not come back",
-                f"give them another way first, or acknowledge with --accept-cut {name}",
+                f"flashing {name} cuts off {', '.join(cuts[name])}, permanently if it does not come back",
+                f"give them another path first, or acknowledge with --accept-cut {name}",
             )
     return "", ""

@@ -1,6 +1,6 @@
-"""What radios must share to hear each other, read out of UCI: two nodes with different cells are in different meshes.
+"""The cell of a radio, read from UCI: everything radios must share to be in the same mesh.
 
-wireless + network (as text or trees) -> `cells` -> one `Cell` per radio; `differences` names what parts two of them.
+wireless + network packages -> `cells` -> one `Cell` per radio; `differences` lists the fields that differ.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass, fields
 
 from meshctl.uci import Package, Section
 
-# batman-adv's default when the option is not there (openwrt-facts.md section 1)
+# batman-adv's default without the option (openwrt-facts.md section 1)
 DEFAULT_ROUTING = "BATMAN_IV"
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Everything that must be equal on both ends; `key` is only ever compared, never shown."""
+    """Everything that must be equal on both ends; `key` is only compared, never shown."""
 
     mode: str
     channel: str
@@ -32,7 +32,7 @@ class Cell:
 
 
 def cells(wireless: Package | None, network: Package | None) -> dict[str, Cell]:
-    """Radio section -> the cell it is configured for. Radios that are off, or in no mesh mode, have none."""
+    """Radio section -> its configured cell. A radio that is disabled, or not in a mesh mode, has none."""
     found: dict[str, Cell] = {}
     if wireless is None:
         return found
@@ -71,19 +71,21 @@ def _routing_algo(network: Package | None, interface: str) -> str:
 
 
 def differences(before: Cell, after: Cell) -> tuple[str, ...]:
-    """`channel 6 -> 11`, one for each field that differs; a key is only said to change."""
-    told = []
+    """`channel 6 -> 11`, one for each field that differs; a key is not shown."""
+    changed = []
     for item in fields(Cell):
         old, new = getattr(before, item.name), getattr(after, item.name)
         if old != new:
-            told.append(f"{item.name} changes" if item.name == "key" else f"{item.name} {old or '-'} -> {new or '-'}")
-    return tuple(told)
+            changed.append(
+                f"{item.name} changes" if item.name == "key" else f"{item.name} {old or '-'} -> {new or '-'}"
+            )
+    return tuple(changed)
 
 
-def split_differences(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
-    """Radio -> what parts its present cell from the one to come; radios without a present cell part from nothing."""
+def partitions(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[str, tuple[str, ...]]:
+    """Radio -> how its current cell differs from the planned one; a radio without a current cell is left out."""
     return {
-        radio: told
+        radio: changed
         for radio, cell in before.items()
-        if (told := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
+        if (changed := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
     }

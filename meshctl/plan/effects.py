@@ -1,7 +1,7 @@
-"""Which services a change of configuration reloads, and what that cuts.
+"""Which services a configuration change reloads, and what that interrupts.
 
-`reload_config` reloads the service of each package that changed (procd's triggers); what that interrupts depends on
-what changed within it and on the release, since netifd takes down only what differs.
+`reload_config` reloads the service of each changed package (procd's triggers). What that interrupts depends on the
+changed options and the release, since netifd takes down only what differs.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from meshctl.plan.radios import RadioChange, radio_changes
 from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
-# Package -> (service, what its reload cuts), where the content does not matter.
-_SIMPLE: Mapping[str, tuple[str, Cut]] = {
+# Package -> (service, what its reload cuts), whatever options changed.
+_RELOADS: Mapping[str, tuple[str, Cut]] = {
     "system": ("system, log", Cut.NOTHING),
     "dhcp": ("dnsmasq, odhcpd", Cut.NOTHING),
     "firewall": ("firewall", Cut.LOGIN),
@@ -37,20 +37,20 @@ def _effects(
     path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None], release: Release
 ) -> list[Effect]:
     if not path.startswith("etc/config/"):
-        # keys and markers are read when they are needed
+        # keys and markers are read on use
         return []
     package = path.rpartition("/")[2]
     if package == "network":
         return _network(before.get(package), after.get(package))
     if package == "wireless":
         return _wireless(before.get(package), after.get(package), release)
-    service, cut = _SIMPLE.get(package, (package, Cut.MESH))
+    service, cut = _RELOADS.get(package, (package, Cut.MESH))
     return [Effect(service, cut, f"{package} changes")]
 
 
 def _wireless(before: Package | None, after: Package | None, release: Release) -> list[Effect]:
     if not _has_live_radio(before):
-        return [Effect("wifi", Cut.NOTHING, "radios were off")]
+        return [Effect("wifi", Cut.NOTHING, "radios are off")]
     if before is None or after is None:
         return [Effect("wifi", Cut.MESH, "wireless changes")]
     found = [_radio(change) for change in radio_changes(before, after, release)]
@@ -77,14 +77,14 @@ def _network(before: Package | None, after: Package | None) -> list[Effect]:
     old, new = _by_key(before), _by_key(after)
     differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
     was_there = [section for key in differing if (section := old.get(key)) is not None]
-    told = []
+    found = []
     if any(section.get("proto") in ("batadv", "batadv_hardif") for section in was_there):
         # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
-        told.append(Effect("network", Cut.MESH, "bat0 is made anew"))
+        found.append(Effect("network", Cut.MESH, "bat0 is recreated"))
     address = _address(old.get("lan")), _address(new.get("lan"))
     if address[0] != address[1]:
-        told.append(Effect("network", Cut.LAN, f"its address moves from {address[0] or '-'} to {address[1] or '-'}"))
-    return told or [Effect("network", Cut.LAN, "network changes")]
+        found.append(Effect("network", Cut.LAN, f"its address changes from {address[0] or '-'} to {address[1] or '-'}"))
+    return found or [Effect("network", Cut.LAN, "network changes")]
 
 
 def _by_key(package: Package) -> dict[str, Section]:

@@ -1,4 +1,4 @@
-"""Whether a node needs other firmware: the revision the inventory names against the one that runs."""
+"""Whether a node needs other firmware: the revision in the inventory against the running one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshctl.plan.values import FirmwareStep
 
 
 def firmware_step(node: Node, seen: Observation) -> FirmwareStep | None:
-    """The step to the inventory's revision; None when it runs, or when the inventory names no image or revision."""
+    """The step to the inventory's revision; None when it is running, or the inventory names no image or revision."""
     wanted = node.hardware.firmware
     running = seen.release.revision if seen.release else ""
     if not wanted.image or not wanted.revision or is_revision(running, wanted.revision):
@@ -18,6 +18,6 @@ def firmware_step(node: Node, seen: Observation) -> FirmwareStep | None:
 
 
 def runs_release(node: Node, seen: Observation) -> bool:
-    """Whether the node runs the release series that its configuration is rendered for; snapshots count as newest."""
+    """Whether the node runs the release series its configuration is rendered for."""
     version = seen.release.version if seen.release else ""
     return version == node.release.value or version.startswith((f"{node.release.value}.", f"{node.release.value}-"))

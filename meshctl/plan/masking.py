@@ -1,7 +1,7 @@
-"""Keeping secrets out of what is shown and stored.
+"""Keep secrets out of what is shown and stored.
 
-`masked_text` gives a package's text with its secrets replaced, `Fingerprints` hashes text in which every secret was
-first put through scrypt: whoever holds a saved plan cannot try pass phrases against it at any useful speed.
+`masked_text` is a package's text with its secrets replaced. `Fingerprints` hashes text in which every secret is first
+replaced by its scrypt hash, so that guessing passphrases against a saved plan is slow.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _SCRYPT_N, _SCRYPT_R, _SCRYPT_P = 2**14, 8, 1
 
 
 def is_secret(option: str, value: Value) -> bool:
-    """Whether an option holds a secret; wireless' `key '1'` is the index of a WEP key, a public fact."""
+    """Whether an option holds a secret; wireless `key '1'` is only the index of a WEP key."""
     return _SECRET_OPTION.fullmatch(option) is not None and value not in ("1", "2", "3", "4")
 
 
 def secrets_of(package: Package) -> tuple[str, ...]:
-    """The secrets in a package, longest first, so that replacing them one by one leaves no part of any."""
+    """The secrets in a package, longest first, so that replacing them in order leaves no part of any."""
     found = {
         item
         for section in package.sections
@@ -41,7 +41,7 @@ def secrets_of(package: Package) -> tuple[str, ...]:
 
 
 def masked_text(package: Package, *, differing_from: Package | None = None) -> str:
-    """Canonical text with secrets masked; one that differs from the same option of `differing_from` says so."""
+    """Canonical text with secrets masked; a secret that differs from the one in `differing_from` is marked."""
 
     def mask(section: Section) -> Section:
         other = _counterpart(section, package, differing_from)
@@ -68,7 +68,7 @@ def _counterpart(section: Section, package: Package, other: Package | None) -> S
 
 
 class Fingerprints:
-    """Hashes of texts with secrets, under one salt (a plan's). Each secret costs one scrypt, once."""
+    """Salted hashes of texts with secrets, one salt for each plan. Each secret costs one scrypt, once."""
 
     def __init__(self, salt: bytes) -> None:
         self.salt = salt
@@ -84,7 +84,7 @@ class Fingerprints:
             return self._digests[value]
 
     def of(self, texts: Mapping[str, str], secrets: Iterable[str] = ()) -> str:
-        """One hash over named texts, whatever their order. `secrets` are replaced wherever they occur."""
+        """One hash over named texts in any order, with every occurrence of `secrets` replaced."""
         longest_first = sorted({secret for secret in secrets if secret}, key=lambda secret: (-len(secret), secret))
         digest = hashlib.sha256(self.salt)
         for name in sorted(texts):

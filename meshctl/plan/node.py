@@ -1,7 +1,7 @@
-"""One node: what the inventory wants of it against what was seen of it -> `NodePlan`.
+"""The plan of one node: desired state against observation -> `NodePlan`.
 
-`node_plan` looks for what forbids touching it (`objections`), then for the firmware step, the package step, the files
-that differ, what their reload cuts, and what would part the node from its mesh. A second plan after an apply is empty.
+`node_plan` checks the preconditions, then finds the firmware step, the package step, the files that differ, what their
+reload interrupts, and whether the node would leave the cell of its mesh. A second plan after an apply is empty.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 from meshctl.device.connection import OwnKey
 from meshctl.device.observation import Observation
 from meshctl.model import Node
-from meshctl.plan.cell import cells, split_differences
+from meshctl.plan.cell import cells, partitions
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
-from meshctl.plan.preconditions import objection
+from meshctl.plan.preconditions import failed_precondition
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import MARKER_PATH, RenderedFile
@@ -30,8 +30,8 @@ PUBLIC_FILES = (MARKER_PATH, "etc/dropbear/authorized_keys")
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What the inventory wants of one node: its rendered files, the secrets in them, its packages."""
+class DesiredState:
+    """The desired state of one node: its rendered files, the secrets in them, its packages."""
 
     node: Node
     files: Sequence[RenderedFile] = field(repr=False)
@@ -44,63 +44,66 @@ class Wanted:
 
 
 def node_plan(
-    wanted: Wanted,
+    desired: DesiredState,
     seen: Observation | None,
     fingerprints: Fingerprints,
     *,
-    away: str = "",
+    unreachable: str = "",
     owner: str = "",
     with_firmware: bool = True,
     own_keys: Sequence[OwnKey] | None = None,
 ) -> NodePlan:
-    """The plan of one node. `seen` None means it did not answer, `away` says why; `owner` is who we are to its lock,
-    `own_keys` what we log in with (None: not asked)."""
-    node = wanted.node
+    """The plan of one node. `seen` is None for a node that did not answer, and `unreachable` is the reason; `owner` is
+    our name in its lock; `own_keys` are checked for a lockout (None: not checked)."""
+    node = desired.node
     target = fingerprints.of(
-        {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in wanted.files},
-        wanted.secrets,
+        {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in desired.files},
+        desired.secrets,
     )
     if seen is None:
-        return NodePlan(node.name, Verdict.AWAY, away or "did not answer", meshes=node.meshes, wanted=target)
-    before = packages_seen(wanted.paths, seen)
-    after = {file.package.name: file.package for file in wanted.files if file.package is not None}
+        return NodePlan(node.name, Verdict.AWAY, unreachable or "did not answer", meshes=node.meshes, wanted=target)
+    before = packages_seen(desired.paths, seen)
+    after = {file.package.name: file.package for file in desired.files if file.package is not None}
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
     live_after = cells(after.get("wireless"), after.get("network"))
-    split = split_differences(live, live_after)
+    partition = partitions(live, live_after)
     basis = NodePlan(
         node.name,
         Verdict.SAME,
-        splits=tuple(f"{radio}: {one}" for radio, all_of_it in split.items() for one in all_of_it),
-        parted_from=_parted_from(node, split),
+        splits=tuple(f"{radio}: {one}" for radio, all_of_it in partition.items() for one in all_of_it),
+        parted_from=_partitioned_meshes(node, partition),
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
-        observed=fingerprints.of(fingerprint_texts(wanted.paths, seen), (*wanted.secrets, *old_secrets)),
+        observed=fingerprints.of(fingerprint_texts(desired.paths, seen), (*desired.secrets, *old_secrets)),
         wanted=target,
     )
     firmware = firmware_step(node, seen) if with_firmware else None
-    packages = package_step(wanted.needs, seen, node.hardware.package_files)
-    problem = objection(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
+    packages = package_step(desired.needs, seen, node.hardware.package_files)
+    problem = failed_precondition(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
-    files = file_changes(wanted.files, seen)
-    contents = {file.path: file.content for file in wanted.files} if files or firmware else {}
-    shut_out = None if own_keys is None else lockout(node, contents, own_keys)
-    if shut_out is None and contents:
-        shut_out = server_lockout(after)
-    if shut_out is not None:
-        return replace(basis, verdict=Verdict.REFUSED, reason=shut_out.reason, hint=shut_out.hint)
-    told = effects((change.path for change in files), before, after, node.release)
+    files = file_changes(desired.files, seen)
+    contents = {file.path: file.content for file in desired.files} if files or firmware else {}
+    locked_out = None if own_keys is None else lockout(node, contents, own_keys)
+    if locked_out is None and contents:
+        locked_out = server_lockout(after)
+    if locked_out is not None:
+        return replace(basis, verdict=Verdict.REFUSED, reason=locked_out.reason, hint=locked_out.hint)
+    node_effects = effects((change.path for change in files), before, after, node.release)
     if firmware is not None:
-        told = (Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"), *told)
+        node_effects = (
+            Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"),
+            *node_effects,
+        )
     return replace(
         basis,
         verdict=Verdict.CHANGE if files or firmware or packages else Verdict.SAME,
         firmware=firmware,
         packages=packages,
         files=files,
-        effects=told,
+        effects=node_effects,
         notes=(
             *seen.notes,
             *_tagged_ports(node, seen, after.get("network")),
@@ -109,8 +112,8 @@ def node_plan(
     )
 
 
-def _parted_from(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
-    """The meshes of these radios, or all of the node's when one of the radios is not in the inventory."""
+def _partitioned_meshes(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
+    """The meshes of these radios; all of the node's if a radio is not in the inventory."""
     mesh_of = {radio.name: radio.mesh for radio in node.radios}
     names = set(radios)
     if not names <= set(mesh_of):
@@ -119,19 +122,20 @@ def _parted_from(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
 
 
 def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tuple[str, ...]:
-    """Ports that lead to a switch which takes tagged frames alone: the inventory names eth0, the board eth0.1."""
+    """Ports to a switch that accepts only tagged frames: the inventory names eth0, the board eth0.1."""
     if network is None or seen.board is None or not any(network.of_type("switch_vlan")):
         return ()
     parents = {port.partition(".")[0]: port for port in seen.board.lan_ports if "." in port}
     return tuple(
-        f"{port} leads to a switch, whose LAN is {parents[port]}: what is on its ports will not be heard (lan_ports)"
+        f"{port} connects to a switch whose LAN is {parents[port]}: devices on its ports will be unreachable; "
+        "correct lan_ports"
         for port in node.lan_ports
         if port in parents
     )
 
 
 def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: FirmwareStep | None) -> tuple[str, ...]:
-    """That the radio's own scripts are not all there. A node that is in its mesh has them, by whatever name."""
+    """A note if the package with the wireless scripts is missing. A node in its mesh has them, by whatever name."""
     package = wireless_scripts(node.release)
     if package is None or firmware is not None or seen.packages is None or package in seen.packages:
         return ()
@@ -139,14 +143,14 @@ def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: F
         return ()
     return (
         f"it lacks {package}: without its /usr/share/hostap/wdev.uc OpenWrt {node.release} brings up no mesh "
-        "interface, encrypted or not; if so, the node goes back by itself. Build the image with it",
+        "interface, and the node would roll back. Build the image with it",
     )
 
 
 def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:
-    """The files that are not on the node as they shall be, each with a masked diff.
+    """The files that differ from the desired ones, each with a masked diff.
 
-    UCI packages are compared as trees: other quoting, comments or blank lines are no difference to OpenWrt.
+    UCI packages are compared as trees: quoting, comments and blank lines make no difference to OpenWrt.
     """
     return tuple(change for file in files if (change := _file_change(file, seen)) is not None)
 
@@ -163,21 +167,21 @@ def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
         return None
     if live == content:
         return FileChange(file.path, "changed", f"mode {info.mode:04o} -> {file.mode:04o}\n")
-    # what stands there now may hold secrets of a kind that nobody can tell: only what is public by nature is shown
+    # the current file may hold unknown secrets, so only files that are public by nature are shown
     old = live if live is not None and file.path in PUBLIC_FILES else "(not shown)\n"
     return FileChange(file.path, "changed", _diff(file.path, old, file.masked))
 
 
-def _package_change(path: str, wanted: Package, live: str | None) -> FileChange | None:
+def _package_change(path: str, desired: Package, live: str | None) -> FileChange | None:
     if live is None:
-        return FileChange(path, "added", _diff(path, "", masked_text(wanted)))
-    current = parsed(live, wanted.name)
+        return FileChange(path, "added", _diff(path, "", masked_text(desired)))
+    current = parsed(live, desired.name)
     if current is None:
-        return FileChange(path, "changed", f"--- a/{path}\n(no UCI reader accepts what is there)\n+++ b/{path}\n")
-    if current == wanted:
+        return FileChange(path, "changed", f"--- a/{path}\n(not readable as UCI)\n+++ b/{path}\n")
+    if current == desired:
         return None
-    old = masked_text(current, differing_from=wanted)
-    return FileChange(path, "changed", _diff(path, old, masked_text(wanted)))
+    old = masked_text(current, differing_from=desired)
+    return FileChange(path, "changed", _diff(path, old, masked_text(desired)))
 
 
 def _diff(path: str, old: str, new: str) -> str:

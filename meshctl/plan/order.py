@@ -1,8 +1,8 @@
-"""The order of a fleet's change: who first, who together, who alone, who last, each with its reason.
+"""The stages of a fleet's change, each with its nodes and its reason.
 
-`stages_of` takes the nodes with something to do and the observed mesh and gives stages: nodes outside any running mesh
-(nothing is cut), then whole-mesh switches, then the running mesh from its far end, cut vertices alone, and last the
-node we stand on. The first stage of each kind is a canary when the policy asks for one.
+`stages_of` orders the nodes to change by the observed mesh: nodes outside any running mesh (nothing is cut), then
+whole-mesh changes, then the running mesh from its far end, with each cut vertex alone, and the entry node last. If the
+policy asks for it, the first stage of a kind is a canary.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from meshctl.topology import Graph, Path
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What the order depends on besides the plans: the observed mesh, the node we reach it through, the robots."""
+class MeshContext:
+    """What the order depends on besides the plans: the observed mesh, its entry node, the policy, the robots."""
 
     graph: Graph
     entry: str
@@ -27,90 +27,94 @@ class Surroundings:
 
 
 def stages_of(
-    plans: Iterable[NodePlan], around: Surroundings, switches: Mapping[str, Sequence[str]] | None = None
+    plans: Iterable[NodePlan], context: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
 ) -> tuple[Stage, ...]:
-    """The stages for all plans with something to do. `switches` maps meshes to the nodes that change cell together."""
+    """The stages of these plans. `switches` maps meshes to the nodes that change their cell simultaneously."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
     todo = [plan for plan in plans if plan.node not in switched]
-    rank = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
+    rank = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
     todo.sort(key=lambda plan: (rank.get(plan.node, -1), plan.node))
     free = [plan for plan in todo if not plan.is_meshed]
     harmless = [plan for plan in todo if plan.is_meshed and plan.cut <= Cut.LOGIN]
     cutting = [plan for plan in todo if plan.is_meshed and plan.cut > Cut.LOGIN]
     return (
-        *_together(free, around.policy, "outside any running mesh: nothing in use is cut"),
-        *(_switch(mesh, nodes, around) for mesh, nodes in (switches or {}).items()),
-        *_together(harmless, around.policy, "nothing is cut by it"),
-        *_rolling(cutting, around),
+        *_together(free, context.policy, "outside any running mesh: nothing in use is interrupted"),
+        *(_switch(mesh, nodes, context) for mesh, nodes in (switches or {}).items()),
+        *_together(harmless, context.policy, "interrupts nothing"),
+        *_rolling(cutting, context),
     )
 
 
 def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
-    """All at once (the executor bounds how many are in work), after one of them alone."""
+    """All in one stage (the executor limits the parallelism), after a canary."""
     names = [plan.node for plan in plans]
-    # devices fresh from their box have nothing to lose, and undo themselves like all others
+    # factory devices need no canary: they have no configuration to lose
     if policy.canary and len(names) > 1 and any(plan.has_cell for plan in plans):
-        first = Stage(StageKind.CANARY, (names[0],), f"first alone, to see it work; {reason}")
+        first = Stage(StageKind.CANARY, (names[0],), f"canary: first alone; {reason}")
         return (first, Stage(StageKind.FREE, tuple(names[1:]), reason))
     return (Stage(StageKind.FREE, tuple(names), reason),) if names else ()
 
 
-def _switch(mesh: str, nodes: Sequence[str], around: Surroundings) -> Stage:
-    order = {name: position for position, name in enumerate(around.graph.farthest_first(around.entry))}
-    last = [name for name in nodes if name == around.entry]
-    names = sorted((name for name in nodes if name != around.entry), key=lambda name: (order.get(name, -1), name))
+def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
+    order = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
+    last = [name for name in nodes if name == context.entry]
+    names = sorted((name for name in nodes if name != context.entry), key=lambda name: (order.get(name, -1), name))
     count = len(nodes)
     what = f"meshes {mesh} change their cells" if "," in mesh else f"mesh {mesh} changes its cell"
     return Stage(
         StageKind.SWITCH,
         (*names, *last),
-        f"{what}: {count} node{'s' if count > 1 else ''} at one moment, undone everywhere unless "
-        f"{around.policy.quorum:.0%} of them meet again",
+        f"{what}: {count} node{'s' if count > 1 else ''} simultaneously, rolled back unless "
+        f"{context.policy.quorum:.0%} rejoin",
         mesh=mesh,
     )
 
 
-def _rolling(plans: Sequence[NodePlan], around: Surroundings) -> tuple[Stage, ...]:
-    """From the far end inward, at most `max_down` at once, cut vertices alone, the entry last."""
-    paths = around.graph.paths(around.entry)
-    cuts = around.graph.cut_off_by(around.entry)
-    waiting = [plan.node for plan in plans if plan.node != around.entry]
+def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ...]:
+    """From the far end inward, at most `max_down` at once, each cut vertex alone, the entry last."""
+    paths = context.graph.paths(context.entry)
+    cuts = context.graph.cut_off_by(context.entry)
+    waiting = [plan.node for plan in plans if plan.node != context.entry]
     stages: list[Stage] = []
-    if around.policy.canary and len(waiting) > 1:
-        # the farthest node whose loss harms nobody else
+    if context.policy.canary and len(waiting) > 1:
+        # the farthest node that is not a cut vertex
         canary = next((name for name in waiting if name not in cuts), waiting[0])
         waiting.remove(canary)
-        reason = f"first alone, to see it work: {_distance(canary, paths)}"
+        reason = f"canary: first alone; {_distance(canary, paths)}"
         stages.append(Stage(StageKind.CANARY, (canary,), reason, cuts.get(canary, ())))
     while waiting:
-        batch = _batch(waiting, around, cuts)
+        batch = _batch(waiting, context, cuts)
         waiting = [name for name in waiting if name not in batch]
         lost = cuts.get(batch[0], ())
         if lost:
-            reason = f"alone, a cut vertex: while it is down {', '.join(lost)} cannot be reached"
+            reason = f"alone, because it is a cut vertex: while it is down {', '.join(lost)} cannot be reached"
         elif len(batch) == 1:
             reason = _distance(batch[0], paths)
         else:
-            reason = f"together, they cut nobody else off: {'; '.join(_distance(name, paths) for name in batch)}"
+            reason = (
+                f"together, because they cut off no other node: {'; '.join(_distance(name, paths) for name in batch)}"
+            )
         stages.append(Stage(StageKind.ROLLING, batch, reason, lost))
-    if any(plan.node == around.entry for plan in plans):
-        rest = sorted(around.graph.reachable(around.entry) - {around.entry})
-        stages.append(Stage(StageKind.LAST, (around.entry,), "last: we reach the mesh through it", tuple(rest)))
+    if any(plan.node == context.entry for plan in plans):
+        rest = sorted(context.graph.reachable(context.entry) - {context.entry})
+        stages.append(
+            Stage(StageKind.LAST, (context.entry,), "last, because the mesh is reached through it", tuple(rest))
+        )
     return tuple(stages)
 
 
-def _batch(waiting: Sequence[str], around: Surroundings, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
     batch = [waiting[0]]
     if waiting[0] in cuts:
         return (waiting[0],)
     for name in waiting[1:]:
-        if len(batch) >= max(1, around.policy.max_down):
+        if len(batch) >= max(1, context.policy.max_down):
             break
-        robots = {around.robot_of.get(other) for other in batch} - {None, ""}
-        # both radios of a robot down at once would cut the robot itself off
-        if name in cuts or around.robot_of.get(name) in robots:
+        robots = {context.robot_of.get(other) for other in batch} - {None, ""}
+        # with both radios of a robot down, the robot itself would be cut off
+        if name in cuts or context.robot_of.get(name) in robots:
             continue
-        if not around.graph.cut_off_by_all(around.entry, [*batch, name]):
+        if not context.graph.cut_off_by_all(context.entry, [*batch, name]):
             batch.append(name)
     return tuple(batch)
 
@@ -118,5 +122,5 @@ def _batch(waiting: Sequence[str], around: Surroundings, cuts: Mapping[str, tupl
 def _distance(name: str, paths: Mapping[str, Path]) -> str:
     path = paths.get(name)
     if path is None:
-        return f"{name} has no known way to us"
+        return f"{name} has no known path to the entry"
     return f"{name} is {path.hops} hop{'s' if path.hops != 1 else ''} away, quality {path.quality:.0%}"

@@ -1,4 +1,4 @@
-"""Which packages a node lacks, and which package files bring them (nodes have no internet)."""
+"""Which packages a node lacks, and which package files provide them (nodes have no internet)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _APK = re.compile(r"(?P<name>[^/]+?)-[0-9][^/]*\.apk")
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """`any_of`: of each group one must be installed, the first is preferred; `removed` must not be."""
+    """`any_of`: one package of each group must be installed, preferably the first; `removed` must not be."""
 
     any_of: tuple[tuple[str, ...], ...] = ()
     removed: tuple[str, ...] = ()
@@ -26,23 +26,24 @@ NO_NEEDS = Needs()
 
 
 def package_name(file: str) -> str | None:
-    """`path/kmod-batman-adv_5.15-1_mips_24kc.ipk` -> `kmod-batman-adv`; None for what is no package file."""
+    """`path/kmod-batman-adv_5.15-1_mips_24kc.ipk` -> `kmod-batman-adv`; None for any other file."""
     base = file.rpartition("/")[2]
     match = _IPK.fullmatch(base) or _APK.fullmatch(base)
     return None if match is None else match["name"]
 
 
 def missing_packages(needs: Needs, seen: Observation) -> tuple[tuple[str, ...], ...]:
-    """The groups of which nothing is installed; none when the node did not tell its packages."""
+    """The groups of which no package is installed; empty when the installed packages are unknown."""
     if seen.packages is None:
         return ()
     return tuple(group for group in needs.any_of if not any(name in seen.packages for name in group))
 
 
 def package_step(needs: Needs, seen: Observation, files: Iterable[str]) -> PackageStep | None:
-    """What to install and remove. All given files go along with a missing package, since they hold what it depends on.
+    """The packages to install and remove, None when nothing is missing. All given files that are not installed are
+    included, since they may be dependencies.
 
-    None when nothing is to do. A group that no file brings stands in `install` all the same: see `unavailable`.
+    A group that no file provides is in `install`, too: see `unavailable`.
     """
     missing = missing_packages(needs, seen)
     if not missing:
@@ -58,6 +59,6 @@ def package_step(needs: Needs, seen: Observation, files: Iterable[str]) -> Packa
 
 
 def unavailable(step: PackageStep) -> tuple[str, ...]:
-    """The packages of a step that none of its files brings."""
+    """The packages of a step that none of its files provides."""
     brought = {package_name(file) for file in step.files}
     return tuple(name for name in step.install if name not in brought)

@@ -1,4 +1,4 @@
-"""Why meshctl would not touch a node: found before anything is sent to it, each with its remedy."""
+"""Preconditions of changing a node, checked before anything is sent to it; each failed one has a hint."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from meshctl.uci import Package
 
 
 @dataclass(frozen=True, slots=True)
-class Objection:
+class FailedPrecondition:
     reason: str
     hint: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class _Checked:
     node: Node
     seen: Observation
     uci: Mapping[str, Package | None]
@@ -29,7 +29,7 @@ class _Case:
     packages: PackageStep | None
 
 
-def objection(
+def failed_precondition(
     node: Node,
     seen: Observation,
     uci: Mapping[str, Package | None],
@@ -37,101 +37,103 @@ def objection(
     owner: str,
     is_flashed: bool,
     packages: PackageStep | None,
-) -> Objection | None:
-    """The first reason against touching this node, or None. `owner` is who we are to the node's lock."""
-    case = _Case(node, seen, uci, owner, is_flashed, packages)
+) -> FailedPrecondition | None:
+    """The first precondition that this node fails, or None. `owner` is our name in the node's lock."""
+    case = _Checked(node, seen, uci, owner, is_flashed, packages)
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
 
-def _told(case: _Case) -> Objection | None:
+def _observed(case: _Checked) -> FailedPrecondition | None:
     if case.seen.uci is None or case.seen.board is None:
         missing = "its configuration" if case.seen.uci is None else "its board"
-        return Objection(f"it did not tell {missing}", "; ".join(case.seen.notes))
+        return FailedPrecondition(f"cannot read {missing}", "; ".join(case.seen.notes))
     return None
 
 
-def _board(case: _Case) -> Objection | None:
+def _board(case: _Checked) -> FailedPrecondition | None:
     found = case.seen.board.board_name if case.seen.board else ""
     expected = case.node.hardware.board
     if found == expected:
         return None
-    return Objection(
+    return FailedPrecondition(
         f"wrong board: expected {expected} ({case.node.hardware.name}), found {found or 'none'}",
-        "another device answers here, or the node's hardware is wrong in the inventory",
+        "another device answers at this address, or the node's hardware is wrong in the inventory",
     )
 
 
-def _release(case: _Case) -> Objection | None:
+def _release(case: _Checked) -> FailedPrecondition | None:
     if case.is_flashed or runs_release(case.node, case.seen):
         return None
     found = case.seen.release.version if case.seen.release else "an unknown release"
-    return Objection(
+    return FailedPrecondition(
         f"its configuration is for OpenWrt {case.node.release}, it runs {found}",
-        "name the firmware's image and revision in the inventory so that it is flashed, or correct the release",
+        "set the firmware image and revision in the inventory to have it flashed, or correct the release",
     )
 
 
-def _radio_paths(case: _Case) -> Objection | None:
+def _radio_paths(case: _Checked) -> FailedPrecondition | None:
     wireless = case.uci.get("wireless")
     for radio in case.node.radios:
         section = None if wireless is None else wireless.section(radio.name)
         found = "" if section is None else section.get("path")
         if found and radio.hardware.path and found != radio.hardware.path:
-            return Objection(
-                f"{radio.name} stands at another path: expected {radio.hardware.path}, found {found}",
+            return FailedPrecondition(
+                f"wrong path of {radio.name}: expected {radio.hardware.path}, found {found}",
                 "copy the path from the device into its hardware profile",
             )
     return None
 
 
-def _lan_ports(case: _Case) -> Objection | None:
+def _lan_ports(case: _Checked) -> FailedPrecondition | None:
     known = case.seen.macs
     if not known:
         return None
     for port in case.node.lan_ports:
         # a VLAN (eth0.1) exists only while it is configured, its parent always
         if port.partition(".")[0] not in known:
-            return Objection(
+            return FailedPrecondition(
                 f"it has no port {port}: found {', '.join(sorted(known))}",
                 "correct lan_ports in its hardware profile",
             )
     return None
 
 
-def _packages(case: _Case) -> Objection | None:
+def _packages(case: _Checked) -> FailedPrecondition | None:
     lacking = () if case.packages is None or case.is_flashed else unavailable(case.packages)
     if not lacking:
         return None
-    return Objection(
-        f"it lacks {', '.join(lacking)} and no package file brings it",
-        "bake it into the image (`meshctl render --imagebuilder`), or name package_files in its hardware profile",
+    return FailedPrecondition(
+        f"it lacks {', '.join(lacking)}, and no package file provides it",
+        "build it into the image (`meshctl render --imagebuilder`), or set package_files in its hardware profile",
     )
 
 
-def _foreign_changes(case: _Case) -> Objection | None:
+def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     changes = case.seen.uci_changes
     if not changes:
         return None
-    return Objection(
-        f"somebody has uncommitted changes on it: {'; '.join(changes[:3])}",
+    return FailedPrecondition(
+        f"it has uncommitted UCI changes: {'; '.join(changes[:3])}",
         "run `uci commit` or `uci revert` on the node, then plan again",
     )
 
 
-def _other_operator(case: _Case) -> Objection | None:
+def _other_operator(case: _Checked) -> FailedPrecondition | None:
     change = case.seen.change
     if change is None:
         return None
     if change.lock_owner and change.lock_owner != case.owner:
-        left = f" for another {change.lock_left_s:.0f} s" if change.lock_left_s else ""
-        return Objection(f"{change.lock_owner} has locked it{left}")
+        left = f" for {change.lock_left_s:.0f} more seconds" if change.lock_left_s else ""
+        return FailedPrecondition(f"locked by {change.lock_owner}{left}")
     if change.state in ("armed", "waiting", "applied", "restoring") and change.owner != case.owner:
-        return Objection(f"a change of {change.owner or 'somebody'} is {change.state} on it", "wait until it has ended")
+        return FailedPrecondition(
+            f"{change.owner or 'another operator'} has a change {change.state} on it", "wait until it has ended"
+        )
     return None
 
 
-_CHECKS: tuple[Callable[[_Case], Objection | None], ...] = (
-    _told,
+_CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
+    _observed,
     _board,
     _release,
     _radio_paths,

@@ -1,8 +1,8 @@
-"""Which of a node's radios restart: expected from its wireless settings, or seen on its radios afterwards. Pure.
+"""Which of a node's radios restart: predicted from its wireless settings, or observed afterwards. Pure.
 
-`radio_changes` says what netifd does with each radio, by release; the plan shows it. `restarted` names the radios that
-may restart at all, whose neighbors then look for stale station entries (`apply/stale_stations.py`). `seen_to_restart`
-and `started_within` say which ones have.
+`radio_changes` predicts what netifd does with each radio, by release; the plan shows it. `restarting_radios` are those
+that may restart at all, so that neighbors look for stale station entries (`apply/stale_stations.py`).
+`observed_restarts` and `started_within` are those that did.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from meshctl.device.observation import Observation
 from meshctl.model import Release
 from meshctl.uci import Package, Section
 
-# iw counts whole seconds, and a question takes its time.
+# iw counts whole seconds, and a query takes time.
 SLACK_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Radios:
-    """The radios with these interfaces, or all that the node has."""
+    """The radios with these interfaces, or all radios of the node."""
 
     ifnames: frozenset[str] = frozenset()
     every: bool = False
@@ -35,9 +35,9 @@ NO_RADIOS = Radios()
 EVERY_RADIO = Radios(every=True)
 
 
-def restarted(before: Package | None, after: Package | None) -> Radios:
-    """The radios that may restart when /etc/config/wireless becomes `after`: each whose own section or one of whose
-    interfaces differs. A package that cannot be read may have held anything."""
+def restarting_radios(before: Package | None, after: Package | None) -> Radios:
+    """The radios that may restart when /etc/config/wireless becomes `after`: those whose section or an interface
+    differs; all radios if a package is unreadable."""
     if before is None or after is None:
         return EVERY_RADIO
     new = _by_device(after)
@@ -51,14 +51,14 @@ def restarted(before: Package | None, after: Package | None) -> Radios:
 # mac80211.sh and wdev.uc; txpower was run on 24.10 and 25.12). Up to 22.03 netifd takes the whole radio down and up for
 # every difference (wireless.c: IFC_RELOAD).
 IN_PLACE = frozenset({"txpower", "distance", "rts", "frag", "country", "antenna_gain"})
-# Of these, what may leave a weak link without one end: less range, or a shorter wait for acknowledgements.
+# Of these, the options that may break a weak link: less range, or a shorter wait for acknowledgements.
 RANGE = frozenset({"txpower", "distance", "country", "antenna_gain"})
 
 
 @dataclass(frozen=True, slots=True)
 class RadioChange:
-    """What happens to one radio: `options` differ, in its own section or its interfaces'. `restarts`: its interfaces go
-    down and come up again; `may_lose_range`: they stay up, with less reach than before."""
+    """The change of one radio: `options` differ, in its section or its interfaces'. `restarts`: its interfaces go down
+    and up; `may_lose_range`: they stay up, with less range."""
 
     radio: str
     options: tuple[str, ...]
@@ -67,7 +67,7 @@ class RadioChange:
 
 
 def radio_changes(before: Package, after: Package, release: Release) -> tuple[RadioChange, ...]:
-    """What becomes of each radio that differs when /etc/config/wireless changes, on that release."""
+    """The change of each radio that differs in /etc/config/wireless, on that release."""
     old, new = _by_device(before), _by_device(after)
     changes = []
     for name, parts in {**old, **new}.items():
@@ -77,7 +77,7 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
         device = _differing(old_parts[:1], new_parts[:1])
         faces = _differing(old_parts[1:], new_parts[1:])
         in_place = set(IN_PLACE)
-        # wpa_supplicant's file names the country
+        # wpa_supplicant's configuration contains the country
         if any(face.get("encryption", "none") != "none" or face.get("mode") == "mesh" for face in parts[1:]):
             in_place.discard("country")
         restarts = release < Release.V23_05 or bool(faces) or not device <= in_place
@@ -87,7 +87,7 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
 
 
 def _differing(old: tuple[Section, ...], new: tuple[Section, ...]) -> set[str]:
-    """The options in which sections differ; the name of each section that only one side has."""
+    """The options that differ, and the names of sections that only one side has."""
     before, after = ({section.name: section for section in side} for side in (old, new))
     found = {str(name) for name in before.keys() ^ after.keys()}
     for name in before.keys() & after.keys():
@@ -97,7 +97,7 @@ def _differing(old: tuple[Section, ...], new: tuple[Section, ...]) -> set[str]:
 
 
 def _is_stronger(options: set[str], old: Section, new: Section) -> bool:
-    """Whether nothing but the transmit power changes, upward."""
+    """Whether the only change is a higher transmit power."""
     powers = old.get("txpower"), new.get("txpower")
     return options & RANGE == {"txpower"} and all(p.isdigit() for p in powers) and int(powers[0]) < int(powers[1])
 
@@ -111,9 +111,9 @@ def _by_device(wireless: Package) -> dict[str, tuple[Section, ...]]:
     }
 
 
-def seen_to_restart(before: Observation, now: Observation, seconds: float) -> Radios:
-    """The radios that were seen to restart between two observations, the change being `seconds` old at the second: the
-    node booted, the interface has another index, or it knows no neighbor for longer than that."""
+def observed_restarts(before: Observation, now: Observation, seconds: float) -> Radios:
+    """The radios that restarted between two observations, with the change `seconds` old at the second one: the node
+    booted, the interface has another index, or all of its station entries are younger."""
     if before.boot_id != now.boot_id:
         return EVERY_RADIO
     old, new = before.ifindexes or {}, now.ifindexes or {}
@@ -123,10 +123,10 @@ def seen_to_restart(before: Observation, now: Observation, seconds: float) -> Ra
 
 
 def started_within(seen: Observation, seconds: float) -> Radios:
-    """The radios that must have started within these last seconds: they know somebody, and nobody for longer; or the
-    whole node has. One that knows nobody, or does not tell for how long, is not taken for one that did.
+    """The radios that must have started within the last `seconds`: all of their station entries are younger, or the
+    node booted since. A radio without station entries, or with entries of unknown age, does not count.
     """
-    # two clocks: one that booted just before has started its radios anew just as well
+    # with slack for two clocks: a node that booted just before has restarted its radios as well
     if seen.uptime_s is not None and seen.uptime_s < seconds + SLACK_S:
         return EVERY_RADIO
     known: dict[str, list[int | None]] = {}

@@ -1,7 +1,7 @@
-"""A plan as a JSON file, and back: what was agreed on is what is applied, even by another person on another day.
+"""Save a plan as JSON and load it, so that exactly the reviewed plan is applied later.
 
-`dump` and `load` are inverse; `as_agreed` holds a saved plan against a fresh one and leaves what still applies. The
-file holds masked diffs and salted fingerprints, no secret.
+`dump` and `load` are inverse; `as_agreed` compares a saved plan with a fresh one and keeps what still applies. The file
+contains masked diffs and salted fingerprints, no secret.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FORMAT_VERSION = 2
 
 @dataclass(frozen=True, slots=True)
 class SavedPlan:
-    """`salt` is what the fingerprints were made with; `inventory` the path it was made from, as given."""
+    """`salt` is that of the fingerprints; `inventory` the path the plan was made from, as given."""
 
     plan: Plan
     salt: bytes
@@ -69,7 +69,7 @@ def _plain(value: Any) -> dict[str, Any]:
 
 
 def load(text: str, file: str) -> SavedPlan:
-    """The plan that `dump` wrote. Raises InputError naming the file and what is wrong with it."""
+    """Load a plan that `dump` wrote. Raises InputError with the file name and the fault."""
     try:
         document = json.loads(text)
     except ValueError as error:
@@ -79,7 +79,7 @@ def load(text: str, file: str) -> SavedPlan:
     if document.get("version") != FORMAT_VERSION:
         raise InputError(
             f"{file}: expected a plan of version {FORMAT_VERSION}, found {document.get('version')!r}",
-            hint="make the plan anew with this meshctl",
+            hint="make a new plan with this version of meshctl",
         )
     try:
         nodes = [_node(node) for node in document["nodes"]]
@@ -93,15 +93,15 @@ def load(text: str, file: str) -> SavedPlan:
             str(document["refusal"]),
             str(document["refusal_hint"]),
         )
-        strangers = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
-        if strangers:
-            raise ValueError(f"stages name {', '.join(strangers)}, which is no node of the plan")
+        unknown = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
+        if unknown:
+            raise ValueError(f"stages name {', '.join(unknown)}, which is not in the plan")
         return SavedPlan(
             plan, bytes.fromhex(document["salt"]), str(document["inventory"]), bool(document["with_firmware"])
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{file}: damaged plan: {what}", hint="make the plan anew") from error
+        raise InputError(f"{file}: damaged plan: {what}", hint="make a new plan") from error
 
 
 def _node(data: Mapping[str, Any]) -> NodePlan:
@@ -142,23 +142,23 @@ def _texts(items: Any) -> tuple[str, ...]:
     return tuple(str(item) for item in items)
 
 
-def moved_on(agreed: NodePlan, now: NodePlan) -> str:
-    """Why a node can no longer be done as agreed; empty when it can. Both plans must share a salt."""
+def stale_reason(agreed: NodePlan, now: NodePlan) -> str:
+    """Why a node's saved plan is stale; empty when it still applies. Both plans must share a salt."""
     if now.verdict is Verdict.AWAY:
         return ""
     if agreed.wanted != now.wanted:
-        return "the inventory wants something else now than when the plan was made"
+        return "the inventory has changed since the plan was made"
     if agreed.observed != now.observed:
-        return "the node is not as it was when the plan was made"
+        return "the node has changed since the plan was made"
     if now.verdict is Verdict.REFUSED and agreed.verdict is not Verdict.REFUSED:
         return now.reason
     return ""
 
 
 def as_agreed(agreed: Plan, now: Plan) -> Plan:
-    """The agreed plan as it can still be carried out: nodes that moved on are refused, those away now are left out.
+    """The saved plan as far as it still applies: stale nodes are refused, unreachable ones are left out.
 
-    `now` is a fresh plan under the same salt. A switch that not everybody can take part in any more is a refusal.
+    `now` is a fresh plan under the same salt. A mesh change in which not all nodes can take part is refused.
     """
     nodes = {name: _still(old, now.nodes[name]) for name, old in agreed.nodes.items()}
     stages, refusal = [], agreed.refusal
@@ -166,7 +166,7 @@ def as_agreed(agreed: Plan, now: Plan) -> Plan:
         ready = tuple(name for name in stage.nodes if nodes[name].verdict is Verdict.CHANGE)
         if stage.kind is StageKind.SWITCH and len(ready) < len(stage.nodes):
             absent = ", ".join(sorted(set(stage.nodes) - set(ready)))
-            refusal = f"mesh {stage.mesh} changes its cell together, and {absent} cannot take part as agreed"
+            refusal = f"mesh {stage.mesh} changes its cell simultaneously, but {absent} cannot take part as planned"
         if ready:
             stages.append(replace(stage, nodes=ready))
     return replace(agreed, nodes=MappingProxyType(nodes), stages=tuple(stages), refusal=refusal)
@@ -176,8 +176,8 @@ def _still(old: NodePlan, now: NodePlan) -> NodePlan:
     if old.verdict is not Verdict.CHANGE:
         if now.verdict is not Verdict.CHANGE:
             return now
-        return replace(now, verdict=Verdict.REFUSED, reason="the plan that was agreed on does nothing to it")
+        return replace(now, verdict=Verdict.REFUSED, reason="the saved plan does not change it")
     if now.verdict is Verdict.AWAY:
         return now
-    why = moved_on(old, now)
+    why = stale_reason(old, now)
     return replace(old, verdict=Verdict.REFUSED, reason=why, hint="make a new plan") if why else old

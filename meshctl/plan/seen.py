@@ -1,6 +1,6 @@
-"""What an observation says of the files a plan is about, and of the node's place in the mesh.
+"""Read the planned files and the mesh state from an observation.
 
-Paths are written without a leading slash (`etc/config/network`), as rendered files have them.
+Paths have no leading slash (`etc/config/network`), as in rendered files.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ WIRELESS = f"{CONFIG}wireless"
 
 
 def package_of(path: str) -> str | None:
-    """The UCI package that a path is, or None."""
+    """The UCI package at a path, or None."""
     return path.removeprefix(CONFIG) if path.startswith(CONFIG) else None
 
 
 def text_of(path: str, seen: Observation) -> str | None:
-    """A file's text on the node; None when it is not there or is not text."""
+    """A file's text on the node; None when it is missing or not text."""
     package = package_of(path)
     if package is not None:
         return (seen.uci or {}).get(package)
@@ -32,12 +32,12 @@ def text_of(path: str, seen: Observation) -> str | None:
 
 
 def file_info(path: str, seen: Observation) -> FileInfo | None:
-    """What was told about a file that was asked for by path."""
+    """The file's mode, hash and text, if it was requested by path."""
     return seen.files.get(f"/{path}") or seen.files.get(path)
 
 
 def packages_seen(paths: Iterable[str], seen: Observation) -> dict[str, Package | None]:
-    """The UCI packages among these paths as trees; None for one that is missing or that no UCI reader accepts."""
+    """The UCI packages among these paths as trees; None for one that is missing or not readable as UCI."""
     found: dict[str, Package | None] = {}
     for path in paths:
         package = package_of(path)
@@ -47,7 +47,7 @@ def packages_seen(paths: Iterable[str], seen: Observation) -> dict[str, Package 
 
 
 def parsed(text: str | None, package: str) -> Package | None:
-    """A package's tree, or None for what is missing or unreadable."""
+    """A package's tree, or None if it is missing or unreadable."""
     if text is None:
         return None
     try:
@@ -57,7 +57,7 @@ def parsed(text: str | None, package: str) -> Package | None:
 
 
 def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]:
-    """Everything a plan rests on, by name: when any of it differs later, the node has moved on."""
+    """Everything a plan depends on, by name: if any of it differs later, the plan is stale."""
     texts = {f"file {path}": "missing" if (text := text_of(path, seen)) is None else f"text {text}" for path in paths}
     for path in paths:
         info = file_info(path, seen)
@@ -69,7 +69,7 @@ def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]
 
 
 def is_meshed(seen: Observation, live: Mapping[str, Cell]) -> bool:
-    """Whether it is part of a running mesh: a radio in a cell, and somebody heard lately (or nobody can tell)."""
+    """Whether the node is part of a running mesh: a radio in a cell, and a neighbor heard recently or unknown."""
     if not live:
         return False
     if seen.neighbours is not None:

@@ -1,8 +1,8 @@
-"""Changes that part a node from its mesh: which of them are a switch of the whole mesh, and whom that leaves behind.
+"""Cell changes: which of them change a whole mesh simultaneously, and which nodes that leaves behind.
 
-A mesh whose members already run the cell to come takes strays back one by one. Otherwise all members that run another
-cell change together, at one moment; members that do not answer would stay behind in the old cell, so they have to be
-acknowledged by name. A node's files change all at once: meshes that share a changing node are one switch.
+Nodes rejoin one by one a mesh whose other members already run the planned cell. Otherwise all members in another cell
+change simultaneously; unreachable members would be left behind in the old cell, so they have to be acknowledged by
+name. A node's files change all at once, so meshes that share a changing node change as one.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from types import MappingProxyType
 from meshctl.model import Fleet, NodeState
 from meshctl.plan.values import NodePlan, Verdict
 
-# Acknowledges whoever is off.
+# Acknowledges any node that is off.
 ALL = "all"
 
 
 @dataclass(frozen=True, slots=True)
-class Switches:
+class MeshSwitches:
     """`nodes`: mesh, or meshes (`main, far`) -> the nodes that change cell together. `left_behind`: mesh -> members
-    that are off, not acknowledged. `blocked`: mesh -> members that answer and yet cannot take part, with the reason."""
+    that are off and not acknowledged. `blocked`: mesh -> reachable members that cannot take part, with the reason."""
 
     nodes: Mapping[str, tuple[str, ...]]
     left_behind: Mapping[str, tuple[str, ...]]
@@ -32,22 +32,24 @@ def switches(
     fleet: Fleet,
     plans: Mapping[str, NodePlan],
     *,
-    around: Mapping[str, NodePlan] = MappingProxyType({}),
+    unchanged: Mapping[str, NodePlan] = MappingProxyType({}),
     acknowledged: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
-) -> Switches:
-    """The switches among these plans. `around` are members that were seen and to which nothing is done; `never_meshed`
-    names nodes known to be in no cell yet (fresh from their box)."""
-    known, fresh = set(acknowledged), set(never_meshed)
+) -> MeshSwitches:
+    """The whole-mesh changes among these plans. `unchanged` are other observed members; `never_meshed` names nodes that
+    were never in a cell (factory devices)."""
+    known, new_nodes = set(acknowledged), set(never_meshed)
     nodes: dict[str, tuple[str, ...]] = {}
-    left: dict[str, tuple[str, ...]] = {}
+    left_behind: dict[str, tuple[str, ...]] = {}
     blocked: dict[str, tuple[str, ...]] = {}
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
         parting = [plan for plan in members if mesh in plan.parted_from and plan.verdict is Verdict.CHANGE]
-        beside = [around[node.name] for node in fleet.members(mesh) if node.name in around and node.name not in plans]
+        beside = [
+            unchanged[node.name] for node in fleet.members(mesh) if node.name in unchanged and node.name not in plans
+        ]
         staying = [plan for plan in (*members, *beside) if plan.has_cell and mesh not in plan.parted_from]
-        # the mesh is where most of its members are; a few that differ from it come back to it
+        # the mesh is where most of its members are; the few that differ rejoin it one by one
         if not parting or len(staying) >= len(parting):
             continue
         nodes[mesh] = tuple(plan.node for plan in parting)
@@ -55,21 +57,23 @@ def switches(
         flashed = [f"{plan.node}: its firmware changes too" for plan in parting if plan.firmware is not None]
         if refused or flashed:
             blocked[mesh] = (*refused, *flashed)
-        there = {plan.node for plan in staying}
-        unplanned = [node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in there]
+        staying_names = {plan.node for plan in staying}
+        unplanned = [
+            node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in staying_names
+        ]
         away = [plan.node for plan in members if plan.verdict is Verdict.AWAY]
         behind = tuple(
             name
             for name in (*away, *unplanned)
-            if name not in known and name not in fresh and fleet.nodes[name].state is not NodeState.SPARE
+            if name not in known and name not in new_nodes and fleet.nodes[name].state is not NodeState.SPARE
         )
         if behind and ALL not in known:
-            left[mesh] = behind
-    return Switches(_joined(nodes), left, blocked)
+            left_behind[mesh] = behind
+    return MeshSwitches(_joined(nodes), left_behind, blocked)
 
 
 def _joined(switching: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Switches that share nodes as one, named after all of their meshes."""
+    """Merge changes that share nodes, named after all of their meshes."""
     joined: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
     for mesh, nodes in switching.items():
         sharing = [switch for switch in joined if set(switch[1]) & set(nodes)]

@@ -1,4 +1,4 @@
-"""The plan as frozen values: steps of a node, stages of a fleet. It may be shown and stored: no secret is in it."""
+"""The plan as frozen values: steps of a node, stages of a fleet. It contains no secret."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 
 class Verdict(Enum):
-    """CHANGE: there is something to do. SAME: nothing. AWAY: it did not answer. REFUSED: meshctl will not touch it."""
+    """CHANGE: something changes. SAME: nothing does. AWAY: unreachable. REFUSED: a precondition failed."""
 
     CHANGE = "change"
     SAME = "same"
@@ -18,7 +18,7 @@ class Verdict(Enum):
 
 
 class Cut(IntEnum):
-    """What is interrupted while a change takes effect, the least first."""
+    """What a change interrupts while it takes effect, the least first."""
 
     NOTHING = 0
     # new SSH logins, for about a second
@@ -46,7 +46,7 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """`service` is reloaded because of `why`, which cuts `cut`."""
+    """`service` is reloaded because of `why`, which interrupts `cut`."""
 
     service: str
     cut: Cut
@@ -65,7 +65,7 @@ class FirmwareStep:
 
 @dataclass(frozen=True, slots=True)
 class PackageStep:
-    """`install` are the missing packages, `files` the package files that bring them, `remove` what has to go first."""
+    """`install`: missing packages; `files`: package files that provide them; `remove`: what is removed first."""
 
     install: tuple[str, ...]
     files: tuple[str, ...]
@@ -74,11 +74,11 @@ class PackageStep:
 
 @dataclass(frozen=True, slots=True)
 class NodePlan:
-    """One node: what is done to it, in this order: firmware, packages, files.
+    """The steps of one node, in this order: firmware, packages, files.
 
-    `observed` and `wanted` are fingerprints of what was seen and what is to be; `splits` names what parts
-    the cell that it runs from the wanted one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns;
-    `has_cell` whether a radio is configured for some mesh now, `is_meshed` whether it is part of a running one.
+    `observed` and `wanted` are fingerprints of its observed and desired state. `splits` lists how its current cell
+    differs from the planned one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns. `has_cell`:
+    a radio is configured for a mesh now; `is_meshed`: the node is part of a running mesh.
     """
 
     node: str
@@ -100,13 +100,13 @@ class NodePlan:
 
     @property
     def cut(self) -> Cut:
-        """The worst of what its steps interrupt."""
+        """The most disruptive of its effects."""
         return max((effect.cut for effect in self.effects), default=Cut.NOTHING)
 
 
 class StageKind(Enum):
-    """CANARY: one node alone, to see it work. FREE: nothing that is in use is cut. ROLLING: at most `max_down` at a
-    time. SWITCH: a whole mesh at one moment. LAST: the node we stand on."""
+    """CANARY: one node alone, as a test. FREE: interrupts nothing in use. ROLLING: at most `max_down` at a time.
+    SWITCH: a whole mesh simultaneously. LAST: the entry node."""
 
     CANARY = "canary"
     FREE = "free"
@@ -117,8 +117,8 @@ class StageKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Nodes in work together; the next stage begins when all of them have ended. `mesh` is set for a SWITCH:
-    one mesh, or all that change with it (`main, far`)."""
+    """Nodes changed together; the next stage starts when all of them have ended. `mesh` is set for a SWITCH: one mesh,
+    or all that change with it (`main, far`)."""
 
     kind: StageKind
     nodes: tuple[str, ...]
@@ -129,7 +129,7 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The whole fleet. `entry` is the node we reach the mesh through; `notes` concern the fleet as a whole."""
+    """The plan of a fleet. `entry` is the node through which the mesh is reached; `notes` concern the whole fleet."""
 
     fleet: str
     created_s: float
@@ -137,7 +137,7 @@ class Plan:
     nodes: Mapping[str, NodePlan] = field(default_factory=lambda: MappingProxyType({}))
     stages: tuple[Stage, ...] = ()
     notes: tuple[str, ...] = ()
-    # a reason why nothing of it may be applied as it stands
+    # why the plan as a whole must not be applied
     refusal: str = ""
     refusal_hint: str = ""
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from meshctl.device.connection import Connection, Credentials, Endpoint
 from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKeyUnknown
 from meshctl.device.ssh import SshConnection, connect
-from meshctl.device.trust import HostKey, HostKeyPolicy, Recorder
+from meshctl.device.trust import AcceptAnyKey, HostKey, HostKeyPolicy
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.robots.host import Host, SshHost, become_root
 from meshctl.robots.preconditions import computer_of
 
@@ -35,7 +35,7 @@ class RobotConnector:
     what sudo gets where it wants one; `owner` names us to the robots' locks. Safe for many threads."""
 
     fleet: Fleet
-    access: Access
+    access: ConnectionPool
     password: Callable[[], Secret | None] = field(default=_no_password, repr=False)
     owner: str = ""
 
@@ -93,7 +93,7 @@ class RobotConnector:
 
     def presented_key(self, robot: str) -> HostKey | None:
         """The host key that the computer shows, believed by nobody. Raises what `ssh.connect` raises."""
-        recorder = Recorder()
+        recorder = AcceptAnyKey()
         try:
             # without credentials: the key is shown before anyone logs in
             with self._connected(robot, Credentials(use_agent=False), recorder):

@@ -22,10 +22,10 @@ from meshctl.device.observe import observe
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet.journal import Journal
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import Seen, facts_of, known_macs
-from meshctl.nodes.connections import Access
+from meshctl.nodes.collect import FleetObservation, facts_of, known_macs
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
-from meshctl.plan import NodePlan, Wanted, node_plan
+from meshctl.plan import DesiredState, NodePlan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.robots.connection import RobotConnector
 from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts, expected_release
@@ -63,13 +63,13 @@ class Collector:
 
     fleet: Fleet
     renderer: Renderer
-    access: Access
+    access: ConnectionPool
     journal: Journal
     owner: str
     connector: RobotConnector | None = None
     robots_skipped: str = ""
     clock: Callable[[], float] = time.time
-    _desired_states: dict[str, Wanted | str] = field(default_factory=dict, repr=False)
+    _desired_states: dict[str, DesiredState | str] = field(default_factory=dict, repr=False)
     _expected_releases: dict[str, ExpectedRelease | str] = field(default_factory=dict, repr=False)
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -92,7 +92,7 @@ class Collector:
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
                 no_answer[kind][name] = no_answer_of(answer)
-        seen = Seen(observations, {})
+        seen = FleetObservation(observations, {})
         self.journal.remember_all(
             self.fleet.name, {name: facts_of(one) for name, one in observations.items()}, self.clock()
         )
@@ -150,15 +150,15 @@ class Collector:
     def _observe(self, node: Node) -> Observation:
         wanted = self._desired_state(node)
         paths = () if isinstance(wanted, str) else other_paths(wanted)
-        with self.access.lease(node) as connection:
+        with self.access.borrow(node) as connection:
             return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
-    def _desired_state(self, node: Node) -> Wanted | str:
+    def _desired_state(self, node: Node) -> DesiredState | str:
         """The desired state of a node, or why it cannot be rendered: status also works without the secrets."""
         with self._lock:
             if node.name not in self._desired_states:
                 try:
-                    self._desired_states[node.name] = self.renderer.wanted(node)
+                    self._desired_states[node.name] = self.renderer.desired(node)
                 except MeshctlError as error:
                     self._desired_states[node.name] = first_line(error)
             return self._desired_states[node.name]
@@ -175,7 +175,7 @@ class Collector:
             if isinstance(wanted, str):
                 unrendered[node.name] = wanted
             elif seen is not None:
-                exact = self.renderer.wanted(node, seen)
+                exact = self.renderer.desired(node, seen)
                 plans[node.name] = node_plan(exact, seen, fingerprints, owner=self.owner)
         return plans, unrendered
 

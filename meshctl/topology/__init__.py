@@ -4,7 +4,7 @@ from meshctl.topology.alternate_macs import alternate_macs, with_alternates
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of
 from meshctl.topology.observed import (
     NEIGHBOUR_FRESH_MS,
-    Heard,
+    HeardNeighbor,
     Report,
     Sighting,
     names_by_mac,
@@ -18,7 +18,7 @@ __all__ = [
     "EMPTY",
     "NEIGHBOUR_FRESH_MS",
     "Graph",
-    "Heard",
+    "HeardNeighbor",
     "Link",
     "Path",
     "Report",

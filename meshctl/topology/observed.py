@@ -17,7 +17,7 @@ NEIGHBOUR_FRESH_MS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class HeardNeighbor:
     """A neighbour in a node's table: `quality` 0..1, None when only its presence is known."""
 
     mac: str
@@ -32,7 +32,7 @@ class Report:
 
     node: str
     macs: tuple[str, ...]
-    heard: tuple[Heard, ...] = ()
+    heard: tuple[HeardNeighbor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +51,15 @@ def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> di
     return names
 
 
-def neighbours_of(report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS) -> dict[str, Heard]:
+def neighbours_of(
+    report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
+) -> dict[str, HeardNeighbor]:
     """Whom a node hears now: neighbour -> the best of that neighbour's radios, for it carries the traffic.
 
     `names` maps lower-case MACs to nodes; a MAC that nobody owns stands for itself. Neighbours not heard for longer
     than `fresh_ms`, and the node's own radios, are left out.
     """
-    best: dict[str, Heard] = {}
+    best: dict[str, HeardNeighbor] = {}
     for heard in report.heard:
         mac = heard.mac.lower()
         name = names.get(mac, mac)
@@ -68,7 +70,7 @@ def neighbours_of(report: Report, names: Mapping[str, str], *, fresh_ms: int = N
     return best
 
 
-def _rank(heard: Heard) -> tuple[float, int, int]:
+def _rank(heard: HeardNeighbor) -> tuple[float, int, int]:
     """By measured quality, then by signal, then by how lately it was heard; what nobody measured ranks last."""
     quality = -1.0 if heard.quality is None else heard.quality
     # no receiver hears anything at -200 dBm
@@ -87,26 +89,26 @@ def observed_graph(
     A link has the worse quality of its two directions; one reported by a single side (the other did not answer) has
     that side's. MACs nobody owns become nodes under their MAC, so that a stranger in the mesh shows.
     """
-    told = tuple(reports)
-    names = names_by_mac(told, known_macs or {})
+    known_reports = tuple(reports)
+    names = names_by_mac(known_reports, known_macs or {})
     quality: dict[tuple[str, str], float] = {}
-    for report in told:
+    for report in known_reports:
         for other, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
             quality[report.node, other] = 1.0 if heard.quality is None else heard.quality
     links = [Link(a, b, min(value, quality.get((b, a), value))) for (a, b), value in quality.items()]
     links += [Link(a, b, 1.0, wired=True) for a, b in wires]
-    return graph_of((report.node for report in told), links)
+    return graph_of((report.node for report in known_reports), links)
 
 
 def seen_by(
     reports: Iterable[Report], known_macs: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
 ) -> dict[str, tuple[Sighting, ...]]:
     """For every node that somebody hears: by whom and how long ago, the latest first."""
-    told = tuple(reports)
-    names = names_by_mac(told, known_macs)
+    known_reports = tuple(reports)
+    names = names_by_mac(known_reports, known_macs)
     known = frozenset(names.values())
     sightings: dict[str, list[Sighting]] = {}
-    for report in told:
+    for report in known_reports:
         for name, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
             if name in known:
                 sightings.setdefault(name, []).append(Sighting(report.node, heard.last_seen_ms, heard.signal_dbm))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from meshctl.device.observation import Observation, Originator
-from meshctl.topology.observed import Heard, Report
+from meshctl.topology.observed import HeardNeighbor, Report
 
 # batman-adv's transmit quality is one byte (BATMAN_IV).
 TQ_MAX = 255
@@ -17,7 +17,7 @@ def report_of(node: str, seen: Observation) -> Report:
     signals = {station.mac.lower(): station.signal_dbm for station in seen.stations or ()}
     if seen.neighbours is None:
         heard = [
-            Heard(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
+            HeardNeighbor(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
             for station in seen.stations or ()
         ]
         return Report(node, mesh_macs(seen), tuple(heard))
@@ -26,7 +26,7 @@ def report_of(node: str, seen: Observation) -> Report:
         node,
         mesh_macs(seen),
         tuple(
-            Heard(mac, neighbour.last_seen_ms, quality.get(mac), signals.get(mac))
+            HeardNeighbor(mac, neighbour.last_seen_ms, quality.get(mac), signals.get(mac))
             for neighbour in seen.neighbours
             for mac in (neighbour.mac.lower(),)
         ),

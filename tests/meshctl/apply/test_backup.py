@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.apply.backup import Backup, lacking_packages, lockout_by, objection_to, read_backup, with_info
+from meshctl.apply.backup import Backup, incompatibility, lockout_by, read_backup, uninstalled_packages, with_info
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import NewFile
 from meshctl.device.observation import BoardInfo
@@ -65,8 +65,8 @@ def test_what_would_disable_services_at_the_next_boot_is_told_and_not_put_back()
         (b"", "expected a tar.gz archive"),
         (b"not gzip at all", "expected a tar.gz archive"),
         (gzip.compress(b"no tar"), "expected a tar.gz archive"),
-        (archive(("etc/config/network", b"x")), "no meshctl-backup.json in it"),
-        (with_info(archive(("etc/passwd", b"x")), INFO), "no configuration in it"),
+        (archive(("etc/config/network", b"x")), "contains no meshctl-backup.json"),
+        (with_info(archive(("etc/passwd", b"x")), INFO), "contains no configuration"),
         (archive(("meshctl-backup.json", b"["), ("etc/config/x", b"")), "meshctl-backup.json is damaged"),
         (archive(("meshctl-backup.json", b"[]"), ("etc/config/x", b"")), "expected an object"),
     ],
@@ -89,10 +89,10 @@ def test_damaged_bytes_give_an_error_or_a_backup_and_nothing_else(noise: bytes, 
 
 def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
     seen = running(fleet(), "b01")
-    assert objection_to(saved(), "b01", seen) == ""
-    assert "the backup is of b01, not of b02" in objection_to(saved(), "b02", seen)
-    assert "is ubnt,rocket-m" in objection_to(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
-    assert lacking_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
+    assert incompatibility(saved(), "b01", seen) == ""
+    assert "the backup is of node b01, not b02" in incompatibility(saved(), "b02", seen)
+    assert "is ubnt,rocket-m" in incompatibility(saved(), "b01", replace(seen, board=BoardInfo("ubnt,rocket-m")))
+    assert uninstalled_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
 
 
 def test_a_backup_that_lets_in_none_of_our_keys_is_refused_and_one_without_keys_is_not() -> None:

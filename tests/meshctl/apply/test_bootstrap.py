@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.bootstrap import Arrivals, BenchPlace, Found, find_node, identify, restore_pins
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, find_node, identify, restore_pins
 from meshctl.apply.replace import identity_edits
 from meshctl.device.observation import BoardInfo, Observation
 from meshctl.device.trust import HostKey, TrustStore
@@ -48,21 +48,21 @@ def test_a_mac_tells_who_it_is() -> None:
 
 
 def test_a_device_that_nobody_knows_needs_the_operators_word() -> None:
-    with pytest.raises(NodeError, match="nothing tells which node it is"):
+    with pytest.raises(NodeError, match="cannot identify the node"):
         identify(labelled(), device("02:00:00:00:00:42"), "")
     assert identify(labelled(), device("02:00:00:00:00:42"), "b02").name == "b02"
 
 
 def test_the_wrong_device_is_refused_whatever_the_operator_says() -> None:
-    with pytest.raises(NodeError, match="said to be b02, its MAC is that of b01"):
+    with pytest.raises(NodeError, match="expected b02, its MAC belongs to b01"):
         identify(labelled(), device(MAC), "b02")
-    with pytest.raises(NodeError, match="b01 has 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
+    with pytest.raises(NodeError, match="b01 has MAC 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
         identify(labelled(), device("02:00:00:00:00:42"), "b01")
 
 
 def test_one_node_is_not_found_twice() -> None:
-    with pytest.raises(NodeError, match="found at another place already"):
-        identify(labelled(), device(MAC), "", taken=["b01"])
+    with pytest.raises(NodeError, match="already found at another address"):
+        identify(labelled(), device(MAC), "", identified=["b01"])
 
 
 def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
@@ -80,8 +80,8 @@ def test_a_device_that_was_refused_leaves_the_pins_of_before(tmp_path: Path) -> 
     for name in ("b01", "b02"):
         trust.replace(name, new)
     found = {
-        name: Found(BenchPlace(node=name), fleet().nodes[name], device(), new, pins)
+        name: FoundDevice(BenchTarget(node=name), fleet().nodes[name], device(), new, pins)
         for name, pins in (("b01", (old,)), ("b02", ()))
     }
-    restore_pins(trust, Arrivals(found, ()), ["b01", "b02"])
+    restore_pins(trust, Discovered(found, ()), ["b01", "b02"])
     assert (trust.pinned("b01"), trust.pinned("b02")) == ((old,), ())

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from meshctl.apply.health_checks import expectation, missing
+from meshctl.apply.health_checks import expectation, unmet
 from meshctl.device.observation import (
     Bridge,
     ChangeStatus,
@@ -38,7 +38,7 @@ def good() -> Observation:
 
 
 def gaps(after: Observation, since_s: float | None = 20.0) -> tuple[str, ...]:
-    return missing(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
+    return unmet(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
 
 
 def test_a_node_with_all_it_had_has_proven_itself() -> None:
@@ -54,7 +54,7 @@ def test_a_node_with_all_it_had_has_proven_itself() -> None:
         ),
         (
             replace(good(), change=ChangeStatus("applied", "c1", reload_status=2)),
-            "reloading its services failed with status 2",
+            "reloading its services failed with exit status 2",
         ),
         (replace(good(), interfaces=()), "its LAN is down"),
         (
@@ -62,7 +62,7 @@ def test_a_node_with_all_it_had_has_proven_itself() -> None:
             "its LAN has 10.42.0.9/24, not 10.42.0.101",
         ),
         (replace(good(), bridges=(Bridge("br-lan", ("bat0",)),)), "eth0 not in its bridge br-lan"),
-        (replace(good(), links=()), "mesh0 is not there"),
+        (replace(good(), links=()), "mesh0 does not exist"),
         (
             replace(good(), links=(WirelessLink("mesh0", "IBSS", channel=6, joined=False),)),
             "mesh0 has not joined its cell",
@@ -75,8 +75,8 @@ def test_a_node_with_all_it_had_has_proven_itself() -> None:
             replace(good(), links=(WirelessLink("mesh0", "IBSS", bssid="06:00:00:00:00:07", channel=6),)),
             "mesh0 is in cell 06:00:00:00:00:07, not 02:ca:fe:00:00:01",
         ),
-        (replace(good(), neighbours=()), "it hears 0 mesh neighbours of the 2 it had"),
-        (replace(good(), originators=()), "it has no way to the base"),
+        (replace(good(), neighbours=()), "it hears 0 mesh neighbors of the 2 it had"),
+        (replace(good(), originators=()), "it has no route to the base"),
     ],
 )
 def test_what_is_not_there_is_named(after: Observation, gap: str) -> None:
@@ -90,26 +90,26 @@ def test_half_of_the_neighbours_is_enough_since_robots_move() -> None:
 def test_what_was_heard_before_the_change_does_not_count() -> None:
     stale = replace(good(), neighbours=(MeshNeighbour(OTHER, "mesh0", 8000), MeshNeighbour(BASE, "mesh0", 8000)))
     assert gaps(stale, since_s=20.0) == ()
-    assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbours of the 2 it had",)
+    assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbors of the 2 it had",)
 
 
 def test_a_node_alone_on_the_bench_need_hear_nobody() -> None:
     alone = replace(good(), neighbours=(), originators=())
-    assert missing(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
+    assert unmet(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
 
 
 def test_the_base_counts_only_if_it_was_reached_before() -> None:
     before = replace(good(), originators=())
-    assert expectation(wanted(fleet(), "b01"), before, [BASE]).bases == frozenset()
+    assert expectation(wanted(fleet(), "b01"), before, [BASE]).base_macs == frozenset()
 
 
 def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> None:
     expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
     moved = "42:00:00:00:00:01"
     after = replace(good(), originators=(Originator(moved, moved, "mesh0", 200, True, 250),))
-    assert missing(expected, after) == ("it has no way to the base",)
-    assert missing(expected.with_bases(frozenset({moved})), after) == ()
-    assert expectation(wanted(fleet(), "b01"), good()).with_bases(frozenset({moved})).bases == frozenset()
+    assert unmet(expected, after) == ("it has no route to the base",)
+    assert unmet(expected.with_base_macs(frozenset({moved})), after) == ()
+    assert expectation(wanted(fleet(), "b01"), good()).with_base_macs(frozenset({moved})).base_macs == frozenset()
 
 
 @pytest.mark.parametrize(
@@ -130,4 +130,4 @@ def test_an_encrypted_radio_that_joined_in_the_open_has_not_proven_itself(
     text = re.sub("option encryption '.*'", f"option encryption '{encryption}'", dump(expected.wireless))
     assert f"'{encryption}'" in text
     sealed = replace(expected, wireless=parse(text, "wireless"))
-    assert missing(sealed, replace(good(), supplicants=supplicants)) == gaps
+    assert unmet(sealed, replace(good(), supplicants=supplicants)) == gaps

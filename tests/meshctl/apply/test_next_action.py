@@ -8,15 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.apply.next_action import Move, applied_age_s, next_move, why_it_went_back
+from meshctl.apply.next_action import Action, applied_age_s, next_action, rollback_reason
 from meshctl.device.observation import ChangeStatus
 
 APPLIED = ChangeStatus("applied", "c1", owner="me", window_s=60, left_s=40.0, reload_status=0)
 STATES = ("idle", "staged", "armed", "waiting", "applied", "restoring", "absent")
 
 
-def move(status: ChangeStatus, *missing: str, new: bool = True, leaving: bool = False, given_up: bool = False) -> Move:
-    return next_move("c1", status, missing, is_at_new_address=new, leaving=leaving, is_given_up=given_up)
+def move(
+    status: ChangeStatus, *missing: str, new: bool = True, leaving: bool = False, given_up: bool = False
+) -> Action:
+    return next_action("c1", status, missing, is_at_new_address=new, leaving=leaving, is_given_up=given_up)
 
 
 @st.composite
@@ -39,7 +41,7 @@ def test_only_our_own_applied_and_proven_change_at_the_new_address_is_confirmed(
     status: ChangeStatus, missing: list[str], new: bool, leaving: bool, given_up: bool
 ) -> None:
     chosen = move(status, *missing, new=new, leaving=leaving, given_up=given_up)
-    if chosen is Move.CONFIRM:
+    if chosen is Action.CONFIRM:
         assert status.installed
         assert (status.state, status.change_id) == ("applied", "c1")
         assert new
@@ -49,36 +51,36 @@ def test_only_our_own_applied_and_proven_change_at_the_new_address_is_confirmed(
 
 @given(statuses(), st.booleans())
 def test_what_was_given_up_is_never_sent_begun_or_confirmed(status: ChangeStatus, new: bool) -> None:
-    assert move(status, new=new, given_up=True) not in (Move.START, Move.BEGIN, Move.CONFIRM)
+    assert move(status, new=new, given_up=True) not in (Action.START, Action.BEGIN, Action.CONFIRM)
 
 
 @pytest.mark.parametrize(
     ("status", "expected"),
     [
-        (ChangeStatus("absent", installed=False), Move.START),
-        (ChangeStatus("idle"), Move.START),
-        (ChangeStatus("staged", "c1"), Move.START),
-        (ChangeStatus("staged", "c2"), Move.START),
-        (ChangeStatus("armed", "c1"), Move.BEGIN),
-        (ChangeStatus("waiting", "c1"), Move.WAIT),
-        (ChangeStatus("restoring", "c1"), Move.WAIT),
-        (APPLIED, Move.CONFIRM),
-        (ChangeStatus("applied", "c2", owner="bob"), Move.FOREIGN),
-        (ChangeStatus("idle", last_id="c1", last_outcome="confirmed"), Move.KEPT),
-        (ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="boot"), Move.WENT_BACK),
-        (ChangeStatus("applied", "c2", last_id="c1", last_outcome="restored"), Move.WENT_BACK),
+        (ChangeStatus("absent", installed=False), Action.START),
+        (ChangeStatus("idle"), Action.START),
+        (ChangeStatus("staged", "c1"), Action.START),
+        (ChangeStatus("staged", "c2"), Action.START),
+        (ChangeStatus("armed", "c1"), Action.BEGIN),
+        (ChangeStatus("waiting", "c1"), Action.WAIT),
+        (ChangeStatus("restoring", "c1"), Action.WAIT),
+        (APPLIED, Action.CONFIRM),
+        (ChangeStatus("applied", "c2", owner="bob"), Action.FOREIGN),
+        (ChangeStatus("idle", last_id="c1", last_outcome="confirmed"), Action.KEPT),
+        (ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="boot"), Action.WENT_BACK),
+        (ChangeStatus("applied", "c2", last_id="c1", last_outcome="restored"), Action.WENT_BACK),
     ],
 )
-def test_each_state_of_the_switch_has_its_move(status: ChangeStatus, expected: Move) -> None:
+def test_each_state_of_the_switch_has_its_move(status: ChangeStatus, expected: Action) -> None:
     assert move(status) is expected
 
 
 def test_an_unproven_change_is_given_its_time_and_then_taken_back() -> None:
-    assert move(APPLIED, "no neighbour") is Move.WAIT
-    assert move(replace(APPLIED, left_s=2.0), "no neighbour") is Move.ABORT
-    assert move(replace(APPLIED, reload_status=1), "no neighbour") is Move.ABORT
-    assert move(APPLIED, "no neighbour", leaving=True) is Move.ABORT
-    assert move(APPLIED, new=False) is Move.WAIT
+    assert move(APPLIED, "no neighbour") is Action.WAIT
+    assert move(replace(APPLIED, left_s=2.0), "no neighbour") is Action.ABORT
+    assert move(replace(APPLIED, reload_status=1), "no neighbour") is Action.ABORT
+    assert move(APPLIED, "no neighbour", leaving=True) is Action.ABORT
+    assert move(APPLIED, new=False) is Action.WAIT
 
 
 def test_the_age_of_a_change_is_what_is_gone_of_its_window() -> None:
@@ -88,19 +90,19 @@ def test_the_age_of_a_change_is_what_is_gone_of_its_window() -> None:
 
 def test_a_person_reads_why_it_went_back() -> None:
     status = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="boot")
-    assert why_it_went_back(status, ()) == "its power was cut, or it rebooted, before it was confirmed"
+    assert rollback_reason(status, ()) == "its power was cut, or it rebooted, before it was confirmed"
     late = replace(status, last_reason="timeout")
-    assert why_it_went_back(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
+    assert rollback_reason(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
 
 
 def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = why_it_went_back(late, ("its LAN is down",), "b01: let root in with none of: key a")
+    told = rollback_reason(late, ("its LAN is down",), "b01: let root in with none of: key a")
     assert told == "it was not confirmed in time: b01: let root in with none of: key a"
 
 
 def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = why_it_went_back(late, (), "", "cannot connect: Connection refused")
-    assert told == "it was not confirmed in time: it could not be reached: cannot connect: Connection refused"
-    assert "reached" not in why_it_went_back(late, ("its LAN is down",), "", "cannot connect")
+    told = rollback_reason(late, (), "", "cannot connect: Connection refused")
+    assert told == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
+    assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")

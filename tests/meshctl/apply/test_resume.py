@@ -9,10 +9,10 @@ import pytest
 
 from meshctl.apply.mesh_commit import LEFT_BEHIND
 from meshctl.apply.prepare import Prepared
-from meshctl.apply.resume import settled
+from meshctl.apply.resume import resolutions
 from meshctl.device.observation import ChangeStatus
 from meshctl.fleet import Outcome, Result
-from meshctl.nodes.collect import Seen
+from meshctl.nodes.collect import FleetObservation
 from meshctl.plan import NodePlan, Plan, Verdict
 from tests.meshctl.plan.support import fleet, running
 
@@ -20,30 +20,32 @@ from tests.meshctl.plan.support import fleet, running
 def prepared(verdict: Verdict) -> Prepared:
     plan = Plan("team", 0.0, "base", MappingProxyType({"b01": NodePlan("b01", verdict, "no board")}))
     change = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    return Prepared(plan, {}, Seen({"b01": replace(running(fleet(), "b01"), change=change)}, {}))
+    return Prepared(plan, {}, FleetObservation({"b01": replace(running(fleet(), "b01"), change=change)}, {}))
 
 
 @pytest.mark.parametrize(
     ("verdict", "text"),
     [
-        (Verdict.SAME, "now it is as wanted"),
-        (Verdict.CHANGE, "now it runs what it ran before (it was not confirmed in time), and is changed again"),
-        (Verdict.REFUSED, "now it answers, and is refused: no board"),
-        (Verdict.AWAY, "now it is still not seen"),
+        (Verdict.SAME, "now it is as desired"),
+        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and is changed again"),
+        (Verdict.REFUSED, "now it answers and is refused: no board"),
+        (Verdict.AWAY, "now it is still unreachable"),
     ],
 )
 def test_each_end_of_an_uncertain_node_is_told(verdict: Verdict, text: str) -> None:
-    told = settled(7, [Outcome("b01", Result.UNCERTAIN, "left")], prepared(verdict))
+    told = resolutions(7, [Outcome("b01", Result.UNCERTAIN, "left")], prepared(verdict))
     assert told == {"b01": f"uncertain after run 7; {text}"}
 
 
 def test_one_that_stayed_in_the_old_cell_is_told_how_to_reach_it() -> None:
     left = Outcome("b01", Result.UNCERTAIN, facts={LEFT_BEHIND: "radio0: channel 6 -> 11"})
-    assert settled(7, [left], prepared(Verdict.AWAY))["b01"].endswith(
-        "still not seen: it stayed in its mesh's old cell (radio0: channel 6 -> 11), "
-        "where only a cable, or a node taken back to it, reaches it"
+    assert resolutions(7, [left], prepared(Verdict.AWAY))["b01"].endswith(
+        "still unreachable: it is still in the old cell of its mesh (radio0: channel 6 -> 11); "
+        "reach it by cable or from another node in that cell"
     )
 
 
 def test_nodes_that_ended_otherwise_need_no_account() -> None:
-    assert settled(7, [Outcome("b01", Result.FAILED), Outcome("b09", Result.UNCERTAIN)], prepared(Verdict.SAME)) == {}
+    assert (
+        resolutions(7, [Outcome("b01", Result.FAILED), Outcome("b09", Result.UNCERTAIN)], prepared(Verdict.SAME)) == {}
+    )

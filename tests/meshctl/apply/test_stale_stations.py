@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 
 from meshctl.apply.stale_stations import (
     FIRST_PAUSE_S,
-    LONGEST_PAUSE_S,
-    MOST_ASKED,
-    Entry,
-    behind,
-    booted_unforgotten_s,
+    MAX_PAUSE_S,
+    MAX_QUERIED,
+    StationEntry,
     by_holder,
+    current_neighbors,
     entries_of,
     flush_script,
-    neighbours_now,
-    next_ask_s,
+    next_query_s,
     own_entries,
-    silent_holders,
+    possible_holders,
+    routed_through,
+    unflushed_boot_s,
     watch_script,
 )
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
@@ -51,12 +51,14 @@ def test_those_whose_radios_know_the_node_are_asked_on_the_interface_and_by_the_
         "b03": knows("b03", ("mesh0", OTHER)),
         "base": knows("base", ("wlan0", MAC)),
     }
-    assert entries_of("b02", around) == (Entry("b01", "mesh1", MAC.upper()), Entry("base", "wlan0", MAC))
+    assert entries_of("b02", around) == (StationEntry("b01", "mesh1", MAC.upper()), StationEntry("base", "wlan0", MAC))
 
 
 def test_every_radio_of_the_node_is_forgotten() -> None:
     around = {"b01": knows("b01", ("mesh0", MAC), ("mesh0", OTHER)), "b02": itself(MAC, OTHER)}
-    assert by_holder(entries_of("b02", around)) == {"b01": (Entry("b01", "mesh0", MAC), Entry("b01", "mesh0", OTHER))}
+    assert by_holder(entries_of("b02", around)) == {
+        "b01": (StationEntry("b01", "mesh0", MAC), StationEntry("b01", "mesh0", OTHER))
+    }
 
 
 def test_of_a_node_that_told_nothing_and_of_one_without_a_radio_in_a_mesh_nobody_is_asked() -> None:
@@ -66,8 +68,8 @@ def test_of_a_node_that_told_nothing_and_of_one_without_a_radio_in_a_mesh_nobody
 
 
 def test_a_station_table_of_any_length_has_few_asked() -> None:
-    entries = [Entry(f"n{number:03}", "mesh0", MAC) for number in range(200)]
-    assert list(by_holder(entries)) == [f"n{number:03}" for number in range(MOST_ASKED)]
+    entries = [StationEntry(f"n{number:03}", "mesh0", MAC) for number in range(200)]
+    assert list(by_holder(entries)) == [f"n{number:03}" for number in range(MAX_QUERIED)]
 
 
 @given(st.lists(st.floats(0, 30), max_size=20))
@@ -76,17 +78,17 @@ def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldo
 ) -> None:
     asked: list[float] = []
     for late_s in lateness:
-        due_s = next_ask_s(asked)
+        due_s = next_query_s(asked)
         asked.append(due_s + late_s if asked else late_s)
-    pauses = [next_ask_s(asked[: count + 1]) - asked[count] for count in range(len(asked))]
-    assert next_ask_s([]) < 0
+    pauses = [next_query_s(asked[: count + 1]) - asked[count] for count in range(len(asked))]
+    assert next_query_s([]) < 0
     assert pauses == pytest.approx(sorted(pauses))
-    assert all(FIRST_PAUSE_S - 1e-6 <= pause <= LONGEST_PAUSE_S + 1e-6 for pause in pauses)
+    assert all(FIRST_PAUSE_S - 1e-6 <= pause <= MAX_PAUSE_S + 1e-6 for pause in pauses)
 
 
 def test_of_two_radios_only_those_who_know_the_one_that_starts_anew_are_asked() -> None:
     around = {"b01": knows("b01", ("mesh0", MAC), ("mesh1", OTHER)), "b02": itself(MAC, OTHER)}
-    assert entries_of("b02", around, Radios(frozenset({"mesh1"}))) == (Entry("b01", "mesh1", OTHER),)
+    assert entries_of("b02", around, Radios(frozenset({"mesh1"}))) == (StationEntry("b01", "mesh1", OTHER),)
     assert entries_of("b02", around, NO_RADIOS) == ()
 
 
@@ -100,19 +102,19 @@ def test_whom_the_node_hears_and_who_told_nothing_may_know_it() -> None:
         "b02": hears(BASE, OTHER),
     }
     names = {OTHER: "b03", MAC: "b02"}
-    assert silent_holders("b02", around, names, ("b01", "b02", "b03", "b04")) == ("b03",)
-    assert neighbours_now(around["b02"], {**names, BASE: "b01"}) == ("b01", "b03")
+    assert possible_holders("b02", around, names, ("b01", "b02", "b03", "b04")) == ("b03",)
+    assert current_neighbors(around["b02"], {**names, BASE: "b01"}) == ("b01", "b03")
 
 
 def test_who_answered_without_telling_of_its_stations_may_know_the_node() -> None:
     around = {"b01": replace(knows("b01"), stations=None), "b02": hears(OTHER)}
-    assert silent_holders("b02", around, {OTHER: "b01"}, ()) == ("b01",)
+    assert possible_holders("b02", around, {OTHER: "b01"}, ()) == ("b01",)
 
 
 def test_a_stranger_may_be_any_fellow_whose_radios_nobody_has_seen() -> None:
     around = {"b01": knows("b01"), "b02": hears("02:99:00:00:00:01")}
-    assert silent_holders("b02", around, {OTHER: "b03"}, ("b01", "b02", "b03", "b04")) == ("b04",)
-    assert silent_holders("b02", around, {"02:99:00:00:00:01": "b02"}, ("b04",)) == ()
+    assert possible_holders("b02", around, {OTHER: "b03"}, ("b01", "b02", "b03", "b04")) == ("b04",)
+    assert possible_holders("b02", around, {"02:99:00:00:00:01": "b02"}, ("b04",)) == ()
 
 
 def hop(name: str, mac: str, next_hop: str, *, best: bool = True) -> Observation:
@@ -136,10 +138,10 @@ def test_who_has_known_a_radio_from_before_its_node_booted_must_forget_it(
         ),
         "b02": at(itself(MAC), 1000.0, uptime_s=100.0),
     }
-    assert booted_unforgotten_s("b02", around) == (900.0 if is_old else None)
-    assert booted_unforgotten_s("b01", around) is None
-    assert booted_unforgotten_s("b02", {**around, "b02": at(itself(MAC), 1000.0, uptime_s=None)}) is None
-    assert booted_unforgotten_s("b03", around) is None
+    assert unflushed_boot_s("b02", around) == (900.0 if is_old else None)
+    assert unflushed_boot_s("b01", around) is None
+    assert unflushed_boot_s("b02", {**around, "b02": at(itself(MAC), 1000.0, uptime_s=None)}) is None
+    assert unflushed_boot_s("b03", around) is None
 
 
 def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -> None:
@@ -150,13 +152,13 @@ def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -
         "b04": hop("b04", BASE, MAC, best=False),
         "b05": hop("b05", OTHER, MAC),
     }
-    assert behind("b02", around, (BASE,)) == {"b03"}
-    assert behind("b02", around, ()) == frozenset()
+    assert routed_through("b02", around, (BASE,)) == {"b03"}
+    assert routed_through("b02", around, ()) == frozenset()
 
 
 def test_a_node_watches_its_own_entries_on_the_radios_that_may_restart() -> None:
     seen = knows("b02", ("mesh0", OTHER), ("mesh1", BASE))
-    assert own_entries("b02", seen, Radios(frozenset({"mesh1"}))) == (Entry("b02", "mesh1", BASE),)
+    assert own_entries("b02", seen, Radios(frozenset({"mesh1"}))) == (StationEntry("b02", "mesh1", BASE),)
     assert own_entries("b02", seen, NO_RADIOS) == ()
 
 
@@ -224,7 +226,7 @@ def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0
 
 def flushed(place: Path, now: Second, *, bat: str = "bat0", has_restarted: bool = False) -> str:
     """What a holder with such an entry prints when it is asked for entries of at least 11.2 s."""
-    text = flush_script([Entry("b01", "mesh0", MAC)], older_than_s=11.2, has_restarted=has_restarted)
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, has_restarted=has_restarted)
     printed, deleted = deletions(place, [now], text, bat=bat)
     assert deleted == ([f"1 mesh0 {MAC}"] if printed == f"gone {MAC}\n" else [])
     return printed
@@ -268,12 +270,12 @@ def test_where_there_is_no_batman_adv_only_a_restart_that_was_seen_counts(tmp_pa
 
 
 def test_an_entry_that_cannot_be_removed_is_reported(tmp_path: Path) -> None:
-    text = flush_script([Entry("b01", "mesh0", "unknown")], older_than_s=1)
+    text = flush_script([StationEntry("b01", "mesh0", "unknown")], older_than_s=1)
     assert deletions(tmp_path, [Second(100, 50, LOST)], text)[0] == "kept unknown\n"
 
 
 def test_a_holder_that_did_not_answer_before_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
-    text = flush_script([Entry("b01", "", MAC)], older_than_s=11.2)
+    text = flush_script([StationEntry("b01", "", MAC)], older_than_s=11.2)
     printed, deleted = deletions(tmp_path, [Second(100, 50, LOST)], text)
     assert printed == f"gone {MAC}\n" * 2
     assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
@@ -281,7 +283,7 @@ def test_a_holder_that_did_not_answer_before_looks_on_all_of_its_interfaces(tmp_
 
 def watched(place: Path, seconds: list[Second]) -> list[int]:
     """When an entry like this is deleted by a holder that watches it."""
-    text = watch_script("b02", [Entry("b01", "mesh0", MAC)], for_s=len(seconds))
+    text = watch_script("b02", [StationEntry("b01", "mesh0", MAC)], for_s=len(seconds))
     _, deleted = deletions(place, [*seconds, *seconds[-1:]], text)
     assert all(line.endswith(f" mesh0 {MAC}") for line in deleted)
     return [int(line.split()[0]) for line in deleted]
@@ -309,7 +311,7 @@ def test_where_removing_it_does_not_help_it_is_not_repeated_for_ever(tmp_path: P
 
 
 def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
-    evil = [Entry("b01", "mesh0; touch x", "$(touch x)"), Entry("b01", "'; touch x; '", "`touch x`")]
+    evil = [StationEntry("b01", "mesh0; touch x", "$(touch x)"), StationEntry("b01", "'; touch x; '", "`touch x`")]
     for has_restarted in (False, True):
         text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)
         deletions(tmp_path, [Second(100, 5000, LOST)] * 9, text)

@@ -13,9 +13,9 @@ from typing import cast
 
 import pytest
 
-from meshctl.apply.context import Job, Work
-from meshctl.apply.neighbor_query import REMEMBERED_S, neighbours_of
-from meshctl.apply.station_flush import Forgetting, ask_the_rest, make_up_for
+from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
+from meshctl.apply.station_flush import StationFlush, flush_later, retry_unanswered
 from meshctl.device.observation import Observation, Station, WirelessLink
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
@@ -49,21 +49,23 @@ class Neighbours:
         self.notes: list[str] = []
         self.steps: list[str] = []
         self.work = cast(
-            "Work",
+            "RunContext",
             SimpleNamespace(
                 fleet=fleet(),
-                around=around,
-                current_names=lambda: {mac: name for name, mac in MACS.items()},
-                bases=(),
-                later=[],
+                observations=around,
+                current_mac_owners=lambda: {mac: name for name, mac in MACS.items()},
+                base_macs=(),
+                unfinished_flushes=[],
                 interrupt=SimpleNamespace(leaving=False),
-                access=SimpleNamespace(take=lambda name: None, open=self._open, keep=lambda name, kept: None),
+                connections=SimpleNamespace(
+                    acquire=lambda name: None, open=self._open, release=lambda name, kept: None
+                ),
                 note=lambda text, name: self.notes.append(f"{name}: {text}"),
             ),
         )
         before = around.get("b02") or node("b02")
-        job = SimpleNamespace(name="b02", node=fleet().nodes["b02"], work=self.work, step=self._step, before=before)
-        self.job = cast("Job", job)
+        job = SimpleNamespace(name="b02", node=fleet().nodes["b02"], run=self.work, step=self._step, before=before)
+        self.job = cast("NodeContext", job)
 
     def _open(self, there: SimpleNamespace, **_: object) -> SimpleNamespace:
         if there.name in self.silent:
@@ -90,58 +92,58 @@ def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighb
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
-    monkeypatch.setattr("meshctl.apply.station_flush.next_ask_s", lambda asked_s: float("-inf"))
-    forgetting = Forgetting(near.job)
-    forgetting.begins()
+    monkeypatch.setattr("meshctl.apply.station_flush.next_query_s", lambda asked_s: float("-inf"))
+    forgetting = StationFlush(near.job)
+    forgetting.started()
     for _ in range(5):
-        forgetting.while_silent()
-    forgetting.when_back()
+        forgetting.unreachable()
+    forgetting.ended()
     assert near.names == ["b01"] * 6
-    assert near.steps == ["neighbours forget it"]
+    assert near.steps == ["flush neighbor station entries"]
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
 
 
 def test_of_a_node_whose_radios_stay_as_they_are_nobody_is_asked_unless_it_rebooted() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
-    forgetting = Forgetting(near.job, NO_RADIOS)
-    forgetting.begins()
-    forgetting.while_silent()
-    forgetting.when_back(node("b02"))
+    forgetting = StationFlush(near.job, NO_RADIOS)
+    forgetting.started()
+    forgetting.unreachable()
+    forgetting.ended(node("b02"))
     assert near.asked == []
-    forgetting.when_back(node("b02"), rebooted=True)
+    forgetting.ended(node("b02"), rebooted=True)
     assert near.names == ["b01"]
 
 
 def test_who_did_not_tell_when_the_plan_was_made_is_asked_when_the_node_is_back() -> None:
     near = Neighbours({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
-    forgetting = Forgetting(near.job)
-    forgetting.begins()
-    forgetting.while_silent()
+    forgetting = StationFlush(near.job)
+    forgetting.started()
+    forgetting.unreachable()
     assert near.names == ["b01"]
     near.silent.clear()
-    forgetting.when_back(node("b02", "b04"))
+    forgetting.ended(node("b02", "b04"))
     # b03 was heard before, b04 is heard now: neither told, so each looks on whatever interfaces it has
     assert near.names == ["b01", "b01", "b03", "b04"]
     assert all("iw dev 2>/dev/null" in script for name, script in near.asked if name != "b01")
-    assert near.work.later == []
+    assert near.work.unfinished_flushes == []
 
 
 def test_who_does_not_answer_then_either_is_asked_once_more_in_the_end_and_the_operator_is_told_of_the_rest() -> None:
     near = Neighbours(
         {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
     )
-    forgetting = Forgetting(near.job)
-    forgetting.begins()
-    forgetting.when_back(node("b02"))
+    forgetting = StationFlush(near.job)
+    forgetting.started()
+    forgetting.ended(node("b02"))
     assert near.asked == []
     assert near.notes == []
     near.silent = {"b03", "b04"}
-    assert ask_the_rest(near.work) == {"b02": ("b03", "b04")}
+    assert retry_unanswered(near.work) == {"b02": ("b03", "b04")}
     assert near.names == ["b01"]
     assert near.notes == [
         "b02: b01 removed a stale entry of its radio",
         "b02: b03 and b04 did not answer and may hold a stale entry of its radio: "
-        "what it sends them may be lost for minutes",
+        "unicast frames to them may be lost for minutes",
     ]
 
 
@@ -149,37 +151,37 @@ def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytes
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    forgetting = Forgetting(near.job)
-    forgetting.begins()
+    forgetting = StationFlush(near.job)
+    forgetting.started()
     now_s[0] += 10.0
     near.log_in = lambda: now_s.__setitem__(0, now_s[0] + 7.0)
-    forgetting.when_back(node("b02"))
+    forgetting.ended(node("b02"))
     assert f"flush_stale mesh0 {MAC} 17\n" in near.asked[0][1]
 
 
 def test_who_cannot_forget_is_told_to_the_operator() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
-    forgetting = Forgetting(near.job)
-    forgetting.begins()
-    forgetting.when_back(node("b02"))
-    assert near.notes == ["b02: b01 cannot remove its stale entry: what it sends them may be lost for minutes"]
+    forgetting = StationFlush(near.job)
+    forgetting.started()
+    forgetting.ended(node("b02"))
+    assert near.notes == ["b02: b01 cannot remove its stale entry: unicast frames to them may be lost for minutes"]
 
 
 def test_who_cannot_find_out_removes_the_entry_only_of_a_radio_that_was_seen_to_restart() -> None:
     for index, has_restarted in ((7, False), (8, True)):
         near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
-        forgetting = Forgetting(near.job)
-        forgetting.begins()
-        forgetting.when_back(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
+        forgetting = StationFlush(near.job)
+        forgetting.started()
+        forgetting.ended(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
         assert ["flush_restarted mesh0" in script for _, script in near.asked] == [False, True][: 1 + has_restarted]
 
 
 def test_a_change_whose_end_nobody_saw_is_made_up_for_if_the_radio_has_started_since() -> None:
     same = Neighbours({"b02": node("b02", "b01", connected_s=500)})
-    make_up_for(same.job, ago_s=100.0)
+    flush_later(same.job, ago_s=100.0)
     assert same.asked == []
     anew = Neighbours({"b02": node("b02", "b01", connected_s=50)})
-    make_up_for(anew.job, ago_s=100.0)
+    flush_later(anew.job, ago_s=100.0)
     assert anew.names == ["b01"]
     assert re.search(r"flush_stale .* 10[01]\n", anew.asked[0][1])
 
@@ -190,7 +192,7 @@ def test_of_a_node_that_booted_since_what_was_known_before_its_boot_is_forgotten
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 1003.0))
     seen = replace(node("b02", "b01"), asked_at_s=1000.0, uptime_s=40.0)
     booted = Neighbours({"b02": seen})
-    make_up_for(booted.job, ago_s=500.0)
+    flush_later(booted.job, ago_s=500.0)
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
 
 
@@ -201,8 +203,8 @@ def test_beside_whom_a_node_hears_those_are_looked_at_that_it_heard_lately() -> 
         "b01": LastKnown("b01", 1.0, {"macs": MACS["b01"]}),
         "b03": LastKnown("b03", 1.0, {"macs": MACS["b03"]}),
     }
-    assert neighbours_of(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S - 1) == ("b01", "b03")
-    assert neighbours_of(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S + 1) == ("b01",)
+    assert known_neighbors(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S - 1) == ("b01", "b03")
+    assert known_neighbors(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S + 1) == ("b01",)
 
 
 def test_radios_are_told_apart_by_name_unless_all_are_meant() -> None:
@@ -259,7 +261,7 @@ class TestOnAVirtualFleet:
             ended = rig.meshctl("provision", variant, "n001", "--yes", "--json")
             assert ended.results == {"n001": "done"}, ended.out + ended.err
             assert notes(ended) == []
-            assert not [event for event in ended.events if event.get("text") == "neighbours forget it"]
+            assert not [event for event in ended.events if event.get("text") == "flush neighbor station entries"]
 
     def test_a_node_that_is_put_back_from_a_backup_is_forgotten_by_its_neighbour(self, rig: Rig) -> None:
         folder = rig.directory / "backups"
@@ -279,8 +281,10 @@ class TestOnAVirtualFleet:
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
         assert ended.results == {"n001": "done"}, ended.out + ended.err
-        told = "base did not answer and may hold a stale entry of its radio: what it sends them may be lost for minutes"
-        assert notes(ended) == [told]
+        assert notes(ended) == [
+            "base did not answer and may hold a stale entry of its radio: "
+            "unicast frames to them may be lost for minutes"
+        ]
         assert ended.events[-1]["outcomes"][0]["facts"] == {"not_asked": "base"}
         _, new = rig.flip()
         said: list[str] = []

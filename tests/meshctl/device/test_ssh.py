@@ -454,10 +454,10 @@ def test_a_quiet_command_keeps_its_connection_because_its_server_gives_signs_of_
     ):
         node.run("/bin/busybox", "mkfifo", "/tmp/end")
         waiting = pool.submit(connected.run, "read -r end </tmp/end; echo $end")
-        first = connected._heard.at_s
-        eventually(lambda: connected._heard.at_s > first)
-        second = connected._heard.at_s
-        eventually(lambda: connected._heard.at_s > second)
+        first = connected._activity.last_received_s
+        eventually(lambda: connected._activity.last_received_s > first)
+        second = connected._activity.last_received_s
+        eventually(lambda: connected._activity.last_received_s > second)
         assert not waiting.done()
         with connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=PATIENT) as other:
             other.run("echo now >/tmp/end").check("end it")

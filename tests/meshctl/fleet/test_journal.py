@@ -44,11 +44,11 @@ def test_what_a_run_left_stands_until_a_later_run_takes_it_up(path: Path) -> Non
         second.finish_node(Outcome("b", Result.DONE))
         journal.begin("robots deploy", fleet="f", inventory="inv", nodes=("a",))
         journal.begin("provision", fleet="other", inventory="inv", nodes=("c",))
-        assert journal.left("f") == {3: ("a",), 1: ("a", "c")}
+        assert journal.unfinished_runs("f") == {3: ("a",), 1: ("a", "c")}
         third = journal.begin("resume", fleet="f", inventory="inv", nodes=("a", "c"))
         third.finish_node(Outcome("a", Result.DONE))
         third.finish_node(Outcome("c", Result.FAILED))
-        assert journal.left("f") == {5: ("c",), 3: ("a",)}
+        assert journal.unfinished_runs("f") == {5: ("c",), 3: ("a",)}
         assert [run.id for run in journal.runs(fleet="f", node="b")] == [2, 1]
 
 
@@ -59,18 +59,18 @@ def test_a_change_is_lost_sight_of_from_its_beginning_until_a_run_has_seen_how_i
             with first.step(name, "stage" if name == "c" else "apply"):
                 pass
         first.finish_node(Outcome("b", Result.ROLLED_BACK))
-        lost = journal.lost_sight_of("f")
+        lost = journal.unfinished_changes("f")
         assert lost == {"a": next(step.began_s for step in journal.steps(first.id, "a"))}
         first.finish_node(Outcome("a", Result.UNCERTAIN))
         second = journal.begin("resume", fleet="f", inventory="inv", nodes=("a",))
         second.finish_node(Outcome("a", Result.UNREACHABLE))
         robots = journal.begin("robots deploy", fleet="f", inventory="inv", nodes=("a",))
         robots.finish_node(Outcome("a", Result.DONE))
-        assert journal.lost_sight_of("f") == lost
-        assert journal.lost_sight_of("other") == {}
+        assert journal.unfinished_changes("f") == lost
+        assert journal.unfinished_changes("other") == {}
         third = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         third.finish_node(Outcome("a", Result.UNCHANGED))
-        assert journal.lost_sight_of("f") == {}
+        assert journal.unfinished_changes("f") == {}
 
 
 def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:
@@ -171,7 +171,7 @@ def test_a_journal_that_cannot_be_written_any_more_stops_no_work_and_is_told(pat
         run.remember("f", "a", {"boot_id": "1"}, 5.0)
         run.finish_node(Outcome("a", Result.DONE))
         run.end("1 done")
-        assert "cannot write the journal" in run.trouble
+        assert "cannot write the journal" in run.error
         # a resume looks at the node again
         assert journal.unfinished(run.id) == ("a",)
 
@@ -190,11 +190,11 @@ def test_what_a_held_journal_does_not_take_is_written_as_soon_as_it_is_free(path
             with run.step("a", "arm"):
                 run.remember("f", "a", {"boot_id": "1"}, 5.0)
             run.finish_node(Outcome("a", Result.DONE))
-            assert "locked" in run.trouble
+            assert "locked" in run.error
             assert journal.steps(run.id) == ()
         run.finish_node(Outcome("b", Result.DONE))
         run.end("2 done")
-        assert run.trouble == ""
+        assert run.error == ""
         assert [(step.step, step.result) for step in journal.steps(run.id)] == [("arm", "done")]
         assert [outcome.result for outcome in journal.outcomes(run.id)] == [Result.DONE, Result.DONE]
         assert journal.last_known("f")["a"].facts == {"boot_id": "1"}
@@ -207,10 +207,10 @@ def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
         (pages,) = database.execute("PRAGMA page_count").fetchone()
         database.execute(f"PRAGMA max_page_count = {pages}")
         run.finish_node(Outcome("a", Result.FAILED, "x" * 100_000))
-        assert "full" in run.trouble
+        assert "full" in run.error
         database.execute("PRAGMA max_page_count = 100000")
         run.end("1 failed")
-        assert (run.trouble, journal.outcomes(run.id)[0].result) == ("", Result.FAILED)
+        assert (run.error, journal.outcomes(run.id)[0].result) == ("", Result.FAILED)
 
 
 def test_a_journal_that_another_process_holds_can_be_read_and_says_who_to_look_for(
@@ -241,11 +241,11 @@ def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> 
         practised.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
         lab.remember("f", "b", {"version": "virtual"}, 1.0)
         field.remember("f", "b", {"version": "real"}, 2.0)
-        assert field.left("f") == {}
-        assert field.lost_sight_of("f") == {}
+        assert field.unfinished_runs("f") == {}
+        assert field.unfinished_changes("f") == {}
         assert {node: dict(last.facts) for node, last in field.last_known("f").items()} == {"b": {"version": "real"}}
-        assert lab.left("f") == {practised.id: ("a",)}
-        assert set(lab.lost_sight_of("f")) == {"a"}
+        assert lab.unfinished_runs("f") == {practised.id: ("a",)}
+        assert set(lab.unfinished_changes("f")) == {"a"}
         assert lab.last_known("f")["b"].facts == {"version": "virtual"}
         assert [(run.fleet, run.lab) for run in field.runs()] == [("f", "/lab")], "a journal without a lab lists all"
         assert (field.runs(fleet="f"), len(lab.runs(fleet="f"))) == ((), 1)
@@ -265,8 +265,8 @@ def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_the
         field.remember("f", "a", {"version": "x"}, 1.0)
         field.remember("practice", "a", {"version": "x"}, 1.0)
         for fleet in ("f", "practice"):
-            field.separate(fleet, lab_of)
-            field.separate(fleet, lab_of)
+            field.move_lab_runs(fleet, lab_of)
+            field.move_lab_runs(fleet, lab_of)
         assert [run.id for run in field.runs(fleet="f")] == [real.id]
         assert [run.id for run in lab.runs(fleet="f")] == [virtual.id]
         assert [run.id for run in lab.runs(fleet="practice")] == [only_virtual.id]

@@ -17,7 +17,7 @@ EVENTS = [
     Event(EventKind.STARTED, "b01", 1.0),
     Event(EventKind.STEP, "b01", 1.1, "stage"),
     Event(EventKind.PROGRESS, "b01", 1.2, fraction=0.5),
-    Event(EventKind.NOTE, "", 1.3, "3 nodes change at one moment"),
+    Event(EventKind.NOTE, "", 1.3, "3 nodes change simultaneously"),
     Event(EventKind.FINISHED, "b01", 1.4, GONE.reason, outcome=GONE),
 ]
 
@@ -29,7 +29,7 @@ def test_plain_lines_tell_steps_notes_and_outcomes() -> None:
             progress(event)
     assert out.getvalue().splitlines() == [
         "b01: stage",
-        "3 nodes change at one moment",
+        "3 nodes change simultaneously",
         "b01: rolled back: no neighbour came back (12.3 s)",
         "  hint: look at its antenna",
     ]

@@ -79,7 +79,7 @@ def test_an_interruption_lets_those_in_work_finish_and_begins_no_more() -> None:
 
     outcomes = run(NODES, work, parallel=1, interrupt=interrupt)
     assert outcomes["b00"].result is Result.DONE
-    assert outcomes["b01"] == Outcome("b01", Result.PENDING, "interrupted before its turn")
+    assert outcomes["b01"] == Outcome("b01", Result.PENDING, "interrupted before it started")
     assert interrupt.stopping
     assert not interrupt.leaving
     interrupt.request()

@@ -8,7 +8,7 @@ from pathlib import Path
 from meshctl.device.ssh import SshConnection
 from meshctl.device.trust import TrustStore
 from meshctl.inventory import load_fleet
-from meshctl.nodes.connections import Access
+from meshctl.nodes.connections import ConnectionPool
 
 ROOT = Path(__file__).resolve().parents[3]
 PATIENCE_S = 60.0
@@ -33,14 +33,14 @@ class Kept(SshConnection):
 
 def test_kept_connections_are_closed_side_by_side_before_those_they_go_through(tmp_path: Path) -> None:
     closed: list[str] = []
-    access = Access(load_fleet(ROOT / "inventory/lab"), TrustStore(tmp_path / "known_hosts"))
+    access = ConnectionPool(load_fleet(ROOT / "inventory/lab"), TrustStore(tmp_path / "known_hosts"))
     together = threading.Barrier(8)
     for number in range(8):
-        access.keep(f"b{number}", Kept(f"b{number}", together, closed))
+        access.release(f"b{number}", Kept(f"b{number}", together, closed))
     access._jumps["base"] = Kept("base", threading.Barrier(1), closed)
     access.close()
     assert closed[-1] == "base"
     assert sorted(closed[:-1]) == [f"b{number}" for number in range(8)]
-    assert access.take("b0") is None
+    assert access.acquire("b0") is None
     access.close()
     assert len(closed) == 9

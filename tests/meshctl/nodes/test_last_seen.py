@@ -7,7 +7,7 @@ from typing import Any
 
 from meshctl.device.observation import MeshNeighbour, Observation, Originator, Station
 from meshctl.fleet.journal import LastKnown
-from meshctl.nodes.last_seen import Whereabouts, whereabouts
+from meshctl.nodes.last_seen import LastSeen, last_seen_of
 from tests.meshctl.plan.support import fleet, running
 
 LOST = "02:00:00:00:01:03"
@@ -24,8 +24,8 @@ def hears(name: str, age_ms: int, **changes: Any) -> Observation:
     return replace(seen, neighbours=(MeshNeighbour(LOST.upper(), "mesh0", age_ms),), **changes)
 
 
-def of(**observations: Observation) -> Whereabouts:
-    return whereabouts(fleet(), ["b03"], observations, KNOWN)["b03"]
+def of(**observations: Observation) -> LastSeen:
+    return last_seen_of(fleet(), ["b03"], observations, KNOWN)["b03"]
 
 
 def test_the_last_sighting_and_those_who_hear_it_are_told_the_latest_first() -> None:
@@ -43,9 +43,7 @@ def test_where_no_neighbour_hears_it_a_way_that_somebody_knew_is_told() -> None:
         running(fleet(), "base"), originators=(Originator(LOST, "02:00:00:00:01:00", "mesh0", 12_000, True, 90),)
     )
     assert (
-        of(base=far)
-        .text(NOW_S)
-        .endswith("; no neighbour that answers hears it; a way to it was known by base 12 s ago")
+        of(base=far).text(NOW_S).endswith("; no reachable neighbor hears it; a route to it is known by base 12 s ago")
     )
 
 
@@ -55,7 +53,7 @@ def test_nobody_who_hears_it_is_told_with_the_number_of_those_asked() -> None:
         .text(NOW_S)
         .endswith("; heard by none of the 2 nodes that answered")
     )
-    assert of().text(NOW_S).endswith("; no other node could be asked")
+    assert of().text(NOW_S).endswith("; no other node is reachable")
 
 
 def test_what_batman_has_long_forgotten_does_not_count() -> None:
@@ -63,8 +61,8 @@ def test_what_batman_has_long_forgotten_does_not_count() -> None:
 
 
 def test_a_node_never_seen_is_told_as_such_and_an_old_sighting_with_its_day() -> None:
-    assert whereabouts(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
-        "never seen before; no other node could be asked"
+    assert last_seen_of(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
+        "never seen before; no other node is reachable"
     )
     assert "last seen 3 d ago (1970-01-01 02:46 UTC)" in of().text(10_000.0 + 3 * 86400)
 

@@ -13,7 +13,7 @@ from typing import Any
 from meshctl.device.observation import BoardInfo, ChangeStatus, FileInfo, MeshNeighbour, Observation, ReleaseInfo
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet, Node, Secret, SecretRef
-from meshctl.plan import NodePlan, Wanted, node_plan
+from meshctl.plan import DesiredState, NodePlan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.packages import Needs
 from meshctl.render import render_node
@@ -101,10 +101,10 @@ def secret(ref: SecretRef) -> Secret:
     return Secret(PASS_PHRASE)
 
 
-def wanted(team: Fleet, name: str) -> Wanted:
+def wanted(team: Fleet, name: str) -> DesiredState:
     rendered = render_node(team, name, secret)
     needs = Needs(tuple((package,) for package in rendered.packages), rendered.removed_packages)
-    return Wanted(team.nodes[name], rendered.files, (PASS_PHRASE,), needs)
+    return DesiredState(team.nodes[name], rendered.files, (PASS_PHRASE,), needs)
 
 
 def running(

@@ -11,7 +11,7 @@ import pytest
 from meshctl.errors import InputError
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import Plan, StageKind, Verdict, fleet_plan
-from meshctl.plan.saved import SavedPlan, dump, load, moved_on
+from meshctl.plan.saved import SavedPlan, dump, load, stale_reason
 from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running, two_meshes
 
 TEAM = ("base", "b01", "b02", "b03", "b04", "b05")
@@ -76,7 +76,7 @@ def test_one_that_stayed_in_the_old_cell_comes_back_alone_when_the_rest_is_seen_
     new = fleet(channel=11)
     stray = plans(new, {"b01": running(fleet(), "b01")})
     others = plans(new, {name: running(new, name) for name in TEAM if name != "b01"})
-    plan = fleet_plan(new, stray, STAR, now_s=0.0, around=others)
+    plan = fleet_plan(new, stray, STAR, now_s=0.0, unchanged=others)
     assert (plan.refusal, [stage.nodes for stage in plan.stages]) == ("", [("b01",)])
     assert plan.stages[0].kind is not StageKind.SWITCH
 
@@ -85,14 +85,14 @@ def test_others_that_still_run_the_old_cell_are_not_left_behind_by_a_part_of_the
     new = fleet(channel=11)
     some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
     others = plans(new, {name: running(fleet(), name) for name in TEAM[3:]})
-    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, around=others).refusal
+    assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, unchanged=others).refusal
 
 
 def test_members_that_are_refused_in_the_old_cell_block_a_switch_however_many_they_are() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name, uci_changes=("system.x",) if name > "b01" else ()) for name in TEAM}
     plan = fleet_plan(new, plans(new, seen), STAR, now_s=0.0)
-    assert "changes its cell, and not every member can take part" in plan.refusal
+    assert "changes its cell, but not every member can take part" in plan.refusal
 
 
 def test_even_a_base_that_hears_nobody_does_not_leave_its_mesh_unasked() -> None:
@@ -111,7 +111,7 @@ def test_a_switch_with_a_refused_member_is_refused() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name) for name in TEAM}
     seen["b02"] = replace(seen["b02"], uci_changes=("network.lan=x",))
-    assert "b02: somebody has uncommitted changes" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
+    assert "b02: it has uncommitted UCI changes" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
 
 
 def test_a_switch_and_new_firmware_at_once_are_refused() -> None:
@@ -125,7 +125,7 @@ def test_flashing_a_cut_vertex_has_to_be_acknowledged() -> None:
     line = graph("base-b01", "b01-b02")
     todo = plans(team, {"b01": running(team, "b01")})
     plan = fleet_plan(team, todo, line, now_s=0.0)
-    assert plan.refusal == "flashing b01 cuts off b02, for good if it does not come back"
+    assert plan.refusal == "flashing b01 cuts off b02, permanently if it does not come back"
     assert fleet_plan(team, todo, line, now_s=0.0, accept_cuts=["b01"]).refusal == ""
 
 
@@ -190,13 +190,11 @@ def test_what_is_no_json_is_refused() -> None:
 
 def test_a_node_that_moved_on_is_told_from_one_that_did_not() -> None:
     agreed = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
-    assert moved_on(agreed, agreed) == ""
+    assert stale_reason(agreed, agreed) == ""
     edited = running(fleet(), "b01")
     assert edited.uci is not None
     edited = replace(edited, uci={**edited.uci, "dhcp": edited.uci["dhcp"] + "config dhcp 'wan'\n"})
-    assert "not as it was" in moved_on(agreed, planned(fleet(channel=11), "b01", edited))
-    assert "inventory wants something else" in moved_on(
-        agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01"))
-    )
+    assert "has changed since" in stale_reason(agreed, planned(fleet(channel=11), "b01", edited))
+    assert "inventory has changed" in stale_reason(agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01")))
     rebooted = replace(running(fleet(), "b01"), boot_id="another", uptime_s=3.0)
-    assert moved_on(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""
+    assert stale_reason(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""

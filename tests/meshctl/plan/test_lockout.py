@@ -9,7 +9,7 @@ import pytest
 
 from meshctl.device.connection import OwnKey
 from meshctl.model import Release
-from meshctl.plan import Verdict, Wanted
+from meshctl.plan import DesiredState, Verdict
 from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout, server_lockout
 from meshctl.uci import parse
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
@@ -20,7 +20,7 @@ OURS = OwnKey("agent key alice", "ssh-ed25519", base64.b64decode(AUTHORIZED.spli
 OTHER = OwnKey("key /home/bob/.ssh/id_ed25519", "ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes(32))
 
 
-def contents(want: Wanted) -> dict[str, bytes]:
+def contents(want: DesiredState) -> dict[str, bytes]:
     return {file.path: file.content for file in want.files}
 
 
@@ -40,7 +40,7 @@ def test_a_change_that_lets_in_none_of_our_keys_is_refused_with_both_lists() -> 
 def test_without_any_key_nothing_is_begun() -> None:
     plan = planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=())
     assert plan.verdict is Verdict.REFUSED
-    assert plan.reason.endswith("the keys we have: none")
+    assert plan.reason.endswith("your keys: none")
 
 
 def test_a_node_to_which_nothing_is_done_needs_none_of_our_keys() -> None:
@@ -57,7 +57,7 @@ def test_1907_lets_in_rsa_alone() -> None:
     assert lockout(want.node, contents(want), (OURS,)) is None
     refused = lockout(old, contents(want), (OURS,))
     assert refused is not None
-    assert "the keys we have that OpenWrt 19.07 knows: none" in refused.reason
+    assert "your keys that OpenWrt 19.07 supports: none" in refused.reason
 
 
 def test_another_user_than_root_has_keys_of_its_own() -> None:
@@ -70,7 +70,7 @@ def test_a_line_that_is_no_key_is_told_as_one() -> None:
     want = wanted(TEAM, "b01")
     refused = lockout(want.node, {AUTHORIZED_KEYS: b"ssh-rsa AAAA! x\n"}, ())
     assert refused is not None
-    assert "it gets the keys one that cannot be read" in refused.reason
+    assert "it gets the keys an unreadable key" in refused.reason
 
 
 NETWORK = """\
@@ -90,8 +90,8 @@ config interface 'wan'
     [
         ("", ""),
         ("\toption Interface 'lan'\n", ""),
-        ("\toption enable '0'\n", "its dropbear is off"),
-        ("\toption enable 'off'\n", "its dropbear is off"),
+        ("\toption enable '0'\n", "its dropbear is disabled"),
+        ("\toption enable 'off'\n", "its dropbear is disabled"),
         ("\toption Interface 'nosuch'\n", "dropbear would wait for Interface nosuch"),
         # a network that is there, whose address may never come
         ("\toption Interface 'wan'\n", "dropbear would wait for Interface wan"),

@@ -32,7 +32,7 @@ def test_a_factory_device_gets_everything_and_nothing_in_use_is_cut() -> None:
     assert plan.verdict is Verdict.CHANGE
     assert {file.path for file in plan.files} == {file.path for file in wanted(fleet(), "b01").files}
     assert (plan.has_cell, plan.is_meshed, plan.splits) == (False, False, ())
-    assert any("moves from 192.168.1.1 to 10.42.0.101" in effect.why for effect in plan.effects)
+    assert any("changes from 192.168.1.1 to 10.42.0.101" in effect.why for effect in plan.effects)
 
 
 def test_another_channel_parts_the_node_from_its_mesh_and_says_so() -> None:
@@ -80,7 +80,7 @@ def test_what_no_reader_accepts_is_replaced_and_not_shown() -> None:
 
 
 def test_a_silent_node_is_away_with_its_reason() -> None:
-    plan = planned(fleet(), "b01", None, away="no answer at 10.42.0.101")
+    plan = planned(fleet(), "b01", None, unreachable="no answer at 10.42.0.101")
     assert (plan.verdict, plan.reason) == (Verdict.AWAY, "no answer at 10.42.0.101")
 
 
@@ -88,20 +88,20 @@ def test_a_silent_node_is_away_with_its_reason() -> None:
     ("changes", "reason"),
     [
         ({"board": BoardInfo("ubnt,rocket-m")}, "wrong board: expected compex,wpj344-16m (box), found ubnt,rocket-m"),
-        ({"board": None}, "it did not tell its board"),
-        ({"uci": None}, "it did not tell its configuration"),
+        ({"board": None}, "cannot read its board"),
+        ({"uci": None}, "cannot read its configuration"),
         (
             {"release": ReleaseInfo("OpenWrt", "21.02.7", "r1", "ath79/generic")},
             "its configuration is for OpenWrt 23.05, it runs 21.02.7",
         ),
         ({"macs": {"lan1": "02:00:00:00:00:10"}}, "it has no port eth0: found lan1"),
-        ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "somebody has uncommitted changes on it"),
+        ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "it has uncommitted UCI changes"),
         ({"packages": {"dropbear": "1"}}, "it lacks batctl-default, iw, kmod-batman-adv"),
         (
             {"change": ChangeStatus("idle", lock_owner="bob@laptop:1", lock_left_s=42.0)},
-            "bob@laptop:1 has locked it for another 42 s",
+            "locked by bob@laptop:1 for 42 more seconds",
         ),
-        ({"change": ChangeStatus("applied", owner="bob@laptop:1")}, "a change of bob@laptop:1 is applied on it"),
+        ({"change": ChangeStatus("applied", owner="bob@laptop:1")}, "bob@laptop:1 has a change applied on it"),
     ],
 )
 def test_what_must_not_be_touched_is_refused_with_its_reason(changes: dict[str, Any], reason: str) -> None:
@@ -115,7 +115,7 @@ def test_a_radio_at_another_path_is_refused() -> None:
     assert seen.uci is not None
     moved = {**seen.uci, "wireless": seen.uci["wireless"].replace("18100000", "18200000")}
     plan = planned(fleet(), "b01", replace(seen, uci=moved))
-    assert "radio0 stands at another path: expected platform/ahb/18100000.wmac" in plan.reason
+    assert "wrong path of radio0: expected platform/ahb/18100000.wmac" in plan.reason
 
 
 def test_our_own_lock_is_no_obstacle() -> None:
@@ -172,6 +172,6 @@ def test_a_port_that_leads_to_a_switch_of_tagged_frames_is_planned_with_a_word_o
         for file in want.files
     )
     (note,) = node_plan(replace(want, files=kept), behind, FINGERPRINTS).notes
-    assert note.startswith("eth0 leads to a switch, whose LAN is eth0.1")
+    assert note.startswith("eth0 connects to a switch whose LAN is eth0.1")
     assert node_plan(want, behind, FINGERPRINTS).notes == ()
     assert node_plan(replace(want, files=kept), seen, FINGERPRINTS).notes == ()

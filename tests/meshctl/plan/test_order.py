@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from meshctl.model import ApplyPolicy
 from meshctl.plan import Cut, Effect, NodePlan, StageKind, Verdict
-from meshctl.plan.order import Surroundings, stages_of
+from meshctl.plan.order import MeshContext, stages_of
 from meshctl.topology import Graph, Link, graph_of
 from tests.meshctl.plan.support import graph
 
@@ -23,8 +23,8 @@ def changing(name: str, *, cut: Cut = Cut.MESH, is_meshed: bool = True) -> NodeP
     )
 
 
-def around(mesh: Graph, *, max_down: int = 1, canary: bool = False, **robots: str) -> Surroundings:
-    return Surroundings(mesh, "base", ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
+def around(mesh: Graph, *, max_down: int = 1, canary: bool = False, **robots: str) -> MeshContext:
+    return MeshContext(mesh, "base", ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
 
 
 @st.composite
@@ -64,7 +64,7 @@ def test_one_at_a_time_no_node_goes_before_a_farther_one(mesh: Graph) -> None:
 def test_a_line_goes_from_its_end_and_names_its_cut_vertices() -> None:
     stages = stages_of([changing(name) for name in NAMES[:4]], around(graph("base-b00", "b00-b01", "b01-b02")))
     assert [stage.nodes for stage in stages] == [("b02",), ("b01",), ("b00",), ("base",)]
-    assert stages[1].reason == "alone, a cut vertex: while it is down b02 cannot be reached"
+    assert stages[1].reason == "alone, because it is a cut vertex: while it is down b02 cannot be reached"
     assert stages[0].reason == "b02 is 3 hops away, quality 73%"
 
 

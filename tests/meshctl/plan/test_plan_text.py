@@ -32,7 +32,7 @@ def test_it_begins_with_the_totals_and_gives_every_stage_its_reason() -> None:
     text = read(another_host_name())
     assert text.startswith("fleet team: 2 to change, 1 as wanted\nreached through base\n")
     assert "  1  rolling b02\n             b02 is 2 hops away" in text
-    assert "alone, a cut vertex: while it is down b02 cannot be reached" in text
+    assert "alone, because it is a cut vertex: while it is down b02 cannot be reached" in text
 
 
 def test_it_tells_what_is_cut_and_shows_masked_differences() -> None:
@@ -50,7 +50,7 @@ def test_a_refusal_stands_at_its_end_with_its_remedy() -> None:
     seen = {name: None if name == "b02" else running(fleet(), name) for name in ("base", "b01", "b02")}
     text = read(fleet_plan(new, plans(new, seen), LINE, now_s=0.0))
     assert "b02  away: did not answer" in text
-    assert "refused: mesh main changes its cell, and would leave behind b02, b03, b04, b05" in text
+    assert "refused: mesh main changes its cell and would leave behind b02, b03, b04, b05" in text
     assert text.endswith("acknowledge with --leave-behind b02,b03,b04,b05")
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from meshctl.device.observation import Station
-from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarted, started_within
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios, started_within
 from meshctl.uci import Package, parse
 from tests.meshctl.plan.support import fleet, running
 
@@ -45,27 +45,27 @@ def wireless(old: str = "", new: str = "") -> Package:
     ],
 )
 def test_only_the_radio_whose_own_settings_or_interface_differ_starts_anew(old: str, new: str, ifname: str) -> None:
-    assert restarted(wireless(), wireless(old, new)) == Radios(frozenset({ifname}))
+    assert restarting_radios(wireless(), wireless(old, new)) == Radios(frozenset({ifname}))
 
 
 def test_a_radio_that_is_taken_out_of_the_settings_stops() -> None:
     _, _, without = WIRELESS.partition("config wifi-device 'radio1'")
-    assert restarted(wireless(), parse(WIRELESS.removesuffix("config wifi-device 'radio1'" + without), "wireless")) == (
-        Radios(frozenset({"mesh1"}))
-    )
+    assert restarting_radios(
+        wireless(), parse(WIRELESS.removesuffix("config wifi-device 'radio1'" + without), "wireless")
+    ) == (Radios(frozenset({"mesh1"})))
 
 
 def test_other_quoting_and_order_of_options_start_no_radio() -> None:
     same = wireless("option ifname 'mesh0'\n\toption key 'one'", 'option key one\n\toption ifname "mesh0"')
-    assert restarted(wireless(), same) == NO_RADIOS
+    assert restarting_radios(wireless(), same) == NO_RADIOS
     assert not NO_RADIOS
 
 
 def test_where_names_or_files_are_not_known_every_radio_may_have_started() -> None:
     nameless = wireless("\toption ifname 'mesh1'\n", "")
-    assert restarted(nameless, wireless()) == EVERY_RADIO
-    assert restarted(None, wireless()) == EVERY_RADIO
-    assert restarted(wireless(), None) == EVERY_RADIO
+    assert restarting_radios(nameless, wireless()) == EVERY_RADIO
+    assert restarting_radios(None, wireless()) == EVERY_RADIO
+    assert restarting_radios(wireless(), None) == EVERY_RADIO
     assert "anything" in EVERY_RADIO
 
 

@@ -64,7 +64,7 @@ def test_a_backup_brings_back_what_was(rig: Rig) -> None:
     assert restored.code == 0, restored.out + restored.err
     assert rig.state_of("n001", "split", rig.current) == "new"
     wrong = rig.meshctl("restore", rig.current, "n002", str(file), "--yes")
-    assert "the backup is of n001, not of n002" in wrong.err
+    assert "the backup is of node n001, not n002" in wrong.err
 
 
 def test_a_command_runs_on_all_nodes_and_a_failure_is_told(rig: Rig) -> None:

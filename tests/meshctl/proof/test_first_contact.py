@@ -46,7 +46,7 @@ def test_a_device_is_taken_in_only_by_who_will_be_let_in_and_keeps_what_its_boar
         )
         refused = rig.meshctl("bootstrap", "a", "n001", "--yes", "--json")
         assert refused.results == {"n001": "refused"}, refused.out + refused.err
-        assert "nobody here could log in to it afterwards" in refused.out
+        assert "you could not log in to it afterwards" in refused.out
         assert node.exec("cat /etc/config/*").stdout == before
         key.write_bytes(right)
         taken = rig.meshctl("bootstrap", "a", "n001", "--yes", "--json")

@@ -41,7 +41,7 @@ def test_packages_come_first_a_flash_that_is_not_ready_is_waited_for_and_netifd_
             said = []
             for text in process.stdout:
                 said.append(text)
-                if "its flash is not ready yet" in text:
+                if "waiting for its flash" in text:
                     # nothing is written to a node whose flash would lose it
                     assert "n001: stage\n" not in said
                     mark.unlink()

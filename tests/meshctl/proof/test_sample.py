@@ -49,7 +49,7 @@ def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_chang
     rig.fleet.repair("n001")
     resumed = rig.meshctl("resume", "a", "--yes")
     assert "n001: uncertain after run" in resumed.out
-    assert "it runs what it ran before" in resumed.out
+    assert "it runs its previous state" in resumed.out
     assert resumed.code == 0, resumed.out + resumed.err
     assert rig.state_of("n001", "split", "a") == "new"
     rig.current = "a"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from meshctl.topology import Heard, Link, Report, Sighting, neighbours_of, observed_graph, seen_by
+from meshctl.topology import HeardNeighbor, Link, Report, Sighting, neighbours_of, observed_graph, seen_by
 
-BASE = Report("base", ("02:00:00:00:00:01",), (Heard("02:00:00:00:00:02", 100, 0.9),))
+BASE = Report("base", ("02:00:00:00:00:01",), (HeardNeighbor("02:00:00:00:00:02", 100, 0.9),))
 B01 = Report(
-    "b01", ("02:00:00:00:00:02",), (Heard("02:00:00:00:00:01", 200, 0.7), Heard("02:00:00:00:00:03", 4000, 0.5, -71))
+    "b01",
+    ("02:00:00:00:00:02",),
+    (HeardNeighbor("02:00:00:00:00:01", 200, 0.7), HeardNeighbor("02:00:00:00:00:03", 4000, 0.5, -71)),
 )
 
 
@@ -25,7 +27,7 @@ def test_a_stranger_stands_under_its_mac() -> None:
 
 
 def test_a_neighbour_silent_for_long_is_no_link() -> None:
-    stale = Report("b01", ("02:00:00:00:00:02",), (Heard("02:00:00:00:00:01", 60_000, 1.0),))
+    stale = Report("b01", ("02:00:00:00:00:02",), (HeardNeighbor("02:00:00:00:00:01", 60_000, 1.0),))
     assert observed_graph([stale], known_macs={"02:00:00:00:00:01": "base"}).links == ()
 
 
@@ -40,20 +42,20 @@ def test_who_hears_a_silent_node_is_told_with_its_age() -> None:
 
 def test_of_a_neighbours_radios_the_best_one_counts() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky", "02:00:00:00:00:03": "husky"}
-    front, rear = Heard("02:00:00:00:00:01", 100, 0.4, -60), Heard("02:00:00:00:00:02", 900, 0.8, -75)
-    unmeasured = Heard("02:00:00:00:00:03", 10, None, -40)
+    front, rear = HeardNeighbor("02:00:00:00:00:01", 100, 0.4, -60), HeardNeighbor("02:00:00:00:00:02", 900, 0.8, -75)
+    unmeasured = HeardNeighbor("02:00:00:00:00:03", 10, None, -40)
     assert neighbours_of(Report("base", (), (front, rear, unmeasured)), names) == {"husky": rear}
     assert neighbours_of(Report("base", (), (unmeasured, front)), names) == {"husky": front}
 
 
 def test_without_measured_quality_the_stronger_signal_counts_then_the_later_sighting() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky"}
-    weak, strong = Heard("02:00:00:00:00:01", 10, None, -80), Heard("02:00:00:00:00:02", 900, None, -60)
+    weak, strong = HeardNeighbor("02:00:00:00:00:01", 10, None, -80), HeardNeighbor("02:00:00:00:00:02", 900, None, -60)
     assert neighbours_of(Report("base", (), (weak, strong)), names) == {"husky": strong}
-    early, late = Heard("02:00:00:00:00:01", 900), Heard("02:00:00:00:00:02", 10)
+    early, late = HeardNeighbor("02:00:00:00:00:01", 900), HeardNeighbor("02:00:00:00:00:02", 10)
     assert neighbours_of(Report("base", (), (early, late)), names) == {"husky": late}
 
 
 def test_a_node_does_not_neighbour_itself() -> None:
-    own = Report("husky", ("02:00:00:00:00:01",), (Heard("02:00:00:00:00:02", 10, 0.9),))
+    own = Report("husky", ("02:00:00:00:00:01",), (HeardNeighbor("02:00:00:00:00:02", 10, 0.9),))
     assert neighbours_of(own, {"02:00:00:00:00:02": "husky"}) == {}

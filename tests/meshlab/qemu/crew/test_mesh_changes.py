@@ -81,7 +81,7 @@ def test_the_running_mesh_is_changed_from_its_far_end_and_radios_that_start_anew
     begun = [event["node"] for event in first if event["event"] == "started"]
     assert begun == far_first[: len(begun)]
     steps = [event["text"] for event in first if event["event"] == "step" and event["node"] == "b02"]
-    assert steps.index("neighbours watch it") < steps.index("apply")
+    assert steps.index("watch neighbor station entries") < steps.index("apply")
     assert {crew.on(name, "uci get wireless.mesh0.mcast_rate").strip() for name in FIELDED} == {"6000"}
     crew.settle()
     # without a word from anybody else: unicast from a node to each of its neighbours is taken
