@@ -1,0 +1,50 @@
+"""MkDocs hooks: generated reference pages, and the repository's own pages (README, ...) as pages of the site."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+from docgen.pages import pages
+
+_ROOT = Path(__file__).resolve().parent.parent
+_REPOSITORY_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+_DIRECTORIES = {
+    "docs/decisions/": "decisions/0001-dependencies.md",
+    "docs/facts/": "facts/openwrt-facts.md",
+    "docs/lint/": "lint/index.md",
+    "inventory/": "inventory.md",
+}
+_LINK = re.compile(r"(?<=\]\()([^)#\s]+)(?=[)#])")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    for name, text in pages().items():
+        files.append(File.generated(config, f"reference/{name}", content=_relative(text, "../")))
+    for source, target in _REPOSITORY_PAGES.items():
+        text = (_ROOT / source).read_text(encoding="utf-8")
+        files.append(File.generated(config, target, content=_LINK.sub(lambda link: _site_path(link[1]), text)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Links from docs/ to the repository's own pages lead to their copies in the site."""
+    for source, target in _REPOSITORY_PAGES.items():
+        up = "../" * page.file.src_uri.count("/")
+        markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
+    return markdown
+
+
+def _site_path(link: str) -> str:
+    """Where a link of a page at the repository's root leads in the site."""
+    if link in _DIRECTORIES:
+        return _DIRECTORIES[link]
+    return _REPOSITORY_PAGES.get(link, link.removeprefix("docs/"))
+
+
+def _relative(text: str, up: str) -> str:
+    """Generated pages name others as if they stood in docs/ itself."""
+    return _LINK.sub(lambda link: up + link[1] if link[1] not in pages() else link[1], text)
