@@ -24,7 +24,7 @@ check: setup
 
 # The site, in build/site: warnings are errors, links and anchors are checked, nothing is fetched while it builds.
 docs: $(VENV)-docs/.ready
-	PYTHONPATH=$(CURDIR) NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
+	PYTHONPATH=$(CURDIR) NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict
 	@echo "docs: open build/site/index.html"
 
 $(VENV)-docs/.ready: pyproject.toml

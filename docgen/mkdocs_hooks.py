@@ -12,12 +12,15 @@ from docgen.pages import pages
 
 _ROOT = Path(__file__).resolve().parent.parent
 _REPOSITORY_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+# a link to a directory shows its files in a repository browser; in the site it needs a page
 _DIRECTORIES = {
-    "docs/decisions/": "decisions/0001-dependencies.md",
-    "docs/facts/": "facts/openwrt-facts.md",
-    "docs/lint/": "lint/index.md",
+    "decisions/": "decisions/0001-dependencies.md",
+    "facts/": "facts/openwrt-facts.md",
+    "lint/": "lint/index.md",
     "inventory/": "inventory.md",
 }
+# search in pages opened from disk needs it; Material would load it from a CDN
+_SHIM = "iframe-worker.js"
 _LINK = re.compile(r"(?<=\]\()([^)#\s]+)(?=[)#])")
 
 
@@ -27,22 +30,25 @@ def on_files(files: Files, config: Any) -> Files:
     for source, target in _REPOSITORY_PAGES.items():
         text = (_ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, target, content=_LINK.sub(lambda link: _site_path(link[1]), text)))
+    shim = Path(__file__).with_name(_SHIM).read_text(encoding="utf-8")
+    files.append(File.generated(config, f"assets/{_SHIM}", content=shim))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links from docs/ to the repository's own pages lead to their copies in the site."""
+    """Links from docs/ to the repository's own pages lead to their copies in the site, those to directories to a page."""
+    up = "../" * page.file.src_uri.count("/")
     for source, target in _REPOSITORY_PAGES.items():
-        up = "../" * page.file.src_uri.count("/")
         markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
+    for directory, target in _DIRECTORIES.items():
+        markdown = markdown.replace(f"]({up}{directory})", f"]({up}{target})")
     return markdown
 
 
 def _site_path(link: str) -> str:
     """Where a link of a page at the repository's root leads in the site."""
-    if link in _DIRECTORIES:
-        return _DIRECTORIES[link]
-    return _REPOSITORY_PAGES.get(link, link.removeprefix("docs/"))
+    inside = link.removeprefix("docs/")
+    return _REPOSITORY_PAGES.get(link) or _DIRECTORIES.get(inside, inside)
 
 
 def _relative(text: str, up: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from docgen import commands, markdown, roff
+from docgen import commands, markdown, metrics, roff
 
 
 def pages() -> dict[str, str]:
@@ -14,6 +14,7 @@ def pages() -> dict[str, str]:
         "cli-udp-mesh.md": markdown.command_page(commands.udp_mesh()),
         "inventory-keys.md": markdown.inventory_page(json_schema()),
         "daemon-configuration.md": markdown.daemon_page(),
+        "metrics.md": metrics.metrics_page(),
     }
 
 
