@@ -36,7 +36,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Links from docs/ to the repository's own pages lead to their copies in the site, those to directories to a page."""
+    """Links from docs/ to the repository's own pages, and to directories, lead to pages of the site."""
     up = "../" * page.file.src_uri.count("/")
     for source, target in _REPOSITORY_PAGES.items():
         markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
