@@ -21,6 +21,7 @@ _DIRECTORIES = {
 }
 # search in pages opened from disk needs it; Material would load it from a CDN
 _SHIM = "iframe-worker.js"
+_ITEM = re.compile(r"(?:[-*]|\d+\.) ")
 _LINK = re.compile(r"(?<=\]\()([^)#\s]+)(?=[)#])")
 
 
@@ -42,7 +43,24 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
     for directory, target in _DIRECTORIES.items():
         markdown = markdown.replace(f"]({up}{directory})", f"]({up}{target})")
-    return markdown
+    return _separated(markdown)
+
+
+def _separated(markdown: str) -> str:
+    """With a blank line before every list and table: Python-Markdown needs one where CommonMark does not."""
+    lines: list[str] = []
+    in_code = False
+    previous = ""
+    for line in markdown.splitlines():
+        if line.lstrip().startswith("```"):
+            in_code = not in_code
+        begins = _ITEM.match(line) or line.startswith("|")
+        continues = not previous.strip() or previous.startswith(("|", " ")) or _ITEM.match(previous)
+        if begins and not continues and not in_code:
+            lines.append("")
+        lines.append(line)
+        previous = line
+    return "\n".join(lines) + "\n"
 
 
 def _site_path(link: str) -> str:

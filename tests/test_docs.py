@@ -169,8 +169,9 @@ def test_man_pages_are_well_formed(name: str, tmp_path: Path, commands: dict[str
 # pages in plain English (the words are those of no message, either)
 PLAIN = [
     "CONTRIBUTING.md",
-    *(f"docs/{name}.md" for name in ("tutorial", "glossary", "provisioning", "status", "robots")),
-    *(str(page.relative_to(ROOT)) for page in sorted((DOCS / "how-to").glob("*.md"))),
+    *(f"docs/{name}.md" for name in ("tutorial", "glossary", "provisioning", "status", "robots", "design")),
+    *("docs/device-scripts.md", "docs/facts/node-assumptions.md", "docs/facts/openwrt-checked.md"),
+    *(str(page.relative_to(ROOT)) for part in ("how-to", "decisions") for page in sorted((DOCS / part).glob("*.md"))),
 ]
 WORDS = re.compile(
     r"\b(told|tells?|anew|whoever|somebody|nobody|mend(?:s|ed)?|of a node that|takes? up|taken up|carr(?:y|ied) out"
