@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: setup demo test check proof bench lab clean
+.PHONY: setup demo test check docs proof bench lab clean
 
 setup: $(VENV)/.ready
 
@@ -22,6 +22,16 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The site, in build/site: warnings are errors, links and anchors are checked, nothing is fetched while it builds.
+docs: $(VENV)-docs/.ready
+	PYTHONPATH=$(CURDIR) NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict
+	@echo "docs: open build/site/index.html"
+
+$(VENV)-docs/.ready: pyproject.toml
+	test -x $(VENV)-docs/bin/python || python3 -m venv $(VENV)-docs
+	$(VENV)-docs/bin/pip install --quiet --disable-pip-version-check -e '.[docs]'
+	touch $@
+
 # The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time, real roscores, real sudo, missions of
 # real radios.
 proof: setup
@@ -39,4 +49,4 @@ lab: setup
 	$(BIN)/meshctl lab up --real
 
 clean:
-	rm -rf $(VENV) $(VENV)-bench .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build
+	rm -rf $(VENV) $(VENV)-bench $(VENV)-docs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache dist build

@@ -58,6 +58,8 @@ def test_the_wheel_carries_templates_examples_pages_scripts_and_scenarios(wheel:
         "udp_mesh/daemon/units/",
     ):
         assert any(name.startswith(start) for name in names), start
+    for page in ("meshctl.1", "udp-mesh.1"):
+        assert any(name.endswith(f".data/data/share/man/man1/{page}") for name in names), page
 
 
 def test_meshctl_lints_and_renders_a_shipped_example_from_any_directory(installed: Path, tmp_path: Path) -> None:

@@ -1,0 +1,18 @@
+"""`python -m docgen DIRECTORY`: write the generated pages and man pages there."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from docgen.pages import man_pages, pages
+
+
+def main(directory: Path) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    for name, text in {**pages(), **man_pages()}.items():
+        (directory / name).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,188 @@
+"""The pages for people: every file, command and option they name exists, and the generated ones are well formed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from docgen.commands import Command, programs
+from docgen.pages import man_pages, pages
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
+
+# facts that were copied from elsewhere and name files of other projects
+FOREIGN = {"field-needs.md", "lab-facts.md", "legacy-wire.md", "openwrt-facts.md", "ros-facts.md", "transport-facts.md"}
+PACKAGE_FILE = re.compile(
+    r"(?<![\w/.-])(?:tests/|benchmarks/)?(?:meshctl|meshlab|udp_mesh|docgen)/[\w/.-]+\.(?:py|sh|init|awk)\b"
+)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_source_file_that_a_page_names_exists(page: Path) -> None:
+    named = set(PACKAGE_FILE.findall(page.read_text(encoding="utf-8")))
+    # tests mirror the packages, and some pages leave out `tests/`
+    missing = {name for name in named if not (ROOT / name).is_file() and not (ROOT / "tests" / name).is_file()}
+    assert missing == set() or page.name in FOREIGN
+
+
+def test_assumptions_about_a_node_name_existing_files() -> None:
+    """The tables of node-assumptions.md name files relative to meshctl/ or to the scripts that run on a node."""
+    text = (DOCS / "facts/node-assumptions.md").read_text(encoding="utf-8")
+    rows = [row.split("|") for row in text.splitlines() if row.startswith("| ")]
+    named = {name for row in rows if len(row) == 7 for name in re.findall(r"`((?:\w+/)*\w+\.(?:py|sh|init))`", row[2])}
+    places = ("meshctl", "meshctl/device", "meshctl/device/scripts")
+    assert len(named) > 15
+    assert {name for name in named if not any((ROOT / place / name).is_file() for place in places)} == set()
+
+
+def table(page: Path, heading: str) -> dict[str, str]:
+    """The first two columns of the table below a heading."""
+    section = page.read_text(encoding="utf-8").split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
+    rows = [row.strip("| ").split(" | ") for row in section.splitlines() if row.startswith("| ")]
+    return {row[0]: row[1] for row in rows[2:]}
+
+
+def test_the_contributor_guide_says_where_things_are() -> None:
+    places = table(ROOT / "CONTRIBUTING.md", "Where is ...")
+    for subject in ("rolled back", "lost packet", "window", "offline", "priority", "quoted", "stale entry", "fault"):
+        (place,) = [files for what, files in places.items() if subject in what]
+        files = re.findall(r"`([^`]+)`", place)
+        assert files, subject
+        assert [name for name in files if not (ROOT / name).is_file()] == []
+
+
+def test_the_layout_names_existing_directories() -> None:
+    assert [name for name in table(ROOT / "CONTRIBUTING.md", "Layout") if not (ROOT / name.strip("`")).is_dir()] == []
+
+
+@pytest.fixture(scope="module")
+def commands() -> dict[str, Command]:
+    return {command.name: command for program in programs() for command in program.walk()}
+
+
+CODE = re.compile(r"^ *```(?:sh|console)?\n(.*?)^ *```|`((?:meshctl|udp-mesh) [^`]+)`", re.MULTILINE | re.DOTALL)
+
+
+def command_lines(page: Path) -> Iterator[str]:
+    """Calls of the two programs in code blocks and in backticks, without comments and what follows a pipe."""
+    for block, inline in CODE.findall(page.read_text(encoding="utf-8")):
+        for line in (inline or block).splitlines():
+            for call in re.split(r"\s#\s|\|| && |;|>|<", line.strip().removeprefix("$ ")):
+                if re.match(r"(meshctl|udp-mesh) [a-z]", call.strip()):
+                    yield call.strip()
+
+
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if "facts" not in page.parts], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_every_command_and_option_that_a_page_shows_exists(page: Path, commands: dict[str, Command]) -> None:
+    wrong = []
+    for line in command_lines(page):
+        try:
+            words = shlex.split(line)
+        except ValueError:
+            words = line.split()
+        # behind `--` stands a command for the node
+        own = words[: words.index("--")] if "--" in words else words
+        name = own[0]
+        for word in own[1:]:
+            if f"{name} {word}" not in commands:
+                break
+            name += f" {word}"
+        if name in ("meshctl", "udp-mesh"):
+            # a word in prose such as "meshctl and udp-mesh"
+            continue
+        known = {each for option in commands[name].options for each in option.names} | {"--help", "-h"}
+        options = {word.split("=")[0] for word in own if re.match(r"--?[a-z]", word)}
+        wrong += [f"{line}: {option}" for option in sorted(options - known)]
+    assert wrong == []
+
+
+def test_the_tutorial_shows_what_every_command_printed() -> None:
+    text = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    lines = [line for block in re.findall(r"```console\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
+    silent = re.compile(r"\$ (export|sed -i) ")
+    for line, following in zip(lines, [*lines[1:], "$ "], strict=True):
+        assert silent.match(line) or not line.startswith("$ ") or not following.startswith("$ "), line
+
+
+def test_the_site_lists_every_page() -> None:
+    site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+
+    def files(entry: object) -> Iterator[str]:
+        if isinstance(entry, str):
+            yield entry
+        elif isinstance(entry, list):
+            for each in entry:
+                yield from files(each)
+        elif isinstance(entry, dict):
+            yield from files(list(entry.values()))
+
+    listed = set(files(site["nav"]))
+    generated = {"index.md", "contributing.md", "changelog.md"} | {f"reference/{name}" for name in pages()}
+    written = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
+    assert listed == {page for page in written | generated if not page.startswith("lint/MC")}
+
+
+def test_the_reference_describes_every_command(commands: dict[str, Command]) -> None:
+    made = pages()
+    text = made["cli-meshctl.md"] + made["cli-udp-mesh.md"]
+    for command in commands.values():
+        if not command.commands:
+            assert f"## `{command.name}`" in text
+            assert command.summary, command.name
+    assert "| `confirm_window_s` |" in made["inventory-keys.md"]
+    assert "| `offline_s` | number | `10.0` |" in made["daemon-configuration.md"]
+    assert "| `udp_mesh_peer_online` | gauge | `peer` |" in made["metrics.md"]
+
+
+@pytest.mark.parametrize("name", ["meshctl.1", "udp-mesh.1"])
+def test_man_pages_are_well_formed(name: str, tmp_path: Path, commands: dict[str, Command]) -> None:
+    text = man_pages()[name]
+    requests = [line.split()[0] for line in text.splitlines() if line.startswith(".")]
+    assert set(requests) <= {".TH", ".nh", ".ad", ".SH", ".SS", ".B", ".PP", ".TP", ".nf", ".fi"}
+    assert requests[0] == ".TH"
+    sections = re.findall(r"^\.SH (.*)$", text, re.MULTILINE)
+    assert sections[:3] == ["NAME", "SYNOPSIS", "DESCRIPTION"]
+    shown = {
+        command.usage for command in commands.values() if command.name.split()[0] == name[:-2] and not command.commands
+    }
+    headings = {heading.replace(r"\-", "-") for heading in re.findall(r"^\.SS (.*)$", text, re.MULTILINE)}
+    assert shown <= headings
+    if shutil.which("groff") is None:
+        # the structure above is all that was checked
+        return
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    done = subprocess.run(["groff", "-man", "-ww", "-z", tmp_path / name], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+
+
+# pages in plain English (the words are those of no message, either)
+PLAIN = [
+    "CONTRIBUTING.md",
+    *(f"docs/{name}.md" for name in ("tutorial", "glossary", "provisioning", "status", "robots", "design")),
+    *("docs/device-scripts.md", "docs/facts/node-assumptions.md", "docs/facts/openwrt-checked.md"),
+    *(str(page.relative_to(ROOT)) for part in ("how-to", "decisions") for page in sorted((DOCS / part).glob("*.md"))),
+]
+WORDS = re.compile(
+    r"\b(told|tells?|anew|whoever|somebody|nobody|mend(?:s|ed)?|of a node that|takes? up|taken up|carr(?:y|ied) out"
+    r"|neighbours?|behaviours?|colours?)\b"
+)
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_pages_use_plain_words(name: str) -> None:
+    text = (ROOT / name).read_text(encoding="utf-8")
+    without_code = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)
+    # the meanings of alarms are the program's own words
+    prose = "\n".join(line for line in without_code.splitlines() if not line.startswith("|  | "))
+    assert WORDS.findall(prose) == []
