@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from tests.udp_mesh.core.pair import World, settings
-from tests.udp_mesh.core.test_legacy import OLD, OldRobot, pieces
+from tests.udp_mesh.core.test_legacy import OLD, OldRobot, fragments
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.legacy.acks import LegacyAcks
@@ -31,12 +31,12 @@ DELAY_S, TICK_S = 0.010, 0.001
 
 
 @dataclass
-class FieldedProgram:
+class LegacyProgram:
     """Its sending half, as documented: three fragments in flight, no retransmission, everything dropped if one is
     unanswered for 10 s."""
 
     queue: list[tuple[int, int, int, LegacyPayload]] = field(default_factory=list)
-    on_way: dict[tuple[int, int], float] = field(default_factory=dict)
+    in_flight: dict[tuple[int, int], float] = field(default_factory=dict)
     sequence: int = 0
     flushed: int = 0
 
@@ -44,27 +44,27 @@ class FieldedProgram:
         self.sequence = self.sequence % 0x7FFF + 1
         chunks = fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, "t", data)))
         for place, chunk in enumerate(chunks):
-            piece = LegacyPayload(self.sequence, place, len(chunks), chunk, wants_ack=True)
-            heapq.heappush(self.queue, (priority, self.sequence, place, piece))
+            fragment = LegacyPayload(self.sequence, place, len(chunks), chunk, wants_ack=True)
+            heapq.heappush(self.queue, (priority, self.sequence, place, fragment))
 
     def leave(self, now: float) -> list[LegacyPayload]:
-        if any(now - at > 10.0 for at in self.on_way.values()):
+        if any(now - at > 10.0 for at in self.in_flight.values()):
             self.flushed += len(self.queue)
             self.queue.clear()
-            self.on_way.clear()
+            self.in_flight.clear()
         out = []
-        while self.queue and len(self.on_way) < 3:
-            _, sequence, place, piece = heapq.heappop(self.queue)
-            self.on_way[sequence, place] = now
-            out.append(piece)
+        while self.queue and len(self.in_flight) < 3:
+            _, sequence, place, fragment = heapq.heappop(self.queue)
+            self.in_flight[sequence, place] = now
+            out.append(fragment)
         return out
 
 
 def play(
     loss: float, seconds: float, *, seed: int = 1, restart_at: float | None = None
-) -> tuple[int, int, FieldedProgram]:
+) -> tuple[int, int, LegacyProgram]:
     """Send ten urgent messages and twenty bulk messages a second; returns how many of each arrived."""
-    rng, old, program = random.Random(seed), OldRobot(), FieldedProgram()
+    rng, old, program = random.Random(seed), OldRobot(), LegacyProgram()
     started = old.now
     wire: deque[tuple[float, LegacyPayload]] = deque()
     back: deque[tuple[float, LegacyAck]] = deque()
@@ -82,12 +82,12 @@ def play(
             old = OldRobot()
             old.now = now
             old.say(Host("old", "10.0.0.9"))
-        wire.extend((old.now + DELAY_S, piece) for piece in program.leave(old.now) if rng.random() >= loss)
+        wire.extend((old.now + DELAY_S, fragment) for fragment in program.leave(old.now) if rng.random() >= loss)
         while wire and wire[0][0] <= old.now:
             old.say(wire.popleft()[1])
         while back and back[0][0] <= old.now:
             ack = back.popleft()[1]
-            program.on_way.pop((ack.sequence, ack.position), None)
+            program.in_flight.pop((ack.sequence, ack.position), None)
         for answer in old.hear():
             if isinstance(answer, LegacyAck) and rng.random() >= loss:
                 back.append((old.now + DELAY_S, answer))
@@ -114,7 +114,7 @@ def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
     assert bulk >= 200
     assert program.flushed == 0
     assert program.queue == []
-    assert program.on_way == {}
+    assert program.in_flight == {}
 
 
 def test_a_restart_of_ours_stalls_a_fielded_sender_for_no_ten_seconds() -> None:
@@ -127,20 +127,20 @@ def test_acknowledgements_besides_stay_few_without_loss() -> None:
     """One repetition each and some predictions per second: no more airtime than that."""
     acks, now, more = LegacyAcks(), 0.0, 0
     for sequence in range(1, 1001):
-        piece = LegacyPayload(sequence, 0, 1, b"x", wants_ack=True)
-        more += len(acks.on_fragment(piece, now))
+        fragment = LegacyPayload(sequence, 0, 1, b"x", wants_ack=True)
+        more += len(acks.on_fragment(fragment, now))
         now += 0.005
         more += len(acks.due(now))
     assert more <= 1000 + 6 * 5.0 / 0.05 + 24
 
 
-def fielded(*topics: Topic) -> OldRobot:
+def legacy(*topics: Topic) -> OldRobot:
     return OldRobot(topics=(Topic("map", priority=9), *topics))
 
 
 def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
     """It acknowledges before its reader has subscribed: what arrives before that is lost."""
-    old = fielded(Topic("kept", priority=8, outbox=Outbox.ALL))
+    old = legacy(Topic("kept", priority=8, outbox=Outbox.ALL))
     old.now += 20.0
     old.hear()
     old.events()
@@ -152,9 +152,9 @@ def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
     while old.now < heard_at + SETTLE_S + 5.0:
         if int(old.now * 100) % 100 == 0:
             old.say(Host("old", "10.0.0.9"))
-        for piece in old.hear_payloads():
+        for fragment in old.hear_payloads():
             left_at.append(old.now)
-            old.say(LegacyAck(piece.sequence, piece.position))
+            old.say(LegacyAck(fragment.sequence, fragment.position))
         left += sum(isinstance(event, MessageDelivered) for event in old.events())
         old.now += 0.01
     assert min(left_at) >= heard_at + SETTLE_S
@@ -187,13 +187,13 @@ def test_a_fielded_robot_names_so_many_topics_and_no_more() -> None:
         body = encode_mesh_data(PriorityMeshData("old", "a/B", 1, f"t{number}", b"x"))
         old.say(LegacyPayload(number + 1, 0, 1, body, wants_ack=True))
     assert len(old.received()) == MAX_TOPICS
-    old.say(pieces(2000, b"x")[0])
+    old.say(fragments(2000, b"x")[0])
     assert old.node.conditions(old.now).counters.dropped_over_limit == 51
 
 
 def test_another_port_of_a_fielded_robot_is_not_believed() -> None:
     old = OldRobot()
-    old.node.receive(encode_legacy(pieces(1, b"forged")[0]), "mesh", (OLD[0], 4444), old.now)
+    old.node.receive(encode_legacy(fragments(1, b"forged")[0]), "mesh", (OLD[0], 4444), old.now)
     assert old.received() == []
     old.node.send("map", b"x", destination="old", now=old.now)
     assert len(old.hear_payloads()) == 1
@@ -206,9 +206,9 @@ def test_the_status_of_a_fielded_robot_and_our_own_rate_say_what_goes_to_it() ->
 
     def answer(name: str, datagram: Datagram, now: float) -> None:
         if datagram.destination == OLD:
-            piece = decode_legacy(datagram.data)
-            if isinstance(piece, LegacyPayload):
-                ack = encode_legacy(LegacyAck(piece.sequence, piece.position))
+            fragment = decode_legacy(datagram.data)
+            if isinstance(fragment, LegacyPayload):
+                ack = encode_legacy(LegacyAck(fragment.sequence, fragment.position))
                 world.at(now + 0.005, lambda: world.nodes["new"].receive(ack, "mesh", OLD, world.now))
 
     world.tap = answer
@@ -241,12 +241,12 @@ def test_answers_that_come_too_soon_after_a_resend_teach_patience() -> None:
             old.node.send("stop", b"%d" % tick, destination="old", now=old.now)
         if tick % 1000 == 0:
             old.say(Host("old", "10.0.0.9"))
-        for piece in old.hear_payloads():
+        for fragment in old.hear_payloads():
             sent += 1
-            resent += piece.sequence in seen
-            seen.add(piece.sequence)
+            resent += fragment.sequence in seen
+            seen.add(fragment.sequence)
             delay_s = 0.004 if rng.random() < 0.9 else 0.07
-            answers.append((old.now + delay_s, LegacyAck(piece.sequence, piece.position)))
+            answers.append((old.now + delay_s, LegacyAck(fragment.sequence, fragment.position)))
         for at, ack in list(answers):
             if at <= old.now:
                 answers.remove((at, ack))

@@ -140,12 +140,12 @@ def mutated_datagrams(fuzzer: Fuzzer) -> None:
     fuzzer.receive(fuzzer.mutated(data))
 
 
-def fielded(fuzzer: Fuzzer) -> None:
+def legacy(fuzzer: Fuzzer) -> None:
     data = fuzzer.mutated(fuzzer.dice.choice(fuzzer.old))
     fuzzer.node().receive(data, "mesh", OLD, fuzzer.both.now)
 
 
-SURFACES = (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, fielded)
+SURFACES = (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy)
 
 
 @pytest.mark.parametrize("surface", SURFACES)
@@ -158,7 +158,7 @@ def test_any_bytes_are_taken_or_counted(surface: Callable[[Fuzzer], None]) -> No
 def test_after_any_bytes_the_pair_still_talks() -> None:
     fuzzer = Fuzzer(seed=77)
     for _ in range(3000):
-        fuzzer.step(fuzzer.dice.choice((random_bytes, mutated_datagrams, fielded)))
+        fuzzer.step(fuzzer.dice.choice((random_bytes, mutated_datagrams, legacy)))
     both = fuzzer.both
     both.roundtrip(times=30)
     both.events(both.b)

@@ -184,8 +184,8 @@ def test_a_message_larger_than_the_limit_is_refused_and_its_sender_told() -> Non
     world.run(1.5)
     world.send("a", "any", bytes(20_000), "b")
     world.run(3.0)
-    told = [str(getattr(event, "reason", "")) for _, event in world.events["a"]]
-    assert "ExpiryReason.REFUSED" in told
+    events = [str(getattr(event, "reason", "")) for _, event in world.events["a"]]
+    assert "ExpiryReason.REFUSED" in events
     world.send("a", "any", bytes(9_000), "b")
     assert world.run(3.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 

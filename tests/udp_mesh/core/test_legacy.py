@@ -66,10 +66,10 @@ class OldRobot:
         return [datagram for datagram in self.hear() if isinstance(datagram, LegacyPayload)]
 
     def events(self) -> list[Event]:
-        told = []
+        events = []
         while (event := self.node.next_event()) is not None:
-            told.append(event)
-        return told
+            events.append(event)
+        return events
 
     def received(self) -> list[MessageReceived]:
         return [event for event in self.events() if isinstance(event, MessageReceived)]
@@ -79,7 +79,7 @@ def message(data: bytes, topic: str = "chat", priority: int = 4) -> list[bytes]:
     return fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, topic, data)))
 
 
-def pieces(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[LegacyPayload]:
+def fragments(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[LegacyPayload]:
     chunks = message(data)
     return [LegacyPayload(sequence, place, len(chunks), chunk, wants_ack) for place, chunk in enumerate(chunks)]
 
@@ -88,23 +88,23 @@ def test_messages_go_to_a_fielded_peer_in_its_own_format_with_their_priority() -
     old = OldRobot()
     sent_type = "std_msgs/Empty d41d8cd98f00b204e9800998ecf8427e"
     old.node.send("stop", b"halt", destination="old", now=old.now, type_name=sent_type)
-    (piece,) = old.hear_payloads()
-    told = decode_mesh_data(piece.data)
-    assert (told.host, told.topic, told.type_name, told.priority, told.data) == (
+    (fragment,) = old.hear_payloads()
+    events = decode_mesh_data(fragment.data)
+    assert (events.host, events.topic, events.type_name, events.priority, events.data) == (
         "new",
         "stop",
         "std_msgs/Empty",
         0,
         b"halt",
     )
-    old.say(LegacyAck(piece.sequence, piece.position))
+    old.say(LegacyAck(fragment.sequence, fragment.position))
     assert [type(event) for event in old.events()] == [MessageDelivered]
 
 
 def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
     old = OldRobot()
-    for piece in reversed(pieces(5, b"x" * 4000)):
-        old.say(piece)
+    for fragment in reversed(fragments(5, b"x" * 4000)):
+        old.say(fragment)
     acks = [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert {(ack.sequence, ack.position) for ack in acks} == {(5, 0), (5, 1), (5, 2), (5, 3)}
     (event,) = old.received()
@@ -133,7 +133,7 @@ def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_somethi
 
 def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
     old = OldRobot()
-    old.say(pieces(0x8001, b"all", wants_ack=False)[0])
+    old.say(fragments(0x8001, b"all", wants_ack=False)[0])
     assert not [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert [event.broadcast for event in old.received()] == [True]
 
@@ -151,7 +151,7 @@ def test_three_fragments_are_in_flight_to_a_fielded_peer_and_urgent_ones_go_firs
 def test_a_message_to_all_reaches_fielded_peers_too() -> None:
     old = OldRobot()
     old.node.send("stop", b"all", now=old.now)
-    assert [decode_mesh_data(piece.data).data for piece in old.hear_payloads()] == [b"all"]
+    assert [decode_mesh_data(fragment.data).data for fragment in old.hear_payloads()] == [b"all"]
 
 
 # The defects, in the order listed in the facts about the legacy system.
@@ -163,12 +163,12 @@ def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
     seen: set[int] = set()
     dropped = False
     for _ in range(200):
-        for piece in old.hear_payloads():
-            if piece.position == 1 and not dropped:
+        for fragment in old.hear_payloads():
+            if fragment.position == 1 and not dropped:
                 dropped = True
                 continue
-            seen.add(piece.position)
-            old.say(LegacyAck(piece.sequence, piece.position))
+            seen.add(fragment.position)
+            old.say(LegacyAck(fragment.sequence, fragment.position))
         old.now += 0.01
         if any(isinstance(event, MessageDelivered) for event in old.events()):
             break
@@ -188,7 +188,7 @@ def test_defect_3_a_fragment_past_its_total_is_counted_and_dropped() -> None:
     raw[3:7] = (7).to_bytes(4, "little")
     old.node.receive(bytes(raw), "mesh", OLD, old.now)
     assert old.node.conditions(old.now).counters.dropped_malformed == 1
-    old.say(pieces(2, b"fine")[0])
+    old.say(fragments(2, b"fine")[0])
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
@@ -198,15 +198,15 @@ def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
     raw = bytearray(encode_legacy(Host("old", "10.0.0.9")))
     raw[0] = kind
     old.node.receive(bytes(raw), "mesh", OLD, old.now)
-    old.say(pieces(2, b"fine")[0])
+    old.say(fragments(2, b"fine")[0])
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
 def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
     world = World(seed=9)
-    fielded = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
+    legacy = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
     topic = Topic("cast", repair=True)
-    world.add(settings("a", topic, neighbours=(fielded,)))
+    world.add(settings("a", topic, neighbours=(legacy,)))
     world.add(settings("b", topic))
     to_all: list[Datagram] = []
 
@@ -241,11 +241,11 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
 def test_defect_5_a_name_is_not_believed_as_announced() -> None:
     old = OldRobot()
     old.say(Host("base", "10.0.0.9"))
-    old.say(pieces(2, b"who")[0])
+    old.say(fragments(2, b"who")[0])
     assert [event.source for event in old.received()] == ["old"]
     stranger = ("10.0.0.66", 8700)
     old.node.receive(encode_legacy(Host("old", "10.0.0.66")), "mesh", stranger, old.now)
-    old.node.receive(encode_legacy(pieces(3, b"forged")[0]), "mesh", stranger, old.now)
+    old.node.receive(encode_legacy(fragments(3, b"forged")[0]), "mesh", stranger, old.now)
     assert old.received() == []
     assert old.node.conditions(old.now).counters.dropped_unauthenticated == 2
 
@@ -282,19 +282,19 @@ def test_defect_6_the_broadcast_address_is_the_one_given_never_guessed(broadcast
 
 def test_defect_7_each_partial_message_is_purged_by_its_own_age() -> None:
     reassembly = LegacyReassembly(Limits())
-    reassembly.add(pieces(1, bytes(2000))[0], 0.0)
-    reassembly.add(pieces(2, bytes(2000))[0], 9.0)
+    reassembly.add(fragments(1, bytes(2000))[0], 0.0)
+    reassembly.add(fragments(2, bytes(2000))[0], 9.0)
     reassembly.purge(11.0)
     assert len(reassembly) == 1
-    _, whole = reassembly.add(pieces(2, bytes(2000))[1], 11.0)
+    _, whole = reassembly.add(fragments(2, bytes(2000))[1], 11.0)
     assert whole is not None
 
 
 def test_defect_8_a_number_that_comes_around_does_not_meet_an_old_partial_message() -> None:
     reassembly = LegacyReassembly(Limits())
-    reassembly.add(pieces(7, b"a" * 2000)[0], 0.0)
-    fresh = pieces(7, b"b" * 3000)
-    wholes = [reassembly.add(piece, 1.0)[1] for piece in fresh]
+    reassembly.add(fragments(7, b"a" * 2000)[0], 0.0)
+    fresh = fragments(7, b"b" * 3000)
+    wholes = [reassembly.add(fragment, 1.0)[1] for fragment in fresh]
     assert wholes[-1] is not None
     assert wholes[-1].data == b"b" * 3000
 
@@ -317,9 +317,9 @@ def test_defect_9_priority_order_survives_the_wrap_of_the_sequence_numbers() -> 
         old.node.send("map", bytes([number]), destination="old", now=old.now)
     order = []
     for _ in range(6):
-        for piece in old.hear_payloads():
-            order.append(decode_mesh_data(piece.data).data[0])
-            old.say(LegacyAck(piece.sequence, piece.position))
+        for fragment in old.hear_payloads():
+            order.append(decode_mesh_data(fragment.data).data[0])
+            old.say(LegacyAck(fragment.sequence, fragment.position))
     assert order == sorted(order)
 
 
@@ -351,13 +351,13 @@ def test_defect_11_the_fielded_receiver_still_gets_the_empty_fragment_it_counts_
     overhead = len(encode_mesh_data(PriorityMeshData("new", "", 9, "map", b"")))
     old = OldRobot()
     old.node.send("map", bytes(1300 - overhead), destination="old", now=old.now)
-    assert [len(piece.data) for piece in old.hear_payloads()] == [1300, 0]
+    assert [len(fragment.data) for fragment in old.hear_payloads()] == [1300, 0]
 
 
 def test_a_repeated_fragment_of_a_finished_message_is_acknowledged_and_opens_no_new_one() -> None:
     old = OldRobot()
-    for piece in pieces(5, b"x" * 2000) * 2:
-        old.say(piece)
+    for fragment in fragments(5, b"x" * 2000) * 2:
+        old.say(fragment)
     assert len(old.received()) == 1
     assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == 4
 
@@ -373,8 +373,8 @@ def test_a_silent_fielded_peer_is_probed_gently_and_loses_nothing() -> None:
     old.say(Host("old", "10.0.0.9"))
     delivered = False
     for _ in range(400):
-        for piece in old.hear_payloads():
-            old.say(LegacyAck(piece.sequence, piece.position))
+        for fragment in old.hear_payloads():
+            old.say(LegacyAck(fragment.sequence, fragment.position))
         delivered = delivered or any(isinstance(event, MessageDelivered) for event in old.events())
         old.now += 0.01
     assert delivered
@@ -396,26 +396,28 @@ def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
 def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_start_anew() -> None:
     old = OldRobot()
     for sequence in (1, 2):
-        for piece in pieces(sequence, b"x" * 2000):
-            old.say(piece)
+        for fragment in fragments(sequence, b"x" * 2000):
+            old.say(fragment)
     assert len(old.received()) == 2
     # The second message of the next run is cut off in the middle by another restart.
     old.now += 5.0
-    for piece in [*pieces(1, b"y" * 2000), *pieces(2, b"y" * 2000)[:1]]:
-        old.say(piece)
+    for fragment in [*fragments(1, b"y" * 2000), *fragments(2, b"y" * 2000)[:1]]:
+        old.say(fragment)
     old.now += 5.0
     for sequence in (1, 2):
-        for piece in pieces(sequence, b"z" * 2000):
-            old.say(piece)
+        for fragment in fragments(sequence, b"z" * 2000):
+            old.say(fragment)
     assert [event.payload[:1] for event in old.received()] == [b"y", b"z", b"z"]
 
 
 def test_a_message_above_the_limit_stalls_no_fielded_sender() -> None:
     old = OldRobot(limits=Limits(message_bytes=5000))
-    for piece in [*pieces(1, bytes(20_000)), *pieces(2, b"small")]:
-        old.say(piece)
+    for fragment in [*fragments(1, bytes(20_000)), *fragments(2, b"small")]:
+        old.say(fragment)
     assert [event.payload for event in old.received()] == [b"small"]
-    assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == len(pieces(1, bytes(20_000))) + 1
+    assert (
+        len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == len(fragments(1, bytes(20_000))) + 1
+    )
 
 
 def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:

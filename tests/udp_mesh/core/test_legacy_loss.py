@@ -29,16 +29,16 @@ def play(seed: int, duration_s: float) -> tuple[list[float], int]:
         while back and back[0][0] <= old.now:
             _, sequence, position = heapq.heappop(back)
             old.say(LegacyAck(sequence, position))
-        for piece in old.hear():
-            if not isinstance(piece, LegacyPayload) or rng.random() < LOSS:
+        for fragment in old.hear():
+            if not isinstance(fragment, LegacyPayload) or rng.random() < LOSS:
                 continue
-            if piece.total == 1:
-                name = decode_mesh_data(piece.data).data
+            if fragment.total == 1:
+                name = decode_mesh_data(fragment.data).data
                 took.setdefault(name, old.now + DELAY_S - sent_at[name])
             else:
-                bulk.add((piece.sequence, piece.position))
+                bulk.add((fragment.sequence, fragment.position))
             if rng.random() >= LOSS:
-                heapq.heappush(back, (old.now + 2 * DELAY_S, piece.sequence, piece.position))
+                heapq.heappush(back, (old.now + 2 * DELAY_S, fragment.sequence, fragment.position))
         old.events()
         tick += 1
         old.now += TICK_S
@@ -57,13 +57,13 @@ def test_a_fielded_peer_that_answered_and_fell_silent_is_probed_gently() -> None
     old.node.send("map", bytes(50_000), destination="old", now=old.now)
     for turn in range(12):
         old.now += 0.010
-        for place, piece in enumerate(old.hear()):
+        for place, fragment in enumerate(old.hear()):
             # One of three never arrives.
-            if isinstance(piece, LegacyPayload) and (turn + place) % 3:
-                old.say(LegacyAck(piece.sequence, piece.position))
+            if isinstance(fragment, LegacyPayload) and (turn + place) % 3:
+                old.say(LegacyAck(fragment.sequence, fragment.position))
     silent_from, left = old.now + 2.0, 0
     while old.now < silent_from + 10.0:
         old.now += 0.010
-        pieces = [piece for piece in old.hear() if isinstance(piece, LegacyPayload)]
-        left += len(pieces) if old.now > silent_from else 0
+        fragments = [fragment for fragment in old.hear() if isinstance(fragment, LegacyPayload)]
+        left += len(fragments) if old.now > silent_from else 0
     assert 30 <= left <= 60

@@ -33,7 +33,7 @@ def test_a_range_set_equals_a_plain_set(numbers: list[int]) -> None:
     assert all(before[1] + 1 < after[0] for before, after in pairwise(pairs))
 
 
-def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
+def fragments_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
     chunks = [body[start : start + size] for start in range(0, len(body), size)] or [b""]
     head = MessageHead(len(body), len(chunks), 0, 3, RELIABLE)
     return [
@@ -43,10 +43,10 @@ def pieces_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
 
 @given(st.binary(max_size=400), st.integers(1, 50), st.data())
 def test_reassembly_does_not_depend_on_order_or_repetition(body: bytes, size: int, data: st.DataObject) -> None:
-    pieces = pieces_of(body, size)
-    order = data.draw(st.permutations(pieces + pieces[: len(pieces) // 2]))
+    fragments = fragments_of(body, size)
+    order = data.draw(st.permutations(fragments + fragments[: len(fragments) // 2]))
     reassembly = Reassembly(Limits())
-    results = [reassembly.add(piece, 0.0) for piece in order]
+    results = [reassembly.add(fragment, 0.0) for fragment in order]
     wholes = [result for result in results if isinstance(result, CompleteMessage)]
     assert [whole.body for whole in wholes] == [body]
     assert set(results) - set(wholes) <= {FragmentStatus.KEPT, FragmentStatus.DUPLICATE}
@@ -76,7 +76,7 @@ def test_reassembly_never_holds_more_than_its_cap_whatever_fragments_claim(claim
 
 def test_a_refused_piece_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
     reassembly = Reassembly(Limits(partial_bytes_per_peer=FRAGMENT_OVERHEAD_BYTES + 50))
-    first, second = pieces_of(bytes(60), 30)
+    first, second = fragments_of(bytes(60), 30)
     assert reassembly.add(first, 0.0) is FragmentStatus.KEPT
     other = Fragment(2, 1, bytes(30))
     assert reassembly.add(other, 0.0) is FragmentStatus.FULL

@@ -16,7 +16,7 @@ class Watched(World):
     def _pump(self, name: str) -> None:
         node = self.nodes[name]
         due = node.next_timer()
-        told = len(self.events[name])
+        events = len(self.events[name])
         is_quiet = node.is_quiet and (due is None or due > self.now)
         sent: list[object] = []
         self.tap = lambda source, datagram, now: sent.append(datagram)
@@ -25,7 +25,7 @@ class Watched(World):
         if is_quiet:
             self.quiet += 1
             assert not sent
-            assert len(self.events[name]) == told
+            assert len(self.events[name]) == events
         # Packets held back by pacing wait for a timer, not for another call.
         assert not node.has_datagrams
 

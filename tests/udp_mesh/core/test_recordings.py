@@ -285,8 +285,8 @@ def test_two_peers_whose_tags_collide_are_both_heard() -> None:
             world.send(name, "any", b"%d" % number, "base")
         world.run(0.05)
     world.run(1.0)
-    told = world.events_of("base", MessageReceived)[before:]
-    heard = [event.source for event in told if isinstance(event, MessageReceived)]
+    events = world.events_of("base", MessageReceived)[before:]
+    heard = [event.source for event in events if isinstance(event, MessageReceived)]
     assert (heard.count("one"), heard.count("two")) == (40, 40)
 
 

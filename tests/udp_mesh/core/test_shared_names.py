@@ -56,9 +56,11 @@ def test_each_of_them_is_told_as_long_as_it_lasts_and_once_a_minute_whatever_boo
         again.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
         world.nodes["a2"] = again
         world.run(9.0)
-        told = [event for event in world.events_of("a", NameConflict) if isinstance(event, NameConflict) and event.own]
-        assert len(told) <= 1 + (number + 2) * 9.0 / REPORT_INTERVAL_S
-    assert len(told) >= 3
+        events = [
+            event for event in world.events_of("a", NameConflict) if isinstance(event, NameConflict) and event.own
+        ]
+        assert len(events) <= 1 + (number + 2) * 9.0 / REPORT_INTERVAL_S
+    assert len(events) >= 3
 
 
 @pytest.mark.parametrize("how", ["says good-bye", "is killed"])

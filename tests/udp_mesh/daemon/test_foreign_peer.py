@@ -99,7 +99,7 @@ def test_what_it_sends_arrives_once_and_is_acknowledged(daemon: RunningDaemon, f
             foreign.send(alice, "from-abroad", payload, size=700)
         assert foreign.run(lambda: all(number in alice.ends for number in numbers), WAIT_S)
         foreign.send(alice, "from-abroad", b"last")
-        foreign.run(lambda: not alice.under_way, WAIT_S)
+        foreign.run(lambda: not alice.in_flight, WAIT_S)
         assert collect(client, 1)[0].payload == b"last"
 
 

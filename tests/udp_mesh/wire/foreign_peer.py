@@ -203,7 +203,7 @@ class Peer:
     def __init__(self, key: FleetKey, own: bytes, boot: bytes, address: Address) -> None:
         self.boot, self.address = boot, address
         self.out, self.into = Channel(key, own, boot), Channel(key, boot, own)
-        self.casts = Channel(key, boot, TO_ALL)
+        self.broadcasts = Channel(key, boot, TO_ALL)
         self.name = ""
         self.heartbeat: Fields = {}
         self.heard_at = 0.0
@@ -212,7 +212,7 @@ class Peer:
         self.partials: dict[tuple[bool, int], Partial] = {}
         self.finished: set[tuple[bool, int]] = set()
         self.next_id = 0
-        self.under_way: dict[int, list[tuple[bytes, set[int]]]] = {}
+        self.in_flight: dict[int, list[tuple[bytes, set[int]]]] = {}
         """Message id -> per fragment its frames and the packets that carried it."""
         self.ends: dict[int, str] = {}
 
@@ -227,7 +227,7 @@ class ForeignNode:
         self.to_all = Channel(self.key, self.boot, TO_ALL)
         self.peers: dict[bytes, Peer] = {}
         self.arrived: list[ReceivedMessage] = []
-        self.casts = 0
+        self.broadcasts = 0
 
     def peer(self, name: str) -> Peer | None:
         return next((peer for peer in self.peers.values() if peer.name == name and peer.believed), None)
@@ -246,7 +246,7 @@ class ForeignNode:
             if now >= resend_at:
                 resend_at = now + RESEND_S
                 for peer in self.peers.values():
-                    for pieces in list(peer.under_way.values()):
+                    for pieces in list(peer.in_flight.values()):
                         self.leave(peer, pieces)
             try:
                 datagram, address = self.socket.recvfrom(65_536)
@@ -258,7 +258,7 @@ class ForeignNode:
     def heartbeat(self) -> bytes:
         now = time.monotonic()
         heard = [peer.boot[:8] for peer in self.peers.values() if now - peer.heard_at < HEARD_FOR_S]
-        numbers = (1, 1, self.features, 1000, len(heard), 0, self.to_all.next_number, self.casts)
+        numbers = (1, 1, self.features, 1000, len(heard), 0, self.to_all.next_number, self.broadcasts)
         head = b"\x01" + text(self.name) + struct.pack(">BBIHHIQI", *numbers)
         return head + bytes((len(heard),)) + b"".join(heard) + b"\x00\x00"
 
@@ -270,11 +270,11 @@ class ForeignNode:
         pieces = [payload[start : start + size] for start in range(0, len(payload), size)] or [b""]
         head = (len(payload), len(pieces), 0, 1000 + len(topic), priority, flags)
         announce = b"\x07" + struct.pack(">H", head[3]) + text(topic) + text("foreign/Type")
-        peer.under_way[number] = [
+        peer.in_flight[number] = [
             ((b"" if place else announce) + fragment(number, place, piece, None if place else head), set())
             for place, piece in enumerate(pieces)
         ]
-        self.leave(peer, peer.under_way[number])
+        self.leave(peer, peer.in_flight[number])
         return number
 
     def broadcast(self, topic: str, payload: bytes) -> None:
@@ -316,10 +316,10 @@ class ForeignNode:
             ):
                 return
             peer = self.peers.setdefault(boot, Peer(self.key, self.boot, boot, address))
-            opened = (peer.casts if kind == HELLO else peer.into).open(datagram)
+            opened = (peer.broadcasts if kind == HELLO else peer.into).open(datagram)
         else:
             for peer in self.peers.values():
-                channel = peer.casts if kind == BROADCAST else peer.into
+                channel = peer.broadcasts if kind == BROADCAST else peer.into
                 opened = channel.open(datagram) if channel.tag == datagram[1:3] else None
                 if opened is not None:
                     break
@@ -332,7 +332,7 @@ class ForeignNode:
         self.take_frames(peer, kind, frames)
 
     def take_frames(self, peer: Peer, kind: int, frames: list[tuple[int, Fields]]) -> None:
-        answer, wanted = b"", kind == INTRODUCTION
+        answer, expected = b"", kind == INTRODUCTION
         for what, fields in frames:
             match what:
                 case 1:
@@ -342,9 +342,9 @@ class ForeignNode:
                     self.acknowledged(peer, fields["largest"], fields["missing"])
                 case 3 if not fields["broadcast"]:
                     for number in fields["ids"]:
-                        if peer.under_way.pop(number, None):
+                        if peer.in_flight.pop(number, None):
                             peer.ends[number] = "delivered"
-                case 4 if fields["reason"] != 2 and peer.under_way.pop(fields["id"], None):
+                case 4 if fields["reason"] != 2 and peer.in_flight.pop(fields["id"], None):
                     peer.ends[fields["id"]] = f"refused {fields['reason']}"
                 case 5:
                     for number in fields["ids"]:
@@ -357,9 +357,9 @@ class ForeignNode:
                 case 10:
                     peer.said_bye = True
                 case 0x80 if peer.believed:
-                    wanted |= kind != BROADCAST
-                    self.piece(peer, fields, cast=fields["cast"] or kind == BROADCAST)
-        if wanted and kind != HELLO:
+                    expected |= kind != BROADCAST
+                    self.piece(peer, fields, broadcast=fields["cast"] or kind == BROADCAST)
+        if expected and kind != HELLO:
             answer = self.acknowledgement(peer) + answer
         if answer:
             self.say(peer, answer)
@@ -373,14 +373,14 @@ class ForeignNode:
 
     def acknowledged(self, peer: Peer, largest: int, missing: int) -> None:
         arrived = {largest - 1 - i for i in range(min(256, largest)) if not missing >> i & 1} | {largest}
-        for number, pieces in list(peer.under_way.items()):
+        for number, pieces in list(peer.in_flight.items()):
             pieces[:] = [(frames, packets) for frames, packets in pieces if not packets & arrived]
             if not pieces:
-                del peer.under_way[number]
+                del peer.in_flight[number]
                 peer.ends[number] = "delivered"
 
-    def piece(self, peer: Peer, fields: Fields, *, cast: bool) -> None:
-        key = (cast, fields["id"])
+    def piece(self, peer: Peer, fields: Fields, *, broadcast: bool) -> None:
+        key = (broadcast, fields["id"])
         if key in peer.finished:
             return
         partial = peer.partials.setdefault(key, Partial())

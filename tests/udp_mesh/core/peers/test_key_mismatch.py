@@ -19,12 +19,12 @@ def test_a_flood_of_unknown_keys_is_told_of_in_a_few_events_that_count_all() -> 
         data = stranger.seal_long(encode([Ping(number)]))[1]
         both.b.receive(data, "mesh", (f"10.1.{number >> 8 & 255}.{number & 255}", 8700), both.now)
         both.now += 8.0 / flood
-    told = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert BURST <= len(told) <= BURST + 2
+    events = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert BURST <= len(events) <= BURST + 2
     both.now += REFILL_INTERVAL_S
     both.roundtrip(times=3, step_s=1.0)
-    told += [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert sum(1 + event.more for event in told) == flood
+    events += [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert sum(1 + event.more for event in events) == flood
     assert both.b.conditions(both.now).counters.dropped_unauthenticated >= flood
 
 
@@ -33,5 +33,5 @@ def test_a_team_that_missed_a_rotation_is_told_of_robot_by_robot() -> None:
     for host in range(BURST):
         other = SendChannel(Key(bytes(range(9, 41))), bytes([host]) * 16, TO_ALL)
         both.b.receive(other.seal_long(encode([Ping(1)]))[1], "mesh", (f"10.0.0.{100 + host}", 8700), both.now)
-    told = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
-    assert [event.more for event in told] == [0] * BURST
+    events = [event for event in both.events(both.b) if isinstance(event, KeyMismatch)]
+    assert [event.more for event in events] == [0] * BURST

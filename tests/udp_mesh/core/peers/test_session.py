@@ -41,7 +41,7 @@ def test_two_nodes_meet_within_three_exchanges() -> None:
     assert [type(event) for event in both.events(both.b)] == [PeerOnline]
 
 
-def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
+def events_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Event]:
     """The events of a node that hears a new node of these wire versions that many times."""
     both = pair()
     boot_id = random.Random(5).randbytes(16)
@@ -55,9 +55,9 @@ def told_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[Ev
 
 
 def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_told_of_once_a_minute() -> None:
-    assert PeerOnline in map(type, told_of((1, 2), times=3, apart_s=1.0))
-    assert told_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
-    assert len(told_of((2, 3), times=5, apart_s=61.0)) == 5
+    assert PeerOnline in map(type, events_of((1, 2), times=3, apart_s=1.0))
+    assert events_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
+    assert len(events_of((2, 3), times=5, apart_s=61.0)) == 5
 
 
 def test_a_recorded_heartbeat_brings_nobody_online() -> None:

@@ -371,7 +371,7 @@ def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) 
     assert narrow(world) == []
 
 
-def under_way(world: World) -> list[int]:
+def in_flight(world: World) -> list[int]:
     """Sizes, as IP packets, of the datagrams that a sends from now on."""
     sizes: list[int] = []
     world.tap = lambda name, datagram, _: sizes.append(len(datagram.data) + IP_UDP_BYTES) if name == "a" else None
@@ -384,7 +384,7 @@ def under_way(world: World) -> list[int]:
 
 def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
     world = met(1500)
-    sizes = under_way(world)
+    sizes = in_flight(world)
     link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
     world.nodes["a"].link_up(link, world.now)
     assert world.run(20.0, until=lambda: bool(topics(world, "a", MessageDelivered)))

@@ -15,7 +15,7 @@ GAP_S, OVERDUE_S = 0.003, 0.025
 EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
 
 
-def piece(*, reliable: bool = True) -> OutgoingMessage:
+def fragment(*, reliable: bool = True) -> OutgoingMessage:
     topic = Topic("stop", priority=0, reliable=reliable)
     accepted = AcceptedMessage(
         MessageId(1), TopicChannel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None
@@ -40,25 +40,25 @@ def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at:
 
 def test_the_more_is_lost_the_more_copies_leave_before_an_answer_can_come() -> None:
     early = [
-        sum(at < OVERDUE_S for at in sendings(piece(), twice=twice, loss=loss))
+        sum(at < OVERDUE_S for at in sendings(fragment(), twice=twice, loss=loss))
         for twice, loss in ((False, 0.0), (True, 0.05), (True, 0.1), (True, 0.2))
     ]
     assert early == [0, 1, 2, 3]
-    assert sendings(piece(), twice=False, loss=0.0) == []
-    assert sendings(piece(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
+    assert sendings(fragment(), twice=False, loss=0.0) == []
+    assert sendings(fragment(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
 
 
 def test_an_overdue_answer_brings_another_copy_a_bounded_number_of_times() -> None:
-    later = [at for at in sendings(piece(), twice=True, loss=0.05) if at > GAP_S]
+    later = [at for at in sendings(fragment(), twice=True, loss=0.05) if at > GAP_S]
     assert later == pytest.approx([n * OVERDUE_S for n in range(1, MAX_OVERDUE_COPIES + 1)])
 
 
 def test_an_answer_ends_it() -> None:
-    assert sendings(piece(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
+    assert sendings(fragment(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
 
 
 def test_best_effort_is_copied_early_only_since_nobody_answers_for_it() -> None:
-    message = piece(reliable=False)
+    message = fragment(reliable=False)
     message.ended = True
     assert sendings(message, twice=True, loss=0.2) == pytest.approx(EARLY_S)
 

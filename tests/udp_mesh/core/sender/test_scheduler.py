@@ -126,8 +126,8 @@ def test_a_level_that_never_gets_its_turn_is_reported() -> None:
         world.send("a", "hog", bytes(1_000_000), "b")
     world.send("a", "starving", b"please", "b")
     world.run(8.0)
-    told = world.events_of("a", TopicStarved)
-    assert [event.topic for event in told if isinstance(event, TopicStarved)] == ["starving"]
+    events = world.events_of("a", TopicStarved)
+    assert [event.topic for event in events if isinstance(event, TopicStarved)] == ["starving"]
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
     assert queues[12].starved_s > 5
     assert queues[5].starved_s == 0
