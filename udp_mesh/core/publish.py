@@ -30,7 +30,7 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
-from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
+from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES

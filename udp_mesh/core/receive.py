@@ -17,8 +17,9 @@ from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
-from udp_mesh.wire.codec import FRAGMENT, decode
+from udp_mesh.wire.codec import decode
 from udp_mesh.wire.errors import DecodeError, UnknownVersionError
+from udp_mesh.wire.fragment import FRAGMENT
 from udp_mesh.wire.frames import (
     Ack,
     Bye,

@@ -6,8 +6,6 @@ full fragments of one message takes the fast path: one pack, one seal and one re
 datagram.
 """
 
-import struct
-
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receiver.datagram_age import clock_ms
@@ -20,7 +18,8 @@ from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
-from udp_mesh.wire.codec import (
+from udp_mesh.wire.codec import encode
+from udp_mesh.wire.fragment import (
     FRAGMENT,
     FRAGMENT_ACK_NOW,
     FRAGMENT_BYTES,
@@ -29,7 +28,9 @@ from udp_mesh.wire.codec import (
     HEAD_BYTES,
     LENGTH_BYTES,
     LIFE_BYTES,
-    encode,
+    NARROW_HEADER,
+    WIDE_FROM,
+    WIDE_HEADER,
 )
 from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, Sent, TopicAnnounce
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
@@ -50,10 +51,6 @@ ID_BYTES = 4
 
 NO_MESSAGE_ID = 0xFFFF_FFFF
 """Messages are numbered from 0; no boot lives long enough to use this number."""
-
-_NARROW = struct.Struct(">BIH")
-_WIDE = struct.Struct(">BII")
-_NARROW_POSITIONS = 65_536
 
 
 def header_bytes(address: Address) -> int:
@@ -241,12 +238,12 @@ def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSn
     frames = []
     spacing = ack_spacing(sender)
     since = sender.since_ack_requested
-    wide = position + count > _NARROW_POSITIONS
-    pack = _WIDE.pack if wide else _NARROW.pack
+    wide = position + count > WIDE_FROM
+    pack = WIDE_HEADER.pack if wide else NARROW_HEADER.pack
     plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
-    if wide and position < _NARROW_POSITIONS:
-        count = _NARROW_POSITIONS - position
-        pack, plain = _NARROW.pack, FRAGMENT
+    if wide and position < WIDE_FROM:
+        count = WIDE_FROM - position
+        pack, plain = NARROW_HEADER.pack, FRAGMENT
     for place in range(position, position + count):
         since += 1
         first = plain
