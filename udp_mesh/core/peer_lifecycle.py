@@ -28,6 +28,7 @@ from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, SUSPENDED_S, State
@@ -175,7 +176,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
             validate_path(state, session, link, source, now)
             return
         set_online(state, peer, session, now)
-    if peer.has_sender and peer.sender.unresponsive_since is not None:
+    if peer.has_sender and peer.sender.state is SendState.UNRESPONSIVE:
         peer.sender.on_activity(now)
         state.ready[peer] = None
 
@@ -206,7 +207,7 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
         return
     path = session.path
     sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
-    timing_out = sender is not None and (sender.timing_out or sender.unresponsive_since is not None)
+    timing_out = sender is not None and sender.state is not SendState.ACTIVE
     first = not path.link
     quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
     if not first and not quiet and not timing_out:
@@ -307,7 +308,12 @@ def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None
     larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
     if not larger:
         size.narrowed_at = None
-    elif peer.online and path.confirmed and sender.unresponsive_since is None and size.probe.due(now, sender.loss):
+    elif (
+        peer.online
+        and path.confirmed
+        and sender.state is not SendState.UNRESPONSIVE
+        and size.probe.due(now, sender.loss)
+    ):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
             size.probe.on_probe_sent(token, mtu)
@@ -328,9 +334,8 @@ def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     peer.left = left
     peer.online_since = None
     state.event_queue.emit(PeerOffline(peer.name, left))
-    if peer.has_sender and peer.sender.unresponsive_since is None and peer.sender.in_flight.outstanding:
-        peer.sender.unresponsive_since = now
-        peer.sender.allow_probe(now)
+    if peer.has_sender and peer.sender.state is not SendState.UNRESPONSIVE and peer.sender.in_flight.outstanding:
+        peer.sender.become_unresponsive(now)
     store_in_outbox(state, peer, now)
 
 

@@ -14,6 +14,7 @@ from udp_mesh.core.peers.session import Session
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, long_lateness_s, timestamp_of
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
@@ -136,7 +137,7 @@ def _receive_data(
         and peer.session is session
         and source == path.address
         and link == path.link
-        and peer.sender.unresponsive_since is None
+        and peer.sender.state is not SendState.UNRESPONSIVE
     ):
         session.last_heard = path.heard_at = now
     else:

@@ -14,6 +14,7 @@ from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
 from udp_mesh.core.sender.send_quota import ack_spacing, cwnd_room, next_send_at, send_quota, urgent_wait_until
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
@@ -144,7 +145,7 @@ def send_level(
         if quota <= 0:
             sender.app_limited = False
             if urgent:
-                if sender.unresponsive_since is None:
+                if sender.state is not SendState.UNRESPONSIVE:
                     sender.wake_at = min(sender.wake_at, urgent_wait_until(sender))
             elif (next_at := next_send_at(sender, room, now, pace)) is not None:
                 sender.wake_at = min(sender.wake_at, next_at)
@@ -183,7 +184,7 @@ def send_level(
 def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
     """Send the redundant copies that are due and not acknowledged meanwhile."""
     for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
-        if sender.unresponsive_since is not None:
+        if sender.state is SendState.UNRESPONSIVE:
             continue
         run = Run(message, position, 1, retransmit=True)
         _seal_datagram(
