@@ -21,6 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.path_validation import validate_path
+from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
@@ -140,11 +141,9 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
 
 def set_online(state: State, peer: Peer, session: Session, now: float) -> None:
     """The peer is online (again)."""
-    peer.left = False
-    peer.lost = False
     if peer.online:
         return
-    peer.online = True
+    peer.transition(PeerEvent.HEARD)
     peer.online_since = now
     state.event_queue.emit(PeerOnline(peer.name, session.path.address, session.path.link))
     release_outbox(state, peer, now)
@@ -330,8 +329,7 @@ def on_bye(state: State, session: Session, now: float) -> None:
 
 def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     """The peer is unreachable: messages with an outbox move there; the rest waits for `peer_lost_s`."""
-    peer.online = False
-    peer.left = left
+    peer.transition(PeerEvent.SILENT)
     peer.online_since = None
     state.event_queue.emit(PeerOffline(peer.name, left))
     if peer.has_sender and peer.sender.state is not SendState.UNRESPONSIVE and peer.sender.in_flight.outstanding:
@@ -395,8 +393,8 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
     offline_after_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
     if peer.online and max(quiet_s, one_way_s) > offline_after_s:
         set_offline(state, peer, now, left=False)
-    if not peer.online and not peer.lost and max(quiet_s, one_way_s) > rates.peer_lost_s:
-        peer.lost = True
+    if peer.state is PeerState.OFFLINE and max(quiet_s, one_way_s) > rates.peer_lost_s:
+        peer.transition(PeerEvent.GIVEN_UP)
         if peer.has_sender:
             peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)

@@ -21,6 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.legacy.sender import can_publish
 from udp_mesh.core.outbox import HeldMessage
+from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
@@ -191,7 +192,7 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     message.store_key = store_key
     sender = peer.sender
     sender.accept(message, now)
-    if peer.lost:
+    if peer.state is PeerState.LOST:
         sender.finish(message, Outcome.PEER_LOST)
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)

@@ -10,6 +10,7 @@ from udp_mesh.core.conditions import Counters
 from udp_mesh.core.events import ExpiryReason, MessageReceived
 from udp_mesh.core.peer_lifecycle import migrate_path, on_activity, on_bye, on_heartbeat, on_verified
 from udp_mesh.core.peers.path_validation import send_on_path
+from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, long_lateness_s, timestamp_of
@@ -133,7 +134,7 @@ def _receive_data(
             return
     if (
         peer is not None
-        and peer.online
+        and peer.state is PeerState.ONLINE
         and peer.session is session
         and source == path.address
         and link == path.link
