@@ -31,13 +31,11 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
+from udp_mesh.wire.codec import ANNOUNCE_BYTES
 from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
-
-ANNOUNCE_BYTES = 5
-"""Size of a topic announcement without its two names."""
 
 RELEASE_BATCH = 400
 """Outbox messages queued at a time: some milliseconds, in which no urgent message can be sent."""

@@ -15,10 +15,20 @@ from udp_mesh.core.peers.session import Session
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, long_lateness_s, timestamp_of
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
+from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
-from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, UnknownKeyError, check_long
+from udp_mesh.crypto import (
+    SHORT_OVERHEAD_BYTES,
+    TO_ALL,
+    Key,
+    OpenError,
+    ReceiveChannel,
+    ReplayError,
+    UnknownKeyError,
+    check_long,
+)
 from udp_mesh.wire.codec import decode
 from udp_mesh.wire.errors import DecodeError, UnknownVersionError
 from udp_mesh.wire.fragment import FRAGMENT
@@ -56,7 +66,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
     counters = state.event_queue.counters
     size = len(data)
     counters.datagrams_received += 1
-    counters.bytes_received += size + 28
+    counters.bytes_received += size + IP_UDP_BYTES
     if size < _MIN_BYTES:
         counters.dropped_malformed += 1
         return
@@ -123,7 +133,7 @@ def _receive_data(
     """Process a datagram bound to our current boot: its sender is alive, or was when it was recorded."""
     path = session.path
     peer = session.peer
-    session.received_bytes += len(frames) + 51
+    session.received_bytes += len(frames) + SHORT_OVERHEAD_BYTES + IP_UDP_BYTES
     if not frames:
         state.event_queue.counters.dropped_malformed += 1
         return

@@ -57,6 +57,8 @@ _HEARTBEAT = struct.Struct(">BBIHHIQI")
 
 SENT_BYTES = 5
 """The frame `Sent`."""
+ANNOUNCE_BYTES = 5
+"""The frame `TopicAnnounce` without its two names."""
 
 _NO_EXTENSION = b"\x00"
 """Length of an empty heartbeat extension; a reader skips extension fields it does not know."""

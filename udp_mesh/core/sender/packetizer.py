@@ -19,7 +19,7 @@ from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
-from udp_mesh.wire.codec import encode
+from udp_mesh.wire.codec import ANNOUNCE_BYTES, encode
 from udp_mesh.wire.fragment import (
     FRAGMENT,
     FRAGMENT_ACK_NOW,
@@ -217,7 +217,7 @@ def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
     channel = message.accepted.channel
     first = path.fragment_bytes - HEAD_BYTES
     if channel.number not in sender.announced:
-        first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+        first -= ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
     broadcast_number = message.accepted.broadcast_number
     if broadcast_number is not None:
@@ -351,7 +351,7 @@ def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
         size += HEAD_BYTES + (LIFE_BYTES if _sends_life(path, message) else 0)
         channel = message.accepted.channel
         if channel.number not in sender.announced:
-            size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+            size += ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 
