@@ -93,19 +93,19 @@ def on_heartbeat(
 
 def on_verified(state: State, session: Session, now: float) -> None:
     """The session has proved that it hears our current boot."""
-    arrival, peer = state.peer_table.verify(session, state.settings)
-    if arrival is VerifyResult.OWN_NAME:
+    result, peer = state.peer_table.verify(session, state.settings)
+    if result is VerifyResult.OWN_NAME:
         _own_name(state, session, now)
         return
     if peer is None:
         state.event_queue.counters.dropped_over_limit += 1
         return
-    if arrival is VerifyResult.RETIRED:
+    if result is VerifyResult.RETIRED:
         # It becomes current again when it is heard and the later boot is gone (`on_activity`).
         return
     session.freshness.confirm(now)
     _replace(state, peer, session, now)
-    if arrival is VerifyResult.RESTARTED and peer.online:
+    if result is VerifyResult.RESTARTED and peer.online:
         state.event_queue.emit(PeerRestarted(peer.name))
         peer.online_since = now
     set_online(state, peer, session, now)
@@ -359,9 +359,9 @@ def maintain(state: State, now: float) -> None:
         if not peer.has_sender:
             _maintain_peer(state, peer, now)
     for name in state.outboxes.peers():
-        holding = state.peer_table.peers.get(name)
-        if holding is not None and holding.online and not holding.settling:
-            release_outbox(state, holding, now)
+        peer_with_outbox = state.peer_table.peers.get(name)
+        if peer_with_outbox is not None and peer_with_outbox.online and not peer_with_outbox.settling:
+            release_outbox(state, peer_with_outbox, now)
     for session in state.peer_table.not_current():
         session.age_windows(now)
         if session.name_conflict and session.peer is not None:
@@ -388,12 +388,12 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         return
     rates = state.settings.rates
     session.age_windows(now)
-    quiet_s = now - session.last_heard
+    silent_s = now - session.last_heard
     one_way_s = now - session.one_way_since if session.one_way_since is not None else 0.0
     offline_after_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
-    if peer.online and max(quiet_s, one_way_s) > offline_after_s:
+    if peer.online and max(silent_s, one_way_s) > offline_after_s:
         set_offline(state, peer, now, left=False)
-    if peer.state is PeerState.OFFLINE and max(quiet_s, one_way_s) > rates.peer_lost_s:
+    if peer.state is PeerState.OFFLINE and max(silent_s, one_way_s) > rates.peer_lost_s:
         peer.transition(PeerEvent.GIVEN_UP)
         if peer.has_sender:
             peer.sender.finish_all(Outcome.PEER_LOST)

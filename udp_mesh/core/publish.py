@@ -280,8 +280,8 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
         started, session = held.started, peer.session
         if started is not None and held.epoch == peer.sender.epoch:
             # A message sent completely may have arrived completely; under a new number it would arrive twice.
-            whole = started.next_position >= started.fragments
-            if session is not None and (whole or started.fragment_bytes <= session.path.fragment_bytes):
+            fully_sent = started.next_position >= started.fragments
+            if session is not None and (fully_sent or started.fragment_bytes <= session.path.fragment_bytes):
                 started.store_key = held.store_key
                 peer.sender.resume(started, now)
                 state.ready[peer] = None

@@ -118,9 +118,9 @@ class LegacyPeers:
                     peer.transition(PeerEvent.CONFIGURED)
                     self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
 
-    def _drop(self, gone: LegacyPeer) -> None:
+    def _drop(self, removed: LegacyPeer) -> None:
         """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
-        peer, state = gone.peer, self._state
+        peer, state = removed.peer, self._state
         peer.legacy = peer.settling = False
         peer.legacy_meters = None
         heard = peer.session is not None or peer.legacy_path is not None
@@ -256,13 +256,13 @@ class LegacyPeers:
             peer = legacy.peer
             if suspended_s > SUSPENDED_S:
                 legacy.last_heard = min(now, legacy.last_heard + suspended_s)
-            quiet_s = now - legacy.last_heard
-            if peer.online and quiet_s > rates.offline_s:
+            silent_s = now - legacy.last_heard
+            if peer.online and silent_s > rates.offline_s:
                 peer.transition(PeerEvent.SILENT)
                 peer.online_since = None
                 state.event_queue.emit(PeerOffline(peer.name, left=False))
                 store_in_outbox(state, peer, now)
-            if peer.state is PeerState.OFFLINE and quiet_s > rates.peer_lost_s:
+            if peer.state is PeerState.OFFLINE and silent_s > rates.peer_lost_s:
                 peer.transition(PeerEvent.GIVEN_UP)
                 peer.sender.finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
