@@ -48,6 +48,10 @@ from udp_mesh.wire.header import (
 
 _MIN_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
+# Compared for every datagram: a global costs less than an enum member.
+_ONLINE = PeerState.ONLINE
+_UNRESPONSIVE = SendState.UNRESPONSIVE
+
 
 def receive_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
     """See `Node.receive`."""
@@ -132,11 +136,11 @@ def _receive_data(
             return
     if (
         peer is not None
-        and peer.state is PeerState.ONLINE
+        and peer.state is _ONLINE
         and peer.session is session
         and source == path.address
         and link == path.link
-        and peer.sender.state is not SendState.UNRESPONSIVE
+        and peer.sender.state is not _UNRESPONSIVE
     ):
         session.last_heard = path.heard_at = now
     else:
