@@ -45,8 +45,8 @@ CHANNEL_BITS_PER_S = 20e6
 TRANSMISSION_S = 0.0001
 """Preamble, spacing and acknowledgement of a radio."""
 TELEMETRY_S = 0.2
-SWITCHED_ON_WITHIN_S = 2.0
-LONGEST_S = 900.0
+POWER_ON_SPREAD_S = 2.0
+MAX_DURATION_S = 900.0
 """A team that has not met by then never will."""
 
 
@@ -81,7 +81,7 @@ class OpenField:
         self._wake_s = [float("inf")] * count
         for index, node in enumerate(self.nodes):
             node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, self.addresses[index], ("10.0.255.255", 8700)), 0.0)
-            self.agenda.at(rng.random() * SWITCHED_ON_WITHIN_S, partial(self._switch_on, index))
+            self.agenda.at(rng.random() * POWER_ON_SPREAD_S, partial(self._switch_on, index))
 
     @property
     def all_pairs(self) -> int:
@@ -98,7 +98,7 @@ class OpenField:
         """Run until the number of known pairs satisfies `pairs`; returns how long that took."""
         begun = self.agenda.now
         while not pairs(self.known_pairs):
-            if self.agenda.now - begun > LONGEST_S:
+            if self.agenda.now - begun > MAX_DURATION_S:
                 return None
             self.agenda.run_until(self.agenda.now + 0.05)
         return self.agenda.now - begun

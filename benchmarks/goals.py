@@ -64,7 +64,7 @@ COMPARED: tuple[tuple[str, bool], ...] = (
     ("settled_p99_s", False),
 )
 # whose urgent messages do not arrive has no latency to compare
-_LEAST_ARRIVED = 0.99
+_MIN_ARRIVED = 0.99
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def compared(results: Iterable[Mapping[str, Any]]) -> list[Comparison]:
 
 def _comparable(result: Mapping[str, Any], figure: str) -> float | None:
     arrived = result.get("urgent_arrived")
-    if figure == "urgent_p99_s" and arrived is not None and arrived < _LEAST_ARRIVED:
+    if figure == "urgent_p99_s" and arrived is not None and arrived < _MIN_ARRIVED:
         return None
     value = result.get(figure)
     return None if value is None else float(value)

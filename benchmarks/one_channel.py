@@ -48,9 +48,9 @@ GOAL_P99_S = {0.0: 0.020, 0.05: 0.025, 0.2: 0.050}
 """By the channel's loss: the base link's goals for one robot, asked of each of several."""
 GOAL_DEVIATION_S = 0.04
 GOAL_OF_CEILING = 0.95
-LEAST_FAIRNESS = 0.95
+MIN_FAIRNESS = 0.95
 """Jain's index where one robot of four gets half of what the others get is 0.93."""
-BEGIN_S = 3.0
+START_S = 3.0
 """The team has met."""
 COUNT_FROM_S = 6.0
 COUNT_S = 30.0
@@ -97,9 +97,9 @@ class OneChannel:
         for number, name in enumerate((*self.senders, *self.guests)):
             # robots do not report at one moment
             if telemetry:
-                agenda.at(BEGIN_S + TELEMETRY_S * number / len(self.seen), partial(self._report, name))
+                agenda.at(START_S + TELEMETRY_S * number / len(self.seen), partial(self._report, name))
         for name in self.senders:
-            agenda.at(BEGIN_S, partial(self._fill, name))
+            agenda.at(START_S, partial(self._fill, name))
 
     def run(self) -> None:
         """To the end; `airtime_s` is then what everybody sent while counting, `base_airtime_s` what the base sent."""
@@ -289,7 +289,7 @@ def tables(results: Sequence[dict[str, Any]]) -> str:
     head += ["urgent p50, ms", "urgent p99 of the worst, ms", "goal, ms", ""]
     parts.append([row(head), row(["---"] * len(head))])
     for one in (one for one in results if one["set"] == "teams"):
-        met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= LEAST_FAIRNESS
+        met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= MIN_FAIRNESS
         parts[-1].append(
             row([
                 str(one["robots"]), f"{one['loss']:.0%}",

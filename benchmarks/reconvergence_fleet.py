@@ -219,8 +219,8 @@ class Bench:
             list(pool.map(tell, range(len(NODES))))
         self._configured_s = time.monotonic()
         for name in NODES:
-            told = json.loads(self._on(name, "batctl meshif bat0 mesh_json"))
-            found = (told["algo_name"], told["orig_interval"])
+            mesh = json.loads(self._on(name, "batctl meshif bat0 mesh_json"))
+            found = (mesh["algo_name"], mesh["orig_interval"])
             if found != (case.algorithm, case.interval_ms):
                 raise RuntimeError(f"{name} runs {found} and not {case}")
 

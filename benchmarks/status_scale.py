@@ -31,7 +31,7 @@ from benchmarks.status_fleet import Devices, programs_missing
 
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
 RUNS = 3
-LOOKS_WATCHED = 4
+WATCH_ROUNDS = 4
 
 
 def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, float, dict[str, Any]]:
@@ -76,7 +76,7 @@ def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, flo
         text=True,
     ) as process:
         assert process.stdout is not None
-        looks = [json.loads(process.stdout.readline()) for _ in range(LOOKS_WATCHED)]
+        looks = [json.loads(process.stdout.readline()) for _ in range(WATCH_ROUNDS)]
         process.send_signal(signal.SIGINT)
         process.wait(60)
     return {"seconds": statistics.median(look["took_s"] for look in looks[1:])}
