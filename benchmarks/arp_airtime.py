@@ -1,12 +1,12 @@
-"""What ARP costs of the air, batman-adv's table of answers off and on: `python -m benchmarks.arp_airtime [--fill]`.
+"""Airtime of ARP, with batman-adv's distributed ARP table off and on: `python -m benchmarks.arp_airtime [--fill]`.
 
-The lab's example fleet (six nodes, three computers) is taken in on real 802.11 radios, then, for each setting of
-`distributed_arp_table` on all nodes (`Bench.set_table`) and each scene:
+The lab's example fleet (six nodes, three computers) is provisioned on the kernel's 802.11 radios, then, for each
+setting of `distributed_arp_table` on all nodes (`Bench.set_table`) and each scenario:
 
-    caches are emptied -> somebody listens on the air, the operator's computer does what the scene says -> one line
+    flush ARP caches -> capture the channel while the operator's computer runs the scenario -> one line of results
 
-of results. `quiet`: nobody talks. `pings`: the operator's computer pings every node and every other computer once in
-five seconds, as somebody does who watches a fleet. `one gone`: the same, and one of the nodes has lost its power.
+`quiet`: no traffic. `pings`: the operator's computer pings every node and every other computer every five seconds, as
+monitoring would. `one gone`: the same, with one node powered off.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ PROGRAM = Path(__file__).with_name("in_machine") / "overhear_arp.py"
 SCENARIOS = ("quiet", "pings", "one gone")
 SCENARIO_S = 60
 PING_EVERY_S = 5
-# whoever loses its power in the last scene: there is a way around it, so that it alone is looked for in vain
+# powered off in the last scenario: there is a path around it, so that only its own address is unanswered
 POWERED_OFF_NODE = "b02"
-# under emulation, on a machine with other things to do; loop avoidance alone holds a new bat0 for half a minute
+# under emulation on a busy host; loop avoidance alone holds a new bat0 for half a minute
 _START_S, _COMMAND_S, _SETTLE_S = 600.0, 900.0, 240.0
 _POLL_S = 0.5
 _WINDOW_S = 600
-# a connection into a starved machine may break; what is said to a node may be said again
+# a connection into a starved machine may break; all commands are safe to repeat
 _ATTEMPTS = 3
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.arp_airtime", description=__doc__)
-    parser.add_argument("--runs", type=int, default=2, help="how often each scene is measured")
+    parser.add_argument("--runs", type=int, default=2, help="number of runs of each scenario")
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
-    parser.add_argument("--fill", action="store_true", help=f"put the table into {PAGE.relative_to(ROOT)}")
+    parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
+    parser.add_argument("--fill", action="store_true", help=f"write the table to {PAGE.relative_to(ROOT)}")
     arguments = parser.parse_args()
     if not arguments.tables:
         measure(arguments.results, arguments.runs)
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def measure(results: Path, runs: int) -> None:
-    """Append what every scene lacks to the results, each as soon as it was measured."""
+    """Append the missing runs of every scenario to the results, each as soon as it was measured."""
     with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as made:
         for _ in range(runs):
             for is_on in (False, True):
@@ -93,9 +93,9 @@ def measure(results: Path, runs: int) -> None:
 
 @contextmanager
 def bench(place: Path) -> Iterator[Bench]:
-    """The example fleet, taken in and carried into the field."""
+    """The example fleet, provisioned and unplugged."""
     copy = copy_inventory(ROOT / "inventory" / "lab", place / "lab")
-    # a change is proven within seconds; on a starved host the emulated one takes minutes
+    # confirming a change takes seconds, but minutes in an emulated machine on a starved host
     file = copy.inventory / "fleet.yaml"
     text = file.read_text(encoding="utf-8")
     file.write_text(text.replace("confirm_window_s: 90", f"confirm_window_s: {_WINDOW_S}"), encoding="utf-8")
@@ -133,42 +133,42 @@ class Bench:
         for _ in range(_ATTEMPTS):
             words = (sys.executable, "-m", "meshctl", "bootstrap", "--yes", *left)
             subprocess.run(words, env=environment, check=False, timeout=_COMMAND_S, stdout=subprocess.DEVNULL)
-            # what was proven too late, on a starved machine, has gone back by itself
+            # on a starved machine, nodes that were proven too late have rolled back
             left = [
                 name for name in left if self._fleet.node(name).address != str(self._inventory.nodes[name].address.ip)
             ]
             if not left:
                 break
         else:
-            raise RuntimeError(f"{', '.join(left)} could not be taken in")
+            raise RuntimeError(f"cannot provision {', '.join(left)}")
         for name in self.nodes:
             self._fleet.node(name).plug(False)
         control.run(self._fleet.directory, f"cat >/run/overhear_arp.py <<'END'\n{PROGRAM.read_text()}END").check("put")
 
     def set_table(self, *, is_on: bool) -> None:
-        """On every node, and bat0 is made anew, so that no table knows anything; then wait for the mesh."""
+        """Set the table on every node, which recreates bat0 with empty tables; then wait for the mesh."""
         words = f"uci set network.bat0.distributed_arp_table={is_on:d} && uci commit network && reload_config"
         self._on_all(words)
         for name in self.nodes:
             setting = self._on(name, "batctl meshif bat0 distributed_arp_table").strip()
             if setting != ("enabled" if is_on else "disabled"):
-                raise RuntimeError(f"{name}: its table of ARP answers is {setting}")
+                raise RuntimeError(f"{name}: its distributed ARP table is {setting}")
         self._settle()
 
     def run_scenario(self, scene: str) -> dict[str, Any]:
-        """What was on the air: `overheard`, lists of kind, rate, bytes and count, and the number of `requests`."""
+        """The captured traffic: `overheard`, rows of kind, rate, bytes and count, and the number of `requests`."""
         if scene == "one gone":
             self._fleet.inject_fault(POWERED_OFF_NODE, "off")
         self._on_all("ip neigh flush all", but=POWERED_OFF_NODE if scene == "one gone" else "")
         for robot in self._inventory.robots:
             self._machine(f"ip netns exec pc.{robot} ip neigh flush all")
         try:
-            # whoever listens is there before anybody speaks
+            # start the capture before any traffic
             self._machine(f"python3 /run/overhear_arp.py {SCENARIO_S} >/run/arp.out 2>&1 </dev/null &")
-            self._until(lambda: self._capture().startswith("listening"), "somebody to listen")
+            self._until(lambda: self._capture().startswith("listening"), "the capture to start")
             if scene != "quiet":
                 self._machine("; ".join(self._ping(address) for address in self._addresses))
-            self._until(lambda: "requests" in self._capture(), "the scene to end")
+            self._until(lambda: "requests" in self._capture(), "the scenario to end")
             text = self._capture()
         finally:
             if scene == "one gone":
@@ -182,7 +182,7 @@ class Bench:
         return {"requests": int(last.split()[1]), "overheard": overheard}
 
     def _ping(self, address: str) -> str:
-        # with a deadline of its own ping would end at the first address that nobody has
+        # with its own deadline ping would end at the first address that does not answer
         words = f"timeout {SCENARIO_S} ping -q -i {PING_EVERY_S} {address}"
         return f"(ip netns exec pc.{self._operator} {words} >/dev/null 2>&1 </dev/null &)"
 
@@ -218,7 +218,7 @@ class Bench:
                 if not left:
                     raise
                 _log(f"{name}: {error}; again")
-        raise AssertionError("no try was made")
+        raise AssertionError("no attempt was made")
 
     def _machine(self, command: str, *, timeout_s: float = 60.0) -> str:
         return control.run(self._fleet.directory, command, timeout_s=timeout_s).check(command[:80]).stdout
@@ -232,7 +232,7 @@ def _log(text: str) -> None:
 
 
 def recorded(path: Path) -> list[dict[str, Any]]:
-    """Every scene that was measured, in the order of measuring."""
+    """Every recorded run, in order."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
@@ -241,7 +241,7 @@ def runs_of(results: list[dict[str, Any]], scene: str, *, is_on: bool) -> list[d
 
 
 def air_us(result: dict[str, Any], *kinds: str) -> float:
-    """How long frames of these kinds took the air, in microseconds; what goes to one station is acknowledged."""
+    """Airtime of frames of these kinds, in microseconds; unicast frames are acknowledged."""
     total_us: float = sum(
         one["count"] * airtime_us(one["rate"], one["bytes"], "probe" if one["kind"] in ("unicast", "table") else "ogm")
         for one in result["overheard"]
@@ -254,7 +254,7 @@ ARP = ("broadcast", "unicast", "table")
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """One row per scene and setting: medians of the runs, per minute."""
+    """One row per scenario and setting: medians of the runs, per minute."""
     lines = [
         "| scene | table | runs | ARP broadcasts | their transmissions | other ARP frames | ARP, bytes "
         "| ARP, of the air | OGMs, of the air |",
