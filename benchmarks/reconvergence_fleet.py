@@ -209,14 +209,14 @@ class Bench:
         # BATMAN_V measures links with ELP, by default twice per OGM interval
         elp = f"set network.mesh0.elp_interval={case.interval_ms // 2}" if case.algorithm == "BATMAN_V" else ""
 
-        def tell(number: int) -> None:
+        def set_node(number: int) -> None:
             words = _CONFIGURE.format(
                 address=f"10.42.0.{101 + number}", algorithm=case.algorithm, interval_ms=case.interval_ms, elp=elp
             )
             self._fleet.node(NODES[number]).exec(words, timeout_s=_COMMAND_S).check(f"configure {NODES[number]}")
 
         with ThreadPoolExecutor(len(NODES)) as pool:
-            list(pool.map(tell, range(len(NODES))))
+            list(pool.map(set_node, range(len(NODES))))
         self._configured_s = time.monotonic()
         for name in NODES:
             mesh = json.loads(self._on(name, "batctl meshif bat0 mesh_json"))

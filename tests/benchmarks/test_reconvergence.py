@@ -144,8 +144,8 @@ def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path
         SECOND: [NoPauseError("telemetry did not pause when one fell silent"), 3.0, 4.0],
         THIRD: [NoPauseError("never")] * 9,
     }
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
-    assert told == [
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
+    assert lines == [
         "500: 1.0", "500: waited 90 s for telemetry over the other relay", "1000: 3.0", "1000: 4.0", "100: never",
     ]  # fmt: skip
     assert machine.boots == 1
@@ -153,14 +153,14 @@ def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path
 
 def test_a_machine_that_ends_is_started_once_more_for_the_cases_left(tmp_path: Path, machine: Machine) -> None:
     machine.outcomes = {FIRST: [LabError("gone")], SECOND: [3.0, 4.0], THIRD: [LabError("gone again")]}
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
-    assert told == ["500: gone", "1000: 3.0", "1000: 4.0", "100: gone again"]
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
+    assert lines == ["500: gone", "1000: 3.0", "1000: 4.0", "100: gone again"]
     assert machine.boots == 2
 
 
 def test_without_time_each_case_that_was_not_begun_says_so(tmp_path: Path, machine: Machine) -> None:
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND], ends_s=0.0)
-    assert told == [f"{case.interval_ms}: not begun: no machine, or no time left" for case in (FIRST, SECOND)]
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND], ends_s=0.0)
+    assert lines == [f"{case.interval_ms}: not begun: no machine, or no time left" for case in (FIRST, SECOND)]
     assert machine.boots == 0
     machine.outcomes = {FIRST: [1.0, 2.0], SECOND: [3.0, 4.0]}
     assert len(measure(tmp_path / "results.jsonl", [FIRST, SECOND])) == 6

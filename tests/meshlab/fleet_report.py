@@ -33,22 +33,22 @@ def fleets_of(values: Iterable[object]) -> list[VirtualFleet]:
 def report(fleet: VirtualFleet, failure: str) -> str:
     """All nodes in a line each; console, log and processes of those that are not up or that `failure` names (none: of
     all); the end of the fleet's own logs."""
-    told = [f"fleet {fleet.spec.name} in {fleet.directory}"]
+    parts = [f"fleet {fleet.spec.name} in {fleet.directory}"]
     try:
         nodes = fleet.status()["nodes"]
     except MeshctlError as error:
         nodes = []
-        told.append(f"it does not answer: {error}")
-    told += [json.dumps({key: node[key] for key in ("name", "power", "reason", "boots", "breaks")}) for node in nodes]
+        parts.append(f"it does not answer: {error}")
+    parts += [json.dumps({key: node[key] for key in ("name", "power", "reason", "boots", "breaks")}) for node in nodes]
     odd = [node for node in nodes if node["power"] != Power.UP.value or node["name"] in failure]
     for node in (odd or nodes)[:_NODES]:
-        told.append(_node(fleet.node(node["name"]), is_running=bool(node["pid"])))
+        parts.append(_node(fleet.node(node["name"]), is_running=bool(node["pid"])))
     for name in _LOGS:
         file = fleet.directory / name
         if file.exists():
             lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-            told.append("\n".join([f"--- {name}", *lines[-_LOG_LINES:]]))
-    return "\n".join(told)
+            parts.append("\n".join([f"--- {name}", *lines[-_LOG_LINES:]]))
+    return "\n".join(parts)
 
 
 def _node(node: VirtualNode, *, is_running: bool) -> str:

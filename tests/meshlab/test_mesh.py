@@ -18,17 +18,17 @@ pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 def test_a_node_behind_the_mesh_is_reached_at_its_address_and_knows_its_neighbours(mesh: VirtualFleet) -> None:
     transport = connect(mesh.endpoint("10.42.0.3"))
-    neighbours = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
+    neighbors = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
     originators = json.loads(run(transport, "batctl meshif bat0 originators_json"))
     stations = run(transport, "iw dev mesh0 station dump")
     info = json.loads(run(transport, 'ubus call iwinfo info \'{"device":"mesh0"}\''))
     transport.close()
-    assert len(neighbours) == 1
-    assert set(neighbours[0]) == {"hard_ifindex", "hard_ifname", "last_seen_msecs", "neigh_address"}
+    assert len(neighbors) == 1
+    assert set(neighbors[0]) == {"hard_ifindex", "hard_ifname", "last_seen_msecs", "neigh_address"}
     assert [path["best"] for path in originators] == [True, True]
-    assert {path["neigh_address"] for path in originators} == {neighbours[0]["neigh_address"]}
+    assert {path["neigh_address"] for path in originators} == {neighbors[0]["neigh_address"]}
     assert sorted(path["tq"] for path in originators) == [165, 200]
-    assert stations.startswith(f"Station {neighbours[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
+    assert stations.startswith(f"Station {neighbors[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
     assert (info["mode"], info["channel"], info["ssid"]) == ("Ad-Hoc", 6, "a team")
 
 

@@ -115,13 +115,13 @@ def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, mon
 def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: VirtualFleet) -> None:
     pair.node("here").power_cut(back=False)
     (fleet,) = fleets_of([1, pair.node("there"), pair])
-    told = report(fleet, "waited 180 s for something")
-    console = told.partition("--- here: console\n")[2].partition("\n--- ")[0]
+    text = report(fleet, "waited 180 s for something")
+    console = text.partition("--- here: console\n")[2].partition("\n--- ")[0]
     assert re.search(r"- boot [0-9a-f-]{36} -\n", console)
     assert re.search(r"^\[[0-9.]+\] S20network$", console, re.M)
-    assert '"name": "here", "power": "off"' in told
+    assert '"name": "here", "power": "off"' in text
     # it is up, and nothing was said of it
-    assert "--- there" not in told
+    assert "--- there" not in text
     assert "--- there: log and processes" in report(fleet, "waited 180 s for there to boot")
 
 

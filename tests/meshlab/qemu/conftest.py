@@ -71,11 +71,11 @@ class Lab:
     state: Path
 
     def meshctl(
-        self, *words: str, expect: int | None = 0, when_told: tuple[str, Callable[[], None]] | None = None
+        self, *words: str, expect: int | None = 0, on_line: tuple[str, Callable[[], None]] | None = None
     ) -> Done:
         """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code.
 
-        `when_told`: a text, and what is done as soon as meshctl has said it.
+        `on_line`: a text, and the function to call as soon as meshctl prints it.
         """
         environment = {
             **os.environ,
@@ -98,9 +98,9 @@ class Lab:
                 assert process.stdout is not None
                 for line in process.stdout:
                     lines.append(line)
-                    if when_told is not None and when_told[0] in line:
-                        when_told[1]()
-                        when_told = None
+                    if on_line is not None and on_line[0] in line:
+                        on_line[1]()
+                        on_line = None
                 status = process.wait()
             finally:
                 patience.cancel()
@@ -110,7 +110,7 @@ class Lab:
         assert expect is None or status == expect, f"meshctl {' '.join(words)}: {done.text}{done.errors}"
         return done
 
-    def take_in(self) -> None:
+    def bootstrap(self) -> None:
         """Take the mesh's nodes in on the bench and carry them into the field, where only the mesh leads to them.
 
         On a starved host a node may not answer in time, or not begin; then an operator does it again.
@@ -172,7 +172,7 @@ class Lab:
         known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
         return {names[one["orig_address"]]: names[one["neigh_address"]] for one in known if one.get("best")}
 
-    def neighbours(self, node: str) -> set[str]:
+    def neighbors(self, node: str) -> set[str]:
         """Whom the node's own batman-adv has heard within the last seconds."""
         names = self.names()
         known = json.loads(self.on(node, "batctl meshif bat0 neighbors_json"))
@@ -207,14 +207,14 @@ class Lab:
     def tables(self) -> str:
         """What the kernel of each node knows of the others: for whoever has to find out why a mesh carries nothing."""
         names = self.names()
-        told = []
+        parts = []
         for name in self.NODES:
             text = self.node(name).exec(_TABLES).stdout
             for mac, owner in names.items():
                 text = text.replace(mac, owner)
-            told.append(f"--- {name}\n{text}")
-        told.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
-        return "\n".join(told)
+            parts.append(f"--- {name}\n{text}")
+        parts.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
+        return "\n".join(parts)
 
 
 L = TypeVar("L", bound=Lab)
@@ -250,7 +250,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 @contextmanager
-def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
+def field_lab(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
     """Nodes fresh from their boxes, taken into the fleet on the bench and carried into the field: only the mesh leads
     there. A mesh that does not come about is made once more in a new machine, and the reason told at the end.
     """
@@ -264,7 +264,7 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
             if before is not None:
                 before(made)
             try:
-                made.take_in()
+                made.bootstrap()
             except AssertionError as error:
                 # here, because the fleet is down when the fixture has failed
                 error.add_note(report(fleet, str(error)))
@@ -296,7 +296,7 @@ def why_once_more(record_property: Callable[[str, object], None]) -> None:
 @pytest.fixture(scope="package")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """Five nodes of one mesh, three hops long."""
-    with fielded(Lab, INVENTORY, tmp_path_factory.mktemp("real")) as made:
+    with field_lab(Lab, INVENTORY, tmp_path_factory.mktemp("real")) as made:
         yield made
 
 

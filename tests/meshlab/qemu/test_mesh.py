@@ -46,7 +46,7 @@ def test_what_was_provisioned_is_a_mesh_of_three_hops_with_lans_behind_it(lab: L
     # the kernel's own routes: each hop only hears the next
     assert lab.originators("base") == {"b01": "b01", "b02": "b01", "husky-front": "b01", "husky-rear": "b01"}
     assert lab.originators("b01")["husky-front"] == "b02"
-    assert lab.neighbours("b02") == {"b01", "husky-front", "husky-rear"}
+    assert lab.neighbors("b02") == {"b01", "husky-front", "husky-rear"}
     # node to node over three hops, and computer to computer behind them
     until(lambda: "2 packets received" in lab.on("base", "ping -c 2 -W 5 10.42.0.11 || true"), "three hops")
     assert lab.answers("husky", "10.42.0.2")
@@ -86,7 +86,7 @@ def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
     for link in drawn["links"]:
         linked[link["a"]].add(link["b"])
         linked[link["b"]].add(link["a"])
-    assert linked == {name: lab.neighbours(name) for name in NODES}
+    assert linked == {name: lab.neighbors(name) for name in NODES}
     cuts_off = {node["name"]: set(node["cuts_off"]) for node in drawn["nodes"]}
     assert cuts_off["b01"] == {"b02", "husky-front", "husky-rear"}
     assert cuts_off["b02"] == {"husky-front", "husky-rear"}
@@ -113,17 +113,17 @@ def test_status_says_what_the_radios_hear(lab: Lab) -> None:
     names = lab.names()
 
     def agrees() -> bool:
-        told = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
-        nodes = {node["name"]: node for node in told if node["answers"]}
+        reported = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
+        nodes = {node["name"]: node for node in reported if node["answers"]}
         return nodes.keys() == set(NODES) and all(
-            {neighbour["name"] for neighbour in node["neighbours"]} == heard(name) for name, node in nodes.items()
+            {neighbor["name"] for neighbor in node["neighbours"]} == heard(name) for name, node in nodes.items()
         )
 
     def heard(name: str) -> set[str]:
         stations = lab.on(name, "iw dev mesh0 station dump")
         return {names[line.split()[1]] for line in stations.splitlines() if line.startswith("Station")}
 
-    until(agrees, "the told neighbours to be the stations that the kernels know")
+    until(agrees, "the reported neighbors to be the stations of the kernels")
 
 
 def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> None:
@@ -136,7 +136,7 @@ def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> No
     lab.meshctl("lab", "link", "base", "b01", "--loss", "0.4")
     until(lambda: quality() < 190, "losses to show in batman-adv's quality")
     lab.meshctl("lab", "link", "base", "b01", "--down")
-    until(lambda: "base" not in lab.neighbours("b01"), "the link to be gone")
+    until(lambda: "base" not in lab.neighbors("b01"), "the link to be gone")
     lab.meshctl("lab", "mend", "base-b01")
     lab.settle()
     until(lambda: quality() > 230, "the link's full quality again")

@@ -112,7 +112,7 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
     lab.meshctl("lab", "link", "base", "b02", "--loss", "0.3")
     try:
         with telemetry(lab):
-            until(lambda: "base" in lab.neighbours("b02"), "the other way to be there")
+            until(lambda: "base" in lab.neighbors("b02"), "the other way to be there")
             until(lambda: lab.originators("b02").get("base") == "b01", "the way over the relay to be the better one")
             until(lambda: arrived(lab) > PLENTY, "telemetry over the relay")
             lab.fleet.inject_fault("b01", "off")
@@ -126,5 +126,5 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
             have_forgotten(lab, name, "b01")
         lab.fleet.repair("b01")
         lab.meshctl("lab", "mend", "base-b02")
-    until(lambda: "base" not in lab.neighbours("b02"), "the links to be as they were")
+    until(lambda: "base" not in lab.neighbors("b02"), "the links to be as they were")
     lab.settle()

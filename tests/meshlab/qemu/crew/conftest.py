@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.meshlab.qemu.conftest import Lab, fielded
+from tests.meshlab.qemu.conftest import Lab, field_lab
 
 INVENTORY = Path(__file__).with_name("inventory")
 FIELDED = ("base", "b01", "b02", "husky")
@@ -29,19 +29,19 @@ class Crew(Lab):
     def stations(self, name: str, interface: str) -> dict[str, bool]:
         """Whom a radio of the node knows, and whether each has proven that it knows the key."""
         names = self.names()
-        told: dict[str, bool] = {}
+        authorized: dict[str, bool] = {}
         mac = ""
         for line in self.on(name, f"iw dev {interface} station dump").splitlines():
             words = line.split()
             if line.startswith("Station"):
                 mac = words[1]
             elif words[0] == "authorized:":
-                told[names[mac]] = words[1] == "yes"
-        return told
+                authorized[names[mac]] = words[1] == "yes"
+        return authorized
 
 
 @pytest.fixture(scope="package")
 def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
     """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
-    with fielded(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
+    with field_lab(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
         yield made

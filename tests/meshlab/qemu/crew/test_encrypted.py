@@ -53,13 +53,13 @@ def heard_over(crew: Crew, name: str) -> dict[str, set[str]]:
 def keys(crew: Crew) -> dict[str, set[str]]:
     """The keys that the nodes' radios are configured with, by mesh."""
     words = "uci -q get wireless.mesh0.key; echo; uci -q get wireless.mesh1.key || true"
-    told = [crew.on(name, words).split("\n") for name in FIELDED]
-    return {"main": {lines[0] for lines in told}, "fast": {lines[2] for lines in told if lines[2:] and lines[2]}}
+    outputs = [crew.on(name, words).split("\n") for name in FIELDED]
+    return {"main": {lines[0] for lines in outputs}, "fast": {lines[2] for lines in outputs if lines[2:] and lines[2]}}
 
 
-def all_are_let_in(crew: Crew) -> bool:
-    neighbours = {"base": {"b01"}, "b01": {"base", "b02"}, "b02": {"b01", "husky"}, "husky": {"b02"}}
-    main = all(crew.stations(name, "mesh0") == dict.fromkeys(near, True) for name, near in neighbours.items())
+def all_authorized(crew: Crew) -> bool:
+    neighbors = {"base": {"b01"}, "b01": {"base", "b02"}, "b02": {"b01", "husky"}, "husky": {"b02"}}
+    main = all(crew.stations(name, "mesh0") == dict.fromkeys(near, True) for name, near in neighbors.items())
     return main and all(
         crew.stations(name, "mesh1") == {other: True} for name, other in zip(TWINS, TWINS[::-1], strict=True)
     )
@@ -73,7 +73,7 @@ def test_every_cell_is_the_one_that_is_configured_and_all_in_it_have_proven_the_
         info = crew.on(name, "iw dev mesh1 info")
         assert "type mesh point" in info
         assert "channel 36 (5180 MHz), width: 20 MHz" in info
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized")
 
 
 def test_nothing_but_handshakes_passes_the_air_in_the_clear(crew: Crew) -> None:
@@ -114,4 +114,4 @@ def test_the_whole_mesh_takes_a_new_key_over_itself(crew: Crew) -> None:
     assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} <= {"done", "unchanged"}
     assert keys(crew) == {"main": {"the new word of all"}, "fast": {KEYS["fast"]}}
     crew.settle()
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized with the new key")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized with the new key")

@@ -10,7 +10,7 @@ import pytest
 
 from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.crew.conftest import FIELDED, Crew
-from tests.meshlab.qemu.crew.test_encrypted import TWINS, all_are_let_in, heard_over, keys
+from tests.meshlab.qemu.crew.test_encrypted import TWINS, all_authorized, heard_over, keys
 
 pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
@@ -22,7 +22,7 @@ def results(events: Iterable[dict[str, Any]]) -> dict[str, str]:
 def works(crew: Crew) -> bool:
     """Whether every radio is known to its neighbours with a proven key, and unicast passes each of them."""
     both = all(heard_over(crew, name)["mesh1"] == {other} for name, other in zip(TWINS, TWINS[::-1], strict=True))
-    return both and all_are_let_in(crew) and crew.answers("base-station", "10.42.0.10")
+    return both and all_authorized(crew) and crew.answers("base-station", "10.42.0.10")
 
 
 def switches(crew: Crew) -> list[list[str]]:
@@ -54,5 +54,5 @@ def test_both_meshes_take_new_keys_at_one_moment(crew: Crew) -> None:
     assert set(ended.values()) <= {"done", "unchanged"}
     assert keys(crew) == {"main": {"new for all of them"}, "fast": {"new for the fast ones, too"}}
     crew.settle()
-    until(lambda: works(crew), "every neighbour to be authorized with the new keys")
+    until(lambda: works(crew), "every neighbor to be authorized with the new keys")
     until(lambda: crew.meshctl("provision", "--check", *FIELDED, expect=None).status == 0, "nothing left to change")
