@@ -1,4 +1,4 @@
-"""Which frames carry ARP, what they cost of the air, and the table of it."""
+"""Recognition of ARP frames, their airtime, and the table."""
 
 from __future__ import annotations
 

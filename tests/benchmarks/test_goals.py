@@ -1,4 +1,4 @@
-"""The comparison's bookkeeping: every goal names a cell that is run, and a missed goal is told as missed."""
+"""Evaluation of goals: every goal names an existing cell, and a missed goal is reported as missed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The airtime of batman-adv's own packets, what is a pause, which case is measured when, and the table."""
+"""Airtime of batman-adv's own packets, detection of pauses, order of the cases, and the table."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_row_says_what_was_not_measured_and_why() -> None:
 
 
 def arrivals(*silences: tuple[float, float], until_s: float) -> list[float]:
-    """Messages every tenth of a second from 0 on, but for those between the given times."""
+    """Messages every tenth of a second from 0 on, except between the given times."""
     every = [number * TELEMETRY_S for number in range(int(until_s / TELEMETRY_S) + 1)]
     return [at_s for at_s in every if not any(begin < at_s < end for begin, end in silences)]
 
@@ -76,7 +76,7 @@ def test_no_pause_is_said_only_after_a_while() -> None:
 
 
 class Machine:
-    """A bench whose cases take their outcomes from a list: a pause, or what goes wrong."""
+    """A bench whose cases take their outcomes from a list: a pause, or an error."""
 
     def __init__(self, outcomes: dict[Case, list[float | Exception]]) -> None:
         self.outcomes = outcomes
@@ -121,7 +121,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def measure(results: Path, cases: list[Case], *, runs: int = 2, ends_s: float = float("inf")) -> list[str]:
-    """Measure, and tell what is written down then."""
+    """Measure, and return the recorded results."""
     Measuring(results, runs, ends_s).all(cases)
     return [f"{one['interval_ms']}: {one.get('pause_s', one.get('failed'))}" for one in recorded(results)]
 

@@ -1,4 +1,4 @@
-"""A ground under a running fleet: what its nodes' own tools, and logins through the mesh, show of it."""
+"""The radio environment of a running fleet, as shown by its nodes' own tools and logins over the mesh."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def grounded(mesh: VirtualFleet) -> Iterator[VirtualFleet]:
 
 
 def neighbors(fleet: VirtualFleet, name: str) -> dict[str, int]:
-    """Who a node's batman-adv has as a direct neighbour, with its quality (originators whose next hop they are)."""
+    """The direct neighbors of a node's batman-adv and their quality (originators that are their own next hop)."""
     macs = {mac_of(fleet, one): one for one in ("base", "near", "far")}
     table = json.loads(fleet.node(name).exec("batctl meshif bat0 originators_json").stdout)
     return {macs[row["orig_address"]]: row["tq"] for row in table if row["orig_address"] == row["neigh_address"]}
@@ -72,7 +72,7 @@ def test_a_loss_shows_as_quality_in_both_directions_and_one_way_in_one(grounded:
     assert neighbors(grounded, "far")["near"] == tq_of(0.3, 0.3)
     lab(grounded, "link", "near", "far", "--loss", "0", "--tq", "255")
     lab(grounded, "link", "far", "near", "--loss", "50%", "--one-way")
-    until(lambda: neighbors(grounded, "far").get("near") == tq_of(0.5, 0.0), "far's worse way to near")
+    until(lambda: neighbors(grounded, "far").get("near") == tq_of(0.5, 0.0), "far's worse link to near")
     assert neighbors(grounded, "near")["far"] == tq_of(0.0, 0.5)
     lab(grounded, "mend", "near-far")
     until(lambda: neighbors(grounded, "far").get("near") == 200, "the link as it was")
@@ -97,7 +97,7 @@ def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounde
     until(lambda: set(neighbors(grounded, "base")) == {"near"}, "far to be out of the base's earshot")
     until(lambda: in_mesh(grounded) == {"near", "far"} and answers(grounded.endpoint("10.42.0.3")), "far over near")
     lab(grounded, "move", "far", "900", "0")
-    until(lambda: in_mesh(grounded) == {"near"}, "far to be out of everybody's earshot")
+    until(lambda: in_mesh(grounded) == {"near"}, "far to lose all its links")
     assert not answers(grounded.endpoint("10.42.0.3"))
     assert placement.current_environment(grounded).positions["far"].at == (900, 0)
 

@@ -1,4 +1,4 @@
-"""Radios of the virtual fleet that are made anew: interface numbers, addresses, station tables, and who hears whom."""
+"""Recreated radios of the virtual fleet: interface indexes, addresses, station tables, and half deafness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How nodes were lost on real OpenWrt 24.10 and 25.12, over again in the virtual fleet.
+"""Failures that lost nodes on real OpenWrt 24.10 and 25.12, reproduced in the virtual fleet.
 
 Changes that were confirmed although they lock everybody out, undone although they succeeded, or that cost a node its
 neighbours' unicast.
@@ -35,7 +35,7 @@ LATE_S = 10.0
     ],
 )
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """A base, and two nodes that only the mesh leads to, which run inventory `a`."""
+    """A base and two nodes that are reached only over the mesh, with inventory `a`."""
     with Rig(tmp_path_factory.mktemp("lost"), 2, window_s=WINDOW_S, release=request.param) as started:
         taken = started.take_in("a")
         assert (taken.code, set(taken.results.values())) == (0, {"done"}), taken.out + taken.err
@@ -47,7 +47,7 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 def variant(rig: Rig, name: str, more: str) -> str:
-    """Inventory `a` with a line more for n001."""
+    """Inventory `a` with an additional line for n001."""
     text = rig.inventory("a").read_text(encoding="utf-8")
     rig.inventory(name).write_text(f"{text}  n001: {{{more}}}\n", encoding="utf-8")
     return name
@@ -58,7 +58,7 @@ def mac(fleet: VirtualFleet, name: str) -> str:
 
 
 def greets(rig: Rig) -> bool:
-    """Whether an SSH server greets a new connection to n001, which only the mesh leads to."""
+    """Whether an SSH server answers a new connection to n001, which is reached only over the mesh."""
     endpoint = rig.fleet.endpoint(ADDRESS)
     try:
         with socket.create_connection((endpoint.host, endpoint.port), timeout=60) as connection:
@@ -68,13 +68,13 @@ def greets(rig: Rig) -> bool:
 
 
 def stays_reachable(rig: Rig) -> bool:
-    """Whether it still does when all that may come late has come."""
+    """Whether it still does after all delayed effects."""
     rig.fleet.node("base").exec(f"sleep {LATE_S:g}").check("wait")
     return greets(rig)
 
 
 def passes(rig: Rig) -> bool:
-    """Whether frames to n001 alone come back."""
+    """Whether unicast frames to n001 are answered."""
     return rig.fleet.node("base").exec(f"batctl ping -c 3 -t 1 {mac(rig.fleet, 'n001')}").exit_status == 0
 
 

@@ -1,4 +1,4 @@
-"""A fleet as a mesh: who is reached when, and what links do to connections."""
+"""A fleet as a mesh: reachability, and the effect of links on connections."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_another_channel_cuts_a_node_and_what_lies_behind_it_off(mesh: VirtualFl
     assert not answers(mesh.endpoint("10.42.0.3"))
     until(lambda: mesh.node("far").exec("batctl meshif bat0 neighbors_json").stdout == "[]\n", "empty tables")
     mesh.node("near").exec("uci set wireless.radio0.channel=6; uci commit; reload_config").check("change back")
-    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
 
 
 def test_a_node_without_batman_has_no_mesh(mesh: VirtualFleet) -> None:
@@ -112,7 +112,7 @@ def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) ->
     mesh.repair("far")
     far.plug(False)
     until(lambda: in_mesh(mesh) == {"near", "far"}, "the link to come back")
-    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
 
 
 def test_a_wrong_key_or_one_encrypted_side_separates(mesh: VirtualFleet) -> None:

@@ -1,4 +1,4 @@
-"""Who hears whom, and over which path: pure laws of the air."""
+"""The mesh model: properties of edges and routes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One virtual node: what it is fresh from the box, what survives what, and how it is flashed."""
+"""One virtual node: its factory state, what survives power cuts and reboots, and flashing."""
 
 from __future__ import annotations
 

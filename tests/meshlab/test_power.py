@@ -1,4 +1,4 @@
-"""Nodes that go down and come back: no signal, no word of the bell and no descriptor may keep one from starting."""
+"""Nodes that go down and come back: no signal, bell message or descriptor may keep one from starting."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.meshlab.fleet_report import fleets_of, report
 from tests.meshlab.power_cycles import cycle
 from tests.waiting import until
 
-# the kernel's number of write(2), as /proc/PID/syscall tells it
+# the system call number of write(2), as in /proc/PID/syscall
 _WRITE = {"x86_64": "1", "aarch64": "64"}[os.uname().machine]
 _PIPE_BYTES = 4096
 
@@ -82,7 +82,7 @@ def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
 
 
 def _has_ended(lines: int) -> bool:
-    """Read what is there; whether the other end is closed."""
+    """Read the available data; returns whether the other end is closed."""
     try:
         while os.read(lines, _PIPE_BYTES):
             pass

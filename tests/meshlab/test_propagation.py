@@ -1,4 +1,4 @@
-"""Who hears whom on a ground: laws of the path-loss model, and the file format."""
+"""Radio propagation: properties of the path-loss model, and the file format."""
 
 from __future__ import annotations
 

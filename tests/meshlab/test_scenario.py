@@ -1,4 +1,4 @@
-"""Missions: where everybody is at which time, what happens when, and the file format."""
+"""Scenarios: positions over time, the timeline, and the file format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Playing a mission in virtual time on a stage that keeps what it was told."""
+"""Play a scenario in virtual time on a target that records all calls."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.meshlab.test_scenario import AWAY
 
 @dataclass
 class RecordedTarget:
-    """A fleet of these names; a clock that `wait` moves, and that stops everything at `stop_at_s`."""
+    """A fleet with these names, and a clock that `wait` advances and that interrupts at `stop_at_s`."""
 
     names: tuple[str, ...] = AWAY.names
     stop_at_s: float = float("inf")
@@ -56,7 +56,7 @@ def played(stage: RecordedTarget, *, speed: float = 1.0, start_s: float = 0.0) -
 
 
 @given(st.sampled_from([0.5, 1.0, 10.0, 1000.0]))
-def test_every_event_is_told_once_in_order_however_fast(speed: float) -> None:
+def test_every_event_is_reported_once_in_order_however_fast(speed: float) -> None:
     stage = RecordedTarget()
     assert played(stage, speed=speed) is None
     assert stage.events == list(timeline(AWAY))
@@ -70,7 +70,7 @@ def test_carried_beacons_are_off_until_they_are_dropped() -> None:
     assert [on for name, on in stage.switched if name == "beacon"] == [False, True]
 
 
-def test_the_fleet_is_told_of_new_links_alone() -> None:
+def test_the_fleet_gets_only_changed_links() -> None:
     stage = RecordedTarget()
     played(stage)
     link_sets = [links_of(ground) for ground in stage.environments]
@@ -94,7 +94,7 @@ def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int)
     ("on_s", "is_forgotten"), [(80.0 + STATION_EXPIRY_S - 1, False), (80.0 + STATION_EXPIRY_S, True)]
 )
 @pytest.mark.parametrize("start_s", [0.0, 85.0])
-def test_whoever_was_away_for_long_is_known_to_nobody_when_it_comes_on(
+def test_station_entries_of_a_node_that_was_off_for_long_are_flushed(
     on_s: float, start_s: float, is_forgotten: bool
 ) -> None:
     stage = RecordedTarget()
@@ -104,7 +104,7 @@ def test_whoever_was_away_for_long_is_known_to_nobody_when_it_comes_on(
     assert ("beacon" in stage.forgotten) == (start_s < 50)
 
 
-def test_nodes_that_the_fleet_has_not_are_told_of_and_not_switched() -> None:
+def test_events_of_nodes_outside_the_fleet_are_reported_but_not_applied() -> None:
     stage = RecordedTarget(names=("base", "rover"))
     played(stage)
     assert set(stage.powered) == {"base", "rover"}

@@ -1,4 +1,4 @@
-"""Laws of station tables: who is half deaf to whom, and what ends it (docs/lab.md, What only real radios showed)."""
+"""Properties of station tables: half deafness and what ends it (docs/lab.md, "What only real radios showed")."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Pair:
         self.nodes[name] = EffectiveState((cell,), self.nodes[name].addresses)
 
     def restart(self, name: str, *, away_s: float = 1.0) -> None:
-        """The interface is made anew; nobody hears it meanwhile."""
+        """Recreate the interface; meanwhile no one hears it."""
         cell = self.nodes[name].interfaces[0]
         self.nodes[name] = EffectiveState((), self.nodes[name].addresses)
         self.hear()

@@ -205,7 +205,7 @@ class Lab:
             raise AssertionError(f"{error}\n{self.tables()}") from error
 
     def tables(self) -> str:
-        """What the kernel of each node knows of the others: for whoever has to find out why a mesh carries nothing."""
+        """The kernel tables of each node, for the report of a mesh that does not forward."""
         names = self.names()
         parts = []
         for name in self.NODES:
@@ -252,7 +252,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 @contextmanager
 def field_lab(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
     """Nodes fresh from their boxes, taken into the fleet on the bench and carried into the field: only the mesh leads
-    there. A mesh that does not come about is made once more in a new machine, and the reason told at the end.
+    there. A mesh that does not form is set up once more in a new machine, and the reason reported at the end.
     """
     set_up_host()
     for turn in ("lab", "again"):

@@ -76,7 +76,7 @@ def test_two_radios_on_one_switch_pass_a_broadcast_once_and_make_no_storm(lab: L
     frames = "cat /sys/class/net/eth0/statistics/rx_packets"
     before = int(lab.computer("husky", frames))
     lab.computer("husky", "sleep 5")
-    # what passes the switch while nobody speaks: the loop avoidance's claims, a few neighbour solicitations
+    # idle traffic on the switch: the loop avoidance's claims, a few neighbor solicitations
     assert int(lab.computer("husky", frames)) - before < 200
 
 

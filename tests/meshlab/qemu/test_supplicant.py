@@ -1,4 +1,4 @@
-"""What the lab's wpa_supplicant gets: the cell that is configured, and nothing that it might choose by itself."""
+"""The configuration of the lab's wpa_supplicant: the configured cell, with nothing left for it to choose."""
 
 from __future__ import annotations
 

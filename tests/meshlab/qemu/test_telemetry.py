@@ -76,7 +76,7 @@ def put_programs(lab: Lab) -> None:
 
 @contextmanager
 def telemetry(lab: Lab) -> Iterator[None]:
-    """The Husky's computer tells the base station's something ten times a second."""
+    """The Husky's computer sends the base station's ten messages a second."""
     for robot in ("base-station", "husky"):
         on_machine(lab, _START.format(robot=robot, python=_PYTHON, key="be" * 32))
     try:
@@ -101,19 +101,19 @@ def arrived(lab: Lab) -> int:
 
 
 def have_forgotten(lab: Lab, node: str, other: str) -> None:
-    """Have a node's radio forget that of another one, which is off."""
+    """Delete the station entry of another node, which is off, on a node."""
     mac = next(mac for mac, name in lab.names().items() if name == other)
     lab.on(node, f"iw dev mesh0 station del {mac} || true")
 
 
 def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
     put_programs(lab)
-    # a second way for the relay's neighbours, and not as good
+    # a second route for the relay's neighbors, and a worse one
     lab.meshctl("lab", "link", "base", "b02", "--loss", "0.3")
     try:
         with telemetry(lab):
-            until(lambda: "base" in lab.neighbors("b02"), "the other way to be there")
-            until(lambda: lab.originators("b02").get("base") == "b01", "the way over the relay to be the better one")
+            until(lambda: "base" in lab.neighbors("b02"), "the other route to exist")
+            until(lambda: lab.originators("b02").get("base") == "b01", "the route over the relay to be the better one")
             until(lambda: arrived(lab) > PLENTY, "telemetry over the relay")
             lab.fleet.inject_fault("b01", "off")
             until(lambda: lab.originators("b02").get("base") == "base", "the route without the relay")

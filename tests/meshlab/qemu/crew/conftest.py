@@ -27,7 +27,7 @@ class Crew(Lab):
         (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
 
     def stations(self, name: str, interface: str) -> dict[str, bool]:
-        """Whom a radio of the node knows, and whether each has proven that it knows the key."""
+        """The stations of a node's radio, and whether each is authorized."""
         names = self.names()
         authorized: dict[str, bool] = {}
         mac = ""
@@ -42,6 +42,6 @@ class Crew(Lab):
 
 @pytest.fixture(scope="package")
 def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
-    """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
+    """The nodes of the field, bootstrapped on the bench and unplugged: they are reached only over the mesh."""
     with field_lab(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
         yield made

@@ -41,7 +41,7 @@ python3 /tmp/protected.py
 
 
 def heard_over(crew: Crew, name: str) -> dict[str, set[str]]:
-    """Whom each of the node's radios has heard within the last seconds, as its batman-adv tells."""
+    """The neighbors that each of the node's radios has heard within the last seconds, from its batman-adv."""
     names = crew.names()
     found: dict[str, set[str]] = {"mesh0": set(), "mesh1": set()}
     for one in json.loads(crew.on(name, "batctl meshif bat0 neighbors_json")):

@@ -20,7 +20,7 @@ def results(events: Iterable[dict[str, Any]]) -> dict[str, str]:
 
 
 def works(crew: Crew) -> bool:
-    """Whether every radio is known to its neighbours with a proven key, and unicast passes each of them."""
+    """Whether every radio is authorized at its neighbors, and unicast passes every link."""
     both = all(heard_over(crew, name)["mesh1"] == {other} for name, other in zip(TWINS, TWINS[::-1], strict=True))
     return both and all_authorized(crew) and crew.answers("base-station", "10.42.0.10")
 

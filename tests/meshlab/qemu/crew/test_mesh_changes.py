@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.
 
 # by how much two nodes may differ in when they heard of each other; far below the time since the mesh was made
 SLACK_S = 20
-# nobody waits long for what will not come; a whole mesh has to be ready within it, however slow
+# short, because one test waits until it expires; a whole mesh must be ready within it, however slow
 SHORT_WINDOW_S, SHORTER_WINDOW_S = 45, 25
 # the lines of the inventory's mesh main, as against those of mesh fast
 RATE_OF_MAIN = """\
@@ -51,7 +51,7 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     before = cells(crew)
     crew.edit("channel: 11\n", "channel: 1\n")
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
-    # at the moment of the switch b02 hears nobody any more, and the Husky behind it nobody at all
+    # at the moment of the change b02 loses its links, and with it the Husky behind it
     crew.fleet.inject_fault("b02", "sever@reload_config")
 
     def let_it_be_heard() -> None:
@@ -84,11 +84,11 @@ def test_the_running_mesh_is_changed_from_its_far_end_and_radios_that_start_anew
     assert steps.index("neighbours watch it") < steps.index("apply")
     assert {crew.on(name, "uci get wireless.mesh0.mcast_rate").strip() for name in FIELDED} == {"6000"}
     crew.settle()
-    # without a word from anybody else: unicast from a node to each of its neighbours is taken
+    # without other traffic: unicast frames from a node to each of its neighbors are accepted
     for name, addresses in (("b01", ("10.42.0.1", "10.42.0.102")), ("b02", ("10.42.0.101", "10.42.0.11"))):
         for address in addresses:
             until(lambda: is_answered(crew, name, address), f"an answer from {address} to {name}")  # noqa: B023
-    until(lambda: not _known_longer_than_itself(crew, "b02"), "every neighbor to have forgotten the radio that it had")
+    until(lambda: not _known_longer_than_itself(crew, "b02"), "every neighbor to have deleted the old radio's entry")
 
 
 def is_answered(crew: Crew, node: str, address: str) -> bool:
@@ -96,7 +96,7 @@ def is_answered(crew: Crew, node: str, address: str) -> bool:
 
 
 def _known_longer_than_itself(crew: Crew, name: str) -> list[str]:
-    """The neighbours that know the node's radio for longer than it has known anybody."""
+    """The neighbors whose entry of the node's radio is older than all of the node's own entries."""
     mac = next(mac for mac, node in crew.names().items() if node == name)
     command = "iw dev mesh0 station {what} | sed -n 's/.*connected time:[^0-9]*\\([0-9]*\\).*/\\1/p'"
     own = max(int(age) for age in crew.on(name, command.format(what="dump")).split())
