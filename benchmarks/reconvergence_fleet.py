@@ -231,7 +231,7 @@ class Bench:
         def is_settled() -> bool:
             relays = {_mac(name) for name in RELAYS}
             return (
-                all(relays <= self._neighbours(name, case) for name in ("near", "far"))
+                all(relays <= self._neighbors(name, case) for name in ("near", "far"))
                 and self._next_hop("far", "base") in relays
                 and self._next_hop("near", "far") in relays
                 and self._flows()
@@ -295,7 +295,7 @@ class Bench:
         hops = [one["neigh_address"] for one in known if one.get("best") and one["orig_address"] == _mac(target)]
         return str(hops[0]) if hops else ""
 
-    def _neighbours(self, name: str, case: Case) -> set[str]:
+    def _neighbors(self, name: str, case: Case) -> set[str]:
         known = json.loads(self._on(name, "batctl meshif bat0 neighbors_json") or "[]")
         return {one["neigh_address"] for one in known if one["last_seen_msecs"] < 500 + 2 * case.interval_ms}
 

@@ -116,7 +116,7 @@ class Laboratory:
             self.run(self.namespaces.index(namespace), ["sysctl", "-qw", "net.ipv6.conf.all.disable_ipv6=1"])
             # only the emulator's queue may overflow
             _ip("-n", namespace, "link", "set", INTERFACE, "mtu", "1500", "txqueuelen", "20000", "up")
-        self._fix_neighbours()
+        self._set_permanent_neighbors()
 
     def _join(self) -> None:
         """Create an interface in each namespace, all on one link."""
@@ -136,7 +136,7 @@ class Laboratory:
         self._control.connect(path)
         self._control.settimeout(ANSWER_TIMEOUT_S)
 
-    def _fix_neighbours(self) -> None:
+    def _set_permanent_neighbors(self) -> None:
         macs = []
         for namespace in self.namespaces:
             shown = json.loads(_ip("-n", namespace, "-j", "link", "show", INTERFACE))

@@ -44,7 +44,7 @@ def row(results: list[dict[str, Any]], case: Case) -> str:
     return next(line for line in table(results).splitlines() if f"| {case.algorithm} | {case.interval_ms} ms" in line)
 
 
-def test_a_row_tells_how_often_it_was_measured_with_median_and_range() -> None:
+def test_a_row_has_number_of_runs_median_and_range() -> None:
     results = [result(FIRST, pause_s=pause_s, overheard=OVERHEARD) for pause_s in (4.0, 1.0, 2.5)]
     assert row(results, FIRST) == "| BATMAN_IV | 500 ms | 3 | 2.5 s (1.0-4.0) | 10 | 0.19% |"
     assert row(results[:1], FIRST) == "| BATMAN_IV | 500 ms | 1 | 4.0 s | 10 | 0.19% |"

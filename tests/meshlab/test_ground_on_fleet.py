@@ -78,7 +78,7 @@ def test_a_loss_shows_as_quality_in_both_directions_and_one_way_in_one(grounded:
     until(lambda: neighbors(grounded, "far").get("near") == 200, "the link as it was")
 
 
-def test_a_node_that_nobody_hears_hears_others_and_is_not_reached(grounded: VirtualFleet) -> None:
+def test_a_node_that_no_one_hears_still_hears_others_and_is_unreachable(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "far", "near", "--loss", "100%", "--one-way")
     until(lambda: in_mesh(grounded) == {"near"}, "the mesh without far")
     assert not answers(grounded.endpoint("10.42.0.3"))
@@ -102,7 +102,7 @@ def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounde
     assert placement.current_environment(grounded).positions["far"].at == (900, 0)
 
 
-def test_what_was_set_by_hand_outlives_a_ground_until_it_is_mended(grounded: VirtualFleet) -> None:
+def test_a_link_override_survives_a_new_environment_until_it_is_repaired(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "base", "near", "--down")
     placement.set_environment(grounded, ROW)
     until(lambda: set(neighbors(grounded, "base")) == {"far"}, "the base without near")
@@ -110,7 +110,9 @@ def test_what_was_set_by_hand_outlives_a_ground_until_it_is_mended(grounded: Vir
     until(lambda: set(neighbors(grounded, "base")) == {"near", "far"}, "the link of the ground")
 
 
-def test_a_ground_is_loaded_shown_and_refused_when_it_is_another_s(grounded: VirtualFleet, tmp_path: Path) -> None:
+def test_an_environment_is_loaded_and_shown_and_rejected_if_it_is_for_another_fleet(
+    grounded: VirtualFleet, tmp_path: Path
+) -> None:
     file = tmp_path / "ground.yaml"
     file.write_text("nodes: {base: [0, 0], near: [60, 0], far: [120, 0], other: [0, 9]}\n", encoding="utf-8")
     shown = lab(grounded, "ground", str(file))
@@ -180,6 +182,6 @@ def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFlee
     assert placement.current_environment(grounded).positions["far"].at[0] < 100
 
 
-def test_a_link_of_the_spec_is_a_ground_of_its_own(grounded: VirtualFleet) -> None:
+def test_without_an_environment_the_links_of_the_spec_are_used(grounded: VirtualFleet) -> None:
     assert placement.current_environment(grounded).links == grounded.spec.links
     assert LinkSpec("base", "near", tq=240, signal_dbm=-61) in grounded.spec.links

@@ -52,7 +52,7 @@ def configured(fleet: VirtualFleet, request: pytest.FixtureRequest) -> Iterator[
 
 
 @pytest.mark.parametrize("configured", ["old", "box", "new"], indirect=True)
-def test_what_makes_an_interface_anew_and_its_address_follow_the_release(configured: VirtualNode) -> None:
+def test_recreation_of_an_interface_and_its_address_follow_the_release(configured: VirtualNode) -> None:
     release = configured.spec.release
     first, own = index(configured), mac(configured)
     change(configured, "radio0.txpower=11")
@@ -78,7 +78,7 @@ def test_a_radio_is_pending_while_it_is_set_up_and_its_interface_gone(mesh: Virt
     until(lambda: "channel 11" in near.exec("iw dev mesh0 info").stdout, "the radio")
 
 
-def test_a_radio_that_starts_anew_is_half_deaf_until_its_neighbours_forget_it(mesh: VirtualFleet) -> None:
+def test_a_restarted_radio_is_half_deaf_until_its_neighbors_delete_its_entry(mesh: VirtualFleet) -> None:
     base, near, far = (mesh.node(name) for name in ("base", "near", "far"))
     macs = mac(base), mac(near), mac(far)
     assert near.exec(f"batctl ping -c 1 {macs[0]}").exit_status == 0

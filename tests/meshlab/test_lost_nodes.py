@@ -1,7 +1,7 @@
 """Failures that lost nodes on real OpenWrt 24.10 and 25.12, reproduced in the virtual fleet.
 
-Changes that were confirmed although they lock everybody out, undone although they succeeded, or that cost a node its
-neighbours' unicast.
+Changes that were confirmed although they lock out all logins, were rolled back although they succeeded, or made the
+neighbors of a node drop its unicast frames.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def passes(rig: Rig) -> bool:
         pytest.param("dropbear.main.Port: '2222'", id="dropbear-port"),
     ],
 )
-def test_a_change_that_locks_everybody_out_is_not_confirmed(rig: Rig, lockout: str) -> None:
+def test_a_change_that_locks_out_all_logins_is_not_confirmed(rig: Rig, lockout: str) -> None:
     closed = variant(rig, "closed", f"extra_uci: {{{lockout}}}")
     ended = rig.meshctl("provision", closed, "n001", "--yes", "--json")
     assert ended.results.get("n001") != "done", ended.out + ended.err

@@ -16,7 +16,7 @@ from tests.waiting import until
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 
-def test_a_node_behind_the_mesh_is_reached_at_its_address_and_knows_its_neighbours(mesh: VirtualFleet) -> None:
+def test_a_node_in_the_mesh_is_reachable_at_its_address_and_lists_its_neighbors(mesh: VirtualFleet) -> None:
     transport = connect(mesh.endpoint("10.42.0.3"))
     neighbors = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
     originators = json.loads(run(transport, "batctl meshif bat0 originators_json"))

@@ -126,7 +126,7 @@ def test_status_says_what_the_radios_hear(lab: Lab) -> None:
     until(agrees, "the reported neighbors to be the stations of the kernels")
 
 
-def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> None:
+def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
     def quality() -> int:
         known = json.loads(lab.on("b01", "batctl meshif bat0 originators_json"))
         names = lab.names()

@@ -75,7 +75,7 @@ def test_a_kernel_without_virtual_radios_is_refused(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 2), st.binary(max_size=200))
-def test_a_frames_header_tells_its_stream_and_length(stream: int, content: bytes) -> None:
+def test_a_frame_header_has_stream_and_length(stream: int, content: bytes) -> None:
     sent = guest_protocol.frame(stream, content)
     assert guest_protocol.header(sent[: guest_protocol.HEADER_BYTES]) == (stream, len(content))
     assert sent[guest_protocol.HEADER_BYTES :] == content
@@ -208,7 +208,7 @@ def test_the_files_become_the_kernels_devices_in_the_order_of_making(tmp_path: P
     assert plan[7][2] == "10.42.0.11/24"
 
 
-def test_another_channel_makes_the_radio_and_what_hangs_on_it_anew_and_nothing_else(tmp_path: Path) -> None:
+def test_another_channel_recreates_the_radio_and_its_dependents_and_nothing_else(tmp_path: Path) -> None:
     before = planned(tmp_path / "run", CONFIG.format(channel=6))
     assert planned(tmp_path / "run", CONFIG.format(channel=6)) == before
     after = planned(tmp_path / "run", CONFIG.format(channel=11))

@@ -72,7 +72,7 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     until(lambda: crew.meshctl("provision", *FIELDED, "--check", expect=None).status == 0, "every node to be as it was")
 
 
-def test_the_running_mesh_is_changed_from_its_far_end_and_radios_that_start_anew_are_heard_again(crew: Crew) -> None:
+def test_the_running_mesh_is_changed_from_its_far_end_and_restarted_radios_are_heard_again(crew: Crew) -> None:
     # the broadcast rate restarts a radio on every release; transmit power does not
     crew.edit(RATE_OF_MAIN.format(12000), RATE_OF_MAIN.format(6000))
     far_first = sorted(FIELDED, key=lambda name: -crew.hops()[name])
