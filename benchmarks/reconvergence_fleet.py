@@ -310,7 +310,7 @@ class Bench:
             source.write(data)
             source.seek(0)
             descriptors = (source.fileno(), said.fileno(), said.fileno())
-            answer = self._fleet.ask_with(descriptors, 300.0, "machine", command=command)
+            answer = self._fleet.request_with_fds(descriptors, 300.0, "machine", command=command)
             said.seek(0)
             Completed(b"", said.read(), int(answer["status"])).check(command)
 

@@ -41,7 +41,7 @@ def _all_back(fleet: VirtualFleet, boots: Mapping[str, int]) -> Callable[[], boo
 
 
 def _boots(fleet: VirtualFleet, name: str) -> int:
-    return int(fleet.ask("node", node=name)["boots"])
+    return int(fleet.request("node", node=name)["boots"])
 
 
 def _take_down(node: VirtualNode, how: str, wait_s: float) -> None:

@@ -105,7 +105,7 @@ def test_a_word_that_the_fleet_cannot_read_does_not_take_the_next_one_along(pair
 @pytest.mark.lab
 def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     node = pair.node("here")
-    state = {**pair.ask("node", node="here"), "power": "failed", "reason": "no memory"}
+    state = {**pair.request("node", node="here"), "power": "failed", "reason": "no memory"}
     monkeypatch.setattr(VirtualNode, "_state", lambda _: state)
     with pytest.raises(LabError, match="cannot start here: no memory"):
         node.wait_up()

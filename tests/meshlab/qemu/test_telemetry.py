@@ -69,7 +69,7 @@ def put_programs(lab: Lab) -> None:
         source.seek(0)
         command = "mkdir -p /opt/telemetry && tar -x -C /opt/telemetry"
         descriptors = (source.fileno(), said.fileno(), said.fileno())
-        answer = lab.fleet.ask_with(descriptors, _UPLOAD_S, "machine", command=command)
+        answer = lab.fleet.request_with_fds(descriptors, _UPLOAD_S, "machine", command=command)
         said.seek(0)
         assert answer["status"] == 0, said.read().decode(errors="replace")
 
