@@ -70,9 +70,9 @@ def _is_writing(pid: int) -> bool:
 
 def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
     program = (
-        "import os, sys; from meshlab.node_runner import _close_all_but\n"
+        "import os, sys; from meshlab.node_runner import _close_all_except\n"
         "kept, other = os.open('/dev/null', os.O_RDONLY), os.open('/proc/self/ns/net', os.O_RDONLY)\n"
-        "_close_all_but([kept])\n"
+        "_close_all_except([kept])\n"
         "os.fstat(kept)\n"
         "try: os.fstat(other)\n"
         "except OSError: sys.exit(0)\n"
