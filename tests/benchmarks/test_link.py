@@ -54,7 +54,7 @@ def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab
     send(lab, 200)
     settled(lab, 200)
     count = lab.count()
-    # the receiver's answers to the datagram that taught the emulator may still be under way
+    # the receiver's replies to the learning datagram may still be in flight
     assert 200 <= count.ports[1].out_frames <= 202
     assert count.ports[1].out_bytes == pytest.approx(200 * 1028, rel=0.01)
     assert count.airtime_s == pytest.approx(200 * 1028 * 8 / 1e9, rel=0.02)

@@ -65,7 +65,7 @@ def arrivals(*silences: tuple[float, float], until_s: float) -> list[float]:
 def test_a_pause_counts_once_telemetry_has_flowed_again_for_a_while() -> None:
     assert longest_pause(arrivals((5.0, 8.0), until_s=9.0), 5.0, 9.0) is None
     assert longest_pause(arrivals((5.0, 8.0), until_s=13.0), 5.0, 13.0) == pytest.approx(3.0)
-    # it has stopped once more
+    # it has paused again
     assert longest_pause(arrivals((5.0, 8.0), until_s=13.0), 5.0, 16.0) is None
 
 

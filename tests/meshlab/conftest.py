@@ -15,7 +15,7 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.waiting import until
 
-# one kind of host key: making RSA keys would take most of the tests' time
+# one kind of host key: generating RSA keys would take most of the tests' time
 KEYS = ("ed25519",)
 LINE = ("base", "near", "far")
 MESH = """

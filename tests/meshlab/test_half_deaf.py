@@ -100,7 +100,7 @@ def test_a_restarted_radio_is_half_deaf_until_its_neighbors_delete_its_entry(mes
         holder.exec(f"iw dev mesh0 station del {macs[1]}").check("forget")
         assert (station(holder, macs[1], "connected time") or 0) <= age_s
     until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way")
-    # what a node hears is written beside what is reachable, not before it
+    # the node's tables are written together with reachability, not before
     until(lambda: near.exec(f"batctl -m bat0 ping -c 1 {macs[0]}").exit_status == 0, "the echo")
 
 

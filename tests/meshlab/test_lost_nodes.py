@@ -19,10 +19,10 @@ from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
 
-# window enough for a reload that takes its time on a busy machine
+# long enough for a reload on a busy machine
 WINDOW_S = 40
 ADDRESS = "10.42.1.1"
-# as long as what a change does may come after it was confirmed: procd's second, the firewall's, and a slow radio
+# the maximum delay of a change's effects after its confirmation: procd's second, the firewall's, and a slow radio
 LATE_S = 10.0
 
 
@@ -30,7 +30,7 @@ LATE_S = 10.0
     scope="module",
     params=[
         pytest.param(Release.V24_10, id="24.10"),
-        # its stand-ins differ from 24.10's in nothing that matters here
+        # its stand-ins do not differ from 24.10's here
         pytest.param(Release.V25_12, id="25.12", marks=pytest.mark.proof),
     ],
 )

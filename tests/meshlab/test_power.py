@@ -53,7 +53,7 @@ def test_a_signal_that_comes_just_before_process_1_waits_is_not_lost(tmp_path: P
     with subprocess.Popen((busybox, "ash", "-c", text), stderr=lines_end, pass_fds=()) as shell:
         os.close(lines_end)
         try:
-            # the pipe holds what the loop asks first; what comes next is the read
+            # the pipe has the loop's first command; the next one is the read
             until(lambda: _is_writing(shell.pid), "the shell to stand before its read")
             shell.send_signal(signal.SIGTERM)
             os.set_blocking(lines, False)
@@ -120,7 +120,7 @@ def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: Vir
     assert re.search(r"- boot [0-9a-f-]{36} -\n", console)
     assert re.search(r"^\[[0-9.]+\] S20network$", console, re.M)
     assert '"name": "here", "power": "off"' in text
-    # it is up, and nothing was said of it
+    # it is up, so the report does not describe it
     assert "--- there" not in text
     assert "--- there: log and processes" in report(fleet, "waited 180 s for there to boot")
 

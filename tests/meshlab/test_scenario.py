@@ -73,7 +73,7 @@ def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, 
 def test_the_timeline_has_planned_events_and_their_effects() -> None:
     assert happenings(AWAY, EventKind.ARRIVES) == [(200.0, "rover", "")]
     assert happenings(AWAY, EventKind.DROPPED) == [(50.0, "beacon", "rover")]
-    # the beacon joins the mesh where it is dropped, and keeps the robot in it for a while
+    # the dropped beacon joins the mesh, and keeps the robot connected for a while
     assert (50.0, "beacon", "") in happenings(AWAY, EventKind.REACHED)
     ((lost_s, *_),) = happenings(AWAY, EventKind.CUT_OFF)
     alone = replace(

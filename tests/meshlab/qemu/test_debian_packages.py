@@ -1,4 +1,4 @@
-"""Where the machine's packages come from, on hosts of other distributions."""
+"""The sources of the machine's packages, on Debian and other distributions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
     listed = Path(options["Dir::Etc::sourcelist"]).read_text()
     assert listed == f"deb [arch=amd64 signed-by={apt.KEYRING}] {apt.MIRROR} bookworm main\n"
     assert options["Dir::Etc::sourceparts"] == "-"
-    # apt itself reads the options as they are meant
+    # check the options with apt itself
     (tmp_path / "work").mkdir()
     shown = apt.Apt(tmp_path / "work", options).get(tmp_path, "-qq", "indextargets", "--format", "$(METAKEY)")
     assert {line.split("/")[0] for line in shown.splitlines()} <= {"main"}

@@ -1,4 +1,4 @@
-"""A ground under real radios: losses, distances and a mission, and what the kernel's own batman-adv makes of them."""
+"""Radio environments of the kernel's radios: losses, positions and a mission, as seen by the kernel's batman-adv."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DRIVE = (
 
 @pytest.fixture
 def field(lab: Lab, tmp_path: Path) -> Iterator[Path]:
-    """A directory for files; afterwards the fleet has its own links again."""
+    """A directory for files; afterwards the fleet's links are restored."""
     yield tmp_path
     lab.meshctl("lab", "mend")
     lab.meshctl("lab", "ground", str(lab.inventory / "links.yaml"))
@@ -33,7 +33,7 @@ def field(lab: Lab, tmp_path: Path) -> Iterator[Path]:
 
 
 def quality(lab: Lab, node: str, other: str) -> int:
-    """What a node's batman-adv thinks of its direct link to another one, 0 while it knows none."""
+    """The quality of a node's direct link to another one in its batman-adv, 0 if there is none."""
     names = lab.names()
     known = json.loads(lab.on(node, "batctl meshif bat0 originators_json"))
     return max(

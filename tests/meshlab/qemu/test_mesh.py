@@ -1,4 +1,4 @@
-"""From factory state to a working mesh of the kernel's own radios, and changes carried over that mesh itself."""
+"""From factory state to a working mesh of the kernel's radios, and changes over that mesh itself."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from meshlab.qemu import control
 from tests.meshlab.qemu.conftest import NODES, Lab, until
 
-# the machine's start, its image's packages and the whole fleet's provisioning fall into the first test
+# the first test includes the machine's start, the download of packages and the provisioning of the fleet
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 # numbers sent as broadcasts from the base's computer, and those that arrive at the Husky's, in the order of arrival
@@ -94,7 +94,7 @@ def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
 
 
 def _topology_of_one_moment(lab: Lab) -> Any:
-    """What meshctl draws; each node's hops are those of the kernels' routes just before or just after."""
+    """The topology of meshctl; each node's hops match the kernels' routes just before or just after."""
     drawn: Any = None
 
     def agrees() -> bool:

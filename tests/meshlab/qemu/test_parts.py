@@ -1,4 +1,4 @@
-"""The machine's parts as functions of values: archives, modules, traffic control, and what the kernel is to have."""
+"""Pure parts of the machine: archives, modules, traffic control, and the kernel's target state."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ config wifi-iface 'mesh0'
 
 
 def planned(run: Path, config: str) -> list[list[str]]:
-    """What the stand-in for netifd wants of the kernel, as lines of fields; of one directory, one after the other."""
+    """The kernel's target state from netifd's stand-in, as lines of fields; state is kept in one directory."""
     run.mkdir(exist_ok=True)
     awk = rootfs.STAND_INS / "lab" / "netifd.awk"
     variables = {
@@ -214,7 +214,7 @@ def test_another_channel_recreates_the_radio_and_its_dependents_and_nothing_else
     after = planned(tmp_path / "run", CONFIG.format(channel=11))
     changed = [line for line in after if line not in before]
     assert [line[:2] for line in changed] == [["radio", "mesh0"], ["tune", "mesh0"], ["hard", "mesh0"]]
-    # another number of making, and the other address, because the old interface still stands when it is chosen
+    # another creation number, and the other address, because the old interface still exists when it is chosen
     assert [(line[9], line[10]) for line in (before[1], changed[0])] == [
         ("21", "02:4d:00:00:00:10"), ("22", "42:4d:00:00:00:10"),
     ]  # fmt: skip

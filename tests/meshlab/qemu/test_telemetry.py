@@ -55,7 +55,7 @@ def on_machine(lab: Lab, command: str) -> str:
 
 
 def put_programs(lab: Lab) -> None:
-    """udp_mesh, the cryptography it stands on, and the client that the benchmark uses, into the machine."""
+    """Copy udp_mesh, its cryptography package and the benchmark's client into the machine."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name in ("udp_mesh", "cryptography"):
@@ -96,7 +96,7 @@ def is_there(lab: Lab, path: str) -> bool:
 
 
 def arrived(lab: Lab) -> int:
-    """How many messages have arrived."""
+    """The number of received messages."""
     return int(on_machine(lab, "cat /run/arrivals 2>/dev/null | wc -l"))
 
 
@@ -121,7 +121,7 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
             until(lambda: arrived(lab) > before + PLENTY, "telemetry without the relay")
             assert not lab.node("b01").is_up()
     finally:
-        # else they would be half deaf to it: it is back within the minute in which Linux forgets
+        # else they would be half deaf to it: it is back within the minute before Linux drops its entry
         for name in ("base", "b02"):
             have_forgotten(lab, name, "b01")
         lab.fleet.repair("b01")

@@ -1,4 +1,4 @@
-"""A second machine of real radios: everything encrypted, a robot whose node has two radios, a spare in its box."""
+"""A second machine with everything encrypted, a robot whose node has two radios, and a factory-fresh spare."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ KEYS = {"main": "a word that all of them know", "fast": "and another one for fiv
 
 @dataclass(frozen=True, slots=True)
 class Crew(Lab):
-    """The running fleet; `spare` stays on its bench, fresh from the box."""
+    """The running fleet; `spare` stays on the bench, factory-fresh."""
 
     NODES = FIELDED
 
     def write_keys(self, **keys: str) -> None:
-        """What the meshes' keys are from now on; a node has them once it is provisioned."""
+        """Set the meshes' keys in the inventory; a node gets them when it is provisioned."""
         lines = "".join(f"{mesh}: {key}\n" for mesh, key in {**KEYS, **keys}.items())
         (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
 

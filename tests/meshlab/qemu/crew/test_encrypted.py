@@ -1,4 +1,4 @@
-"""Encrypted meshes of real radios, and a node with two of them: WPA2 in an ad-hoc cell, SAE in 802.11s."""
+"""Encrypted meshes of the kernel's radios, and a node with two: WPA2 in an ad-hoc cell, SAE in 802.11s."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.meshlab.qemu.crew.conftest import FIELDED, KEYS, Crew
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 TWINS = ("b02", "husky")
-# data frames on the air in ten seconds: how many are encrypted, how many carry anything but a handshake in the clear
+# data frames in ten seconds: the number of encrypted ones, and of unencrypted ones except handshakes
 _LISTEN = """
 ip link set hwsim0 up
 cat >/tmp/protected.py <<'END'
@@ -51,7 +51,7 @@ def heard_over(crew: Crew, name: str) -> dict[str, set[str]]:
 
 
 def keys(crew: Crew) -> dict[str, set[str]]:
-    """The keys that the nodes' radios are configured with, by mesh."""
+    """The configured keys of the nodes' radios, by mesh."""
     words = "uci -q get wireless.mesh0.key; echo; uci -q get wireless.mesh1.key || true"
     outputs = [crew.on(name, words).split("\n") for name in FIELDED]
     return {"main": {lines[0] for lines in outputs}, "fast": {lines[2] for lines in outputs if lines[2:] and lines[2]}}

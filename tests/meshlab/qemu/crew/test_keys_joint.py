@@ -1,4 +1,4 @@
-"""New keys over the very meshes they are for: of 802.11s with SAE alone, and of both meshes of a team at one moment."""
+"""New keys over the meshes that use them: for 802.11s with SAE only, and for both meshes of a team simultaneously."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def works(crew: Crew) -> bool:
 
 
 def switches(crew: Crew) -> list[list[str]]:
-    """The nodes of each switch that meshctl would make now."""
+    """The nodes of each simultaneous change that meshctl plans now."""
     plan = crew.fleet.directory / "plan.json"
     crew.meshctl("plan", "--out", str(plan), *FIELDED)
     stages = json.loads(plan.read_text(encoding="utf-8"))["stages"]
@@ -47,7 +47,7 @@ def test_the_key_of_a_mesh_with_sae_changes_alone_and_the_other_mesh_is_left_as_
 
 def test_both_meshes_take_new_keys_at_one_moment(crew: Crew) -> None:
     crew.write_keys(main="new for all of them", fast="new for the fast ones, too")
-    # the two meshes share the nodes with two radios, whose files change at once: so there is one switch
+    # the two meshes share the nodes with two radios, whose files change together: so there is one simultaneous change
     assert switches(crew) == [sorted(FIELDED)]
     ended = results(crew.provision(*FIELDED)[-1])
     assert set(ended) == set(FIELDED)

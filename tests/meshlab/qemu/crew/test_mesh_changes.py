@@ -1,4 +1,4 @@
-"""Changing a mesh of real radios over that mesh itself: order, switch, undo, cuts."""
+"""Changing a mesh of the kernel's radios over that mesh itself: order, simultaneous change, rollback, cuts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.meshlab.qemu.crew.test_encrypted import all_authorized, keys
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
-# by how much two nodes may differ in when they heard of each other; far below the time since the mesh was made
+# tolerance between the ages of two nodes' entries of each other; far below the age of the mesh
 SLACK_S = 20
 # short, because one test waits until it expires; a whole mesh must be ready within it, however slow
 SHORT_WINDOW_S, SHORTER_WINDOW_S = 45, 25
@@ -62,7 +62,7 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     done = crew.meshctl("provision", "--yes", "--json", *FIELDED, expect=1, on_line=on_line)
     results = {event["node"]: event["outcome"]["result"] for event in done.events if event["event"] == "finished"}
     assert results.keys() == set(FIELDED)
-    # on a starved host a node may be seen too late; it is back all the same
+    # on a starved host a node may be seen too late, although it is back
     assert set(results.values()) <= {"rolled back", "uncertain"}
     until(lambda: cells(crew) == before, "every node to be in the old cell again")
     crew.edit("channel: 1\n", "channel: 11\n")
@@ -113,7 +113,7 @@ def test_a_configuration_that_cuts_a_node_off_is_taken_back_by_the_node_itself(c
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORTER_WINDOW_S}")
     done = crew.meshctl("restore", "b01", str(bad), "--yes", expect=1)
     crew.edit(f"confirm_window_s: &window {SHORTER_WINDOW_S}", "confirm_window_s: &window 600")
-    # on a starved host it may not be seen again in time; it is back all the same
+    # on a starved host it may not be seen in time, although it is back
     assert "rolled back" in done.text + done.errors or "uncertain" in done.text + done.errors
     until(lambda: cells(crew) == before, "the node to be in its cell again")
     status = crew.on("b01", "meshctl-deadman status")

@@ -1,4 +1,4 @@
-"""A beacon is dead, and a device fresh from its box takes its name and its place in the mesh."""
+"""Replace a dead beacon by a factory-fresh device, which gets its name and its place in the mesh."""
 
 from __future__ import annotations
 
