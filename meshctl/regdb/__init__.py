@@ -1,4 +1,4 @@
-"""What a country allows on the air, from the kernel's wireless regulatory database.
+"""Regulatory rules of countries, from the kernel's wireless regulatory database.
 
 `load` reads the system database, or the copy shipped here; `Regdb.country` returns a country's rules; `check_span`
 checks a channel of a given width against them.

@@ -73,7 +73,7 @@ def test_a_width_without_its_other_half_does_not_exist(band: Band, channel: int,
 
 
 def test_an_unknown_htmode_is_an_error_of_the_caller() -> None:
-    with pytest.raises(ValueError, match="no such htmode"):
+    with pytest.raises(ValueError, match="unknown htmode"):
         width_mhz("HT30")
 
 

@@ -133,7 +133,7 @@ def test_a_fleet_renders_its_managed_nodes_in_order() -> None:
 
 def test_unknown_and_lost_nodes_are_refused() -> None:
     fleet = fleets.fleet(fleets.node(state=NodeState.LOST))
-    with pytest.raises(UnknownNode, match="is lost: it has no configuration"):
+    with pytest.raises(UnknownNode, match="is lost and has no configuration"):
         render(fleet)
     with pytest.raises(UnknownNode, match="expected a node of the fleet, found 'b99'"):
         render_node(fleet, "b99", fleets.secrets)
@@ -242,7 +242,7 @@ class TestTemplates:
             ("config system\n\toption x {{ [] | uci }}\n", 2, "found list"),
             ("config system\n\toption x {{ ''.__class__ | uci }}\n", 2, "is unsafe"),
             ("config system\n{% include 'gone.j2' %}\n", 0, "found none named gone.j2"),
-            ("option x 'y'\n", 0, "the rendered text is no UCI: etc/config/system:1:1"),
+            ("option x 'y'\n", 0, "template output is not UCI: etc/config/system:1:1"),
         ],
     )
     def test_fail_with_their_file_and_line(self, tmp_path: Path, text: str, line: int, words: str) -> None:
