@@ -152,7 +152,7 @@ def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding
     "A firmware image's signature is invalid or missing",
     why="""The profile's `usign_key` must have signed the image, but the signature does not match, or the signature or
     the key is missing. OpenWrt does not check it.""",
-    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
+    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) next to the image.",
     failing=Example(
         _IMAGE.replace("image: rocket.bin", "image: rocket.bin, usign_key: absent.pub"),
         files={"rocket.bin": ROCKET_IMAGE},

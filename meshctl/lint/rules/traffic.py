@@ -311,7 +311,7 @@ def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC741",
     Severity.WARNING,
     "The transport's port is in the ephemeral range",
-    why="""Linux assigns ports from 32768 on to any program that asks for one: occasionally this port is taken before
+    why="""Linux assigns ports from 32768 on to any program that requests one: occasionally this port is taken before
     udp_mesh starts.""",
     fix="Use a port from 1024 to 32767, such as 8700.",
     failing="udp_mesh: {port: 40000}",

@@ -74,7 +74,7 @@ def test_awkward_names_reach_the_radio_unchanged(ssid: str) -> None:
 def test_no_text_for_people_shows_the_key(key: str) -> None:
     fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     other = render(fleet)
-    # a key that is a part of what everybody may read, such as a package's name, cannot be told from it
+    # a key that is part of public text, such as a package's name, cannot be distinguished from it
     assume(key not in other.masked_text + repr(other))
     rendered = render(fleet, key)
     wireless = rendered.file("etc/config/wireless")
