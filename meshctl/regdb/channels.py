@@ -1,7 +1,7 @@
 """Channels and the frequencies they occupy: numbers by IEEE 802.11-2020 annex E, widths by UCI's htmode.
 
-`center_mhz` and `channel_at` convert a 20 MHz channel; `occupied` returns the whole range of a channel with an htmode,
-or None if there is no such channel.
+`center_mhz` and `channel_at` convert a 20 MHz channel; `occupied_span` returns the whole range of a channel with an
+htmode, or None if there is no such channel.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def width_mhz(htmode: str) -> int:
     return int(match[1])
 
 
-def occupied(band: Band, channel: int, htmode: str) -> Span | None:
+def occupied_span(band: Band, channel: int, htmode: str) -> Span | None:
     """The range that a channel occupies with this htmode; None if they are incompatible (`HT40+` on 165, 80 MHz at
     2.4 GHz). Raises ValueError for an unknown channel or htmode."""
     width = width_mhz(htmode)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from meshctl.model import Band
-from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied, width_mhz
+from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied_span, width_mhz
 from meshctl.regdb.values import NO_FLAGS, Country, Flag, FrequencyRule
 
 
@@ -54,7 +54,7 @@ def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag
     width = width_mhz(htmode)
     legal = []
     for channel in CHANNELS[band]:
-        span = occupied(band, channel, htmode)
+        span = occupied_span(band, channel, htmode)
         if span is None:
             continue
         verdict = check_span(country, span)
@@ -63,7 +63,7 @@ def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag
     return tuple(legal)
 
 
-def primary(band: Band, channel: int) -> Span:
+def primary_span(band: Band, channel: int) -> Span:
     """The primary 20 MHz of a channel. Raises ValueError for an unknown channel."""
     center = center_mhz(band, channel)
     return Span(center - 10, center + 10)

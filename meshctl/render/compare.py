@@ -109,7 +109,7 @@ def compare_files(old: RenderedFile | None, new: RenderedFile | None) -> Iterato
         yield f"mode {old.mode:04o} -> {new.mode:04o}"
     left, right = _package(old, new), _package(new, old)
     if left is not None and right is not None:
-        yield from (_hidden(line, old, new) for line in uci.diff(left, right).lines())
+        yield from (_masked(line, old, new) for line in uci.diff(left, right).lines())
         return
     old_text, new_text = (file.masked if file is not None else "" for file in (old, new))
     if old is not None and new is not None and old_text == new_text and old.content != new.content:
@@ -119,7 +119,7 @@ def compare_files(old: RenderedFile | None, new: RenderedFile | None) -> Iterato
     yield from list(lines)[2:]
 
 
-def _hidden(line: str, *files: RenderedFile | None) -> str:
+def _masked(line: str, *files: RenderedFile | None) -> str:
     """The line with the secrets of both versions masked, in options of any name."""
     for file in files:
         line = file.hide(line) if file is not None else line

@@ -28,8 +28,8 @@ _PACKAGE_LINE = re.compile(r"[A-Za-z0-9_-]+")
 _KEYWORD = re.compile(r"[ \t]*([^ \t]*)[ \t]?")
 _KEYWORDS = {word: word[0] for word in ("package", "config", "option", "list")} | {c: c for c in "pcol"}
 # Fast path for the two most common forms of lines.
-_USUAL_OPTION = re.compile(r"[ \t]*(option|list)[ \t]+([A-Za-z0-9_]+)[ \t]+'([^'\n]*)'[ \t]*(?:\n|\Z)")
-_USUAL_CONFIG = re.compile(r"[ \t]*config[ \t]+([A-Za-z0-9_-]+)(?:[ \t]+'([A-Za-z0-9_]+)')?[ \t]*(?:\n|\Z)")
+_COMMON_OPTION = re.compile(r"[ \t]*(option|list)[ \t]+([A-Za-z0-9_]+)[ \t]+'([^'\n]*)'[ \t]*(?:\n|\Z)")
+_COMMON_CONFIG = re.compile(r"[ \t]*config[ \t]+([A-Za-z0-9_-]+)(?:[ \t]+'([A-Za-z0-9_]+)')?[ \t]*(?:\n|\Z)")
 
 
 def parse(text: str, file: str, *, name: str = "") -> Package:
@@ -157,23 +157,23 @@ class _Reader:
         if nul >= 0:
             raise self._invalid(nul, "text", "a NUL byte")
         while self._end < len(self._text):
-            if self._usual_line(builder):
+            if self._common_line(builder):
                 continue
             self._next_line()
             self._skip_spaces()
             while self._statement(builder):
                 pass
 
-    def _usual_line(self, builder: _Builder) -> bool:
+    def _common_line(self, builder: _Builder) -> bool:
         start = self._end
-        option = _USUAL_OPTION.match(self._text, start)
+        option = _COMMON_OPTION.match(self._text, start)
         if option is not None:
             keyword, name, value = option.groups()
             add = builder.option if keyword == "option" else builder.list_item
             self._apply(lambda: add(name, value), start)
             self._end = option.end()
             return True
-        section = _USUAL_CONFIG.match(self._text, start)
+        section = _COMMON_CONFIG.match(self._text, start)
         if section is not None:
             type_name, section_name = section.groups(default="")
             self._apply(lambda: builder.config(type_name, section_name), start)
