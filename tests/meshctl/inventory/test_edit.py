@@ -99,7 +99,7 @@ def test_topics_are_added_changed_and_removed_in_the_file_that_holds_them(final:
     assert (topics["chat"].priority, topics["chat"].reliable, topics["chat"].deadline_s) == (5, False, 1.5)
     assert (topics["telemetry"].rate_hz, topics["telemetry"].repair) == (5, True)
     text = (final / "topics.yaml").read_text()
-    assert _comments(text) == [line for line in comments if "pieces of the map" not in line]
+    assert _comments(text) == [line for line in comments if "map updates" not in line]
     assert "\n\n\n" not in text
     assert "\n\n  chat:\n    priority: 5\n" in text
     assert (final / "fleet.yaml").read_text() == main
