@@ -172,7 +172,7 @@ def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
         ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
         ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
         ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),
-        ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: the key 'a' stands twice"),
+        ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: duplicate key 'a'"),
     ],
 )
 def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
