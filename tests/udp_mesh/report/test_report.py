@@ -61,14 +61,14 @@ def test_a_torn_line_is_left_out_and_told() -> None:
 @pytest.mark.parametrize(
     ("raw", "problem"),
     [
-        ('{"t": 4, "kind": "recei', "expected one JSON object, found no JSON (a line that was cut off?)"),
+        ('{"t": 4, "kind": "recei', "expected one JSON object, found invalid JSON (a truncated line?)"),
         ("[1]", "expected one JSON object, found another JSON value"),
         ('{"kind": "place"}', "expected a number from 0 to 1e+09 as t, found None"),
         ('{"t": NaN, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found nan"),
         ('{"t": 1e308, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found 1e+308"),
         ('{"t": -3, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found -3"),
         ('{"t": 1, "kind": "place", "x": 1e308, "y": 1}', "expected a number from -1e+07 to 1e+07 as x, found 1e+308"),
-        ('{"t": 1, "kind": "peer-online", "peer": 5}', "expected text as peer, found 5"),
+        ('{"t": 1, "kind": "peer-online", "peer": 5}', "expected a string as peer, found 5"),
         (
             '{"t": 1, "kind": "received", "source": "a", "topic": "t", "priority": 1, "bytes": 1e400}',
             "expected a number from 0 to 1.1259e+15 as bytes, found inf",
@@ -83,7 +83,7 @@ def test_a_torn_line_is_left_out_and_told() -> None:
 def test_a_damaged_line_is_left_out_and_told_by_what_is_wrong_with_it(raw: str, problem: str) -> None:
     recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
     assert recording.problems == [f"r:2: {problem}"]
-    assert "1 lines could not be read" in page([recording], "any")
+    assert "1 lines are invalid" in page([recording], "any")
 
 
 def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
@@ -147,7 +147,7 @@ def test_the_pages_numbers_are_there_for_scripts(tmp_path: Path, capsys: pytest.
     assert value["page"] == str(tmp_path / "page.html")
     assert value["recordings"][0]["received"] == [{"topic": "telemetry", "priority": 3, "messages": 1, "bytes": 1000}]
     assert value["recordings"][0]["online"] == [{"peer": "spot1", "share": 1.0, "spans_s": [[1.0, 3.0]]}]
-    assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more lines that cannot be read"
+    assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more invalid lines"
 
 
 def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
@@ -280,7 +280,7 @@ def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
         "spot1",
         "Throughput by topic",
         "Online",
-        "Round trip",
+        "Round-trip time",
         "Loss",
         "Where the robots were online",
     ):
