@@ -177,7 +177,7 @@ def _command_group(
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """A command with subcommands."""
     parser = _parser(commands, name, help_text, example)
-    return parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    return parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
 
 def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
