@@ -159,7 +159,7 @@ def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapp
     high = max(max(ys) - min(ys), wide * 0.1)
     height = min(600, max(160, int((WIDTH - _LEFT - _RIGHT) * high / wide) + _TOP + _BOTTOM))
     axes = _Axes((min(xs), min(xs) + wide), (min(ys), min(ys) + high), height)
-    parts = axes.lines("metres", "metres")
+    parts = axes.lines("meters", "meters")
     for index, track in enumerate(tracks.values()):
         # One path per section rather than per step: an hour has thousands of steps.
         for on, steps in itertools.groupby(itertools.pairwise(track), key=lambda step: step[1][2]):

@@ -19,7 +19,6 @@ from udp_mesh.core.settings import Outbox, Settings, Topic
 from udp_mesh.sim.medium import Channel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 
-ALL_ROBOTS = "*"
 _MAX_SHOWN_PROBLEMS = 20
 _MAX_BYTES = 1 << 20
 MAX_MESSAGE_BYTES = 1 << 22

@@ -37,5 +37,5 @@ def has_ros() -> bool:
 
 
 def expects_ros() -> bool:
-    """Whether tests of a real ROS 1 are to be run: where there is one, and where somebody says that there is."""
+    """Whether to run tests with a real ROS 1: if it is installed or required."""
     return has_ros() or bool(os.environ.get(NEEDS_ROS))

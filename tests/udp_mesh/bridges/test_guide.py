@@ -37,7 +37,7 @@ def connect(port: int) -> socket.socket:
         except ConnectionRefusedError:
             return None
 
-    return poll(connected, f"somebody at port {port}")
+    return poll(connected, f"a listener at port {port}")
 
 
 def test_the_example_is_short_and_carries_lines(tmp_path: Path) -> None:

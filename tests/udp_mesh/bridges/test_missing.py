@@ -18,7 +18,7 @@ import pytest
         ("zenoh_bridge", "zenoh", "pip install eclipse-zenoh"),
     ],
 )
-def test_a_missing_middleware_is_told_in_one_line(tmp_path: Path, module: str, needs: str, remedy: str) -> None:
+def test_a_missing_middleware_is_reported_in_one_line(tmp_path: Path, module: str, needs: str, remedy: str) -> None:
     (tmp_path / f"{needs}.py").write_text(f"raise ModuleNotFoundError(\"No module named '{needs}'\")\n")
     done = subprocess.run(
         [sys.executable, "-m", f"udp_mesh.bridges.{module}"],

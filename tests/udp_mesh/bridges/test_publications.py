@@ -23,7 +23,7 @@ INT = TypeKey("std_msgs/Int32", "bb")
 
 
 class Graph:
-    """A ROS graph in memory: a master that answers when it is told to, and what subscribers got."""
+    """A ROS graph in memory: a master that answers on request, and what subscribers got."""
 
     def __init__(self) -> None:
         self.answers = threading.Event()

@@ -111,7 +111,7 @@ def test_the_last_latched_message_stays_whatever_the_order_they_arrive_in() -> N
     stop, go = to_bob(alice, b"stop", latched=True), to_bob(alice, b"go", latched=True)
     assert len(carry(go, "alice", bob)) == 1
     assert carry(stop, "alice", bob) == []
-    # Another publisher's is no earlier one, nor what the same publishes after its bridge has started anew.
+    # Another publisher's message is not an earlier one, nor is one of the same publisher after its bridge restarted.
     assert len(carry(to_bob(alice, b"x", latched=True, publisher="/other"), "alice", bob)) == 1
     again = Relay("alice", EXCHANGE, ros_version=1, nonce=b"another start")
     assert len(carry(to_bob(again, b"stop", latched=True)[-1:], "alice", bob)) == 1
@@ -125,9 +125,9 @@ def test_programs_that_latched_and_went_do_not_outlive_who_came_after() -> None:
     repeated = carry(bob.on_peer_online("alice"), "bob", alice)
     assert [effect for effect in repeated if isinstance(effect, ToMesh) and effect.topic == "status"] == []
     late = carry(relay("bob").on_peer_online("alice"), "bob", alice)
-    told = [effect.payload for effect in late if isinstance(effect, ToMesh) and effect.topic == "status"]
-    assert len(told) == MAX_LATCHED_PER_ROUTE
-    assert told[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
+    sent = [effect.payload for effect in late if isinstance(effect, ToMesh) and effect.topic == "status"]
+    assert len(sent) == MAX_LATCHED_PER_ROUTE
+    assert sent[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
 
 
 def test_a_definition_that_never_comes_blocks_its_topic_for_a_while_only() -> None:
@@ -151,8 +151,8 @@ def test_a_publisher_without_a_definition_does_not_blot_out_one_that_has_it() ->
     alice = relay("alice")
     to_bob(alice, b"1")
     alice.from_ros(Route("status", "bob"), "/rosserial", STRING, "", False, b"2")
-    told = alice.from_mesh("bob", EXCHANGE, "bridge", encode(Want([STRING])), 0.0)
-    assert [decode(effect.payload) for effect in told if isinstance(effect, ToMesh)] == [
+    sent = alice.from_mesh("bob", EXCHANGE, "bridge", encode(Want([STRING])), 0.0)
+    assert [decode(effect.payload) for effect in sent if isinstance(effect, ToMesh)] == [
         Definition(STRING, "string data")
     ]
 
@@ -168,7 +168,7 @@ def test_latched_messages_go_to_whom_they_were_for() -> None:
     assert payloads == {"bob": [b"for bob"], "base": [b"for base"], "carol": []}
 
 
-def test_a_fielded_robot_names_the_type_alone() -> None:
+def test_a_legacy_robot_sends_only_the_type_name() -> None:
     found = relay("bob").from_mesh("old", "status", "std_msgs/String", b"x", 0.0)
     assert found == [ToRos("/old/mesh_comm/bob/status", TypeKey("std_msgs/String", ""), None, False, b"x")]
 

@@ -30,7 +30,7 @@ CDR_HELLO = bytes.fromhex("00010000") + struct.pack("<I", 6) + b"hello\0"
 
 
 def settings(listen: int | None = None, connect: int | None = None) -> dict[str, str]:
-    """A peer on the loopback that looks for nobody."""
+    """A peer on the loopback without scouting."""
     return {
         "mode": '"peer"',
         "scouting/multicast/enabled": "false",
@@ -234,14 +234,14 @@ def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_ke
             publisher.put(b"%d %d" % (place, number), attachment=attachment(number, bytes([place] * 16)))
     present: list[bytes] = []
     kept = [late_subscriber(bob, present)]
-    # A robot that comes late: told what is kept, of each publisher the last two.
+    # A robot that joins late gets the cached samples, the last two of each publisher.
     bob.start_bridge()
     poll(lambda: sorted(present) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what was kept: {present}")
     # A subscriber that comes late, on the robot that had it from the mesh.
     late: list[bytes] = []
     kept.append(late_subscriber(bob, late))
     poll(lambda: sorted(late) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what the bridge keeps: {late}")
-    # What comes now comes once, also when the robots meet again and it is told again.
+    # A later sample is put once, even if it is sent again when the robots meet again.
     publishers[0].put(b"0 4", attachment=attachment(4, bytes(16)))
     poll(lambda: b"0 4" in present and b"0 4" in late, "what is new")
     bob.daemon.kill()
@@ -249,7 +249,7 @@ def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_ke
     bob.daemon.start()
     publishers[0].put(b"0 5", attachment=attachment(5, bytes(16)))
     poll(lambda: b"0 5" in present, "what came after they met again")
-    alice.put_until_seen(bob, "demo/after", b"whatever was told again has come before")
+    alice.put_until_seen(bob, "demo/after", b"all cached samples came before")
     assert len(present) == len(set(present)) == 6
     # With the publisher goes what was kept of it.
     token.undeclare()

@@ -52,7 +52,7 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
     assert uptimes[1] > uptimes[0]
 
 
-def test_a_watch_waits_for_a_daemon_that_starts_anew() -> None:
+def test_a_watch_waits_for_a_daemon_that_restarts() -> None:
     with (
         tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder,
         RunningDaemon(Path(folder), "alone", configuration(Path(folder), "alone", 1, [2], free_port())) as daemon,

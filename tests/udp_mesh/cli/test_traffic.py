@@ -66,8 +66,8 @@ def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair:
 def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
     assert run("set", "topic", "orders", 'destinations=["bob", "carol"]', "deadline_s=0.2", "outbox=all")[0] == Exit.OK
     code, text, _ = run("pub", "orders", "go", "--wait", str(WAIT_S), "--json")
-    told = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
-    assert (code, told) == (Exit.NOT_DELIVERED, {"bob": "delivered", "carol": "expired"})
+    outcomes = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
+    assert (code, outcomes) == (Exit.NOT_DELIVERED, {"bob": "delivered", "carol": "expired"})
     code, text, _ = run("pub", "map", "x" * 20_000, "--wait", str(WAIT_S), "--json")
     assert (code, json.loads(text)["peer"]) == (Exit.OK, "bob")
 
@@ -111,7 +111,7 @@ def test_a_file_without_end_is_no_message(run: Run, monkeypatch: pytest.MonkeyPa
     assert (code, complaint) == (Exit.FAILED, f"udp-mesh: {name}: expected at most 1000 bytes, found more\n")
 
 
-def test_a_script_is_told_that_its_message_was_accepted(run: Run) -> None:
+def test_a_script_learns_that_its_message_was_accepted(run: Run) -> None:
     code, text, _ = run("pub", "map", "x", "--to", "bob", "--count", "2", "--rate", "100", "--json")
     assert (code, json.loads(text)) == (Exit.OK, {"topic": "map", "accepted": 2})
 
@@ -210,7 +210,7 @@ def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
     assert run("record", "start", str(path))[::2] == (Exit.FAILED, f"udp-mesh: {path}: File exists\n")
 
 
-def test_a_recording_where_the_daemon_may_not_write_or_we_cannot_look_is_told(
+def test_a_recording_that_cannot_be_written_or_seen_is_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code, _, complaint = run("record", "start", str(tmp_path / "none" / "run.jsonl"))

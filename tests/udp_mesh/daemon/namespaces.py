@@ -1,7 +1,7 @@
 """Two real daemons, each in a network namespace of its own, joined by veth pairs that come, go and change.
 
 `python -m tests.udp_mesh.daemon.namespaces SCENARIO` plays one of the functions below; it must run as root of a network
-namespace nobody else uses (`unshare --net`). Anything that is not as it should be raises.
+namespace of its own (`unshare --net`). Anything that is not as it should be raises.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Pair:
             self.ip(daemon, f"link set {interface} up")
 
     def addresses(self) -> dict[str, str]:
-        """Peer -> the address its messages go to, as each daemon tells."""
+        """Peer -> the address its messages go to, as each daemon reports it."""
         found: dict[str, str] = {}
         for daemon in (self.alice, self.bob):
             with daemon.client() as client:
@@ -112,7 +112,7 @@ def ipv6_only() -> None:
 
 
 def ipv6_neighbours() -> None:
-    """Fixed neighbours with routable addresses, which appear after the link-local ones."""
+    """Fixed neighbors with routable addresses, which appear after the link-local ones."""
     link = '[[links]]\ninterface = "mesh0"\nkind = "neighbours"\n[[neighbours]]\naddress = '
     with pair(f'{link}"fd00::2"\n', f'{link}"[fd00::1]:8700"\n') as both:
         both.join("mesh0")
@@ -204,7 +204,7 @@ def interface_goes_in_the_middle() -> None:
             assert link_of(both.alice, "bob") == "mesh1"
 
 
-def interface_made_anew() -> None:
+def interface_created_again() -> None:
     """Deleted and there again at once, with the same name and address, as a driver's reload or a script does it."""
     with pair() as both:
         both.join("mesh0")
@@ -227,7 +227,7 @@ def interface_made_anew() -> None:
 
 
 def interface_too_narrow() -> None:
-    """An interface that no datagram fits is told of; the others go on."""
+    """An interface too narrow for any datagram is reported; the others keep working."""
     with pair() as both:
         both.join("mesh0")
         both.join("narrow0")
@@ -242,8 +242,8 @@ def interface_too_narrow() -> None:
 
 
 def sending_is_forbidden() -> None:
-    """A rule forbids what goes to one peer, then everything: it is told, why and to whom; when it is gone, all goes on
-    and arrives once."""
+    """A firewall rule drops traffic to one peer, then to all: it is logged with reason and peers; without it, traffic
+    resumes and arrives once."""
     with pair() as both:
         both.join("mesh0")
         for number, daemon in enumerate((both.alice, both.bob), 1):
@@ -318,7 +318,7 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         addresses_without_broadcast,
         address_changes_in_the_middle,
         interface_goes_in_the_middle,
-        interface_made_anew,
+        interface_created_again,
         interface_too_narrow,
         sending_is_forbidden,
         interface_queue_overflows,

@@ -125,7 +125,7 @@ def configuration(
     more: str = "",
     rates: str = RATES,
 ) -> str:
-    """A node at 127.0.3.<own> with fixed neighbours at 127.0.3.<others>."""
+    """A node at 127.0.3.<own> with fixed neighbors at 127.0.3.<others>."""
     key_file = folder / f"{name}.key"
     key_file.write_text("\n".join(keys) + "\n")
     neighbours = "".join(f'[[neighbours]]\naddress = "127.0.3.{other}"\n' for other in others)

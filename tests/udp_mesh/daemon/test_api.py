@@ -110,8 +110,8 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
         assert len(await reading) == rounds
         # all that waits, and at most one frame each beyond its part
         assert sum(client.backlog_bytes() for client in idle) < 10_000_000 + 9 * 1_000_000
-        told = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
-        assert len(told) + told[-1]["messages"] - 1 == rounds
+        received = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
+        assert len(received) + received[-1]["messages"] - 1 == rounds
         for one in (*lazy, program):
             one.close()
 
@@ -140,12 +140,12 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
             await loop.sock_sendall(program, request[:-1])
         await loop.sock_sendall(programs[8], encode_frame({"op": "publish", "id": 2}, b"whole"))
         assert [answer["ok"] for answer in await read(programs[8], bool)] == [True]
-        told = []
+        replies = []
         for program in programs[:8]:
             await loop.sock_sendall(program, request[-1:])
-            told += await read(program, bool)
-        assert {answer["id"] for answer in told} == {1}
-        assert {answer.get("code") for answer in told} == {None, "busy"}
+            replies += await read(program, bool)
+        assert {answer["id"] for answer in replies} == {1}
+        assert {answer.get("code") for answer in replies} == {None, "busy"}
         # and what asyncio reads at a time
         assert most <= 4_000_000 + 256 * 1024
         looking.cancel()
@@ -155,7 +155,7 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
     serve(work)
 
 
-def test_one_program_too_many_is_told_why() -> None:
+def test_one_program_too_many_gets_the_reason() -> None:
     async def work(server: LocalServer, path: Path) -> None:
         programs = await connected(server, path, api.MAX_CLIENTS)
 

@@ -1,4 +1,4 @@
-"""Daemons killed, restarted, reloaded in the middle of transfers: what was accepted is delivered or its end is told."""
+"""Daemons killed, restarted and reloaded during transfers: every accepted message is delivered or has an outcome."""
 
 import signal
 import socket
@@ -60,7 +60,7 @@ def test_what_waited_on_disk_when_the_sender_was_killed_is_delivered_after_its_r
     assert entries == {b"entry %d" % number for number in range(10)}
 
 
-def test_a_disk_that_stands_still_holds_up_nobody_but_the_publisher_who_waits_for_it() -> None:
+def test_a_hung_disk_delays_only_the_publisher_that_waits_for_it() -> None:
     topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
     with (
         two_daemons(topics) as (alice, bob),

@@ -52,7 +52,7 @@ def test_what_is_written_is_read() -> None:
     assert read_back.end_s == 3.0
 
 
-def test_a_torn_line_is_left_out_and_told() -> None:
+def test_a_truncated_line_is_ignored_and_reported() -> None:
     recording = parse([*lines(*ITEMS), b'{"t": 4, "kind": "recei'], "r.jsonl")
     assert len(recording.arrivals) == 1
     assert recording.problems[0].startswith("r.jsonl:7:")
@@ -80,7 +80,7 @@ def test_a_torn_line_is_left_out_and_told() -> None:
         ('{"t": 1, "kind": "conditions", "peers": 5}', "expected a list of objects as peers, found 5"),
     ],
 )
-def test_a_damaged_line_is_left_out_and_told_by_what_is_wrong_with_it(raw: str, problem: str) -> None:
+def test_a_damaged_line_is_ignored_and_reported_with_the_reason(raw: str, problem: str) -> None:
     recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
     assert recording.problems == [f"r:2: {problem}"]
     assert "1 lines are invalid" in page([recording], "any")
@@ -91,9 +91,10 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
         peer = {"name": "spot1", "online": online, "loss": 0.5}
         return json.dumps({"t": t, "kind": "conditions", "peers": [peer]}).encode()
 
-    told = line(Presence(4.0, "base", "spot1", False)).encode()
+    offline = line(Presence(4.0, "base", "spot1", False)).encode()
     recording = parse(
-        [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), told, conditions(5.0, False)], "r"
+        [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), offline, conditions(5.0, False)],
+        "r",
     )
     (spot,) = connections(recording)
     assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
@@ -117,7 +118,7 @@ def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
     assert "<td>estop</td><td>1</td><td>0.00</td><td>2</td><td>0</td><td>0</td><td>40.0</td>" in page([recording], "")
 
 
-def test_lines_that_were_never_written_are_told() -> None:
+def test_lines_that_were_never_written_are_reported() -> None:
     recording = parse([header("a", 0.0).encode(), b'{"t": 1, "kind": "gap", "lines": 40}'], "r")
     assert "40 lines are missing" in page([recording], "any")
     assert summary(recording)["lines_left_out"] == 40
@@ -164,7 +165,7 @@ def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
     assert sorted(tmp_path.iterdir()) == [path, taken]
 
 
-def test_the_topic_with_the_most_messages_is_shown_first_and_its_punctuality_told() -> None:
+def test_the_topic_with_the_most_messages_is_shown_first_with_its_punctuality() -> None:
     often = [Arrival(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
     seldom = [Arrival(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
     first, second = intervals(parse(lines(*often, *seldom), "r"))
@@ -179,7 +180,7 @@ def test_a_track_is_one_path_for_each_stretch_online_or_not() -> None:
     assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
 
 
-def test_a_long_name_fits_beside_its_row_and_is_told_in_full() -> None:
+def test_a_long_name_is_shortened_and_shown_in_full_in_a_tooltip() -> None:
     picture = spans({"operator-base-station": [(0.0, 1.0)]}, 2.0, "s")
     assert ">operator…</text>" in picture
     assert "<title>operator-base-station</title>" in picture
@@ -224,7 +225,7 @@ def periodic(jitter: float) -> Recording:
     return parse(lines(*items), "r")
 
 
-def test_intervals_tell_median_deviation_and_gaps() -> None:
+def test_intervals_have_median_deviation_and_gaps() -> None:
     (steady,) = intervals(periodic(0.0))
     assert (steady.median_s, steady.deviation_s, steady.gaps) == (1.0, 0.0, 0)
     (jittered,) = intervals(periodic(0.1))

@@ -50,7 +50,7 @@ def test_airtime_is_bytes_over_rate_plus_overhead_per_transmission() -> None:
     assert line.medium.counts.airtime_s == (1000 + IP_UDP_BYTES + FRAME_BYTES) / 1e6 + 1e-3
 
 
-def test_a_broadcast_reaches_everybody_once() -> None:
+def test_a_broadcast_reaches_all_once() -> None:
     line = Line("abcde")
     line.medium.send("c", None, b"x")
     line.event_queue.run_until(1.0)
@@ -87,7 +87,7 @@ def test_a_full_queue_drops_and_counts() -> None:
     assert line.medium.counts.queue_drops >= 89
 
 
-def test_a_route_is_found_anew_only_after_the_mesh_layers_time() -> None:
+def test_routes_are_recomputed_only_after_the_mesh_layers_time() -> None:
     line = Line("abc", route_s=1.0)
     line.medium.send("a", "c", b"x")
     line.event_queue.run_until(0.5)
@@ -130,7 +130,7 @@ def test_loss_grows_from_good_to_range_and_rock_stops_all() -> None:
     assert air.loss((10, 0), (10, 20)) == 1.0
 
 
-def test_a_course_is_walked_in_straight_lines() -> None:
+def test_a_trajectory_consists_of_straight_lines() -> None:
     walked = trajectory([(10, (0, 0)), (20, (100, 50))])
     assert walked.at(0) == (0, 0)
     assert walked.at(15) == (50, 25)
@@ -182,5 +182,5 @@ def test_who_waited_while_another_sent_waits_less_the_next_time() -> None:
         line.medium.send("b", "a", bytes(1000))
     line.event_queue.run_until(3.0)
     runs = [len(list(group)) for _, group in itertools.groupby(line.stations)]
-    # a count that began anew each time would let one of two stations send eight times in a row now and then
+    # a back-off that restarted each time would let one of two stations send eight times in a row now and then
     assert max(runs) <= 6

@@ -1,4 +1,4 @@
-"""Scenario files: the shipped ones load, anything wrong is told with its line, nothing raises another exception."""
+"""Scenario files: the shipped ones load, problems are reported with their line, nothing raises another exception."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ def test_each_shipped_scenario_loads(name: str) -> None:
         ),
     ],
 )
-def test_a_problem_is_told_with_its_line(old: str, new: str, message: str) -> None:
+def test_a_problem_is_reported_with_its_line(old: str, new: str, message: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         parse(GOOD.replace(old, new).encode(), "s.yaml")
     assert message in str(raised.value)
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(ScenarioError) as raised:
         parse(GOOD.replace("priority: 0", "priority: x").replace("[0, 0]", "{}").encode(), "s.yaml")
     assert len(str(raised.value).splitlines()) >= 2
@@ -103,9 +103,7 @@ def test_a_number_that_would_play_nothing_is_wrong_usage(words: list[str], capsy
     assert f"argument {words[0]}: expected" in capsys.readouterr().err
 
 
-def test_where_nothing_can_be_written_is_told_before_anything_is_played(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_directory_is_reported_before_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "taken").write_text("")
     assert run_command(["final-run", "--out", str(tmp_path / "taken")]) == 2
     assert capsys.readouterr().err == f"udp-mesh: {tmp_path}/taken: File exists\n"
@@ -120,7 +118,7 @@ VALUES = ("0", "-1", "1", "1.5", "1e400", "nan", "inf", ".inf", "-0.0", "1e18", 
 
 
 @given(st.sampled_from(KEYS), st.sampled_from(VALUES))
-def test_any_number_is_played_or_told(key: str, value: str) -> None:
+def test_any_number_is_played_or_reported(key: str, value: str) -> None:
     outer, _, inner = key.partition(".")
     changed = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
     try:
@@ -131,7 +129,7 @@ def test_any_number_is_played_or_told(key: str, value: str) -> None:
         assert 0 <= play(scenario).summary()["channel"]["airtime_share"] < 50
 
 
-def test_why_messages_were_refused_is_told() -> None:
+def test_reasons_of_refused_messages_are_reported() -> None:
     summary = play(parse(GOOD.replace("a: [0, 0]", "a: [900, 0]").encode(), "s.yaml")).summary()
     assert summary["rejected_because"] == {"unknown peer": summary["rejected"]}
     assert summary["rejected"] > 0

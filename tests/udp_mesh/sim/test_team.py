@@ -54,7 +54,7 @@ def test_an_urgent_message_overtakes_a_map_under_way() -> None:
     assert arrivals == ["estop", "map"]
 
 
-def test_a_repaired_broadcast_reaches_everybody_exactly_once() -> None:
+def test_a_repaired_broadcast_reaches_all_exactly_once() -> None:
     arrivals: list[tuple[str, bytes]] = []
     topics = (Topic("estop", priority=0, repair=True, deadline_s=10),)
 
