@@ -110,7 +110,7 @@ def test_a_reload_of_a_broken_file_changes_nothing_and_names_the_line() -> None:
         poll(lambda: "reload-refused" in alice.log.read_text(), "the refusal is logged")
         assert operator.request("topics")["topics"] == before
         alice.write(text.replace('name = "alice"', 'name = "carol"'))
-        assert operator.request("reload")["changes"] == ["name: takes effect with the next start"]
+        assert operator.request("reload")["changes"] == ["name: takes effect after a restart"]
 
 
 def test_keys_are_rotated_through_two_live_keys_without_losing_a_message() -> None:
@@ -182,7 +182,7 @@ def test_a_second_daemon_does_not_take_the_firsts_socket_or_port() -> None:
                 timeout=WAIT_S,
             )
             assert second.returncode == 1
-            assert f"cannot start: another daemon answers at {first.socket}" in second.stderr
+            assert f"cannot start: {first.socket}: another daemon is already listening" in second.stderr
             assert "Traceback" not in second.stderr
             with first.client() as client:
                 client.request("peers")
