@@ -38,7 +38,7 @@ class RecordingError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ReceivedMessage:
     t: float
     at: str
     source: str
@@ -75,7 +75,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class SentMessage:
     t: float
     topic: str
     priority: int
@@ -83,7 +83,7 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SentOutcome:
     """The outcome of a sent message at one destination; `latency_s` if `kind` is `delivered`."""
 
     t: float
@@ -100,12 +100,12 @@ class Recording:
 
     name: str = ""
     started: float = 0.0
-    arrivals: list[Arrival] = field(default_factory=list)
+    arrivals: list[ReceivedMessage] = field(default_factory=list)
     presences: list[Presence] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
-    sent: list[Sent] = field(default_factory=list)
-    outcomes: list[Outcome] = field(default_factory=list)
+    sent: list[SentMessage] = field(default_factory=list)
+    outcomes: list[SentOutcome] = field(default_factory=list)
     missing_lines: int = 0
     end_s: float = 0.0
     """The latest time of a line."""
@@ -116,10 +116,10 @@ def header(name: str, started: float) -> str:
     return json.dumps({"recording": VERSION, "node": name, "started": started})
 
 
-def line(item: Arrival | Presence | Sample | Place) -> str:
+def line(item: ReceivedMessage | Presence | Sample | Place) -> str:
     """Encodes one line, without the line end."""
     match item:
-        case Arrival(_, _, source, topic, priority, size):
+        case ReceivedMessage(_, _, source, topic, priority, size):
             kind = "received"
             what: dict[str, Any] = {"source": source, "topic": topic, "priority": priority, "bytes": size}
         case Presence(_, _, peer, online):
@@ -207,14 +207,16 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
     match kind:
         case "received":
             recording.arrivals.append(
-                Arrival(t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry))
+                ReceivedMessage(
+                    t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry)
+                )
             )
         case "sent":
-            recording.sent.append(Sent(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
+            recording.sent.append(SentMessage(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
         case "message-delivered" | "message-expired" | "message-peer-lost":
             latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
             outcome = kind.removeprefix("message-")
-            recording.outcomes.append(Outcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
+            recording.outcomes.append(SentOutcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
         case "peer-online" | "peer-offline":
             peer = _text(entry, "peer")
             online[peer] = kind == "peer-online"

@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Callable
 
 
-class EventQueue:
+class SimEventQueue:
     """`now` advances only in `run_until`; everything simulated shares one queue."""
 
     def __init__(self) -> None:

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 
-from udp_mesh.sim.event_queue import EventQueue
+from udp_mesh.sim.event_queue import SimEventQueue
 
 # IP and UDP headers, and the overhead of 802.11 and batman-adv per frame
 IP_UDP_BYTES = 28
@@ -38,7 +38,7 @@ _ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class RadioChannel:
     """`rate` is the bit rate on the air, `overhead_s` the time per transmission for preamble, spacing and ACK."""
 
     rate: float = 20e6
@@ -52,7 +52,7 @@ class Channel:
 
 
 @dataclass(slots=True)
-class Frame:
+class RadioFrame:
     """A datagram in transit; `to` None means broadcast."""
 
     number: int
@@ -63,7 +63,7 @@ class Frame:
 
 
 @dataclass(slots=True)
-class Counts:
+class ChannelCounters:
     """Counters of the whole channel since the start."""
 
     transmissions: int = 0
@@ -82,7 +82,7 @@ class _Queue:
 
     station: _Station
     slots: tuple[int, int]
-    frames: deque[Frame] = field(default_factory=deque)
+    frames: deque[RadioFrame] = field(default_factory=deque)
     is_waiting: bool = False
     backoff_slots: int | None = None
     """Slots left before the first frame may be sent; None: not drawn yet."""
@@ -102,7 +102,7 @@ class _Station:
 
 Loss = Callable[[str, str, float], float]
 """(station, station, now) -> probability that a frame is lost; 1 if they are out of range."""
-Deliver = Callable[[str, Frame], None]
+DeliverFrame = Callable[[str, RadioFrame], None]
 
 
 class Medium:
@@ -110,14 +110,14 @@ class Medium:
 
     def __init__(
         self,
-        event_queue: EventQueue,
-        channel: Channel,
+        event_queue: SimEventQueue,
+        channel: RadioChannel,
         stations: Iterable[str],
         loss: Loss,
-        deliver: Deliver,
+        deliver: DeliverFrame,
         rng: random.Random,
     ) -> None:
-        self.counts = Counts()
+        self.counts = ChannelCounters()
         self._event_queue = event_queue
         self._channel = channel
         self._stations = {name: _Station(name) for name in stations}
@@ -157,13 +157,13 @@ class Medium:
     def send(self, source: str, to: str | None, data: bytes, *, urgent: bool = False) -> None:
         """Sends one datagram; a full queue drops it silently, as a radio does."""
         self._frames += 1
-        frame = Frame(self._frames, source, to, data, urgent and self._channel.access_categories)
+        frame = RadioFrame(self._frames, source, to, data, urgent and self._channel.access_categories)
         station = self._stations[source]
         if to is None:
             station.flooded.append(frame.number)
         self._enqueue(station, frame)
 
-    def _enqueue(self, station: _Station, frame: Frame) -> None:
+    def _enqueue(self, station: _Station, frame: RadioFrame) -> None:
         if not station.is_on:
             return
         queue = station.urgent if frame.urgent else station.other
@@ -205,7 +205,7 @@ class Medium:
             self._forward(station, frame)
         self._contend(queue)
 
-    def _occupy(self, station: _Station, frame: Frame, times: int) -> float:
+    def _occupy(self, station: _Station, frame: RadioFrame, times: int) -> float:
         """Occupies the channel around a station for `times` transmissions; returns the end of the last."""
         size = len(frame.data) + IP_UDP_BYTES + FRAME_BYTES
         took_s = times * (size * 8 / self._channel.rate + self._channel.overhead_s)
@@ -224,7 +224,7 @@ class Medium:
             station.quiet_from_s = self._event_queue.now
         station.quiet_until_s = max(station.quiet_until_s, end_s)
 
-    def _forward(self, station: _Station, frame: Frame) -> None:
+    def _forward(self, station: _Station, frame: RadioFrame) -> None:
         assert frame.to is not None
         step = self._next_hops.get(frame.to, {}).get(station.name)
         if step is None:
@@ -242,14 +242,14 @@ class Medium:
         else:
             self.counts.losses += 1
 
-    def _broadcast(self, station: _Station, frame: Frame) -> None:
+    def _broadcast(self, station: _Station, frame: RadioFrame) -> None:
         at_s = self._occupy(station, frame, self._channel.broadcast_repeats)
         for name, loss in self._heard[station.name].items():
             if self._rng.random() >= loss**self._channel.broadcast_repeats:
                 other = self._stations[name]
                 self._event_queue.at(at_s, partial(self._arrive, other, frame))
 
-    def _arrive(self, station: _Station, frame: Frame) -> None:
+    def _arrive(self, station: _Station, frame: RadioFrame) -> None:
         if not station.is_on:
             return
         if frame.to == station.name:

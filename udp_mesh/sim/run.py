@@ -24,7 +24,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
-from udp_mesh.sim.medium import Counts
+from udp_mesh.sim.medium import ChannelCounters
 from udp_mesh.sim.mobility import Trajectory
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
@@ -52,7 +52,7 @@ class RunResult:
     topics: dict[str, TopicTotal]
     offered: dict[str, int]
     ledger: Ledger
-    counts: Counts
+    counts: ChannelCounters
     observer_bytes: dict[str, int]
 
     def summary(self) -> dict[str, Any]:
@@ -161,7 +161,7 @@ class _Run:
                 total.latencies_s.append(now - _SENT.unpack_from(payload)[0])
                 if robot == self.scenario.observer:
                     self.observer_bytes[topic] += len(payload)
-                    self._record(recording.Arrival(now, robot, source, topic, priority, len(payload)))
+                    self._record(recording.ReceivedMessage(now, robot, source, topic, priority, len(payload)))
             case PeerOnline(peer) | PeerOffline(peer):
                 if robot == self.scenario.observer:
                     self._record(recording.Presence(now, robot, peer, isinstance(event, PeerOnline)))
@@ -169,7 +169,9 @@ class _Run:
                 # The ledger records outcomes.
                 return
 
-    def _record(self, item: recording.Arrival | recording.Presence | recording.Sample | recording.Place) -> None:
+    def _record(
+        self, item: recording.ReceivedMessage | recording.Presence | recording.Sample | recording.Place
+    ) -> None:
         self.lines.append(recording.line(item))
 
     def _sample(self, progress: Callable[[float], None]) -> None:

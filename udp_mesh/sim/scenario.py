@@ -16,7 +16,7 @@ from typing import Any, Literal
 import yaml
 
 from udp_mesh.core.settings import Outbox, Settings, Topic
-from udp_mesh.sim.medium import Channel
+from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 
 _MAX_SHOWN_PROBLEMS = 20
@@ -26,7 +26,7 @@ MAX_MESSAGE_BYTES = 1 << 22
 MAX_DURATION_S = 1e7
 """Maximum duration: four months. A longer one is a mistake."""
 
-# Minimum and maximum of each number of `Channel` and `PathLoss`, in its unit.
+# Minimum and maximum of each number of `RadioChannel` and `PathLoss`, in its unit.
 _RANGES = {
     "rate": (1e3, 1e11),
     "overhead_s": (0.0, 1.0),
@@ -83,7 +83,7 @@ class Scenario:
     robots: Mapping[str, Trajectory]
     relays: Mapping[str, Trajectory]
     appear_s: Mapping[str, float]
-    channel: Channel
+    channel: RadioChannel
     air: PathLoss
     topics: tuple[Topic, ...]
     flows: tuple[Flow, ...]
@@ -310,8 +310,8 @@ def _numbers(at: _Entry, made: Any) -> dict[str, Any]:
     return values
 
 
-def _channel(at: _Entry) -> Channel:
-    return Channel(**_numbers(at, Channel()))
+def _channel(at: _Entry) -> RadioChannel:
+    return RadioChannel(**_numbers(at, RadioChannel()))
 
 
 def _path_loss(at: _Entry) -> PathLoss:

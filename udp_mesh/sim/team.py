@@ -24,8 +24,8 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.sim.event_queue import EventQueue
-from udp_mesh.sim.medium import Channel, Frame, Loss, Medium
+from udp_mesh.sim.event_queue import SimEventQueue
+from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
 
 LINK = "mesh0"
 BROADCAST = "10.255.255.255"
@@ -83,12 +83,12 @@ class Team:
         robots: Mapping[str, Settings],
         *,
         relays: Iterable[str] = (),
-        channel: Channel,
+        channel: RadioChannel,
         loss: Loss,
         seed: int,
         on_event: OnEvent | None = None,
     ) -> None:
-        self.event_queue = EventQueue()
+        self.event_queue = SimEventQueue()
         self.ledger = Ledger()
         self._rng = random.Random(seed)
         self._on_event = on_event or (lambda now, robot, event: None)
@@ -159,7 +159,7 @@ class Team:
 
     # Called by the medium and the timers
 
-    def _deliver(self, robot: str, frame: Frame) -> None:
+    def _deliver(self, robot: str, frame: RadioFrame) -> None:
         member = self._members.get(robot)
         source = self._members.get(frame.source)
         if member is None or source is None or not member.is_running:

@@ -22,7 +22,7 @@ from udp_mesh.bridges.ros2.quality import Quality, quality_text
 from udp_mesh.bridges.types import (
     MAX_DEFINITION_BYTES,
     Definitions,
-    Mark,
+    LatchMark,
     MessageKind,
     TypeKey,
     kind_text,
@@ -210,8 +210,12 @@ def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -
         assert [type(effect) for effect in relay("bob").from_mesh("a", EXCHANGE, "", data, 0.0)] == [Note]
 
 
-@given(WORDS, WORDS, st.none() | st.builds(Mark, st.from_regex("[0-9a-f]{8}", fullmatch=True), st.integers(0, 1 << 50)))
-def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, mark: Mark | None) -> None:
+@given(
+    WORDS,
+    WORDS,
+    st.none() | st.builds(LatchMark, st.from_regex("[0-9a-f]{8}", fullmatch=True), st.integers(0, 1 << 50)),
+)
+def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, mark: LatchMark | None) -> None:
     kind = MessageKind(TypeKey("pkg/" + name, checksum), mark)
     assert parse_kind(kind_text(kind)) == kind
 

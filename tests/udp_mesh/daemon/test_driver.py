@@ -14,7 +14,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.daemon.driver import MAX_BLOCKED_DATAGRAMS
 from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError
-from udp_mesh.links.udp import Deliver, Outgoing, UdpLink
+from udp_mesh.links.udp import Deliver, OutgoingDatagram, UdpLink
 
 PAYLOAD = bytes(range(256)) * 2000
 
@@ -23,7 +23,7 @@ def test_a_socket_that_is_full_for_a_while_costs_nothing_but_time(monkeypatch: p
     async def body(alice: Node, bob: Node) -> None:
         real, full_for = UdpLink.send, 200
 
-        def send(self: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+        def send(self: UdpLink, datagrams: Sequence[OutgoingDatagram]) -> int:
             nonlocal full_for
             if self.attachment.address[0].endswith(".1") and full_for:
                 full_for -= 1
@@ -62,7 +62,7 @@ def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_
         sent: list[bytes] = []
         room = 0
 
-        def send(_: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+        def send(_: UdpLink, datagrams: Sequence[OutgoingDatagram]) -> int:
             sent.extend(datagram.data for datagram in datagrams[:room])
             return min(room, len(datagrams))
 

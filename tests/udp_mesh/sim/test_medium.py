@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import random
 
-from udp_mesh.sim.event_queue import EventQueue
-from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Channel, Frame, Medium
+from udp_mesh.sim.event_queue import SimEventQueue
+from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Medium, RadioChannel, RadioFrame
 from udp_mesh.sim.mobility import PathLoss, Wall, trajectory
 
 
@@ -14,8 +14,8 @@ class Line:
     """Stations in a row, each hearing only the next, with one frame loss for all links."""
 
     def __init__(self, names: str, loss: float = 0.0, **channel: float) -> None:
-        self.event_queue = EventQueue()
-        self.arrived: list[tuple[float, str, Frame]] = []
+        self.event_queue = SimEventQueue()
+        self.arrived: list[tuple[float, str, RadioFrame]] = []
         self.cut: set[frozenset[str]] = set()
         places = {name: index for index, name in enumerate(names)}
 
@@ -23,10 +23,10 @@ class Line:
             near = abs(places[a] - places[b]) == 1 and frozenset((a, b)) not in self.cut
             return loss if near else 1.0
 
-        def deliver(station: str, frame: Frame) -> None:
+        def deliver(station: str, frame: RadioFrame) -> None:
             self.arrived.append((self.event_queue.now, station, frame))
 
-        self.channel = Channel(**channel)  # type: ignore[arg-type]
+        self.channel = RadioChannel(**channel)  # type: ignore[arg-type]
         self.medium = Medium(self.event_queue, self.channel, names, lost, deliver, random.Random(1))
 
     @property

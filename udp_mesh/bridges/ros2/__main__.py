@@ -66,7 +66,7 @@ def quality_of(info: Any) -> Quality:
     )
 
 
-class Bridge:
+class Ros2Bridge:
     """The running bridge."""
 
     def __init__(self, node: Any, daemon: DaemonClient, own: str) -> None:
@@ -195,7 +195,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Bridge(node, daemon, own)
+        bridge = Ros2Bridge(node, daemon, own)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
