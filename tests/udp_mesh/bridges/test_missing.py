@@ -1,4 +1,4 @@
-"""A bridge without its middleware says what is missing, and what to do."""
+"""A bridge without its middleware reports what is missing and what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Publishing into a ROS graph whose master answers late or never: what waits, what goes on, in which order."""
+"""Publishing into a ROS graph whose master answers late or never: queueing and order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the relay decides: two relays joined in memory, no ROS, no daemon."""
+"""The relay's decisions: two relays connected in memory, without ROS and daemon."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def relay(own: str) -> Relay:
 
 
 def carry(effects: list[Effect], source: str, target: Relay, now: float = 0.0) -> list[Effect]:
-    """What the target makes of what the source put on the mesh."""
+    """The target's effects for what the source sent over the mesh."""
     found: list[Effect] = []
     for effect in effects:
         if isinstance(effect, ToMesh) and effect.peer in (None, target.own):

@@ -1,4 +1,4 @@
-"""The command line against real daemons: what scripts rely on is exit codes and JSON."""
+"""The command line with real daemons: exit codes, JSON and messages."""
 
 import argparse
 import errno
@@ -242,7 +242,7 @@ def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str
 def test_a_socket_for_others_is_not_called_a_missing_daemon(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Root may use every socket, so the refusal is the kernel's word in a stand-in's mouth."""
+    """Root may use every socket, so the kernel's error is simulated."""
 
     def refused(_: socket.socket, _path: str) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -347,7 +347,7 @@ def test_a_directory_that_is_not_ours_is_named_with_the_way_out(
 
 
 def test_events_are_printed_until_the_daemon_ends(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """A stand-in for a daemon that ends right after one event: the command says so and exits."""
+    """A fake daemon that exits after one event: the command reports it and exits."""
     path = tmp_path / "s"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))

@@ -1,4 +1,4 @@
-"""`pub`, `echo`, `ping`, `bench`, `record` against real daemons: what they say, and their exit codes."""
+"""`pub`, `echo`, `ping`, `bench`, `record` with real daemons: output and exit codes."""
 
 import io
 import json
@@ -129,7 +129,7 @@ def test_arriving_messages_are_printed(pair: Pair, capsysbinary: pytest.CaptureF
 
     def send() -> None:
         with bob.client() as client:
-            # The subscription may come a moment later than the first of these.
+            # The subscription may be later than the first of these.
             while not done.wait(0.1):
                 client.publish("status", b"ready", to="alice")
 
@@ -216,7 +216,7 @@ def test_a_recording_that_cannot_be_written_or_seen_is_reported(
     code, _, complaint = run("record", "start", str(tmp_path / "none" / "run.jsonl"))
     assert code == Exit.FAILED
     assert "No such file or directory (the daemon writes the file; as a service it may do so only below" in complaint
-    # a /tmp of the daemon's own: what it made there is not here
+    # A private /tmp of the daemon: its files are not visible here.
     monkeypatch.setattr(MeshClient, "request", lambda *_, **__: {})
     code, _, complaint = run("record", "start", str(tmp_path / "run.jsonl"))
     assert code == Exit.OK

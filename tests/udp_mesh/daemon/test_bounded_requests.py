@@ -1,4 +1,4 @@
-"""No local request holds the daemon up: files that are none, connections that say nothing, requests half sent."""
+"""No local request blocks the daemon: special files, idle connections, incomplete requests."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_status_is_answered_even_if_all_connections_are_in_use(alice: RunningDae
             one = socket.socket(socket.AF_UNIX)
             one.connect(str(alice.socket))
             idle.append(one)
-        # The newest of those there is no room for may ask, unless too many come at the very same moment.
+        # The newest client beyond the limit may send a request, unless too many connect at the same time.
         asked = time.monotonic()
         while True:
             try:

@@ -1,4 +1,4 @@
-"""The configuration: what it means, and that every mistake is named by its line."""
+"""The configuration: its values, and that every mistake is reported with its line."""
 
 import dataclasses
 from pathlib import Path

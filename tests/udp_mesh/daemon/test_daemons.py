@@ -142,7 +142,7 @@ def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: P
 
 
 def test_a_program_that_asks_without_reading_stops_being_answered_until_it_reads(pair: Pair) -> None:
-    # an id comes back in the answer: a long one makes the answers long
+    # Replies contain the id: a long id makes long replies.
     request, taken = encode_frame({"op": "neighbours", "id": "x" * 60_000}), 0
     with socket.socket(socket.AF_UNIX) as hostile:
         hostile.connect(str(pair[0].socket))
@@ -168,7 +168,7 @@ def resident_bytes(daemon: RunningDaemon) -> int:
 
 
 def poll_writable(program: socket.socket) -> bool:
-    """Whether the daemon takes more of this program within a second of its doing nothing else."""
+    """Whether the daemon reads more from this client within a second."""
     return bool(select.select([], [program], [], 1.0)[1])
 
 

@@ -1,4 +1,4 @@
-"""The driver at its edges: full sockets, stepped clocks, vanished links, endings."""
+"""Edge cases of the driver: full sockets, clock steps, removed links, shutdown."""
 
 import asyncio
 from collections.abc import Sequence
@@ -189,7 +189,7 @@ def test_continuous_notices_do_not_postpone_the_refresh_of_interfaces(monkeypatc
         await asyncio.sleep(0.001)
         driver._interfaces_changed()
         assert driver._refresh_timer is first
-        # but one that waits for another attempt later comes at once
+        # A refresh scheduled for a later retry is moved forward.
         first.cancel()
         later = driver._refresh_timer = asyncio.get_running_loop().call_later(3600.0, driver._refresh_and_pump)
         driver._interfaces_changed()

@@ -1,4 +1,4 @@
-"""Messages on disk: what was put is loaded, whatever ended the process."""
+"""Messages on disk: stored messages are loaded again, however the process ended."""
 
 import asyncio
 import signal

@@ -1,4 +1,4 @@
-"""What a local program may ask: what no robot could take is refused by name, and long answers arrive whole."""
+"""Requests of local clients: invalid names are refused with the reason, and long replies arrive complete."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""What the kernel refuses to send is logged soon, then seldom, and when it is resolved."""
+"""Send errors are logged soon after the first, then rarely, and when they stop."""
 
 import errno
 

@@ -1,4 +1,4 @@
-"""A recording survives being written and read, torn and foreign lines included; the page shows what it holds."""
+"""A recording survives a round trip, with truncated and foreign lines; the page shows its contents."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
     )
     (spot,) = connections(recording)
     assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
-    # what is said of a peer that is away is of before
+    # Values of an offline peer are old.
     assert [t for t, _ in time_series(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
 
 

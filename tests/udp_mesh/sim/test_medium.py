@@ -1,4 +1,4 @@
-"""The simulated channel keeps to what its docstring says."""
+"""The simulated channel behaves as its docstring says."""
 
 from __future__ import annotations
 

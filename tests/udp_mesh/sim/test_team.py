@@ -102,7 +102,7 @@ def test_a_soak_with_partitions_and_restarts_accounts_for_every_message(seed: in
     scenario = replace(load(find("partition-soak")), seed=seed, duration_s=900.0)
     played = play(scenario)
     accounted(played)
-    # what was accepted has ended, or is still waiting in an outbox or under way at the end
+    # Every accepted message has an outcome, waits in an outbox, or is in flight at the end.
     ended = sum(played.ledger.total(kind) for kind in (MessageDelivered, MessageExpired, MessagePeerLost))
     assert 0 < ended <= played.ledger.accepted
     assert played.topics["report"].messages > 0
