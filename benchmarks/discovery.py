@@ -30,7 +30,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import channel
-from udp_mesh.sim.event_queue import EventQueue
+from udp_mesh.sim.event_queue import SimEventQueue
 
 # All receivers of a broadcast decrypt it with one key and decode the same bytes to the same frozen frames: cached, one
 # CPU can simulate 1,000 robots that know each other, within its memory.
@@ -54,7 +54,7 @@ class OpenField:
     """A team of robots that all hear each other; `cut` separates even-numbered from odd-numbered robots."""
 
     def __init__(self, count: int) -> None:
-        self.event_queue = EventQueue()
+        self.event_queue = SimEventQueue()
         self.known_pairs = 0
         """Ordered pairs of robots of which the first reports the second online."""
         self.cut = False

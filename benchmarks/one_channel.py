@@ -29,7 +29,7 @@ from typing import Any
 from benchmarks.tables import row, verdict
 from udp_mesh.core.events import Event, MessageDelivered, MessageReceived, Rejected
 from udp_mesh.core.settings import Rates, Settings, Topic
-from udp_mesh.sim.medium import BEST_EFFORT_SLOTS, FRAME_BYTES, IP_UDP_BYTES, SLOT_S, Channel
+from udp_mesh.sim.medium import BEST_EFFORT_SLOTS, FRAME_BYTES, IP_UDP_BYTES, SLOT_S, RadioChannel
 from udp_mesh.sim.team import Team
 
 RESULTS = Path(__file__).with_name("results") / "one_channel.jsonl"
@@ -77,7 +77,7 @@ class OneChannel:
         senders: int,
         guests: int = 0,
         *,
-        channel: Channel,
+        channel: RadioChannel,
         loss: float,
         seed: int,
         rates: Rates | None = None,
@@ -151,8 +151,10 @@ class OneChannel:
                 return
 
 
-def channel(*, access_categories: bool = True, rate: float = RATE_BITS_PER_S) -> Channel:
-    return Channel(rate=rate, attempts=1, hop_delay_s=DELAY_S, queue_frames=100, access_categories=access_categories)
+def channel(*, access_categories: bool = True, rate: float = RATE_BITS_PER_S) -> RadioChannel:
+    return RadioChannel(
+        rate=rate, attempts=1, hop_delay_s=DELAY_S, queue_frames=100, access_categories=access_categories
+    )
 
 
 def rank(values: Sequence[float], share: float) -> float:
@@ -223,7 +225,7 @@ def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
         made.event_queue.after(1.0, report)
 
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in ("base", "rover")}
-    made = Team(settings, relays=row[1:3], channel=Channel(attempts=4), loss=lost, seed=1, on_event=note)
+    made = Team(settings, relays=row[1:3], channel=RadioChannel(attempts=4), loss=lost, seed=1, on_event=note)
     made.event_queue.at(MET_OVER_HOPS_S, report)
     if bulk:
         for _ in range(WAITING_BULKS):
