@@ -229,5 +229,5 @@ def _paragraphs(text: str) -> tuple[list[str], list[str]]:
         if colon and head.strip().lower() in ("example", "examples"):
             examples += [line.strip() for line in rest.strip().splitlines() if line.strip()]
         elif part.strip():
-            prose.append(_one_line(part))
+            prose.append(_sentence(part))
     return prose, examples

@@ -17,7 +17,10 @@ from docgen.commands import Command, Option
 def command_page(program: Command) -> str:
     """Every command of a program, with a heading each."""
     parts = [f"# {program.name}", *map(_prose, program.description)]
-    rows = [f"| [`{each.name}`](#{_anchor(each.name)}) | {_cell(each.summary)} |" for each in _leaves(program)]
+    parts.append(f"Generated from the program; `{program.name} COMMAND --help` and `man {program.name}` show the same.")
+    rows = [
+        f"| [`{each.name}`](#{_anchor(each.name)}) | {_cell(each.summary.rstrip('.'))} |" for each in _leaves(program)
+    ]
     parts.append("\n".join(["| command | does |", "| --- | --- |", *rows]))
     if program.options:
         parts += [_options(program.options)]

@@ -22,6 +22,7 @@ _DIRECTORIES = {
 # search in pages opened from disk needs it; Material would load it from a CDN
 _SHIM = "iframe-worker.js"
 _ITEM = re.compile(r"(?:[-*]|\d+\.) ")
+_CODE = re.compile(r"`[^`]+`")
 _LINK = re.compile(r"(?<=\]\()([^)#\s]+)(?=[)#])")
 
 
@@ -43,11 +44,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         markdown = markdown.replace(f"]({up}../{source}", f"]({up}{target}")
     for directory, target in _DIRECTORIES.items():
         markdown = markdown.replace(f"]({up}{directory})", f"]({up}{target})")
-    return _separated(markdown)
+    return _adapted(markdown)
 
 
-def _separated(markdown: str) -> str:
-    """With a blank line before every list and table: Python-Markdown needs one where CommonMark does not."""
+def _adapted(markdown: str) -> str:
+    """CommonMark as Python-Markdown reads it: a blank line before lists and tables, bare pipes in a table's code."""
     lines: list[str] = []
     in_code = False
     previous = ""
@@ -58,6 +59,8 @@ def _separated(markdown: str) -> str:
         continues = not previous.strip() or previous.startswith(("|", " ")) or _ITEM.match(previous)
         if begins and not continues and not in_code:
             lines.append("")
+        if line.startswith("|") and not in_code:
+            line = _CODE.sub(lambda code: code[0].replace(r"\|", "|"), line)
         lines.append(line)
         previous = line
     return "\n".join(lines) + "\n"

@@ -42,6 +42,17 @@ def test_assumptions_about_a_node_name_existing_files() -> None:
     places = ("meshctl", "meshctl/device", "meshctl/device/scripts")
     assert len(named) > 15
     assert {name for name in named if not any((ROOT / place / name).is_file() for place in places)} == set()
+    # `file.py` followed by names that look like code: they stand in that file
+    sources = {name: (ROOT / place / name) for name in named for place in places if (ROOT / place / name).is_file()}
+    wrong = {
+        (name, word)
+        for row in rows
+        if len(row) == 7
+        for name, words in re.findall(r"`([\w/]+\.(?:py|sh|init))`((?: \w+,?)*)", row[2])
+        for word in re.findall(r"\w*_\w+", words)
+        if word not in sources[name].read_text(encoding="utf-8")
+    }
+    assert wrong == set()
 
 
 def table(page: Path, heading: str) -> dict[str, str]:
