@@ -45,7 +45,7 @@ def _pid(fleet: RobotFleet) -> str:
 def test_the_bridge_is_deployed_watched_and_taken_away_with_the_daemon(fleet: RobotFleet) -> None:
     _robot_with_ros(fleet)
     fleet.shell("husky1", "mv /opt/ros /opt/sor")
-    assert "ROS is not there: no /opt/ros/noetic/setup.bash" in fleet.deploy(exit_code=1)
+    assert "ROS is not installed: /opt/ros/noetic/setup.bash is missing" in fleet.deploy(exit_code=1)
     fleet.shell("husky1", "mv /opt/sor /opt/ros && systemctl start rosmaster")
     assert "husky1: done: runs " in fleet.deploy()
     eventually(lambda: _is_registered(fleet))

@@ -64,7 +64,7 @@ def test_a_key_is_rotated_without_an_interruption_and_waits_for_robots_that_are_
     boots["husky2"] = _boots(fleet)["husky2"]
     eventually(lambda: _all_online(fleet))
     told = fleet.meshctl("rotate-key", "file:keys.yaml#new")
-    assert "the old key is dropped" in told
+    assert "drop the old key" in told
     assert [key.key for key in load_fleet(fleet.file).udp_mesh.keys] == ["new"]
     eventually(lambda: _all_online(fleet))
     assert _boots(fleet) == boots

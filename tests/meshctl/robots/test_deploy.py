@@ -22,7 +22,7 @@ _EVERYTHING = (
 def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
     fleet.add("husky1", fresh=True)
     fleet.write()
-    assert "nothing is installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
+    assert "not installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
     assert "husky1: done: runs " in fleet.deploy()
     before = fleet.shell("husky1", _EVERYTHING)
     assert "husky1: unchanged: already runs " in fleet.deploy()
@@ -58,7 +58,7 @@ def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
     )
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
     told = fleet.deploy("--wait", "5", exit_code=1)
-    assert "husky1: rolled back: systemd could not start the daemon; the release before runs again" in told or (
+    assert "husky1: rolled back: systemd could not start the daemon; the previous release runs again" in told or (
         "husky1: rolled back: the daemon does not run" in told
     )
     assert "no such radio" in told, "the operator sees the daemon's last words"
@@ -78,7 +78,7 @@ def test_a_first_release_that_does_not_run_is_removed_again(
     fleet.write()
     broken = own_wheel_with(tmp_path, "daemon/program.py", "    service = Service(", "    raise OSError\n    Service(")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-    assert "so it was removed" in fleet.deploy("--wait", "3", exit_code=1)
+    assert "removed, since there is no previous release" in fleet.deploy("--wait", "3", exit_code=1)
     assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/udp*.service 2>/dev/null || :") == (
         "/opt/udp-mesh/releases:\n"
     )

@@ -88,7 +88,7 @@ def test_one_answer_tells_service_release_daemon_and_computer() -> None:
     assert facts.bridge is None, "none is wanted and none is installed"
     assert (facts.release, facts.previous, facts.version, facts.drift) == ("aaaa", "bbbb", "0.1.0", ())
     assert facts.online == ("base",)
-    assert facts.remark == "away: husky2"
+    assert facts.remark == "offline peers: husky2"
     (queue,) = facts.queues
     assert (queue.priority, queue.messages, queue.bytes, queue.oldest_s) == (9, 3, 150, 9.0)
     assert {topic.name: topic.last_ago_s for topic in facts.topics} == {"estop": None, "status": 0.25}
@@ -107,7 +107,7 @@ def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_han
     assert facts.drift == (
         "changed on the robot: etc/udp-mesh.toml",
         "differs from the inventory: udp-mesh.service",
-        "another version of udp-mesh than ours",
+        "another version of udp-mesh than in this meshctl",
         "udp-mesh.service will not start at boot",
     )
     assert facts.is_healthy, "what runs is well, only not as the inventory says"
@@ -134,7 +134,7 @@ def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
     assert "the daemon does not answer" in table([silent, _facts()])
     nothing = _facts("")
     assert not nothing.is_healthy
-    assert nothing.drift == ("nothing is installed",)
+    assert nothing.drift == ("not installed",)
     assert "not installed" in nothing.remark
     away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer")
     assert "no answer" in table([away])
@@ -154,4 +154,4 @@ def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble(
         assert [line for line in lines if len(line) > width] == []
         assert "husky9: husky9 (10.42.0.19): no answer" in " ".join(lines)
         assert lines[0].split()[:2] == ["robot", "service"]
-        assert ("no room for" in " ".join(lines)) == (width < 100)
+        assert ("columns not shown" in " ".join(lines)) == (width < 100)

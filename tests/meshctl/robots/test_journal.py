@@ -99,14 +99,14 @@ def test_two_operators_at_one_robot_exclude_each_other_and_the_dead_hold_nobody(
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'
     fleet.shell("husky1", "mkdir -p /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
     told = fleet.deploy(exit_code=1)
-    assert "husky1 (10.42.0.10): ann@laptop:17:4711 changes this robot" in told
+    assert "husky1 (10.42.0.10): locked by ann@laptop:17:4711" in told
     assert "wait until it is done" in told
 
     with subprocess.Popen(["sleep", "600"]) as other:
         start = Path(f"/proc/{other.pid}/stat").read_text().rpartition(")")[2].split()[19]
         dead = f"{lock_owner().rsplit(':', 2)[0]}:{other.pid}:{start}"
         fleet.shell("husky1", claim.format(owner=dead))
-        assert f"{dead} changes this robot" in fleet.deploy(exit_code=1)
+        assert f"locked by {dead}" in fleet.deploy(exit_code=1)
         other.kill()
         other.wait(PATIENCE_S)
     assert "husky1: done: runs " in fleet.deploy()

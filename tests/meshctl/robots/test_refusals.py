@@ -19,7 +19,7 @@ def test_nothing_is_changed_on_a_computer_that_cannot_take_it(fleet: RobotFleet)
 
     fleet.write(arch="aarch65")
     told = fleet.deploy(exit_code=1)
-    assert "husky1: refused: wrong CPU: the inventory says aarch65" in told
+    assert "husky1: refused: wrong CPU: expected aarch65" in told
 
     # another interpreter's answers, as nobody can have every Python installed
     fleet.tool(
@@ -28,9 +28,9 @@ def test_nothing_is_changed_on_a_computer_that_cannot_take_it(fleet: RobotFleet)
         "#!/bin/sh\nprintf 'python=3.8.10\\nimplementation=CPython\\nbits=64\\nlibc=glibc 2.31\\n'\n",
     )
     fleet.write(python="python3.8")
-    assert "wrong Python: python3.8 is 3.8.10, udp_mesh needs 3.11 or newer" in fleet.deploy(exit_code=1)
+    assert "wrong Python: python3.8 is 3.8.10, expected 3.11 or newer" in fleet.deploy(exit_code=1)
     fleet.write(python="python3.99")
-    assert "no python3.99 runs there" in fleet.deploy(exit_code=1)
+    assert "python3.99 does not run" in fleet.deploy(exit_code=1)
 
     assert fleet.shell("husky1", _NOTHING) == before
 
@@ -39,7 +39,7 @@ def test_a_full_disk_is_found_before_and_survived_in_the_middle(fleet: RobotFlee
     fleet.add("husky1", opt_kib=20_000)
     fleet.write()
     told = fleet.deploy(exit_code=1)
-    assert "full disk" in told
+    assert "disk full" in told
     assert fleet.shell("husky1", "ls /opt") == "python\n"
 
     # it looked large enough, and fills up while the packages are unpacked

@@ -21,9 +21,9 @@ def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing
     fleet.write(user="robot")
     told = fleet.deploy(exit_code=1)
     assert "husky1: done: runs " in told
-    assert "husky2 (10.42.0.11): sudo wants a password for robot" in told
+    assert "husky2 (10.42.0.11): sudo requires a password for robot" in told
     assert "husky4: failed" in told
-    assert "put your public key into ~robot/.ssh/authorized_keys there" in told
+    assert "add your public key to ~robot/.ssh/authorized_keys there" in told
     assert "dropbear" not in told
     monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", "wrong")
     told = fleet.deploy("husky2", "husky3", exit_code=1)

@@ -81,13 +81,13 @@ def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_
     told = fleet.deploy(exit_code=1)
     cutting.join()
     assert "husky1: uncertain" in told
-    assert "finishes or undoes the switch by itself" in told
+    assert "completes or rolls back the switch by itself" in told
     machine.start()
     eventually(lambda: fleet.status()["husky1"]["answers"])
     found = fleet.status()["husky1"]
     assert not found["is_proven"]
-    assert "a switch was cut short" in found["remark"]
-    assert "a switch was cut short" in fleet.meshctl("diff", exit_code=1)
+    assert "a switch was interrupted" in found["remark"]
+    assert "a switch was interrupted" in fleet.meshctl("diff", exit_code=1)
     assert "husky1: done: runs " in fleet.root_command("resume")
     found = fleet.status()["husky1"]
     assert found["well"]

@@ -15,7 +15,7 @@ ENTERED, LEFT = r"\x1b\[\?1049h", r"\x1b\[\?1049l"
 # How a look goes, by the word the program gets; `look` counts the looks.
 PROGRAM = """\
 import sys, threading
-from meshctl.cli.live_screen import live
+from meshctl.cli.live_screen import live_screen
 looks = 0
 def look():
     global looks
@@ -28,7 +28,7 @@ def look():
 def draw(seen, size):
     return [f"look {seen} in {size.columns} x {size.lines}", *(f"line {n}" for n in range(10))]
 print("before")
-print("last", live(look, draw, 0.05, sys.stdout))
+print("last", live_screen(look, draw, 0.05, sys.stdout))
 """
 
 
