@@ -86,9 +86,9 @@ def test_a_bridge_that_fails_brings_the_release_before_back_and_one_that_is_no_m
     broken = own_wheel_with(fleet.directory, "bridges/ros1/bridge.py", "import rosgraph\n", "import rosgraf\n")
     with monkeypatch.context() as patch:
         patch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-        told = fleet.deploy("--wait", "12", exit_code=1)
-    assert "husky1: rolled back: the ROS bridge does not run: systemd says" in told
-    assert "No module named 'rosgraf'" in told
+        output = fleet.deploy("--wait", "12", exit_code=1)
+    assert "husky1: rolled back: the ROS bridge does not run: systemd says" in output
+    assert "No module named 'rosgraf'" in output
     found = fleet.status()["husky1"]
     assert (found["release"], found["well"]) == (first, True)
 

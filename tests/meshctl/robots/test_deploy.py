@@ -57,11 +57,11 @@ def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
         '    raise OSError("no such radio")\n    service = Service(',
     )
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-    told = fleet.deploy("--wait", "5", exit_code=1)
-    assert "husky1: rolled back: systemd could not start the daemon; the previous release runs again" in told or (
-        "husky1: rolled back: the daemon does not run" in told
+    output = fleet.deploy("--wait", "5", exit_code=1)
+    assert "husky1: rolled back: systemd could not start the daemon; the previous release runs again" in output or (
+        "husky1: rolled back: the daemon does not run" in output
     )
-    assert "no such radio" in told, "the operator sees the daemon's last words"
+    assert "no such radio" in output, "the operator sees the daemon's last words"
     third = fleet.status()["husky1"]
     assert third["well"]
     assert third["release"] == second["release"]
@@ -91,9 +91,9 @@ def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFl
     release = fleet.status()["husky1"]["release"]
     fleet.shell("husky1", "echo '# tuned' >>/opt/udp-mesh/current/etc/udp-mesh.toml")
     fleet.shell("husky1", "echo broken >/opt/udp-mesh/current/lib/udp_mesh/daemon/api.py")
-    told = fleet.meshctl("diff", exit_code=1)
-    assert "changed on the robot: etc/udp-mesh.toml" in told
-    assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in told
+    output = fleet.meshctl("diff", exit_code=1)
+    assert "changed on the robot: etc/udp-mesh.toml" in output
+    assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in output
     assert f"husky1: done: runs {release}" in fleet.deploy()
     assert "no changes" in fleet.meshctl("diff")
 
@@ -145,7 +145,7 @@ def test_a_release_that_peers_see_and_whose_topics_no_longer_flow_goes_back(
     first = fleet.status()["husky1"]["release"]
     deaf = own_wheel_with(tmp_path, "daemon/service.py", "count.received_messages += 1", "count.received_messages += 0")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: deaf)
-    told = fleet.deploy("husky1", "--wait", "15", exit_code=1)
-    assert "husky1: rolled back: topics flowed before and receive nothing: status" in told
+    output = fleet.deploy("husky1", "--wait", "15", exit_code=1)
+    assert "husky1: rolled back: topics flowed before and receive nothing: status" in output
     assert fleet.status()["husky1"]["release"] == first
     eventually(lambda: heard() > 0)

@@ -1,4 +1,4 @@
-"""What a robot told becomes facts: recorded outputs beside what they mean, and a table for people."""
+"""Facts of robots: recorded outputs, what they mean, and the table."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
     up = ANSWER[:bridge] + ANSWER[bridge:].replace("not-found", "loaded", 1).replace("inactive", "active", 1)
     up = up.replace("UnitFileState=\n", "UnitFileState=enabled\n")
     assert _facts(up, wanted).is_healthy
-    assert _facts(up).bridge is not None, "one that is there is told even where the inventory wants none"
+    assert _facts(up).bridge is not None, "an installed one is reported even if the inventory has none"
 
 
 def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
@@ -141,10 +141,10 @@ def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
 
 
 def test_the_table_tells_queues_by_priority_and_the_youngest_message() -> None:
-    told = table([_facts()])
-    assert "p9: 3" in told
-    assert "status 0 s ago" in told
-    assert "1/2" in told
+    output = table([_facts()])
+    assert "p9: 3" in output
+    assert "status 0 s ago" in output
+    assert "1/2" in output
 
 
 def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble() -> None:

@@ -1,4 +1,4 @@
-"""What a robot must show after a switch before it is called well, and what it says otherwise."""
+"""What makes a robot healthy after a switch, and the reasons otherwise."""
 
 from __future__ import annotations
 

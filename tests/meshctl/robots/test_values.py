@@ -1,4 +1,4 @@
-"""The pure parts: wheel tags, what a probe tells, bundles and their names, what a switch says, the stages of a key."""
+"""The pure parts: wheel tags, probe output, bundles and IDs, switch results, key rotation."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def _reasons(facts: HostFacts) -> list[str]:
     return [reason for reason, _ in unmet_preconditions(facts, robot="r", arch="x86_64", python="python3")]
 
 
-def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once() -> None:
+def test_a_fitting_computer_meets_all_preconditions_and_every_misfit_is_reported_at_once() -> None:
     facts = parse_facts(PROBED)
     assert facts.is_sound
     assert facts.target == BOOKWORM
@@ -129,7 +129,7 @@ def test_a_fitting_computer_meets_no_objection_and_every_misfit_is_told_at_once(
     assert _reasons(parse_facts("")) != [], "a probe that says nothing is no consent"
 
 
-def test_a_clock_that_is_years_off_is_told_and_is_no_objection() -> None:
+def test_a_clock_that_is_years_off_is_reported_and_is_no_obstacle() -> None:
     facts = parse_facts(PROBED)
     assert clock_warning(facts, 1e9) == ("", "")
     assert clock_warning(facts, 1.2e9)[0] == "its clock is 6.3 years behind ours"

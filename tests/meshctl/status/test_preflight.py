@@ -15,7 +15,7 @@ from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
 from meshctl.status.values import Alarm, Level
-from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, seen, status_of, told
+from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, robot_facts, seen, status_of
 
 KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
 DELIVERED = Pings({("station", "rover"): 0.01, ("rover", "station"): 0.02})
@@ -90,7 +90,7 @@ def test_a_radio_without_a_path_or_with_one_that_carries_nothing_is_a_no_go(flee
 
 
 def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
-    found = checks(fleet, {**CREW, "station": told("station")})
+    found = checks(fleet, {**CREW, "station": robot_facts("station")})
     assert found["peers"].reason == "station does not hear rover"
 
 
@@ -130,7 +130,7 @@ def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
     assert stopped(checks(fleet, {**CREW, "rover": busy})) == []
 
 
-def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> None:
+def test_robots_that_were_not_asked_are_shown_and_not_judged(fleet: Fleet) -> None:
     status = replace(
         status_of(fleet, robots={}, known=KNOWN), robots=(), alarms=(Alarm(Level.NOTE, "robots-unasked", "not asked"),)
     )
@@ -156,8 +156,8 @@ def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
 
 def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:
     text = '{"peer": "a", "round_trip_s": 0.5}\nnoise\n{"peer": "b", "error": "no-answer"}\n[1]\n{"peer": "c"}\n'
-    told = parse_pings(text, ("a", "b", "c", "d"))
-    assert told == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
-    pings = pings_of({"x": told})
+    answers = parse_pings(text, ("a", "b", "c", "d"))
+    assert answers == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
+    pings = pings_of({"x": answers})
     assert pings.round_trips_s == {("x", "a"): 0.5}
     assert pings.failed["x", "b"] == "no-answer"
