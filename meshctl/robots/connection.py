@@ -152,8 +152,8 @@ def selected_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, 
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in able):
             if pattern in fleet.robots:
-                fielded = fleet.robots[pattern].fielded is not None
-                instead = " in place of `fielded`, and stop the legacy program there" if fielded else ""
+                is_legacy = fleet.robots[pattern].fielded is not None
+                instead = " in place of `fielded`, and stop the legacy program there" if is_legacy else ""
                 hint = f"set robots.{pattern}.computer{instead}"
                 raise InputError(f"robot {pattern} has no computer in the inventory", hint=hint)
             raise InputError(f"no robot of {fleet.name} matches {pattern!r}", hint=did_you_mean(pattern, able))

@@ -174,12 +174,12 @@ def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Se
     return ExpectedRelease(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
 
 
-def collect_facts(host: Host, robot: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
+def collect_facts(host: Host, robot: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
     """Query one robot; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
-    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), wanted, now_s=now_s)
+    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), expected, now_s=now_s)
 
 
-def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
+def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
     """Parse the sections of `scripts/facts.sh`; a missing section or invalid JSON counts as no answer."""
     sections = _sections(text)
     services = _services(sections.get("services", ()))
@@ -191,11 +191,11 @@ def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: 
         robot,
         seen_s=now_s,
         service=services.get(UNIT_NAME, ServiceFacts()),
-        bridge=bridge if wanted.bridge or bridge.enabled else None,
+        bridge=bridge if expected.bridge or bridge.enabled else None,
         release=_last(release, "current"),
         previous=_last(release, "previous"),
         is_proven=_last(release, "proven") != "no",
-        drift=drift(release, wanted, services),
+        drift=drift(release, expected, services),
         version=str(status.get("version", "")),
         daemon_uptime_s=_float(status.get("uptime_s")),
         keys=tuple(str(key) for key in status.get("keys", ()) or ()),
@@ -209,20 +209,20 @@ def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: 
 
 
 def drift(
-    release: Mapping[str, list[str]], wanted: ExpectedRelease, services: Mapping[str, ServiceFacts]
+    release: Mapping[str, list[str]], expected: ExpectedRelease, services: Mapping[str, ServiceFacts]
 ) -> tuple[str, ...]:
     """One line per difference between the installed release and the inventory, or the release as deployed."""
     if not _last(release, "current"):
         return ("not installed",)
     here = {path: digest for digest, _, path in (row.partition("  ") for row in release.get("file", ()))}
     lines = [f"changed on the robot: {path}" for path in release.get("damaged", ())]
-    lines += [f"differs from the inventory: {path}" for path, sha in wanted.files.items() if here.get(path) != sha]
-    if BRIDGE_UNIT_NAME in here and not wanted.bridge:
+    lines += [f"differs from the inventory: {path}" for path, sha in expected.files.items() if here.get(path) != sha]
+    if BRIDGE_UNIT_NAME in here and not expected.bridge:
         lines.append(f"not in the inventory: {BRIDGE_UNIT_NAME}")
     wheels = {row.split()[0] for row in release.get("wheel", ()) if row.strip()}
-    if wanted.wheel and wanted.wheel not in wheels:
+    if expected.wheel and expected.wheel not in wheels:
         lines.append("another version of udp-mesh than in this meshctl")
-    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if wanted.bridge else (UNIT_NAME,)
+    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if expected.bridge else (UNIT_NAME,)
     for unit in units:
         if services.get(unit, ServiceFacts()).enabled != "enabled":
             lines.append(f"{unit} will not start at boot")

@@ -222,9 +222,9 @@ def _days(seconds: float) -> str:
     return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.1f} days"
 
 
-def changed_files(facts: HostFacts, wanted: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+def changed_files(facts: HostFacts, desired: Iterable[tuple[str, str]]) -> tuple[str, ...]:
     """Paths whose hash differs between the current release and a desired manifest, in manifest order."""
     here = dict(facts.files)
-    wanted = tuple(wanted)
-    gone = [path for path in here if path not in dict(wanted)]
-    return (*(path for path, digest in wanted if here.get(path) != digest), *gone)
+    desired = tuple(desired)
+    gone = [path for path in here if path not in dict(desired)]
+    return (*(path for path, digest in desired if here.get(path) != digest), *gone)

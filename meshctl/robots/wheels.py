@@ -161,16 +161,16 @@ def has_all(target: Target, directory: Path) -> bool:
 
 def cache_wheels(wheels: Iterable[Wheel], directory: Path) -> None:
     """Make these the only wheels in the cache `directory`, for later commands without --wheels. Raises InputError."""
-    wanted = {wheel.file: wheel for wheel in wheels if parse_wheel(wheel.file) != parse_wheel(own_wheel().file)}
+    keep = {wheel.file: wheel for wheel in wheels if parse_wheel(wheel.file) != parse_wheel(own_wheel().file)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for name, wheel in wanted.items():
+        for name, wheel in keep.items():
             if not (directory / name).exists():
                 partial = directory / f".{name}.part"
                 partial.write_bytes(wheel.content)
                 partial.replace(directory / name)
         for path in directory.glob("*.whl"):
-            if path.name not in wanted:
+            if path.name not in keep:
                 path.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"cannot write {directory}: {error.strerror}") from error

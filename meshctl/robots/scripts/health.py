@@ -81,15 +81,15 @@ def flowing(first: list[Json], then: list[Json]) -> dict[str, int]:
     return {name: count for name, count in later.items() if count - counts.get(name, 0) >= MIN_FLOW_MESSAGES}
 
 
-def problems(snapshot: HealthSnapshot, wanted: list[str], baseline: Baseline, now_s: float) -> str:
-    """Why the robot is not healthy yet, in one line; empty if it is. `wanted` are the expected topics."""
+def problems(snapshot: HealthSnapshot, expected: list[str], baseline: Baseline, now_s: float) -> str:
+    """Why the robot is not healthy yet, in one line; empty if it is. `expected` are the topics of the release."""
     for unit in snapshot.units:
         if unit.active != "active":
             return f"{_called(unit)} does not run: systemd says {unit}"
     if snapshot.no_answer_reason:
         return f"the daemon does not answer: {snapshot.no_answer_reason}"
     here = {topic["name"]: topic for topic in snapshot.topics}
-    lacking = [name for name in wanted if not here.get(name, {}).get("configured")]
+    lacking = [name for name in expected if not here.get(name, {}).get("configured")]
     if lacking:
         return f"topics are missing: {', '.join(lacking)}"
     away = [peer for peer in baseline.online if peer not in snapshot.online]
