@@ -52,7 +52,7 @@ def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
 
     broken = own_wheel_with(
         tmp_path,
-        "daemon/program.py",
+        "daemon/main.py",
         "    service = Service(",
         '    raise OSError("no such radio")\n    service = Service(',
     )
@@ -76,7 +76,7 @@ def test_a_first_release_that_does_not_run_is_removed_again(
 ) -> None:
     fleet.add("husky1")
     fleet.write()
-    broken = own_wheel_with(tmp_path, "daemon/program.py", "    service = Service(", "    raise OSError\n    Service(")
+    broken = own_wheel_with(tmp_path, "daemon/main.py", "    service = Service(", "    raise OSError\n    Service(")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
     assert "removed, since there is no previous release" in fleet.deploy("--wait", "3", exit_code=1)
     assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/udp*.service 2>/dev/null || :") == (
