@@ -84,7 +84,7 @@ def test_a_first_release_that_does_not_run_is_removed_again(
     )
 
 
-def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFleet) -> None:
+def test_changes_by_hand_and_interruptions_are_seen_and_fixed(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()

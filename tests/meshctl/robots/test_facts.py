@@ -81,7 +81,7 @@ def _facts(text: str = ANSWER, wanted: ExpectedRelease = WANTED) -> RobotFacts:
     return parse_robot_facts("husky1", text, wanted, now_s=NOW_S)
 
 
-def test_one_answer_tells_service_release_daemon_and_computer() -> None:
+def test_one_answer_has_service_release_daemon_and_computer() -> None:
     facts = _facts()
     assert facts.is_healthy
     assert (facts.service.active, facts.service.enabled, facts.service.restarts) == ("active", "enabled", 2)
@@ -140,7 +140,7 @@ def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
     assert "no answer" in table([away])
 
 
-def test_the_table_tells_queues_by_priority_and_the_youngest_message() -> None:
+def test_the_table_shows_queues_by_priority_and_the_latest_message() -> None:
     output = table([_facts()])
     assert "p9: 3" in output
     assert "status 0 s ago" in output

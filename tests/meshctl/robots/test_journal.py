@@ -74,7 +74,7 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
 
 
 @pytest.mark.proof
-def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_are_taken_up(
+def test_a_second_ctrl_c_leaves_the_robot_intact_and_robots_that_were_off_are_resumed(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("husky1", "husky2"):
@@ -93,7 +93,7 @@ def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_a
     assert "husky2: done: runs " in output
 
 
-def test_two_operators_at_one_robot_exclude_each_other_and_the_dead_hold_nobody(fleet: RobotFleet) -> None:
+def test_two_operators_on_one_robot_exclude_each_other_and_a_dead_claim_does_not_block(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'

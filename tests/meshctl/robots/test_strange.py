@@ -51,9 +51,7 @@ def test_a_half_deleted_installation_is_seen_and_made_whole_by_one_deploy(fleet:
     assert fleet.status()["husky1"]["well"]
 
 
-def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
-    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_login_banners_do_not_affect_a_deploy(fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     key = fleet.key.with_suffix(".pub").read_text()
     for name, rule in (("husky1", "NOPASSWD: ALL"), ("husky2", "ALL")):
         machine = fleet.add(name, start=False)
@@ -82,7 +80,7 @@ def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
     assert "husky1: done: removed" in fleet.meshctl("uninstall", "husky1")
 
 
-def test_what_somebody_there_has_forbidden_is_refused_and_left_as_it_was(fleet: RobotFleet) -> None:
+def test_masked_units_are_refused_and_stay_masked(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()

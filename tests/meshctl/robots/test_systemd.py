@@ -63,7 +63,7 @@ def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it
     assert "husky1: unchanged" in fleet.deploy()
 
 
-def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_it(fleet: RobotFleet) -> None:
+def test_power_lost_in_the_middle_of_a_switch_is_seen_and_fixed_by_the_next_deploy(fleet: RobotFleet) -> None:
     machine = fleet.add("husky1")
     fleet.write()
     fleet.deploy()

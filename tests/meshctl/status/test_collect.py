@@ -35,7 +35,7 @@ def test_a_bug_is_raised_to_the_caller() -> None:
         run_parallel({"a": lambda: 1 // 0}, 1)
 
 
-def test_nobody_to_ask_is_no_wait() -> None:
+def test_without_devices_there_is_no_wait() -> None:
     assert run_parallel({}, 8) == {}
 
 

@@ -200,7 +200,7 @@ def test_topology_draws_the_line(bench: Bench) -> None:
     assert json.loads(bench.run("topology", "--json").stdout)["entry"] == "base"
 
 
-def test_whoever_leaves_a_look_need_not_wait_for_the_silent(bench: Bench) -> None:
+def test_an_interrupt_need_not_wait_for_unreachable_devices(bench: Bench) -> None:
     bench.fleet.break_("b01", "ssh-hang")
     with subprocess.Popen(
         bench.command("status", "--timeout", "3600", "--watch", "1", "--json"),

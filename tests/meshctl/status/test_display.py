@@ -100,7 +100,7 @@ def test_columns_give_way_by_rank_and_those_without_rank_stay(cells: list[tuple[
         assert widest <= width
 
 
-def test_a_column_nobody_has_anything_in_is_left_out_silently(fleet: Fleet) -> None:
+def test_an_empty_column_is_left_out_silently(fleet: Fleet) -> None:
     status = assess(look_of(fleet), fleet.managed(), NOW)
     assert "waits" not in text(status)
     assert "no room" not in text(status)

@@ -40,13 +40,13 @@ def test_a_healthy_team_is_a_go(fleet: Fleet) -> None:
     assert preflight_json(found.values())["go"]
 
 
-def test_who_stays_on_the_shelf_is_named_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_robot_that_stays_on_the_shelf_is_named_and_does_not_block(fleet: Fleet) -> None:
     found = checks(fleet)
     assert "not taking part: shelf (carried)" in found["robot radios"].reason
     assert "not taking part: shelf" in found["daemons"].reason
 
 
-def test_a_robot_that_has_not_moved_over_is_named_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_robot_with_the_legacy_program_is_named_and_does_not_block(fleet: Fleet) -> None:
     husky = Robot("husky", (), fielded=IPv4Address("10.42.0.20"))
     robots = {**fleet.robots, "husky": husky, "cart": Robot("cart", ())}
     # only robots with a computer are asked
@@ -111,20 +111,20 @@ def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) ->
     assert "env:KEY is not set" in found["configuration"].reason
 
 
-def test_what_nobody_could_tell_is_no_go(fleet: Fleet) -> None:
+def test_a_check_without_any_answer_is_a_no_go(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, Pings())}
     assert not any(check.is_go for check in found.values() if check.name != "beacons")
     assert found["radios"].reason == "cannot check: no device answers"
 
 
-def test_how_many_could_tell_is_said_where_some_could_not(fleet: Fleet) -> None:
+def test_a_check_with_some_answers_says_how_many(fleet: Fleet) -> None:
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
     assert found["identity"].reason == "every radio is the expected device (2 of 3 answer)"
 
 
-def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_busy_computer_is_a_note_and_does_not_block(fleet: Fleet) -> None:
     rover = CREW["rover"]
     busy = replace(rover, computer=replace(rover.computer, load=(40.0, 9.0, 3.0)))
     assert stopped(checks(fleet, {**CREW, "rover": busy})) == []

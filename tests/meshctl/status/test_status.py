@@ -93,7 +93,7 @@ def test_hops_and_quality_follow_the_path_to_the_base(fleet: Fleet) -> None:
     assert rover.quality == pytest.approx(250 / 255 * 200 / 255)
 
 
-def test_a_look_at_some_tells_no_paths(fleet: Fleet) -> None:
+def test_a_partial_snapshot_has_no_paths(fleet: Fleet) -> None:
     rover = next(node for node in status_of(fleet, is_partial=True).nodes if node.name == "rover")
     assert (rover.hops, rover.is_path_known, rover.is_cut_vertex) == (None, False, False)
     assert alarms(status_of(fleet, is_partial=True), "b01") == {}
@@ -150,7 +150,7 @@ def test_a_factory_device_has_no_change_under_way(fleet: Fleet) -> None:
     assert alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover") == {}
 
 
-def test_drift_names_the_files_and_the_commands_that_mend_it(fleet: Fleet) -> None:
+def test_drift_names_the_files_and_the_commands_that_fix_it(fleet: Fleet) -> None:
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
     output = text(status_of(fleet, plans={"rover": plan}))
     assert "rover: configuration differs: wireless" in output
@@ -207,7 +207,7 @@ def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet: Fleet) -> None:
+def test_a_dropped_beacon_that_dies_is_an_alarm_although_it_was_not_marked(fleet: Fleet) -> None:
     kept = facts_to_record(status_of(fleet, _DROPPED))
     known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
     status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
@@ -217,7 +217,7 @@ def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet:
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_a_carried_beacon_that_nobody_needed_may_be_switched_off(fleet: Fleet) -> None:
+def test_a_carried_beacon_without_relays_may_be_switched_off(fleet: Fleet) -> None:
     on = {**HEALTHY, "b02": seen("b02", {"b01": 220})}
     kept = facts_to_record(status_of(fleet, on))
     known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
