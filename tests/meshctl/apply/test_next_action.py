@@ -97,8 +97,8 @@ def test_a_person_reads_why_it_went_back() -> None:
 
 def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = rollback_reason(late, ("its LAN is down",), "b01: let root in with none of: key a")
-    assert told == "it was not confirmed in time: b01: let root in with none of: key a"
+    told = rollback_reason(late, ("its LAN is down",), "b01: login refused for root; tried: key a")
+    assert told == "it was not confirmed in time: b01: login refused for root; tried: key a"
 
 
 def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:

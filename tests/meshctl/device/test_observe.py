@@ -87,7 +87,7 @@ def test_a_node_that_tells_nothing_is_observed_as_nothing_with_a_note_for_each_f
         "files",
         "notes",
     }
-    assert "the observation ended early" in seen.notes
+    assert "the observation was cut short" in seen.notes
     assert len(seen.notes) > 10
 
 
@@ -96,7 +96,7 @@ def test_an_answer_cut_anywhere_is_still_an_observation(at: int) -> None:
     whole = (RECORDED / "24.10" / "mesh" / "observe.out").read_bytes()
     seen = interpret(split_sections(whole[:at], "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
     if at < len(whole) - 10:
-        assert "the observation ended early" in seen.notes
+        assert "the observation was cut short" in seen.notes
 
 
 PARSERS = [

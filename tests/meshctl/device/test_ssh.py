@@ -230,7 +230,7 @@ def test_an_encrypted_key_opens_with_its_passphrase_and_says_so_without(
         assert ssh.run("true").exit_status == 0
     with pytest.raises(InputError, match="locked: the key is encrypted"):
         connect(server.endpoint(), credentials=only(locked), trust=trust, deadlines=PATIENT)
-    with pytest.raises(InputError, match="no such key file"):
+    with pytest.raises(InputError, match="key file not found"):
         connect(server.endpoint(), credentials=only(tmp_path / "nowhere"), trust=trust, deadlines=PATIENT)
 
 

@@ -195,8 +195,6 @@ def test_a_node_that_moved_on_is_told_from_one_that_did_not() -> None:
     assert edited.uci is not None
     edited = replace(edited, uci={**edited.uci, "dhcp": edited.uci["dhcp"] + "config dhcp 'wan'\n"})
     assert "has changed since" in stale_reason(agreed, planned(fleet(channel=11), "b01", edited))
-    assert "inventory has changed" in stale_reason(
-        agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01"))
-    )
+    assert "inventory has changed" in stale_reason(agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01")))
     rebooted = replace(running(fleet(), "b01"), boot_id="another", uptime_s=3.0)
     assert stale_reason(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""
