@@ -1,4 +1,4 @@
-"""Laws of following a change: the node's own word decides, and nothing is confirmed that has not proven itself."""
+"""The state of the node's switch decides the next action, and no change is confirmed that has not proven itself."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_person_reads_why_it_went_back() -> None:
     assert rollback_reason(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
 
 
-def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() -> None:
+def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     told = rollback_reason(late, ("its LAN is down",), "b01: login refused for root; tried: key a")
     assert told == "it was not confirmed in time: b01: login refused for root; tried: key a"

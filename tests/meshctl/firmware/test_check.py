@@ -75,7 +75,7 @@ def test_another_board_target_or_release_is_found(folder: Path) -> None:
     assert codes(image, replace(profile(folder), release=Release.V24_10)) == ["FW006"]
 
 
-def test_an_image_without_metadata_and_a_damaged_one_are_told_apart(folder: Path) -> None:
+def test_missing_and_damaged_metadata_are_distinguished(folder: Path) -> None:
     image = folder / "image.bin"
     whole = image.read_bytes()
     plain = profile(folder, sha256="", usign_key="")

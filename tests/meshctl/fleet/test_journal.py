@@ -1,4 +1,4 @@
-"""Laws of the journal: it survives our death, holds one outcome per node, and bears two processes at once."""
+"""The journal survives a killed process, has one outcome per node, and supports two concurrent processes."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() ->
     assert process_lives("elsewhere:1:1")
 
 
-def test_a_journal_that_cannot_be_written_any_more_stops_no_work_and_is_told(path: Path) -> None:
+def test_an_unwritable_journal_stops_no_work_and_is_reported(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         journal._database.execute("PRAGMA query_only = ON")
@@ -213,7 +213,7 @@ def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
         assert (run.error, journal.outcomes(run.id)[0].result) == ("", Result.FAILED)
 
 
-def test_a_journal_that_another_process_holds_can_be_read_and_says_who_to_look_for(
+def test_a_locked_journal_can_be_read_and_hints_at_the_process(
     path: Path,
 ) -> None:
     Journal(path).close()

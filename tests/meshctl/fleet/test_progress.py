@@ -1,4 +1,4 @@
-"""What is shown of a run: plain lines, JSON lines, and live lines that never hide an outcome."""
+"""The output of a run: plain lines, JSON lines, and live lines that never hide an outcome."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_more_nodes_than_lines_leave_room_for_the_totals_and_the_state_of_stoppi
     assert "STOPPING: finishing b00, b01, b02, b03 ...; no other node is begun" in last
 
 
-def test_logs_and_scripts_are_told_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_terminal_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
     for kind in (PlainProgress, JsonProgress):
         out = io.StringIO()
         with kind(out) as progress:
