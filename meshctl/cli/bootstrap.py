@@ -22,7 +22,7 @@ from meshctl.apply.bootstrap import (
     plan_discovered,
     restore_pins,
 )
-from meshctl.apply.replace import adopt, identity_edits, restore_old_pins, with_identity
+from meshctl.apply.replace import adopt, identity_edits, with_identity
 from meshctl.cli.context import KeyFiles, Lab, Session, exit_for, session
 from meshctl.cli.journaled_run import SALT_BYTES, ask_and_carry_out, choices_of
 from meshctl.cli.options import AsJson, InventoryPath
@@ -232,7 +232,7 @@ def replace(
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
-                restore_old_pins(opened.trust, node, successor)
+                restore_pins(opened.trust, successor.discovered, [node.name])
         if status == ExitCode.OK:
             changes = _learn_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)

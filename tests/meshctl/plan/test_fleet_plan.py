@@ -1,4 +1,4 @@
-"""The fleet plan: a cell change is one simultaneous stage, no node is left behind unacknowledged, a saved plan binds."""
+"""The fleet plan: a cell change is one stage, no node is left behind unacknowledged, a saved plan binds."""
 
 from __future__ import annotations
 
