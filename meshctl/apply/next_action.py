@@ -88,7 +88,7 @@ REASONS = {
     "guard": "its timer was killed; its second timer took over",
     "failed": "the files could not be written, or the packages could not be installed",
     "moved-on": "a file on it was changed by someone else",
-    "operator": "it was cancelled",
+    "operator": "it was canceled",
 }
 
 

@@ -67,7 +67,7 @@ def adopt(
     try:
         seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
-            raise NodeError(f"{connection.endpoint.label}: showed no host key")
+            raise NodeError(f"{connection.endpoint.label}: sent no host key")
     except BaseException:
         connection.close()
         raise

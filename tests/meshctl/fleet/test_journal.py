@@ -234,22 +234,22 @@ def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> N
 
 def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
     with Journal(path) as field, Journal(path, lab="/lab") as lab:
-        practised = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
-        with practised.step("a", "apply"):
+        practice = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
+        with practice.step("a", "apply"):
             pass
-        practised.finish_node(Outcome("a", Result.UNCERTAIN))
-        practised.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
+        practice.finish_node(Outcome("a", Result.UNCERTAIN))
+        practice.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
         lab.remember("f", "b", {"version": "virtual"}, 1.0)
         field.remember("f", "b", {"version": "real"}, 2.0)
         assert field.unfinished_runs("f") == {}
         assert field.unfinished_changes("f") == {}
         assert {node: dict(last.facts) for node, last in field.last_known("f").items()} == {"b": {"version": "real"}}
-        assert lab.unfinished_runs("f") == {practised.id: ("a",)}
+        assert lab.unfinished_runs("f") == {practice.id: ("a",)}
         assert set(lab.unfinished_changes("f")) == {"a"}
         assert lab.last_known("f")["b"].facts == {"version": "virtual"}
         assert [(run.fleet, run.lab) for run in field.runs()] == [("f", "/lab")], "a journal without a lab lists all"
         assert (field.runs(fleet="f"), len(lab.runs(fleet="f"))) == ((), 1)
-        record = lab.run(practised.id)
+        record = lab.run(practice.id)
         assert record is not None
         assert (record.fleet, record.lab) == ("f", "/lab")
 
