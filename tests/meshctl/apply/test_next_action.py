@@ -18,7 +18,7 @@ STATES = ("idle", "staged", "armed", "waiting", "applied", "restoring", "absent"
 def move(
     status: ChangeStatus, *missing: str, new: bool = True, leaving: bool = False, given_up: bool = False
 ) -> Action:
-    return next_action("c1", status, missing, is_at_new_address=new, leaving=leaving, is_given_up=given_up)
+    return next_action("c1", status, missing, is_at_new_address=new, leaving=leaving, is_abandoned=given_up)
 
 
 @st.composite
