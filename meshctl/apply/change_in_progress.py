@@ -214,7 +214,7 @@ def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> A
         change.unmet,
         is_at_new_address=connection.endpoint == change.new,
         leaving=ctx.run.interrupt.leaving,
-        is_given_up=change.is_abandoned,
+        is_abandoned=change.is_abandoned,
     )
 
 
@@ -247,7 +247,7 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
         change.unmet,
         is_at_new_address=False,
         leaving=leaving,
-        is_given_up=change.is_abandoned,
+        is_abandoned=change.is_abandoned,
     )
 
 

@@ -264,7 +264,7 @@ def _switch_stage(
         observer(Event(EventKind.STARTED, name, time.time()))
     failed = _packages_first(stage, contexts)
     if failed:
-        reason = f"the mesh change was cancelled: packages could not be installed on {', '.join(failed)}"
+        reason = f"the mesh change was canceled: packages could not be installed on {', '.join(failed)}"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
         ended = commit_mesh(

@@ -94,10 +94,10 @@ def commit_mesh(
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
-            return _cancel(commit, "the mesh change was cancelled: not every node could be armed")
+            return _cancel(commit, "the mesh change was canceled: not every node could be armed")
         _schedule(commit)
         if not all(participant.is_scheduled for participant in participants):
-            return _cancel(commit, "the mesh change was cancelled: not every node could be scheduled")
+            return _cancel(commit, "the mesh change was canceled: not every node could be scheduled")
         needed = quorum_of(participants, quorum)
         quorum_text = ", ".join(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()

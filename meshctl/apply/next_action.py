@@ -34,30 +34,30 @@ MIN_PROOF_S = 3.0
 def next_action(
     change_id: str,
     status: ChangeStatus,
-    missing: Sequence[str],
+    unmet: Sequence[str],
     *,
     is_at_new_address: bool,
     leaving: bool = False,
-    is_given_up: bool = False,
+    is_abandoned: bool = False,
 ) -> Action:
-    """The next action for change `change_id`. `missing` lists the unmet health checks (counts only once applied);
+    """The next action for change `change_id`. `unmet` lists the failing health checks (counts only once applied);
     `is_at_new_address` is whether the node answered at its new address; `leaving` that meshctl is about to exit;
-    `is_given_up` that the change must be rolled back, whatever it proves."""
-    start = Action.WENT_BACK if is_given_up else Action.START
+    `is_abandoned` that the change must be rolled back, whatever it proves."""
+    start = Action.WENT_BACK if is_abandoned else Action.START
     if not status.installed:
         return start
     if status.change_id == change_id:
         match status.state:
             case "staged":
-                return Action.ABORT if is_given_up else Action.START
+                return Action.ABORT if is_abandoned else Action.START
             case "armed":
-                return Action.ABORT if is_given_up else Action.BEGIN
+                return Action.ABORT if is_abandoned else Action.BEGIN
             case "applied":
-                if is_given_up:
+                if is_abandoned:
                     return Action.ABORT
-                return _applied(status, missing, is_at_new_address=is_at_new_address, leaving=leaving)
+                return _applied(status, unmet, is_at_new_address=is_at_new_address, leaving=leaving)
             case _:
-                return Action.ABORT if is_given_up and status.state == "waiting" else Action.WAIT
+                return Action.ABORT if is_abandoned and status.state == "waiting" else Action.WAIT
     if status.last_id == change_id:
         return Action.KEPT if status.last_outcome == "confirmed" else Action.WENT_BACK
     if status.state in ("armed", "waiting", "applied", "restoring"):
@@ -65,8 +65,8 @@ def next_action(
     return start
 
 
-def _applied(status: ChangeStatus, missing: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Action:
-    if not missing and is_at_new_address:
+def _applied(status: ChangeStatus, unmet: Sequence[str], *, is_at_new_address: bool, leaving: bool) -> Action:
+    if not unmet and is_at_new_address:
         return Action.CONFIRM
     failed = status.reload_status not in (None, 0)
     late = status.left_s is not None and status.left_s < MIN_PROOF_S
@@ -88,16 +88,19 @@ REASONS = {
     "guard": "its timer was killed; its second timer took over",
     "failed": "the files could not be written, or the packages could not be installed",
     "moved-on": "a file on it was changed by someone else",
-    "operator": "it was cancelled",
+    "operator": "it was canceled",
 }
 
 
-def rollback_reason(status: ChangeStatus, missing: Sequence[str], shut_out: str = "", unreached: str = "") -> str:
-    """One sentence for an outcome. `shut_out` is a login refused while the change was applied, which takes precedence:
-    `missing` was then observed only after the rollback. `unreached` is why the node was unreachable."""
+def rollback_reason(
+    status: ChangeStatus, unmet: Sequence[str], login_refused: str = "", connect_error: str = ""
+) -> str:
+    """One sentence for an outcome. `login_refused` is a login refused while the change was applied; it takes
+    precedence, because `unmet` was then observed only after the rollback. `connect_error` is why the node was
+    unreachable."""
     word, _, rest = status.last_reason.partition("+")
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and the packages it installed could not be removed"
-    details = shut_out or "; ".join(missing) or (unreached and f"it was unreachable: {unreached}")
+    details = login_refused or "; ".join(unmet) or (connect_error and f"it was unreachable: {connect_error}")
     return f"{reason}: {details}" if details else reason

@@ -15,7 +15,7 @@ from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import connect
-from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
+from meshctl.device.trust import AcceptAnyKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
 from meshctl.model import Fleet, Node, NodeState
@@ -30,7 +30,6 @@ class Replacement:
 
     discovered: Discovered
     spare: Node | None
-    old_pins: tuple[HostKey, ...]
 
 
 def adopt(
@@ -68,7 +67,7 @@ def adopt(
     try:
         seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
-            raise NodeError(f"{connection.endpoint.label}: showed no host key")
+            raise NodeError(f"{connection.endpoint.label}: sent no host key")
     except BaseException:
         connection.close()
         raise
@@ -79,7 +78,7 @@ def adopt(
         connections.interfaces[old.name] = connection.endpoint.interface
     connections.release(old.name, connection)
     where = target or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
-    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key)}, ()), spare, pins)
+    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key, pins)}, ()), spare)
 
 
 def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
@@ -92,11 +91,6 @@ def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
         f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address conflict",
         hint="switch the old device off first",
     )
-
-
-def restore_old_pins(trust: TrustStore, old: Node, replacement: Replacement) -> None:
-    """Pin the previous keys again after a failed change."""
-    trust.replace(old.name, *replacement.old_pins)
 
 
 def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:

@@ -292,7 +292,7 @@ def _joined(scripts: Iterable[Script]) -> str:
 
 def _query_all(run_context: RunContext, scripts: Mapping[str, Script]) -> dict[str, str]:
     """The output of each node that answered in time."""
-    with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="forget") as pool:
+    with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="flush") as pool:
         answers = pool.map(lambda name: _query_one(run_context, name, scripts[name]), scripts)
         return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
 

@@ -22,7 +22,7 @@ from meshctl.apply.bootstrap import (
     plan_discovered,
     restore_pins,
 )
-from meshctl.apply.replace import adopt, identity_edits, restore_old_pins, with_identity
+from meshctl.apply.replace import adopt, identity_edits, with_identity
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
 from meshctl.cli.journaled_run import SALT_BYTES, choices_of, confirm_and_execute
 from meshctl.cli.output import echo, echo_error
@@ -229,7 +229,7 @@ def replace(
             status = ended.exit_code
         finally:
             if status != ExitCode.OK:
-                restore_old_pins(opened.trust, node, successor)
+                restore_pins(opened.trust, successor.discovered, [node.name])
         if status == ExitCode.OK:
             changes = _record_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)

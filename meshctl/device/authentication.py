@@ -1,7 +1,7 @@
-"""Our side of an SSH login: `Credentials` become `Attempt`s, in the order they are tried.
+"""SSH logins: `Credentials` become `LoginAttempt`s, in the order they are tried.
 
-OpenWrt's dropbear hangs up after three refused attempts (`MaxAuthTries` in its init script), so the caller tries at
-most that many on one connection. `auth_none` is not counted by dropbear, and comes first at first contact.
+OpenWrt's dropbear closes the connection after three refused attempts (`MaxAuthTries` in its init script), so the caller
+makes at most that many on one connection. dropbear does not count `auth_none`, which comes first at first contact.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from meshctl.model import Secret
 
 @dataclass(frozen=True, slots=True)
 class LoginAttempt:
-    """One try: `name` for messages, and one of a key, a password, or neither (no authentication at all)."""
+    """One login attempt with a key, a password, or neither (no authentication); `name` is for messages."""
 
     name: str
     key: PKey | None = None
     password: Secret | None = None
 
     def run(self, transport: paramiko.Transport, user: str) -> None:
-        """Raises what paramiko raises; returns once the server has let us in."""
+        """Return once the server accepts the login. Raises what paramiko raises."""
         if self.key is not None:
             transport.auth_publickey(user, self.key)
         elif self.password is not None:
@@ -41,7 +41,7 @@ class LoginAttempt:
 
 @contextmanager
 def login_attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterator[tuple[LoginAttempt, ...]]:
-    """All attempts, while the agent's socket is open. Raises InputError for a key file that cannot be used."""
+    """All attempts, while the agent's socket is open. Raises InputError for an unusable key file."""
     agent = paramiko.Agent() if credentials.use_agent else None
     try:
         found: list[LoginAttempt] = []
@@ -63,18 +63,20 @@ def login_attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterat
 
 
 def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
-    """The public parts of all keys that would be tried. Raises InputError for a key file that cannot be used."""
+    """The public parts of all keys that would be tried. Raises InputError for an unusable key file."""
     with login_attempts(credentials, legacy_rsa_sha1=False) as found:
         return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
 
 
 def load_key(path: Path, passphrase: Secret | None) -> PKey:
-    """A private key file in OpenSSH's or PEM format. Raises InputError saying what is wrong with it."""
+    """Load a private key in OpenSSH or PEM format. Raises InputError with the fault."""
     try:
         return PKey.from_path(path, None if passphrase is None else passphrase.reveal().encode())  # type: ignore[arg-type]
     except FileNotFoundError as error:
-        raise InputError(f"{path}: no such key file") from error
+        raise InputError(f"{path}: key file not found") from error
     except (paramiko.PasswordRequiredException, TypeError) as error:
-        raise InputError(f"{path}: the key is encrypted, or a passphrase was given for one that is not") from error
+        raise InputError(
+            f"{path}: the key is encrypted and needs a passphrase, or is not encrypted and a passphrase was given"
+        ) from error
     except (paramiko.SSHException, UnknownKeyType, UnsupportedAlgorithm, ValueError, OSError) as error:
         raise InputError(f"{path}: cannot be used as a private key: {error}") from error

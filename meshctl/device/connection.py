@@ -1,7 +1,7 @@
-"""The seam between meshctl and a node: where it is, with what we come, how long we wait, and what a command gave back.
+"""The interface between meshctl and a node: endpoint, credentials, deadlines, connection, command result.
 
-`Endpoint`, `Credentials` and `Deadlines` go into `meshctl.device.ssh.connect`, which gives a `Connection`; every verb
-of this package (`observe`, `upload`, `openwrt`, `deadman`) takes one and knows nothing of SSH.
+`meshctl.device.ssh.connect` makes a `Connection` from `Endpoint`, `Credentials` and `Deadlines`. The other modules
+(`observe`, `upload`, `openwrt`, `deadman`) use a `Connection` and do not depend on SSH.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from meshctl.model import Secret
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """Where a node answers. `identity` is the name its host key is pinned under, `interface` the interface of this
-    machine that leads there, empty for whichever the routes name.
+    """Where a node answers. `interface` is the local interface to use, empty for the one of the routing table.
 
-    It is the node's name in the inventory rather than its address, because factory devices all answer at 192.168.1.1
-    and a node's address may change with a plan (OpenSSH calls this `HostKeyAlias`).
+    `identity` is the name its host key is pinned under (`HostKeyAlias` in OpenSSH): the node's name in the inventory
+    rather than its address, because factory devices all answer at 192.168.1.1 and a plan may change the address.
     """
 
     host: str
@@ -50,10 +49,10 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """What we try, in this order: key files, the agent's keys, `password`.
+    """Credentials, tried in this order: key files, the agent's keys, `password`.
 
-    `empty_password` is for first contact alone, because a factory device lets root in with no password: no
-    authentication at all is tried before everything else, an empty password after it.
+    `empty_password` is only for first contact, because a factory device accepts root without a password: no
+    authentication is tried first, an empty password last.
     """
 
     key_files: tuple[Path, ...] = ()
@@ -65,7 +64,7 @@ class Credentials:
 
 @dataclass(frozen=True, slots=True)
 class OwnKey:
-    """The public part of a key that we can log in with: `name` says where it is (`key PATH`, `agent key COMMENT`)."""
+    """The public part of a key we can log in with; `name` is its source (`key PATH`, `agent key COMMENT`)."""
 
     name: str
     key_type: str
@@ -73,7 +72,7 @@ class OwnKey:
 
     @property
     def base64(self) -> str:
-        """As it stands in authorized_keys."""
+        """As in authorized_keys."""
         return b64encode(self.blob).decode()
 
     @property
@@ -89,7 +88,7 @@ def fingerprint_of(blob: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Deadlines:
-    """How long each wait may take, in seconds; every one ends in `Timeout` with its own `phase`.
+    """How long each phase may take, in seconds; then it ends with a `Timeout` of that `phase`.
 
     A radio with a 560 MHz MIPS core needs about two seconds for the key exchange when idle; a mesh of five hops that
     loses packets needs several times that.
@@ -100,18 +99,18 @@ class Deadlines:
     auth_s: float = 30.0
     channel_s: float = 15.0
     run_s: float = 60.0
-    # Between commands. Nobody answers it, but TCP acknowledges it: a link that is silent for four of these is given up.
+    # Between commands. These keepalives want no reply, but TCP acknowledges them; the limit is four of them.
     keepalive_s: int = 15
-    # While a command runs its server is asked for a sign so often, and given up after so long a silence. A radio that
-    # hashes an image or erases flash still answers within a few seconds, and what stands before the question on the
-    # slowest link that is worth an upload (24 KiB of window at 4 KiB/s) takes six.
+    # While a command runs, the server is sent a keepalive every ask_s, and the connection is lost after silence_s. A
+    # radio that hashes an image or erases flash still replies within a few seconds, and the data queued before the
+    # keepalive takes six on the slowest link worth an upload (24 KiB of window at 4 KiB/s).
     ask_s: float = 5.0
     silence_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Completed:
-    """What one command gave back. Text is decoded as UTF-8 with replacement: SSIDs and names may hold any byte."""
+    """The result of one command. Text is decoded as UTF-8 with replacement: SSIDs and names may contain any byte."""
 
     stdout_bytes: bytes = field(repr=False)
     stderr_bytes: bytes = field(repr=False)
@@ -126,7 +125,7 @@ class Completed:
         return self.stderr_bytes.decode("utf-8", "replace")
 
     def check(self, attempted: str) -> Completed:
-        """Itself, or `CommandFailed` naming what was attempted, the status and the last words on stderr."""
+        """Return self, or raise `CommandFailed` with the attempt, the exit status and the last line of stderr."""
         if self.exit_status == 0:
             return self
         words = (self.stderr.strip() or self.stdout.strip()).splitlines()

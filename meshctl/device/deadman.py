@@ -1,8 +1,8 @@
-"""A change that undoes itself: the Python side of `meshctl-deadman` (scripts/deadman.sh, docs/device-scripts.md).
+"""Changes that roll back unless confirmed: client of `meshctl-deadman` (scripts/deadman.sh, docs/device-scripts.md).
 
-A `Change` (files to write, remove, or merely keep safe, and what to reload) becomes a bundle (`bundle`, pure), is
-uploaded and staged, armed with a nonce, applied by a process of the node's own, and kept by `confirm` over a new
-connection. Whatever stops that chain, the node goes back to what it had.
+A `Change` (files to write, remove or only back up, and the reload) becomes a bundle (`bundle`, pure). It is uploaded
+and staged, armed with a nonce, applied by a process on the node, and made permanent by `confirm` over a new connection.
+If any step fails, the node rolls back to its previous state.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from meshctl.model import Secret
 PROGRAM = "/usr/sbin/meshctl-deadman"
 INIT_SCRIPT = "/etc/init.d/meshctl-deadman"
 INIT_LINK = "/etc/rc.d/S05meshctl-deadman"
-# The bundle waits in RAM: it is copied into flash by `stage`, and a reboot may forget it.
+# The bundle is in RAM until `stage` copies it to flash; a reboot may lose it.
 BUNDLE_DIRECTORY = "/tmp/meshctl"
 # Unpacking, copying and syncing into a jffs2 that has to erase blocks first can take a minute.
 STAGE_TIMEOUT_S = 180.0
@@ -38,7 +38,7 @@ _WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9@._:+-]*")
 
 @dataclass(frozen=True, slots=True)
 class NewFile:
-    """A file the change writes: its bytes and its mode."""
+    """The content and mode of a file that the change writes."""
 
     content: bytes = field(repr=False)
     mode: int = 0o644
@@ -46,17 +46,16 @@ class NewFile:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What is to change on a node.
+    """A change of a node.
 
-    `files` are written, `links` (path below /etc/rc.d -> target) made, `removed` deleted, `covered` only kept and
-    restored (what services write themselves when reloaded). `expected` gives the SHA-256 a touched path must have now,
-    or None for absent; the node refuses the change when it finds something else.
+    `files` are written, `links` (path below /etc/rc.d -> target) created, `removed` deleted, `covered` only backed up
+    and restored (files that services write when reloaded). `expected` is the SHA-256 a touched path must have before
+    the change, or None for absent; the node refuses the change if it differs.
 
-    `extra` is POSIX sh for what a change does besides files, called as `extra keep|do|undo DIRECTORY`; see `packages`.
+    `extra` is POSIX sh for changes other than files, called as `extra keep|do|undo DIRECTORY`; see `packages`.
 
-    `reload` is POSIX sh. It runs after the change and, if need be, after the way back, so it must bring the services in
-    line with whatever files are there and change none itself. Its exit status should tell whether it worked: where it
-    fails after a restore, the node reboots.
+    `reload` is POSIX sh. It runs after the change and after a rollback, so it must apply whatever files there are and
+    change none itself. Its exit status must report success: if it fails after a rollback, the node reboots.
     """
 
     change_id: str
@@ -70,8 +69,8 @@ class Change:
 
 
 def packages(tool: str, files: Iterable[str], remove: Iterable[str] = ()) -> str:
-    """A change's `extra` that installs package files which are on the node and removes packages first; undone, the node
-    has the packages that it had. `tool` is opkg or apk. Raises ValueError for words with blanks or quotes."""
+    """A change's `extra` that removes packages and installs package files that are on the node; a rollback restores
+    the previous packages. `tool` is opkg or apk. Raises ValueError for words with blanks or quotes."""
     words = {"TOOL": [tool], "FILES": list(files), "REMOVE": list(remove)}
     if tool not in ("opkg", "apk"):
         raise ValueError(f"expected opkg or apk, found {tool!r}")
@@ -83,7 +82,7 @@ def packages(tool: str, files: Iterable[str], remove: Iterable[str] = ()) -> str
 
 
 def bundle(change: Change) -> bytes:
-    """The change as one tar.gz: `manifest`, `reload`, `new/...`; the same change gives the same bytes.
+    """The change as one deterministic tar.gz: `manifest`, `reload`, `new/...`.
 
     A manifest line is `KIND MODE SHA256 EXPECTED PATH`. Raises ValueError for a path the node would refuse.
     """
@@ -120,7 +119,7 @@ def _expected(change: Change, path: str) -> str:
 
 
 def install(connection: Connection) -> None:
-    """Put the switch and its boot hook on the node, each in one rename; does nothing where they already are."""
+    """Install the switch and its boot hook, each in one rename; does nothing if they are installed."""
     for path, (mode, content) in installed_files().items():
         upload(connection, content, path, mode=mode)
     link = f"../init.d/{INIT_SCRIPT.rsplit('/', 1)[1]}"
@@ -138,7 +137,7 @@ def installed_files() -> dict[str, tuple[int, bytes]]:
 
 
 def status(connection: Connection) -> ChangeStatus:
-    """The switch's state; `installed=False` where it is not on the node."""
+    """The switch's state; `installed=False` if the node has none."""
     done = connection.run(f"[ -x {PROGRAM} ] || {{ echo absent; exit 0; }}; {PROGRAM} status")
     if done.stdout.strip() == "absent":
         return ChangeStatus(state="absent", installed=False)
@@ -149,12 +148,12 @@ def status(connection: Connection) -> ChangeStatus:
 
 
 def lock(connection: Connection, owner: str, *, ttl_s: int) -> None:
-    """Take or renew the node's lock. Raises NodeRefused (`locked`, with who holds it and for how long)."""
+    """Acquire or renew the node's lock. Raises NodeRefused (`locked`, with its owner and remaining time)."""
     _verb(connection, "lock", owner, str(ttl_s))
 
 
 def unlock(connection: Connection, owner: str) -> None:
-    """Give the lock back; another owner's lock stays."""
+    """Release the lock; another owner's lock stays."""
     _verb(connection, "unlock", owner)
 
 
@@ -166,7 +165,7 @@ def stage(
     rate_bytes_per_s: float | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> None:
-    """Upload and stage a change; nothing it touches changes yet, and the previous state is kept in flash.
+    """Upload and stage a change: no file changes yet, and the previous state is saved in flash.
 
     Raises NodeRefused with the node's reason: `foreign-changes`, `moved-on`, `flash-full`, `bad-uci`, `locked`, `busy`.
     """
@@ -179,7 +178,7 @@ def stage(
 
 
 def arm(connection: Connection, owner: str, change_id: str, *, nonce: Secret, window_s: int) -> None:
-    """From here on only `confirm` with this nonce keeps the change. The node learns the nonce's hash alone."""
+    """Arm the change: from now on only `confirm` with this nonce keeps it. The node gets only the nonce's hash."""
     digest = hashlib.sha256(nonce.reveal().encode()).hexdigest()
     _verb(connection, "arm", owner, change_id, digest, str(window_s))
 
@@ -189,8 +188,8 @@ def apply(
 ) -> float:
     """Start the change: now, `in_s` seconds from now, or when the node's own uptime reaches `at_uptime_s`.
 
-    Returns the node's uptime in seconds at which it switches. The answer comes at once; the change is made by a process
-    of the node's own. Ask `status`, over a new connection, for `applied`.
+    Returns at once, with the node's uptime in seconds at which the change starts; a process on the node applies it.
+    `status`, over a new connection, reports `applied`.
     """
     if in_s is not None and at_uptime_s is not None:
         raise ValueError("give in_s or at_uptime_s, not both")
@@ -203,15 +202,15 @@ def apply(
 
 
 def confirm(connection: Connection, change_id: str, *, nonce: Secret) -> None:
-    """Keep the change; safe to repeat when the answer was lost. Raises NodeRefused (`restored`, `wrong-nonce`, ...).
+    """Make the change permanent; safe to repeat if the answer was lost. Raises NodeRefused (`restored`, ...).
 
-    The connection has to be a new one, opened after the change was applied: that is what proves the node reachable.
+    The connection must be opened after the change was applied: that proves the node reachable.
     """
     _verb(connection, "confirm", change_id, nonce.reveal())
 
 
 def abort(connection: Connection, owner: str, change_id: str) -> None:
-    """Drop a staged change, or have an applied one taken back now."""
+    """Drop a staged change, or roll an applied one back now."""
     _verb(connection, "abort", owner, change_id)
 
 
@@ -233,13 +232,13 @@ def _verb(connection: Connection, verb: str, *words: str, timeout_s: float | Non
     raise _unreadable(connection, verb, done)
 
 
-# What to do about a refusal whose text does not tell; by its word (docs/device-scripts.md).
+# Hints by refusal code, where the text has none (docs/device-scripts.md).
 _HINTS = {
-    "locked": "wait for the other one to end, or for the lock to run out",
-    "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what takes the room",
-    "moved-on": "somebody changed it meanwhile: plan again",
-    "not-locked": "it has run out, or the node rebooted: run again",
-    "tmp-full": "`meshctl run NODE -- du -ak /tmp` shows what takes the room; a reboot empties it",
+    "locked": "wait until the other run ends or its lock expires",
+    "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what uses the space",
+    "moved-on": "the node has changed since it was planned: plan again",
+    "not-locked": "the lock expired, or the node rebooted: run again",
+    "tmp-full": "`meshctl run NODE -- du -ak /tmp` shows what uses the space; a reboot empties it",
 }
 
 

@@ -1,7 +1,7 @@
-"""What can go wrong between meshctl and one node; each is a `NodeError`, so a fleet turns it into that node's outcome.
+"""Errors between meshctl and one node. Each is a `NodeError`, which a fleet run turns into that node's outcome.
 
-The messages name the node (`Endpoint.label`), what was attempted and what was found. Nothing of paramiko or `OSError`
-passes this package's edge.
+Messages name the node (`Endpoint.label`), what was attempted and what was found. Exceptions of paramiko and `OSError`
+do not leave this package.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = [
 
 
 class Timeout(Unreachable):
-    """One of our own deadlines passed; `phase` says which: connect, handshake, auth, channel, run."""
+    """One of our deadlines passed; `phase` is which: connect, handshake, auth, channel, run."""
 
     def __init__(self, message: str, *, phase: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
@@ -33,7 +33,7 @@ class Timeout(Unreachable):
 
 
 class ConnectionLost(Unreachable):
-    """The connection was there and is gone: closed or reset by the other side, or by the network."""
+    """The connection was closed or reset, by the other side or by the network."""
 
 
 class ChannelClosed(ConnectionLost):
@@ -41,11 +41,11 @@ class ChannelClosed(ConnectionLost):
 
 
 class IncompatibleServer(NodeError):
-    """Something answered that is no SSH server, or one with no algorithm in common with us."""
+    """What answered is not an SSH server, or has no algorithm in common with us."""
 
 
 class HostKeyUnknown(NodeError):
-    """No key is pinned for this node; `fingerprint` is what it showed (`SHA256:...`)."""
+    """No key is pinned for this node; `fingerprint` is that of its key (`SHA256:...`)."""
 
     def __init__(self, message: str, *, fingerprint: str, key_type: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
@@ -54,7 +54,7 @@ class HostKeyUnknown(NodeError):
 
 
 class HostKeyChanged(NodeError):
-    """The node shows another key than the pinned one: another device, a flash meshctl did not do, or an attack."""
+    """The node's key differs from the pinned one: another device, a flash without meshctl, or an attack."""
 
     def __init__(
         self, message: str, *, fingerprint: str, key_type: str, pinned: tuple[str, ...] = (), hint: str = ""
@@ -66,7 +66,7 @@ class HostKeyChanged(NodeError):
 
 
 class AuthenticationRefused(NodeError):
-    """The node is there and let none of our credentials in; `tried` lists them, `allowed` what the server offers."""
+    """The node refused all credentials in `tried`; `allowed` are the methods the server offers."""
 
     def __init__(
         self, message: str, *, tried: tuple[str, ...] = (), allowed: tuple[str, ...] = (), hint: str = ""
@@ -77,7 +77,7 @@ class AuthenticationRefused(NodeError):
 
 
 class CommandFailed(NodeError):
-    """A command on the node ended with a status other than zero."""
+    """A command on the node ended with a nonzero exit status."""
 
     def __init__(self, message: str, *, exit_status: int, stderr: str = "", hint: str = "") -> None:
         super().__init__(message, hint=hint)
@@ -86,15 +86,15 @@ class CommandFailed(NodeError):
 
 
 class OutputTooLarge(NodeError):
-    """A command on the node printed more than is read into memory; the connection is as good as before."""
+    """A command on the node printed more than is read into memory; the connection stays usable."""
 
 
 class UploadFailed(NodeError):
-    """The bytes on the node are not the bytes sent, or did not fit; nothing was put in place."""
+    """The uploaded bytes do not match, or did not fit; the target file is unchanged."""
 
 
 class NodeRefused(CommandFailed):
-    """The dead-man's switch on the node refused a verb; `code` is its reason's word (see docs/device-scripts.md)."""
+    """The node's dead-man's switch refused a command; `code` is the reason (docs/device-scripts.md)."""
 
     def __init__(self, message: str, *, code: str, exit_status: int, hint: str = "") -> None:
         super().__init__(message, exit_status=exit_status, stderr=message, hint=hint)

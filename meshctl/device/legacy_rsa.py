@@ -1,10 +1,10 @@
-"""RSA with SHA-1, for OpenWrt 19.07 alone.
+"""RSA with SHA-1, only for OpenWrt 19.07.
 
-dropbear 2019.78, which 19.07 ships, signs and accepts RSA with SHA-1 only (`ssh-rsa`, RFC 4253 section 6.6);
-rsa-sha2-256 came with dropbear 2020.79. paramiko 5 removed that algorithm: its RSA key refuses to sign or verify it and
-its transport does not offer it. `LegacyTransport` and `LegacyRsaKey` put back exactly these two things, for host keys
-and for user keys. No node may be talked down to it that could do better, so `ssh.connect` uses this class only where
-the caller says so, or the node's release is 19.07 and it offers nothing else.
+dropbear 2019.78 of 19.07 signs and accepts RSA only with SHA-1 (`ssh-rsa`, RFC 4253 section 6.6); rsa-sha2-256 came
+with dropbear 2020.79. paramiko 5 removed that algorithm: its RSA key does not sign or verify it, and its transport does
+not offer it. `LegacyTransport` and `LegacyRsaKey` restore exactly that, for host keys and user keys. To prevent a
+downgrade, `ssh.connect` uses them only if the caller requests it, or the node's release is 19.07 and it offers nothing
+else.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LegacyRsaKey(paramiko.RSAKey):
 
 
 class LegacyTransport(paramiko.Transport):
-    """A transport that offers `ssh-rsa` last, and signs with it where the server can do nothing else."""
+    """A transport that offers `ssh-rsa` last, and signs with it if the server supports nothing else."""
 
     _preferred_keys = (*paramiko.Transport._preferred_keys, SSH_RSA)  # type: ignore[attr-defined]
     _preferred_pubkeys = (*paramiko.Transport._preferred_pubkeys, SSH_RSA)  # type: ignore[attr-defined]
@@ -36,7 +36,7 @@ class LegacyTransport(paramiko.Transport):
 
     @property
     def preferred_pubkeys(self) -> tuple[str, ...]:
-        """A server that proves itself by `ssh-rsa` alone sends no list of what it accepts, so that goes first."""
+        """`ssh-rsa` first for a server with only an `ssh-rsa` host key: it sends no list of accepted algorithms."""
         usual: tuple[str, ...] = self._filter_algorithm("pubkeys")  # type: ignore[attr-defined]
         if self.host_key_type != SSH_RSA:
             return usual
@@ -44,5 +44,5 @@ class LegacyTransport(paramiko.Transport):
 
 
 def with_sha1(key: PKey) -> PKey:
-    """The key, able to sign `ssh-rsa` if it is an RSA key of a file; an agent's key can do so already."""
+    """The key, with `ssh-rsa` signatures if it is an RSA key from a file; an agent's key supports them already."""
     return LegacyRsaKey(key=key.key) if type(key) is paramiko.RSAKey else key

@@ -1,9 +1,9 @@
-"""Whether the other end of a connection is still there while we wait for it: ask it now and then, and listen.
+"""Detect a dead connection while waiting for it: keepalives, and a watchdog.
 
-A link that breaks says nothing, and TCP notices only after a minute or, through another node's tunnel, never. So while
-a command runs its server is asked for a sign (`asking`; every SSH server answers a request that it does not know, RFC
-4254 section 4), `Heard` remembers when anything came, and `Watch` closes the connection when nothing has for too long,
-or when the whole wait has taken too long.
+TCP detects a broken link only after a minute or, through another node's tunnel, never. So while a command runs the
+server is sent keepalives (`keepalives`; every SSH server replies to an unknown global request, RFC 4254 section 4).
+`ActivityStream` records when data arrived. `Watchdog` closes the connection when none has for too long, or when the
+whole wait has taken too long.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import paramiko
 from paramiko.common import cMSG_GLOBAL_REQUEST
 from paramiko.message import Message
 
-# The name OpenSSH asks under (ServerAliveInterval); dropbear refuses every such request, which is a sign, too.
+# The request name of OpenSSH (ServerAliveInterval); dropbear replies with a failure, which is enough.
 _REQUEST = "keepalive@openssh.com"
-# A process that was stopped, or had no processor for a while, reads what came meanwhile within this time.
+# A process that was suspended reads the data that arrived meanwhile within this time.
 MAX_OWN_PAUSE_S = 1.0
 
 
 class ActivityStream:
-    """A stream that remembers, in `at_s` of the monotonic clock, when it last gave anything."""
+    """A stream that records when it last received data: `last_received_s`, monotonic."""
 
     def __init__(self, stream: socket.socket | paramiko.Channel) -> None:
         self._stream = stream
@@ -40,35 +40,35 @@ class ActivityStream:
         return data
 
     def __getattr__(self, name: str) -> Any:
-        # all else is the stream's own: paramiko also looks at attributes that are none of the public ones
+        # paramiko also reads private attributes of its stream
         return getattr(self._stream, name)
 
 
 @contextmanager
 def keepalives(transport: paramiko.Transport, every_s: float, idle_s: float) -> Iterator[None]:
-    """Within this block the server is asked for a sign whenever nothing was read or written for `every_s`; afterwards
-    it is sent a keepalive that wants no answer, every `idle_s`. The transport's own thread does it."""
+    """Within this block, send a keepalive that wants a reply whenever the connection is idle for `every_s`; afterwards
+    one that wants none, every `idle_s`. The transport's thread sends them."""
 
     def send_request() -> None:
         request = Message()
         request.add_byte(cMSG_GLOBAL_REQUEST)
         request.add_string(_REQUEST)
         request.add_boolean(True)
-        # paramiko's own global_request waits for the answer in the thread that would have to read it
+        # paramiko's global_request would wait for the reply in the thread that has to read it
         transport._send_user_message(request)  # type: ignore[attr-defined]
 
     transport.packetizer.set_keepalive(every_s, send_request)
     try:
         yield
     finally:
-        # one that has been closed has nobody to keep alive
+        # a closed transport needs no keepalives
         if transport.is_active():
             transport.set_keepalive(int(idle_s))
 
 
 class Watchdog:
-    """Closes `transport` when `seconds` have passed (`passed`), or when `heard` has been silent for `silence_s`
-    (`silent`) within this block."""
+    """Closes `transport` when this block takes longer than `seconds` (`timed_out`), or when `activity` shows no data
+    for `silence_s` (`silent`)."""
 
     def __init__(
         self,
@@ -95,12 +95,12 @@ class Watchdog:
                 self.timed_out = True
                 break
             if self._activity is not None:
-                # what was silent before we began to wait had nothing to say
+                # silence before this wait does not count
                 patience_s = max(self._activity.last_received_s, began_s) + self._silence_s - now_s
                 if patience_s <= -MAX_OWN_PAUSE_S:
                     self.silent = True
                     break
-                # past its time it gets one more look: it may be we who slept, and the answer lies there unread
+                # check once more past the limit: our process may have been suspended, with the reply unread
                 left_s = min(left_s, patience_s if patience_s > 0 else MAX_OWN_PAUSE_S)
             if self._over.wait(left_s):
                 return

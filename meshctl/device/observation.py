@@ -1,8 +1,7 @@
-"""What was seen of one node at one moment: `Observation` and its parts, all frozen.
+"""The state of one node at one moment: `Observation` and its parts, all frozen.
 
-A fact is `None` when the node did not tell it or told it in a form the parsers do not know, and `notes` says why; an
-empty tuple or mapping means that the node told there is none. Shapes and sources: docs/facts/openwrt-facts.md,
-section 5.
+A fact is `None` if the node did not report it, or in a form the parsers do not know; `notes` has the reason. An empty
+tuple or mapping means that the node reported none. Formats and sources: docs/facts/openwrt-facts.md, section 5.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class Memory:
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """/proc/loadavg: processes running or waiting, averaged over a minute, and how many processors share them."""
+    """/proc/loadavg: processes running or waiting, averaged over a minute; and the number of processors."""
 
     minute: float
     processors: int
@@ -56,7 +55,7 @@ class Load:
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """One file system, in bytes, after `df -k`."""
+    """One file system, in bytes, from `df -k`."""
 
     path: str
     total: int
@@ -79,7 +78,7 @@ class RadioState:
 
 @dataclass(frozen=True, slots=True)
 class WirelessLink:
-    """One interface of `iw dev`: what the radio really does, whatever the configuration says."""
+    """One interface of `iw dev`: the actual state of the radio, whatever its configuration."""
 
     ifname: str
     mode: str
@@ -92,12 +91,12 @@ class WirelessLink:
     width: str = ""
     tx_power_dbm: float | None = None
     joined: bool | None = None
-    """From `iw dev IF link`: whether an IBSS is really joined; None when iw does not tell for this mode."""
+    """From `iw dev IF link`: whether an IBSS is joined; None if iw does not report it for this mode."""
 
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """One neighbour as the radio sees it (`iw dev IF station dump`)."""
+    """One station entry of a radio (`iw dev IF station dump`)."""
 
     ifname: str
     mac: str
@@ -111,7 +110,7 @@ class Station:
     tx_mbit_s: float | None = None
     rx_mbit_s: float | None = None
     expected_mbit_s: float | None = None
-    # for how long the radio has known it
+    # the age of the entry
     connected_s: int | None = None
 
 
@@ -139,7 +138,7 @@ class Bridge:
 
 @dataclass(frozen=True, slots=True)
 class MeshInfo:
-    """`batctl meshif bat0 mesh_json`; on 19.07 what its text commands give."""
+    """`batctl meshif bat0 mesh_json`; on 19.07 the text commands."""
 
     version: str = ""
     algorithm: str = ""
@@ -149,7 +148,7 @@ class MeshInfo:
 
 @dataclass(frozen=True, slots=True)
 class MeshNeighbour:
-    """One direct neighbour of batman-adv (`neighbors_json` or `batctl n`)."""
+    """One direct neighbor of batman-adv (`neighbors_json` or `batctl n`)."""
 
     mac: str
     ifname: str
@@ -171,7 +170,7 @@ class Originator:
 
 @dataclass(frozen=True, slots=True)
 class HostKeyInfo:
-    """The node's own host key, read on the node: `key_type` as in known_hosts, `fingerprint` `SHA256:...`."""
+    """A host key read on the node: `key_type` as in known_hosts, `fingerprint` `SHA256:...`."""
 
     key_type: str
     fingerprint: str
@@ -179,7 +178,7 @@ class HostKeyInfo:
 
 @dataclass(frozen=True, slots=True)
 class FileInfo:
-    """One file asked for by path. `text` is None for what is not UTF-8 text; `sha256` is of its bytes."""
+    """One file requested by path. `text` is None if it is not UTF-8; `sha256` is of its bytes."""
 
     path: str
     mode: int
@@ -189,7 +188,7 @@ class FileInfo:
 
 @dataclass(frozen=True, slots=True)
 class ChangeStatus:
-    """The dead-man's switch's own line (`deadman.sh status`); see docs/device-scripts.md for the states."""
+    """The state of the dead-man's switch (`deadman.sh status`); see docs/device-scripts.md for the states."""
 
     state: str
     change_id: str = ""
@@ -209,7 +208,7 @@ class ChangeStatus:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Everything one round trip told. `asked_at_s` and `answered_at_s`: the observer's clock around it (Unix time)."""
+    """All facts from one round trip. `asked_at_s` and `answered_at_s`: the observer's clock around it (Unix time)."""
 
     asked_at_s: float
     answered_at_s: float
@@ -222,17 +221,17 @@ class Observation:
     memory: Memory | None = None
     overlay: Space | None = None
     root_in_ram: bool | None = None
-    """Whether / is still in memory because the flash is not ready, as at a first boot."""
+    """Whether / is still in memory because the flash is not formatted yet (first boot)."""
     tmp: Space | None = None
     macs: Mapping[str, str] | None = None
     """Interface name -> MAC address, from /sys/class/net."""
     ifindexes: Mapping[str, int] | None = None
-    """Interface name -> the kernel's index, which an interface that is created again gets a new one of."""
+    """Interface name -> the kernel's index; a recreated interface has a new one."""
     radios: tuple[RadioState, ...] | None = None
     links: tuple[WirelessLink, ...] | None = None
     stations: tuple[Station, ...] | None = None
     supplicants: tuple[str, ...] | None = None
-    """The radio interfaces that wpa_supplicant runs; an encrypted mesh without it is an open one."""
+    """The radio interfaces that wpa_supplicant runs; a mesh interface without it is unencrypted."""
     interfaces: tuple[NetInterface, ...] | None = None
     bridges: tuple[Bridge, ...] | None = None
     mesh: MeshInfo | None = None
@@ -242,13 +241,13 @@ class Observation:
     packages: Mapping[str, str] | None = None
     """Installed package -> version."""
     uci: Mapping[str, str] | None = field(default=None, repr=False)
-    """UCI package -> the text of /etc/config/PACKAGE; keys of encrypted meshes are in it."""
+    """UCI package -> the text of /etc/config/PACKAGE; contains the keys of encrypted meshes."""
     uci_changes: tuple[str, ...] | None = None
-    """Foreign uncommitted changes (`uci changes`), one line each."""
+    """Uncommitted changes (`uci changes`), one line each."""
     authorized_keys: tuple[str, ...] | None = None
     host_keys: tuple[HostKeyInfo, ...] | None = None
     files: Mapping[str, FileInfo | None] = field(default_factory=dict, repr=False)
-    """The extra paths asked for; None for one that does not exist."""
+    """The requested extra paths; None for a path that does not exist."""
     change: ChangeStatus | None = None
     notes: tuple[str, ...] = ()
 
@@ -261,5 +260,5 @@ class Observation:
 
     @property
     def uptime_error_s(self) -> float:
-        """The bound on how wrong `uptime_s` can be against the observer's clock: half the round trip."""
+        """The maximum error of `uptime_s` against the observer's clock: half the round trip."""
         return (self.answered_at_s - self.asked_at_s) / 2

@@ -1,6 +1,6 @@
-"""One look at a node: scripts/observe.sh goes there, its sections come back, the parsers make an `Observation` of them.
+"""Observe a node: run scripts/observe.sh there and parse the sections it prints into an `Observation`.
 
-`observe` is the round trip; `interpret` is pure. A parser never raises: what it cannot read becomes None and a note.
+`observe` is the round trip; `interpret` is pure. Parsers do not raise: what they cannot read becomes None and a note.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def observe(
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> Observation:
-    """Everything about the node, in one round trip; `extra_paths` are files to read besides.
+    """Observe everything about the node in one round trip; `extra_paths` are further files to read.
 
-    Raises Timeout and ConnectionLost; whatever the node says or does not say is data.
+    Raises Timeout and ConnectionLost; a missing or unreadable answer is data.
     """
     nonce = f"meshctl-{secrets.token_hex(16)}"
     sent = observation_script(nonce, extra_paths)
@@ -67,20 +67,20 @@ def observation_script(nonce: str, extra_paths: Iterable[str] = ()) -> str:
 
 
 class _Reader:
-    """Sections by name; collects a note for each that is missing, failed or not understood."""
+    """Sections by name; adds a note for each one that is missing, failed or unparsable."""
 
     def __init__(self, sections: Mapping[str, Section]) -> None:
         self._sections = sections
         self.notes: list[str] = []
         if "done" not in sections:
-            self.notes.append("the observation ended early")
+            self.notes.append("the observation was cut short")
 
     def read(self, name: str, parse: Callable[[str], T | None], *, required: bool = True) -> T | None:
-        """What `parse` makes of the section, or None; an empty section of a failed tool is not parsed."""
+        """Parse a section, or return None; an empty section of a failed tool is not parsed."""
         section = self._sections.get(name)
         if section is None:
             if required:
-                self.notes.append(f"{name}: not told")
+                self.notes.append(f"{name}: not reported")
             return None
         if section.status != 0 and not section.body.strip():
             if required:
@@ -96,7 +96,7 @@ class _Reader:
         return [name.split(" ", 1)[1] for name in self._sections if name.startswith(f"{kind} ")]
 
     def found_nothing(self, name: str) -> bool:
-        """Whether a section's command failed without a word, as `command -v` does."""
+        """Whether a section's command failed without output, as `command -v` does."""
         section = self._sections.get(name)
         return section is not None and section.status > 0 and not section.body.strip()
 
@@ -110,7 +110,7 @@ class _Reader:
 
 
 def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at_s: float) -> Observation:
-    """The sections of observe.sh as facts; pure, and total: any sections give an Observation."""
+    """The sections of observe.sh as facts. Pure; any input gives an Observation."""
     reader = _Reader(sections)
     board, release = _board(reader)
     space = reader.read("df", system.parse_df) or {}
@@ -198,7 +198,7 @@ def _wireless(reader: _Reader) -> tuple[tuple[WirelessLink, ...] | None, tuple[S
 def _mesh(
     reader: _Reader,
 ) -> tuple[MeshInfo | None, tuple[MeshNeighbour, ...] | None, tuple[Originator, ...] | None]:
-    """Of all batman interfaces together; (None, None, None) where there is none."""
+    """Of all batman-adv interfaces together; (None, None, None) without any."""
     names = reader.names("batctl.originators_json")
     if not names:
         return None, None, None
@@ -252,7 +252,7 @@ def _lines(reader: _Reader, name: str) -> tuple[str, ...] | None:
 
 
 def _file(reader: _Reader, path: str) -> FileInfo | None:
-    """None for what does not exist or is no plain file."""
+    """None for a path that does not exist or is not a regular file."""
     listed, hashed, text = (reader.body(f"{kind} {path}") for kind in ("mode", "hash", "text"))
     if listed is None or hashed is None or text is None:
         return None
@@ -265,7 +265,7 @@ def _file(reader: _Reader, path: str) -> FileInfo | None:
 
 
 def _as_text(body: bytes, digest: bytes) -> str | None:
-    """The text, if it is UTF-8 and whole: a long file was cut by the script, and its hash tells."""
+    """The text, if it is UTF-8 and complete: the script truncates a long file, so its hash differs."""
     if hashlib.sha256(body).hexdigest().encode() != digest:
         return None
     try:

@@ -1,7 +1,7 @@
-"""OpenWrt's own verbs on a node: its uptime, files, flash, firmware, reload and reboot.
+"""OpenWrt operations on a node: uptime, files, backup, firmware, reload, reboot.
 
-Each takes a `Connection` and runs one short script with absolute paths of the tools that act. What ends the connection
-(reboot, sysupgrade) is started as a process of its own and answered before it strikes.
+Each runs one short script over a `Connection`, with absolute paths of the tools that change something. What ends the
+connection (reboot, sysupgrade) is started as a detached process after a delay, so that the answer arrives.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ FIRMWARE_TEST_TIMEOUT_S = 120.0
 _PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
 # sysupgrade's own lines have the date before them from 21.02 on (lib/upgrade/common.sh, v).
 _STAMP = re.compile(r"^.{,60} upgrade: ")
-# its advice to flash such an image all the same
+# sysupgrade's advice to flash a rejected image anyway
 _FORCE_ADVICE = "Use sysupgrade -F"
-# Between the answer and the deed, so that the answer arrives.
+# Delay before a detached process acts, so that the answer arrives.
 DETACHED_DELAY_S = 1
 
 
 @dataclass(frozen=True, slots=True)
 class UptimeSample:
-    """The node's uptime at `at_s` of the observer's monotonic clock, right to within `error_s` on either side."""
+    """The node's uptime at `at_s` of the observer's monotonic clock, to within `error_s` on either side."""
 
     boot_id: str
     uptime_s: float
@@ -41,16 +41,16 @@ class UptimeSample:
     error_s: float
 
     def uptime_at(self, now_s: float) -> float:
-        """The node's uptime when the observer's monotonic clock says `now_s`."""
+        """The node's uptime at `now_s` of the observer's monotonic clock."""
         return self.uptime_s + now_s - self.at_s
 
 
 def measure_uptime(
     connection: Connection, *, samples: int = 3, monotonic: Callable[[], float] = time.monotonic
 ) -> UptimeSample:
-    """The node's uptime against our clock: the quickest of some round trips bounds the error by half of itself.
+    """Measure the node's uptime against our clock; half of the shortest round trip bounds the error.
 
-    This is what a switch at one moment counts from; the node's wall clock plays no part.
+    A simultaneous change is scheduled by it; the node's wall clock is not used.
     """
     best: UptimeSample | None = None
     for _ in range(max(samples, 1)):
@@ -70,20 +70,20 @@ def measure_uptime(
 
 @dataclass(frozen=True, slots=True)
 class FetchedFile:
-    """A file as it is on the node."""
+    """A file on the node."""
 
     content: bytes = field(repr=False)
     mode: int
 
 
 def fetch_files(connection: Connection, paths: Iterable[str]) -> dict[str, FetchedFile]:
-    """The plain files among `paths` (patterns of the shell are expanded on the node), in one round trip."""
+    """The regular files among `paths` (shell patterns are expanded on the node), in one round trip."""
     wanted = tuple(paths)
     for path in wanted:
         if not _PATTERN.fullmatch(path):
             raise ValueError(f"{path!r}: expected an absolute path without blanks or quotes")
     words = " ".join(path.lstrip("/") for path in wanted)
-    # a pattern that matches nothing stays as it is, so only what exists is named to tar
+    # a pattern without a match stays as it is, so only existing files are passed to tar
     script = f'cd / || exit 1; set --; for f in {words}; do [ ! -f "$f" ] || set -- "$@" "$f"; done\n'
     script += 'if [ $# -gt 0 ]; then tar -cf - "$@"; fi'
     done = connection.run(script).check(f"{connection.endpoint.label}: read files")
@@ -104,7 +104,7 @@ def fetch_files(connection: Connection, paths: Iterable[str]) -> dict[str, Fetch
 
 
 def backup(connection: Connection) -> bytes:
-    """The node's own configuration backup (`sysupgrade -b`), a tar.gz."""
+    """The node's configuration backup (`sysupgrade -b`), a tar.gz."""
     script = (
         "umask 077; mkdir -p /tmp/meshctl; b=/tmp/meshctl/backup.$$\n"
         '/sbin/sysupgrade -b "$b" >/dev/null && cat "$b"; s=$?; rm -f "$b"; exit $s'
@@ -113,13 +113,13 @@ def backup(connection: Connection) -> bytes:
 
 
 def root_in_ram(connection: Connection) -> bool:
-    """Whether / is still in memory: at a first boot it is, until the flash is ready (fstools, overlay.c)."""
+    """Whether / is still in memory, as at a first boot until the flash is formatted (fstools, overlay.c)."""
     return connection.run("grep -q '^overlayfs:/tmp/root / ' /proc/mounts").exit_status == 0
 
 
 @dataclass(frozen=True, slots=True)
 class FirmwareCheck:
-    """What the node says of an image: `valid` decides, `tests` and `reason` say why."""
+    """The node's verdict on an image: `valid`, with `tests` and `reason`."""
 
     valid: bool
     reason: str
@@ -128,14 +128,14 @@ class FirmwareCheck:
 
 
 def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
-    """`sysupgrade -T` and, where procd has it, `validate_firmware_image`, on an image that was uploaded.
+    """Run `sysupgrade -T` and, where procd has it, `validate_firmware_image` on an uploaded image.
 
-    Also drops caches and tells the memory that is then available: sysupgrade itself does not look.
+    Also drops caches and reports the memory then available, which sysupgrade does not check.
     """
     request = quoted(json.dumps({"path": image_path}))
     script = (
         "/bin/sync; echo 3 2>/dev/null >/proc/sys/vm/drop_caches\n"
-        # with -n, as it will be flashed: without, it refuses an image of another minor compat_version
+        # with -n, as for the flash itself: without, it rejects an image of another minor compat_version
         f'/sbin/sysupgrade -T -n {quoted(image_path)} >/tmp/sysupgrade.test 2>&1; echo "status $?"\n'
         "sed 's/^/said /' /tmp/sysupgrade.test; rm -f /tmp/sysupgrade.test\n"
         f"ubus call system validate_firmware_image {request} 2>/dev/null | tr -d '\\n\\t' | sed 's/^/json /'; echo\n"
@@ -146,12 +146,12 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     said = [_STAMP.sub("", line[5:]).strip() for line in lines if line.startswith("said ")]
     validation = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
-    # procd refuses `-f` for such an image, only after `sysupgrade` has begun; -T does not look at it
+    # procd rejects `-f` for such an image only after `sysupgrade` has started; -T does not check it
     bare = validation.get("allow_backup") is False
     passed = "status 0" in lines and (not validation or truth(validation.get("valid"))) and not bare
     reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
-        reason = "it takes over no configuration from the running system"
+        reason = "it does not accept a configuration from the running system"
     return FirmwareCheck(
         valid=passed,
         reason="" if passed else reason,
@@ -161,9 +161,9 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
 
 
 def start_sysupgrade(connection: Connection, image_path: str, config_path: str) -> None:
-    """Flash the image, keep nothing but what the tar.gz at `config_path` holds (`sysupgrade -n -f`), detached.
+    """Flash the image with only the configuration in the tar.gz at `config_path` (`sysupgrade -n -f`), detached.
 
-    Returns once it is started. The connection will break; only a new boot id, the expected revision and the marker in
+    Returns once it is started; the connection will break. Only a new boot id, the expected revision and the marker in
     the flashed configuration prove success.
     """
     act = f"exec /sbin/sysupgrade -n -f {quoted(config_path)} {quoted(image_path)} >/tmp/sysupgrade.log 2>&1"
@@ -171,17 +171,17 @@ def start_sysupgrade(connection: Connection, image_path: str, config_path: str) 
 
 
 def reboot(connection: Connection) -> None:
-    """Reboot, detached. A change that is armed and not confirmed is undone by the boot."""
+    """Reboot, detached. The boot rolls back an unconfirmed change."""
     _detached(connection, "reboot", "/bin/sync; exec /sbin/reboot")
 
 
 def reload_config(connection: Connection) -> None:
-    """`reload_config`: every service whose configuration changed. For a change that may cut us off use `deadman`."""
+    """Reload every service whose configuration changed. Use `deadman` for a change that may cut the connection."""
     connection.run("/sbin/reload_config").check(f"{connection.endpoint.label}: reload the configuration")
 
 
 def _detached(connection: Connection, name: str, act: str) -> None:
-    # matched by a pid file that is not there: -x alone would find any running shell and start nothing
+    # with a fresh pid file, because -x alone would match any running shell and start nothing
     pid_file = f"/tmp/meshctl/{name}.pid"
     daemon = quoted(f"sleep {DETACHED_DELAY_S}; {act}")
     start = f"start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"

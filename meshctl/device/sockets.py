@@ -1,4 +1,4 @@
-"""The TCP connection below SSH: to an endpoint's address, through the interface it names if it names one."""
+"""The TCP connection below SSH, bound to the endpoint's interface if it has one."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from meshctl.device.errors import Timeout, Unreachable
 def open_socket(endpoint: Endpoint, limits: Deadlines) -> socket.socket:
     """A connected socket. Raises Timeout, Unreachable.
 
-    With `endpoint.interface` it leaves by that interface whatever the routes say (SO_BINDTODEVICE, socket(7); without
-    privileges since Linux 5.7), so that devices with one and the same address are told apart by where they are plugged.
+    With `endpoint.interface` it uses that interface whatever the routing table says (SO_BINDTODEVICE, socket(7);
+    unprivileged since Linux 5.7), which distinguishes devices with the same address by the port they are plugged into.
     """
     try:
         sock = _connected(endpoint, limits.connect_s)
@@ -28,7 +28,7 @@ def open_socket(endpoint: Endpoint, limits: Deadlines) -> socket.socket:
         raise Unreachable(
             f"{endpoint.label}: cannot connect: {error.strerror or error}", hint=_interface_hint(endpoint, error)
         ) from error
-    # between commands keepalives ask for no answer, so the kernel has to notice that nobody acknowledges them
+    # between commands keepalives want no reply, so the kernel has to notice missing acknowledgements
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 4 * limits.keepalive_s * 1000)
     return sock
 
@@ -54,17 +54,17 @@ def _interface_hint(endpoint: Endpoint, error: OSError) -> str:
         return ""
     match error.errno:
         case errno.ENODEV:
-            return f"there is no interface {name} here: `ip link` lists them"
+            return f"this machine has no interface {name}: `ip link` lists them"
         case errno.EPERM:
             return "binding to an interface needs Linux 5.7, or root"
         case errno.ENETUNREACH | errno.EHOSTUNREACH | errno.EADDRNOTAVAIL:
-            return f"is the cable in, and has {name} an address in the same network? `ip addr show {name}`"
+            return f"check the cable, and that {name} has an address in the same network: `ip addr show {name}`"
         case _:
             return ""
 
 
 def _reverse_path_hint(interface: str) -> str:
-    """Strict reverse path filtering drops answers that come in where the kernel would not have sent (RFC 3704)."""
+    """Strict reverse path filtering drops packets on an interface the kernel would not have used (RFC 3704)."""
     if not interface:
         return ""
     values = []

@@ -1,8 +1,8 @@
-"""SSH to one node: socket or tunnel -> key exchange -> host key judged -> login -> `SshConnection` -> `run`.
+"""SSH to one node: socket or tunnel -> key exchange -> host key check -> login -> `SshConnection` -> `run`.
 
-`connect` walks that line, each step under its own deadline. paramiko waits without bound in places (the answer to
-`exec`, a full TCP buffer), so every wait here runs under a `Watch`, which closes the transport when time is up, or when
-the server gives no sign of life: all of paramiko's waits end then. Such a connection cannot be used again.
+`connect` does these steps, each with its own deadline. Some waits of paramiko have no timeout (the answer to `exec`, a
+full TCP buffer), so every wait here runs under a `Watchdog`. It closes the transport on timeout or silence, which ends
+all of paramiko's waits; the connection cannot be used again.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ from meshctl.model import Release
 
 __all__ = ["SshConnection", "connect"]
 
-# OpenWrt's dropbear closes after three refusals (MaxAuthTries in /etc/init.d/dropbear).
+# OpenWrt's dropbear closes the connection after three refusals (MaxAuthTries in /etc/init.d/dropbear).
 MAX_LOGINS_PER_CONNECTION = 3
-# What one command may say; more than any observation, less than what would hurt the host with 200 nodes at once.
+# The output limit of a command: more than any observation, but bounded for 200 nodes in parallel.
 MAX_OUTPUT_BYTES = 16 << 20
-# Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread of its own.
+# Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread.
 MAX_INLINE_STDIN_BYTES = 8 << 10
 _READ_BYTES = 32 << 10
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
-# paramiko reports every failed connection on stderr unless its logger has a handler; our errors say it once.
+# Without a handler, paramiko's logger would print every failed connection on stderr, beside our errors.
 logging.getLogger("paramiko").addHandler(logging.NullHandler())
 
 
@@ -62,8 +62,8 @@ def connect(
 ) -> SshConnection:
     """An authenticated connection to `endpoint`, through the node of `via` if given.
 
-    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; a server that offers nothing else is met with it when the
-    node's `release` is 19.07. Raises Unreachable, Timeout, ConnectionLost, IncompatibleServer, HostKeyUnknown,
+    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; otherwise it is used only if the server offers nothing else
+    and the node's `release` is 19.07. Raises Unreachable, Timeout, ConnectionLost, IncompatibleServer, HostKeyUnknown,
     HostKeyChanged, AuthenticationRefused, and InputError for an unusable key file.
     """
     limits = deadlines or Deadlines()
@@ -78,7 +78,7 @@ def connect(
             except _OnlySha1 as error:
                 if legacy or release is not Release.V19_07:
                     raise IncompatibleServer(
-                        f"{endpoint.label}: offers only RSA with SHA-1 as host key",
+                        f"{endpoint.label}: offers only an RSA host key with SHA-1",
                         hint="only OpenWrt 19.07 does; set the node's release, or upgrade it by cable",
                     ) from error
                 legacy = True
@@ -95,17 +95,17 @@ def connect(
             allowed = refused or allowed
             remaining = remaining[MAX_LOGINS_PER_CONNECTION:]
             if not remaining:
-                given = ", ".join(tried) or "no credentials at all"
+                given = ", ".join(tried) or "no credentials"
                 raise AuthenticationRefused(
-                    f"{endpoint.label}: let {endpoint.user} in with none of: {given}",
+                    f"{endpoint.label}: login refused for {endpoint.user}; tried: {given}",
                     tried=tuple(tried),
                     allowed=allowed,
-                    hint="name a key file whose public part is in the node's /etc/dropbear/authorized_keys",
+                    hint="use a key whose public part is in the node's /etc/dropbear/authorized_keys",
                 )
 
 
 class _OnlySha1(Exception):
-    """No host key algorithm in common; 19.07's dropbear is the known reason."""
+    """No host key algorithm in common, as with the dropbear of 19.07."""
 
 
 @contextmanager
@@ -118,9 +118,9 @@ def _translating_errors(
     activity: ActivityStream | None = None,
     silence_s: float = 0.0,
 ) -> Iterator[None]:
-    """Foreign exceptions become ours here; a wait that took too long is told as such whatever it made paramiko raise.
+    """Translate exceptions of paramiko and the OS into ours; a timeout takes precedence over what paramiko raises.
 
-    With `heard`, a connection that is silent for `silence_s` meanwhile is lost.
+    With `activity`, a connection that is silent for `silence_s` is lost.
     """
     with Watchdog(transport, seconds, activity=activity, silence_s=silence_s) as watchdog:
         try:
@@ -162,7 +162,7 @@ def _handshake(
                 raise IncompatibleServer(f"{endpoint.label}: {error}") from error
             except paramiko.SSHException as error:
                 if any(word in str(error) for word in ("protocol version", "SSH banner", "codec can't decode")):
-                    raise IncompatibleServer(f"{endpoint.label}: what answers there does not speak SSH") from error
+                    raise IncompatibleServer(f"{endpoint.label}: what answers is not an SSH server") from error
                 raise
         remote = transport.get_remote_server_key()
         trust.check(endpoint, HostKey(remote.get_name(), remote.asbytes()))
@@ -174,7 +174,7 @@ def _handshake(
 
 
 def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy: bool) -> None:
-    """Ask for a host key of a type that is pinned; the others stay offered, so that a change is seen as one."""
+    """Prefer the host key types that are pinned; the others stay offered, so that a changed key is detected."""
     rsa = (*_RSA_SHA2, SSH_RSA) if legacy else _RSA_SHA2
     pinned = [name for key in known for name in (rsa if key.key_type == SSH_RSA else (key.key_type,))]
     options = transport.get_security_options()
@@ -188,7 +188,7 @@ def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy
 def _login(
     endpoint: Endpoint, transport: paramiko.Transport, attempts: list[LoginAttempt], limits: Deadlines
 ) -> tuple[bool, tuple[str, ...]]:
-    """Whether one of `wanted` was accepted, and otherwise what the server said it would accept."""
+    """Whether one of `attempts` was accepted, and otherwise the methods the server offers."""
     allowed: tuple[str, ...] = ()
     for attempt in attempts:
         with _translating_errors(endpoint, transport, limits.auth_s, "authentication"):
@@ -198,7 +198,7 @@ def _login(
                 allowed = tuple(error.allowed_types)
             except paramiko.AuthenticationException:
                 if not transport.is_active():
-                    # it hung up on the refusal, as dropbear does after the last one it allows
+                    # dropbear closes the connection after the last refusal it allows
                     return False, allowed
             except (paramiko.SSHException, EOFError):
                 if not transport.is_active() and attempt is attempts[-1]:
@@ -210,7 +210,7 @@ def _login(
 
 
 class SshConnection(Connection):
-    """See `Connection`. Also carries tunnels to nodes behind this one."""
+    """See `Connection`. Also opens tunnels to nodes behind this one."""
 
     def __init__(
         self, endpoint: Endpoint, transport: paramiko.Transport, limits: Deadlines, activity: ActivityStream
@@ -240,7 +240,7 @@ class SshConnection(Connection):
 
     @property
     def host_key_algorithm(self) -> str:
-        """The signature the server proved itself with: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
+        """The server's signature algorithm: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
         return str(self._transport.host_key_type)
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
@@ -283,7 +283,7 @@ class SshConnection(Connection):
 
     def close(self) -> None:
         self._transport.close()
-        # its thread closes the socket; a caller that opens hundreds should not outrun them
+        # wait for the thread that closes the socket: a caller may open hundreds
         self._transport.join(timeout=2.0)
 
     def __enter__(self) -> SshConnection:
@@ -297,7 +297,7 @@ class SshConnection(Connection):
 
 @contextmanager
 def _ignoring_closed() -> Iterator[None]:
-    """Closing what is already gone is no error."""
+    """Closing what is already closed is no error."""
     try:
         yield
     except (paramiko.SSHException, OSError, EOFError):
@@ -305,7 +305,7 @@ def _ignoring_closed() -> Iterator[None]:
 
 
 class _Feeder(threading.Thread):
-    """Writes stdin while the main thread reads; `failure` is what the source of the bytes raised, if anything."""
+    """Writes stdin while the main thread reads; `failure` is the exception of the data source, if any."""
 
     def __init__(self, channel: paramiko.Channel, pieces: Iterable[bytes]) -> None:
         super().__init__(daemon=True)
@@ -321,13 +321,13 @@ class _Feeder(threading.Thread):
             except StopIteration:
                 break
             except OSError as error:
-                self.failure = UploadFailed(f"cannot read what is to be sent: {error}")
+                self.failure = UploadFailed(f"cannot read the data to upload: {error}")
                 break
             try:
                 self._channel.sendall(piece)
             except (paramiko.SSHException, OSError, EOFError):
-                # The command ended without reading all of it, as its exit status says, or the link was cut, as the
-                # reader finds out.
+                # The command ended without reading all of it, which its exit status shows, or the link was cut, which
+                # the reader detects.
                 return
         with _ignoring_closed():
             self._channel.shutdown_write()
@@ -337,7 +337,7 @@ class _Feeder(threading.Thread):
 def _sending_stdin(
     channel: paramiko.Channel, preamble: bytes, pieces: Iterable[bytes], *, inline: bool
 ) -> Iterator[_Feeder | None]:
-    """Send `preamble` and `pieces` to the command: at once when they fit its window, else beside the reading."""
+    """Send `preamble` and `pieces` to the command: at once if they fit its window, else from a thread."""
     if inline:
         text = preamble + b"".join(pieces)
         if len(text) <= MAX_INLINE_STDIN_BYTES:
@@ -365,7 +365,7 @@ def _chained(first: bytes, rest: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _collect(channel: paramiko.Channel, label: str) -> tuple[bytes, bytes]:
-    """Both outputs, read side by side until the command has closed them and told its status. Raises OutputTooLarge."""
+    """Read stdout and stderr until both are closed and the exit status is known. Raises OutputTooLarge."""
     out, err = bytearray(), bytearray()
     poll = select.poll()
     poll.register(channel.fileno(), select.POLLIN)
@@ -377,17 +377,17 @@ def _collect(channel: paramiko.Channel, label: str) -> tuple[bytes, bytes]:
             err += channel.recv_stderr(_READ_BYTES)
         if len(out) + len(err) > MAX_OUTPUT_BYTES:
             raise OutputTooLarge(
-                f"{label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB, and was ended",
-                hint="print less there (`| tail -n 100`), or read it with `meshctl ssh NODE -- COMMAND > FILE`",
+                f"{label}: the command printed more than {MAX_OUTPUT_BYTES >> 20} MiB and was ended",
+                hint="print less (`| tail -n 100`), or use `meshctl ssh NODE -- COMMAND > FILE`",
             )
         if ended:
             return bytes(out), bytes(err)
-        # the exit status has no file descriptor, so look again from time to time
+        # the exit status has no file descriptor, so poll with a timeout
         poll.poll(_next_look_ms(channel))
 
 
 def _next_look_ms(channel: paramiko.Channel) -> int:
-    """Output or EOF wakes the poll at once; after EOF only the exit status is missing, and it follows at once."""
+    """The poll timeout: output and EOF wake it; after EOF only the exit status is missing."""
     if not channel.eof_received:
         return 500
     channel.status_event.wait(0.5)

@@ -1,9 +1,9 @@
-"""Which host key is believed: pins in the fleet's own file, in OpenSSH's known_hosts format.
+"""Host key pinning: the fleet's file of pins, in OpenSSH's known_hosts format.
 
-A server's key arrives as `HostKey`; a `HostKeyPolicy` accepts it or raises. `TrustStore` is the file: a known key
-passes, an unknown one is `HostKeyUnknown`, another one `HostKeyChanged`. `FirstContact` asks about unknown keys and
-pins the accepted; `AfterFlash` lets one announced change through. Names are those of the inventory, so that
-`ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same.
+A `HostKeyPolicy` accepts a server's `HostKey` or raises. `TrustStore` is the file: a pinned key passes, an unknown one
+is `HostKeyUnknown`, a different one `HostKeyChanged`. `FirstContact` asks about unknown keys and pins accepted ones;
+`AfterFlash` accepts one expected change; `AcceptAnyKey` accepts any. Names are those of the inventory, so that
+`ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same keys.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from meshctl.errors import InputError
 
 @dataclass(frozen=True, slots=True)
 class HostKey:
-    """A server's public key: its type (`ssh-ed25519`) and the blob that known_hosts writes in base64."""
+    """A server's public key: its type (`ssh-ed25519`) and the blob that is base64 in known_hosts."""
 
     key_type: str
     blob: bytes
@@ -45,7 +45,7 @@ class HostKey:
 
 
 def parse_key(text: str) -> HostKey:
-    """A key from `TYPE BASE64 [comment]`. Raises ValueError when it is none or its blob names another type."""
+    """Parse `TYPE BASE64 [comment]`. Raises ValueError for anything else, or a blob of another type."""
     words = text.split()
     if len(words) < 2:
         raise ValueError(f"expected `TYPE BASE64`, found {text!r}")
@@ -53,7 +53,7 @@ def parse_key(text: str) -> HostKey:
         blob = base64.b64decode(words[1], validate=True)
     except binascii.Error as error:
         raise ValueError(f"expected base64 after {words[0]}: {error}") from error
-    # RFC 4253 section 6.6: a blob begins with its own type as a length-prefixed string
+    # RFC 4253 section 6.6: a blob starts with its type as a length-prefixed string
     length = int.from_bytes(blob[:4], "big")
     if len(blob) < 4 or blob[4 : 4 + length] != words[0].encode("ascii", "replace"):
         raise ValueError(f"the key's data is not of type {words[0]}")
@@ -62,7 +62,7 @@ def parse_key(text: str) -> HostKey:
 
 @dataclass(frozen=True, slots=True)
 class Pin:
-    """One line of the file: the names it is for, its marker (`@revoked` or empty), the key."""
+    """One line of the file: names, marker (`@revoked` or empty), key."""
 
     names: tuple[str, ...]
     key: HostKey
@@ -86,9 +86,9 @@ def _hashed_as(pattern: str, name: str) -> bool:
 
 
 def parse_pins(text: str, *, source: str = "known_hosts") -> tuple[Pin, ...]:
-    """All lines of a known_hosts file. Raises InputError naming the line that cannot be read.
+    """All pins of a known_hosts file. Raises InputError with the number of an invalid line.
 
-    `@cert-authority` lines and patterns with `*`, `?` or `!` are refused: a fleet's file names each node.
+    `@cert-authority` lines and patterns with `*`, `?` or `!` are invalid: a fleet's file names each node.
     """
     pins = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -113,19 +113,19 @@ def dump_pins(pins: tuple[Pin, ...]) -> str:
 
 
 class HostKeyPolicy(Protocol):
-    """Says which keys are known for a node, so that the server is asked for one of their types, and judges its key."""
+    """Knows the keys of a node, so that the server is asked for one of their types, and checks its key."""
 
     def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]: ...
 
     def check(self, endpoint: Endpoint, key: HostKey) -> None:
-        """Return if the key is to be believed; else raise HostKeyUnknown or HostKeyChanged."""
+        """Return if the key is trusted; else raise HostKeyUnknown or HostKeyChanged."""
         ...
 
 
 class TrustStore:
-    """The fleet's file of pins. `inventory` adds the keys an inventory pins itself (node name -> `TYPE BASE64` lines).
+    """The fleet's file of pins. `inventory` adds the keys pinned in the inventory (node name -> `TYPE BASE64` lines).
 
-    Reads are fresh each time; writes lock, replace the file in one rename, and keep every line they do not concern.
+    Every read opens the file; a write locks it, replaces it in one rename, and keeps all unrelated lines.
     """
 
     def __init__(self, path: Path, *, inventory: Mapping[str, tuple[str, ...]] | None = None) -> None:
@@ -150,7 +150,7 @@ class TrustStore:
         return self.pinned(endpoint.pin_name)
 
     def pinned(self, name: str) -> tuple[HostKey, ...]:
-        """The keys believed for `name`, those of the file first."""
+        """The trusted keys of `name`, those of the file first."""
         pins = self.pins()
         revoked = {pin.key for pin in pins if pin.marker}
         keys = [pin.key for pin in pins if not pin.marker and pin.covers(name)]
@@ -160,7 +160,7 @@ class TrustStore:
     def check(self, endpoint: Endpoint, key: HostKey) -> None:
         if any(pin.marker and pin.key == key for pin in self.pins()):
             raise HostKeyChanged(
-                f"{endpoint.label}: shows a revoked host key {key.fingerprint} ({key.key_type})",
+                f"{endpoint.label}: has a revoked host key {key.fingerprint} ({key.key_type})",
                 fingerprint=key.fingerprint,
                 key_type=key.key_type,
             )
@@ -169,19 +169,19 @@ class TrustStore:
             return
         if not pinned:
             raise HostKeyUnknown(
-                f"{endpoint.label}: no host key is pinned; it shows {key.fingerprint} ({key.key_type})",
+                f"{endpoint.label}: no host key is pinned; it has {key.fingerprint} ({key.key_type})",
                 fingerprint=key.fingerprint,
                 key_type=key.key_type,
-                hint=f"compare it with the node's own, then run `meshctl trust {endpoint.pin_name}`",
+                hint=f"compare it with the key on the node, then run `meshctl trust {endpoint.pin_name}`",
             )
         raise HostKeyChanged(
             f"{endpoint.label}: the host key changed: pinned {', '.join(pin.fingerprint for pin in pinned)}, "
-            f"shows {key.fingerprint} ({key.key_type})",
+            f"found {key.fingerprint} ({key.key_type})",
             fingerprint=key.fingerprint,
             key_type=key.key_type,
             pinned=tuple(pin.fingerprint for pin in pinned),
-            hint="another device, a flash meshctl did not do, or an attack; "
-            f"`meshctl trust {endpoint.pin_name} --replace` once you know",
+            hint="another device, a flash without meshctl, or an attack; "
+            f"run `meshctl trust {endpoint.pin_name} --replace` once you know the reason",
         )
 
     def add(self, name: str, *keys: HostKey) -> None:
@@ -220,7 +220,7 @@ def _without(pins: list[Pin], name: str) -> Iterator[Pin]:
 
 
 class FirstContact:
-    """Asks `accept` about a key nobody pinned yet, and pins it when the answer is yes; a changed key stays refused."""
+    """Asks `accept` about an unknown key and pins it if accepted; a changed key is still refused."""
 
     def __init__(self, store: TrustStore, accept: Callable[[Endpoint, HostKey], bool]) -> None:
         self._store = store
@@ -239,10 +239,10 @@ class FirstContact:
 
 
 class AfterFlash:
-    """The one change of key that is expected: after a flash, a node may show one of `expected` and nothing else new.
+    """Accepts the expected key change after a flash, and nothing else new.
 
-    `expected` are the fingerprints of the keys that went into the flashed configuration. The pin is replaced when the
-    node shows one of them.
+    `expected` are the fingerprints of the keys in the flashed configuration. The pin is replaced when the node has one
+    of them.
     """
 
     def __init__(self, store: TrustStore, name: str, expected: tuple[str, ...]) -> None:
@@ -263,7 +263,7 @@ class AfterFlash:
 
 
 class AcceptAnyKey:
-    """Believes any host key, and keeps it: on the bench a cable is the proof, and the key is pinned right after."""
+    """Accepts any host key and records it: on the bench the cable is the proof, and the key is pinned afterwards."""
 
     def __init__(self) -> None:
         self.key: HostKey | None = None

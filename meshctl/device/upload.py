@@ -1,9 +1,9 @@
-"""Bring a file to a node that has no SFTP, over a link that drops: survey, send what is missing, prove, put in place.
+"""Upload a file to a node without SFTP, over an unreliable link: survey, send missing chunks, verify, rename.
 
-The node's partial file is named after the target and the content's hash, so two contents never mix. A survey hashes
-what is there chunk by chunk; everything up to the first chunk that differs is kept and the rest sent, one chunk for
-each command, each answered with the hash of what was written. At the end the whole is hashed on the node and renamed. A
-cut at any point leaves a partial file, and the next `upload` goes on from it. Bytes travel by `cat`.
+The partial file on the node is named after the target and the content's hash, so two contents never mix. A survey
+hashes it chunk by chunk; everything before the first differing chunk is kept. The other chunks are sent with one
+command each, which answers with the hash of what was written. At the end the whole file is hashed on the node and
+renamed. After a cut, the next `upload` resumes from the partial file. The data goes through `cat`.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from meshctl.device.errors import UploadFailed
 from meshctl.device.framing import quoted
 from meshctl.errors import InputError
 
-# Long enough that the two extra round trips of a chunk do not count, short enough to lose little by a cut: at 1 Mbit/s
-# a chunk takes two seconds.
+# Large enough that the round trips of a chunk do not matter, small enough to lose little at a cut: at 1 Mbit/s a chunk
+# takes two seconds.
 CHUNK_BYTES = 256 << 10
-# A link slower than this is as good as gone; it bounds how long one chunk may take.
+# A slower link counts as lost; bounds how long a chunk may take.
 MIN_BYTES_PER_S = 4 << 10
-# Pieces a rate limit is held with.
+# The unit of rate limiting.
 _PIECE_BYTES = 4 << 10
 _COMMAND_TIMEOUT_S = 60.0
-# How often a chunk that arrived damaged is surveyed anew; a leftover writer of a cut connection can cause one.
+# How often to survey again after a damaged chunk, which a leftover writer of a cut connection can cause.
 MAX_SURVEYS = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """`verified` of `total` bytes are on the node and their hashes agree."""
+    """`verified` of `total` bytes are on the node with matching hashes."""
 
     verified: int
     total: int
@@ -41,7 +41,7 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Uploaded:
-    """What an upload did: `sent` bytes travelled, `kept` were there from before a cut."""
+    """The result of an upload: `sent` bytes were sent, `kept` bytes were there from before a cut."""
 
     path: str
     sha256: str
@@ -51,7 +51,7 @@ class Uploaded:
 
 
 class Content:
-    """What is to be sent, read chunk by chunk: bytes in memory or a file. Raises InputError for an unreadable file."""
+    """The data to upload, read chunk by chunk: bytes or a file. Raises InputError for an unreadable file."""
 
     def __init__(self, source: bytes | Path) -> None:
         self._source = source
@@ -88,10 +88,10 @@ def upload(
     progress: Callable[[Progress], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Uploaded:
-    """Make `path` on the node hold exactly `source`, with `mode`; a second call after a cut goes on where it stopped.
+    """Write `source` to `path` on the node, with `mode`; a second call after a cut resumes.
 
-    Raises UploadFailed when the node has no room or the bytes do not agree, Timeout and ConnectionLost for the link;
-    in each case `path` is untouched.
+    Raises UploadFailed if the node has no space or the data does not match, Timeout and ConnectionLost for the link;
+    then `path` is unchanged.
     """
     content = Content(source)
     partial = _partial(path, content)
@@ -116,7 +116,7 @@ def upload(
             report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
         if good == content.chunks and _put_in_place(connection, partial, path, content, mode):
             return Uploaded(path, content.sha256, content.size, sent, min(kept_at_first, content.size))
-    raise UploadFailed(f"{connection.endpoint.label}: {path}: the bytes that arrive are not those sent")
+    raise UploadFailed(f"{connection.endpoint.label}: {path}: the data was corrupted on the way")
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ def _partial(path: str, content: Content) -> str:
     return str(target.parent / f".{target.name}.{content.sha256[:16]}.part")
 
 
-# The oldest partial files of other contents go: nobody will resume them, and they fill a small /tmp.
+# Partial files of other contents are removed: they are never resumed, and fill a small /tmp.
 _SURVEY = """\
 t={target} p={partial} size={size}
 d=${{t%/*}}
@@ -174,7 +174,7 @@ def _survey(connection: Connection, path: str, partial: str, content: Content) -
     return _Survey(False, good)
 
 
-# dd with nothing to copy only cuts the file at its seek position: OpenWrt has no truncate.
+# dd without input truncates the file at its seek position: OpenWrt has no truncate.
 _CHUNK = """\
 p={partial}
 dd if=/dev/null of="$p" bs=1 seek={start} 2>/dev/null || exit 1
@@ -204,17 +204,17 @@ def _send_chunk(
 
 
 def _paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None]) -> Iterator[bytes]:
-    """`data` in pieces, each followed by the pause its size costs at that rate."""
+    """`data` in pieces, each followed by the pause for its size at that rate."""
     for start in range(0, len(data), _PIECE_BYTES):
         piece = data[start : start + _PIECE_BYTES]
         yield piece
         sleep(len(piece) / rate_bytes_per_s)
 
 
-# A leftover writer may have added to the end; where bytes are missing instead, the hash tells.
+# Truncated first, because a leftover writer may have appended data; the hash detects missing data.
 #
-# sync is the whole machine's, on purpose: `sync FILE` needs busybox's FEATURE_SYNC_FANCY, which OpenWrt leaves out, and
-# `fsync FILE` secures the content but not the rename. A radio has little else that is unwritten: logs are in memory.
+# sync is global on purpose: `sync FILE` needs busybox's FEATURE_SYNC_FANCY, which OpenWrt leaves out, and `fsync FILE`
+# secures the content but not the rename. A radio has little other unwritten data: logs are in memory.
 _FINISH = """\
 p={partial} t={target}
 dd if=/dev/null of="$p" bs=1 seek={size} 2>/dev/null || exit 1

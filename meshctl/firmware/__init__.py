@@ -1,4 +1,4 @@
-"""OpenWrt images: trailers -> metadata -> board, release and revision; hash and signature beside them."""
+"""OpenWrt images: trailers -> metadata -> board, release and revision; and their hash and signature."""
 
 from meshctl.firmware.check import check, image_path, image_version, is_revision, sha256
 from meshctl.firmware.metadata import Metadata, parse_metadata, read_metadata

@@ -1,8 +1,8 @@
-"""An image on disk against its hardware profile: everything that can be known before it is sent anywhere.
+"""Check an image against its hardware profile, before it is sent to a node.
 
-In order: it can be read; its SHA-256 is the one written down; its trailers are whole; it is for this board, target and
-release, and of this revision; and, when the profile names a key, its maker signed it. The device itself checks less:
-stock images accept any signature, and no device checks that a revision is the wanted one.
+In order: it is readable; its SHA-256 matches; its trailers are intact; board, target, release and revision match; and,
+if the profile names a key, its signature is valid. The device checks less: stock images accept any signature, and no
+device checks the revision.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, ve
 from meshctl.inventory.file_access import special_file
 from meshctl.model import HardwareProfile
 
-# The codes, each with what it means (docs/render.md).
+# The codes are documented in docs/render.md.
 UNREADABLE = "FW001"
 WRONG_HASH = "FW002"
 DAMAGED = "FW003"
@@ -27,14 +27,14 @@ WRONG_RELEASE = "FW006"
 WRONG_REVISION = "FW007"
 BAD_SIGNATURE = "FW008"
 
-# The largest flash of any supported board; what is larger is no image, and is not read into memory.
+# The largest flash of any supported board; a larger file is not an image, and is not read into memory.
 MAX_IMAGE_BYTES = 256 * 1024 * 1024
-# Key, signature and hash list are short texts; a profile with a hundred images has a list of 20 kB.
+# Key, signature and hash list are short texts; the list of a hundred images has 20 kB.
 _MAX_TEXT_BYTES = 1024 * 1024
 
 
 def check(image: Path, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
-    """What is wrong with `image` for `profile`; empty when nothing is. Positions name the files concerned."""
+    """The faults of `image` for `profile`. Positions name the files concerned."""
     try:
         content = _read(image, MAX_IMAGE_BYTES)
     except OSError as error:
@@ -47,13 +47,13 @@ def check(image: Path, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
 
 
 def image_path(profile: HardwareProfile) -> Path | None:
-    """Where the profile's image is, None when it names none."""
+    """The path of the profile's image, None if it names none."""
     firmware = profile.firmware
     return Path(firmware.base) / firmware.image if firmware.image else None
 
 
 def image_version(image: Path) -> str:
-    """OpenWrt's version by the image's metadata, such as `25.12.0-rc1`; empty when it cannot be read or has none."""
+    """The OpenWrt version in the image's metadata, such as `25.12.0-rc1`; empty if unknown."""
     try:
         metadata = read_metadata(_read(image, MAX_IMAGE_BYTES))
     except (OSError, ValueError, DamagedImage):
@@ -80,7 +80,7 @@ def _check_hash(image: Path, content: bytes, expected: str) -> tuple[Diagnostic,
     found = sha256(content)
     if not expected or found == expected.lower():
         return ()
-    return (_error(WRONG_HASH, image, "another file than the inventory names", expected=expected.lower(), found=found),)
+    return (_error(WRONG_HASH, image, "not the image named in the inventory", expected=expected.lower(), found=found),)
 
 
 def _check_metadata(image: Path, content: bytes, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
@@ -90,7 +90,7 @@ def _check_metadata(image: Path, content: bytes, profile: HardwareProfile) -> tu
         return (_error(DAMAGED, image, str(error)),)
     if metadata is None:
         hint = "use the sysupgrade image, not the factory one"
-        return (_error(NO_METADATA, image, "no metadata: sysupgrade would refuse it", hint=hint),)
+        return (_error(NO_METADATA, image, "no metadata: sysupgrade would reject it", hint=hint),)
     return (*_check_board(image, metadata, profile), *_check_version(image, metadata, profile))
 
 
@@ -106,34 +106,34 @@ def _check_board(image: Path, metadata: Metadata, profile: HardwareProfile) -> t
 
 
 def _check_version(image: Path, metadata: Metadata, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
-    """Snapshots carry no release number and pass; so does what does not tell."""
+    """Snapshots have no release number and pass, as do images without a version or revision."""
     found = []
     release = str(profile.release)
     is_release = metadata.version[:1].isdigit()
     if is_release and metadata.version != release and not metadata.version.startswith((f"{release}.", f"{release}-")):
-        message = "another release than the profile's"
+        message = "built for another release than the profile's"
         found.append(_error(WRONG_RELEASE, image, message, expected=release, found=metadata.version))
     wanted = profile.firmware.revision
     if wanted and metadata.revision and not is_revision(metadata.revision, wanted):
-        message = "another revision than the inventory names"
+        message = "not the revision named in the inventory"
         found.append(_error(WRONG_REVISION, image, message, expected=wanted, found=metadata.revision))
     return tuple(found)
 
 
 def is_revision(found: str, wanted: str) -> bool:
-    """`r24106` names `r24106-10cc5fcd00`, too."""
+    """Whether a revision matches; `r24106` also matches `r24106-10cc5fcd00`."""
     return found == wanted or found.startswith(f"{wanted}-")
 
 
 def _check_signature(image: Path, content: bytes, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
-    """By `IMAGE.sig`, or by `sha256sums` with `sha256sums.sig` beside the image, as OpenWrt publishes them."""
+    """Verify `IMAGE.sig`, or `sha256sums` and `sha256sums.sig` beside the image, as OpenWrt publishes them."""
     if not profile.firmware.usign_key:
         return ()
     key_path = Path(profile.firmware.base) / profile.firmware.usign_key
     try:
         key = parse_public_key(_text(key_path))
     except (BadSignature, OSError, UnicodeDecodeError) as error:
-        return (_error(BAD_SIGNATURE, key_path, f"no key to check {image.name} with: {_reason(error)}"),)
+        return (_error(BAD_SIGNATURE, key_path, f"no key to verify {image.name}: {_reason(error)}"),)
     own = image.with_name(f"{image.name}.sig")
     sums = image.with_name("sha256sums")
     try:
@@ -146,7 +146,7 @@ def _check_signature(image: Path, content: bytes, profile: HardwareProfile) -> t
         hint = (
             f"put {own.name}, or sha256sums and sha256sums.sig, beside the image" if isinstance(error, OSError) else ""
         )
-        return (_error(BAD_SIGNATURE, place, f"{image.name} is not signed: {_reason(error)}", hint=hint),)
+        return (_error(BAD_SIGNATURE, place, f"{image.name} has no valid signature: {_reason(error)}", hint=hint),)
 
 
 def _check_sums(image: Path, content: bytes, sums: Path, key: PublicKey) -> tuple[Diagnostic, ...]:
@@ -159,7 +159,7 @@ def _check_sums(image: Path, content: bytes, sums: Path, key: PublicKey) -> tupl
     found = sha256(content)
     if found == expected.lower():
         return ()
-    message = f"{image.name} is not the file that was signed"
+    message = f"{image.name} is not the signed file"
     return (_error(BAD_SIGNATURE, sums, message, expected=expected.lower(), found=found),)
 
 

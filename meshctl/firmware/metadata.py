@@ -1,4 +1,4 @@
-"""An image's metadata: JSON -> what the image is, and for which boards."""
+"""An image's metadata: its version, target and supported boards, from JSON."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from meshctl.firmware.trailer import DamagedImage, TrailerType, read_trailers
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """`boards` are those the image is made for, by the names that `ubus call system board` gives; `compat_version`
-    above 1.0 means that the configuration cannot be kept. The rest is empty where the image does not tell."""
+    """`boards` are the supported boards, named as in `ubus call system board`; `compat_version` above 1.0 means that
+    the configuration cannot be kept. A field is empty if the metadata lacks it."""
 
     boards: tuple[str, ...]
     compat_version: str = "1.0"
@@ -25,21 +25,19 @@ class Metadata:
 
 
 def read_metadata(image: bytes) -> Metadata | None:
-    """The metadata of an image, None when it has none. Raises DamagedImage when it has some that cannot be read."""
+    """The metadata of an image, None if it has none. Raises DamagedImage if it is unreadable."""
     for trailer in read_trailers(image):
         if not trailer.is_intact:
-            raise DamagedImage(
-                "expected the checksum that the image carries, found another: it is cut short or changed"
-            )
+            raise DamagedImage("checksum mismatch: the image is truncated or modified")
         if trailer.type is TrailerType.INFO:
             return parse_metadata(trailer.data)
     return None
 
 
 def parse_metadata(text: bytes) -> Metadata:
-    """The metadata's JSON (include/image-commands.mk, metadata_json). Raises DamagedImage for anything else."""
+    """Parse the metadata's JSON (include/image-commands.mk, metadata_json). Raises DamagedImage for anything else."""
     try:
-        # the writer may end it with a NUL or a line end
+        # it may end with a NUL or a newline
         document = json.loads(text.rstrip(b"\0\n").decode("utf-8"))
     except (ValueError, RecursionError) as error:
         raise DamagedImage(f"expected metadata in JSON, found something else: {error}") from error
@@ -48,7 +46,7 @@ def parse_metadata(text: bytes) -> Metadata:
     version = document.get("version")
     about: Mapping[str, Any] = version if isinstance(version, dict) else {}
     compat_version = _text(document, "compat_version") or "1.0"
-    # an image that breaks with older configurations hides its boards from older releases under another name
+    # an image that is incompatible with older configurations hides its boards from older releases under another key
     names = _texts(document, "supported_devices" if compat_version == "1.0" else "new_supported_devices")
     return Metadata(
         boards=names or _texts(document, "supported_devices"),

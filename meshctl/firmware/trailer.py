@@ -1,7 +1,7 @@
 """The trailers at the end of an OpenWrt image: bytes <-> trailers, innermost last (fwtool's fwimage.h and fwtool.c).
 
-A trailer is 16 bytes, big-endian: magic `FWx0`, a CRC-32 of everything in front of it, its type, and its size with the
-data before it. More than one may stand behind each other, so they are read from the end backwards.
+A trailer is 16 bytes, big-endian: magic `FWx0`, a CRC-32 of everything before it, its type, and its size including the
+data before it. An image may have several, so they are read from the end backwards.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class TrailerType(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Trailer:
-    """`data` without the info header; `is_intact` tells whether the CRC is right."""
+    """`data` is without the info header; `is_intact` is whether the CRC matches."""
 
     type: TrailerType
     data: bytes
@@ -38,14 +38,14 @@ class Trailer:
 
 
 class DamagedImage(ValueError):
-    """Trailers that contradict themselves; the text says how."""
+    """Inconsistent trailers; the text has the fault."""
 
 
 def read_trailers(image: bytes) -> tuple[Trailer, ...]:
-    """The image's trailers, the last one first; none for an image without.
+    """The image's trailers, the last one first.
 
-    Stops behind a trailer whose CRC is wrong, because nothing before it can be trusted. Raises DamagedImage for a size
-    that cannot be.
+    Stops after a trailer with a wrong CRC, because nothing before it can be trusted. Raises DamagedImage for an
+    impossible size.
     """
     return tuple(_trailers(image))
 
@@ -61,7 +61,7 @@ def _trailers(image: bytes) -> Iterator[Trailer]:
             raise DamagedImage(f"expected a trailer of at most {min(end, _MAX_DATA_BYTES)} bytes, found {size}")
         is_intact = crc == _crc(image[:start])
         data = image[end - size : start]
-        # types of later versions are passed over, as fwtool does
+        # unknown types are skipped, as fwtool does
         if kind == TrailerType.SIGNATURE.value:
             yield Trailer(TrailerType.SIGNATURE, data, is_intact)
         elif kind == TrailerType.INFO.value:
@@ -86,7 +86,7 @@ def _crc(data: bytes) -> int:
 
 
 def append_metadata(image: bytes, metadata: Mapping[str, object]) -> bytes:
-    """The image with metadata behind it, as `fwtool -I` writes it. Raises ValueError when it is too long."""
+    """The image with metadata appended, as by `fwtool -I`. Raises ValueError if it is too long."""
     text = json.dumps(metadata, separators=(",", ":")).encode()
     if len(text) > MAX_METADATA_BYTES:
         raise ValueError(f"metadata has at most {MAX_METADATA_BYTES} bytes, not {len(text)}")
@@ -94,7 +94,7 @@ def append_metadata(image: bytes, metadata: Mapping[str, object]) -> bytes:
 
 
 def append_signature(image: bytes, signature: bytes) -> bytes:
-    """The image with a signature behind it, as `fwtool -S` writes it. Raises ValueError when it is too long."""
+    """The image with a signature appended, as by `fwtool -S`. Raises ValueError if it is too long."""
     if len(signature) > MAX_SIGNATURE_BYTES:
         raise ValueError(f"a signature has at most {MAX_SIGNATURE_BYTES} bytes, not {len(signature)}")
     return _append(image, signature, TrailerType.SIGNATURE)

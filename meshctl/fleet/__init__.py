@@ -1,4 +1,4 @@
-"""Many nodes at once: bounded concurrency, one outcome per node, cancellation, and a journal that outlives us."""
+"""Work on many nodes: bounded concurrency, one outcome per node, cancellation, and a persistent journal."""
 
 from meshctl.fleet.events import Event, EventKind, Observer, Tee, silent
 from meshctl.fleet.interrupt import Interrupt

@@ -1,4 +1,4 @@
-"""What happens while a fleet is worked on, as values: for live lines, plain lines, JSON lines and the journal."""
+"""Events of a fleet run, as values: for live lines, plain lines, JSON lines and the journal."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from meshctl.fleet.outcome import Outcome
 
 
 class EventKind(Enum):
-    """`STEP` begins a step of a node, `PROGRESS` tells how far it is, `FINISHED` carries the node's outcome; `NOTE` is
-    a line about the node or (empty node) the whole run."""
+    """`STEP` starts a step of a node, `PROGRESS` has its progress, `FINISHED` the node's outcome; `NOTE` is a line
+    about the node or (empty node) the whole run."""
 
     STARTED = "started"
     STEP = "step"
@@ -43,7 +43,7 @@ def silent(event: Event) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Tee:
-    """Tells several observers, in order."""
+    """Passes events to several observers, in order."""
 
     observers: tuple[Observer, ...]
 

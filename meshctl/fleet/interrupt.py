@@ -1,9 +1,9 @@
-"""Ctrl-C as a value that work can look at.
+"""Ctrl-C as a value that running work checks.
 
-The first one stops taking up new nodes and lets those in work come to their end (a change that is armed is confirmed
-or undone within seconds). The second one leaves as soon as waits end that cannot be cut short: what is armed goes back
-by itself, the journal says so. The third one ends the process where it stands, which nodes and journal survive as they
-survive its death. A terminal that is closed counts as one.
+The first one stops starting new nodes and lets those in progress finish (an armed change is confirmed or rolled back
+within seconds). The second one exits as soon as waits that cannot be interrupted end: armed changes roll back by
+themselves, and the journal has them as uncertain. The third one ends the process at once, which nodes and journal
+survive like a crash. A closed terminal counts as one.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ class Interrupt:
         return self._leave.is_set()
 
     def request(self) -> None:
-        """Ask once to stop, twice to leave."""
+        """Request once to stop, twice to leave."""
         if self._stop.is_set():
             self._leave.set()
             self._report(
-                "leaving: what is armed on a node goes back by itself; `meshctl resume` takes it up again "
-                "(a third time to end without waiting for any connection)"
+                "leaving: armed changes roll back by themselves; run `meshctl resume` later "
+                "(Ctrl-C again to exit without closing connections)"
             )
         else:
             self._stop.set()
-            self._report("stopping: finishing the nodes in work, taking up no more (again to leave at once)")
+            self._report("stopping: finishing the nodes in progress, starting no more (Ctrl-C again to leave now)")
 
     def _report(self, text: str) -> None:
-        # whoever closed the terminal hears nothing more, and the work still has to come to its end
+        # the terminal may be closed, and the work still has to finish
         with suppress(OSError):
             self._say(text)
 
@@ -64,13 +64,13 @@ class Interrupt:
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGHUP and self.stopping:
-                # a closed terminal's shell says it once more
+                # the shell of a closed terminal sends a second SIGHUP
                 return
             if self.leaving:
                 _end()
             self.request()
 
-        # nohup has it ignored, and means it
+        # keep SIGHUP ignored under nohup
         hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
         previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, *hangup)}
         try:
@@ -81,7 +81,7 @@ class Interrupt:
 
 
 def _end() -> NoReturn:
-    """Without waiting for threads, some of which wait for sockets; live lines have hidden the cursor."""
+    """Exit without waiting for threads, which may wait for sockets, and show the cursor that live lines have hidden."""
     with suppress(OSError):
         os.write(2, b"\x1b[?25hended\n" if os.isatty(2) else b"ended\n")
     os._exit(ENDED)

@@ -1,11 +1,11 @@
-"""What was done to the fleet, on disk: runs, steps, outcomes, and the last known state of every node.
+"""The journal: runs, steps, outcomes, and the last known state of every node, on disk.
 
-One SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes write at once and a killed one leaves
-it readable). `Journal.begin` opens a run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`,
-`outcomes`, `unfinished` and `last_known` read it. Nothing secret is ever written.
+One SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes can write and a killed one leaves it
+readable). `Journal.begin` starts a run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`,
+`outcomes`, `unfinished` and `last_known` read it. It contains no secret.
 
-A fleet that is practised with in a lab has the same name and the same nodes as the real one. Their runs and facts are
-kept apart: a journal opened for a lab reads and writes under the fleet's name and the lab's directory.
+A lab's fleet has the same name and nodes as the real one. Their runs and facts are separate: a journal opened for a lab
+reads and writes under the fleet's name and the lab's directory.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from meshctl.fleet.outcome import Outcome, Result
 from meshctl.fleet.process import owner, process_lives, this_process
 
 SCHEMA_VERSION = 1
-# Two processes may write at once; each transaction takes milliseconds, so this is far more than ever needed.
+# Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
 BUSY_TIMEOUT_S = 20.0
-# In the middle of a run nodes wait to be confirmed: a journal that somebody holds is written to later.
+# During a run nodes wait to be confirmed, so a locked journal is written later.
 STEP_TIMEOUT_S = 1.0
-# between the name of a fleet and the directory of its lab; ASCII's own character for this (unit separator)
+# separates the name of a fleet and the directory of its lab (ASCII unit separator)
 _LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
-# Outcomes of a node that leave open what became of a change begun before.
+# Outcomes that leave the result of an earlier change unknown.
 _END_UNKNOWN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
 _SCHEMA = """
 CREATE TABLE runs (
@@ -60,7 +60,7 @@ _REMEMBER = (
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """One run; `result` is empty while it is under way, `interrupted` when its process died without a word."""
+    """One run; `result` is empty while it is in progress."""
 
     id: int
     command: str
@@ -97,7 +97,7 @@ class StepRecord:
 
 @dataclass(frozen=True, slots=True)
 class LastKnown:
-    """What a node told when it was last seen, at `seen_s` (Unix time)."""
+    """The facts of a node when it was last seen, at `seen_s` (Unix time)."""
 
     node: str
     seen_s: float
@@ -105,10 +105,10 @@ class LastKnown:
 
 
 class Journal:
-    """The file. Safe to use from several threads and processes; close it, or use it in a `with` block."""
+    """The journal file. Safe for several threads and processes; close it, or use a `with` block."""
 
     def __init__(self, path: Path, *, lab: str = "") -> None:
-        """`lab` is the directory of the virtual fleet that is worked with, empty for real nodes."""
+        """`lab` is the directory of a virtual fleet, empty for real nodes."""
         self.path = path
         self.lab = lab
         self._lock = threading.Lock()
@@ -133,7 +133,7 @@ class Journal:
             raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
 
     def _enter_wal(self) -> None:
-        # Two processes that create the file at once: SQLite answers "locked" here without waiting.
+        # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
         deadline = time.monotonic() + BUSY_TIMEOUT_S
         while True:
             try:
@@ -146,7 +146,7 @@ class Journal:
                 return
 
     def _create(self) -> None:
-        # whoever only reads waits for no writer
+        # a reader does not wait for a writer
         if self._version() == SCHEMA_VERSION:
             return
         with self._write() as database:
@@ -175,7 +175,7 @@ class Journal:
                     raise
                 self._database.execute("COMMIT")
             except sqlite3.Error as error:
-                # a COMMIT that found the disk full may have left its transaction open
+                # a COMMIT on a full disk may leave its transaction open
                 if self._database.in_transaction:
                     with suppress(sqlite3.Error):
                         self._database.execute("ROLLBACK")
@@ -192,7 +192,7 @@ class Journal:
             self._database.close()
 
     def begin(self, command: str, *, fleet: str, inventory: str, nodes: tuple[str, ...], plan: str = "") -> Run:
-        """A new run; every node of it stands as PENDING until it has an outcome."""
+        """Start a run; each of its nodes is PENDING until it has an outcome."""
         now = time.time()
         with self._write() as database:
             cursor = database.execute(
@@ -241,13 +241,13 @@ class Journal:
         return tuple(StepRecord(*row) for row in rows)
 
     def unfinished(self, run_id: int) -> tuple[str, ...]:
-        """The nodes of a run that a resume has to take up, in the run's order."""
+        """The nodes of a run that a resume has to finish, in the run's order."""
         return tuple(outcome.node for outcome in self.outcomes(run_id) if not outcome.result.is_settled)
 
     def unfinished_runs(self, fleet: str) -> dict[int, tuple[str, ...]]:
-        """Run -> the nodes that it left unfinished and no later run took up; the newest run first.
+        """Run -> the nodes that it left unfinished and that are in no later run; the newest run first.
 
-        Runs of `robots` and those of radios do not count as each other's successors.
+        Runs of `robots` and runs of radios are separate.
         """
         rows = self._read(
             "SELECT run, node, outcomes.result FROM outcomes JOIN runs ON id = run WHERE fleet = ?1 AND NOT EXISTS"
@@ -264,7 +264,7 @@ class Journal:
         return unfinished
 
     def unfinished_changes(self, fleet: str) -> dict[str, float]:
-        """The nodes on which a change was begun that no run saw the end of, and when the first such was (Unix time)."""
+        """Node -> when its first change started (Unix time) whose end no run has observed."""
         ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)
         rows = self._read(
             "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
@@ -277,7 +277,7 @@ class Journal:
         return dict(rows)
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
-        """Keep what a node told; an older sighting never replaces a newer one."""
+        """Store the facts of a node; older facts never replace newer ones."""
         self.remember_all(fleet, {node: facts}, seen_s)
 
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
@@ -291,10 +291,10 @@ class Journal:
         return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
 
     def move_lab_runs(self, fleet: str, lab_of: Callable[[str], str]) -> None:
-        """Give each lab its runs of `fleet` that an earlier version kept under the real fleet's name.
+        """Move each lab's runs of `fleet`, which an earlier version stored under the real fleet's name, to the lab.
 
-        `lab_of` gives the lab's directory by a run's inventory, empty for a real one. What was known of the nodes goes
-        along if all runs were one lab's; otherwise its origin is unknown, and it stays.
+        `lab_of` maps a run's inventory to the lab's directory, empty for a real fleet. The nodes' facts move only if
+        all runs are of one lab; otherwise their origin is unknown.
         """
         rows = self._read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
         labs = {inventory: lab_of(inventory) for (inventory,) in rows}
@@ -321,10 +321,10 @@ class Journal:
 
 
 class Run:
-    """One run being written. Steps and outcomes may come from several threads.
+    """Writes one run; steps and outcomes may come from several threads.
 
-    A journal that cannot be written (a full disk, another process that holds it) stops no work on nodes: a change that
-    is armed has to be confirmed. What it does not take is kept, and written with what comes next.
+    A journal that cannot be written (a full disk, a lock) does not stop the work on nodes, because an armed change has
+    to be confirmed. Failed writes are kept and repeated with the next one.
     """
 
     def __init__(self, journal: Journal, run_id: int) -> None:
@@ -332,12 +332,12 @@ class Run:
         self._guard = threading.Lock()
         self._pending: list[tuple[str, tuple[object, ...]]] = []
         self.id = run_id
-        # why the journal lacks something; what it lacks counts as not done to a resume
+        # why the journal is incomplete; a resume treats missing outcomes as not done
         self.error = ""
 
     def _put(self, statement: str, *values: object, wait_s: float = STEP_TIMEOUT_S) -> None:
         with self._guard:
-            # whoever could not write waits no second time before the end
+            # after a failed write, do not wait again before the end
             timeout_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
             self._pending.append((statement, values))
             try:
@@ -351,12 +351,12 @@ class Run:
                 self.error = ""
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
-        """Keep what a node told in the course of this run."""
+        """Store the facts of a node during this run."""
         self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, facts, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
-        """Record a step and how long it took; a step without an end was cut short by our own death."""
+        """Record a step and its duration; a step without an end was cut short by the end of our process."""
         began_s, clock = time.time(), time.monotonic()
         key = (self.id, node, name, began_s)
         self._put("INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", *key)
@@ -388,7 +388,7 @@ class Run:
 
 
 def _key_of(fleet: str, lab: str) -> str:
-    """What the tables have as a fleet. A fleet's name holds no control character, so the parts cannot be confused."""
+    """The value of the tables' `fleet` column. A fleet name has no control character, so the parts are unambiguous."""
     return f"{fleet}{_LAB_SEPARATOR}{lab}" if lab else fleet
 
 
@@ -402,7 +402,7 @@ def _sighting(fleet: str, node: str, facts: Mapping[str, str], seen_s: float) ->
     return fleet, node, seen_s, json.dumps(dict(facts), sort_keys=True)
 
 
-# SQLite's primary result codes (sqlite.org/rescode.html); the bits above these eight tell more about the same.
+# SQLite's primary result codes (sqlite.org/rescode.html) are the low eight bits of the extended ones.
 _PRIMARY = 0xFF
 _LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
 _UNWRITABLE = (
@@ -420,11 +420,11 @@ def _is_locked(error: Exception) -> bool:
 
 
 def _hint(error: Exception) -> str:
-    """What to do when the file cannot be used; empty when the file itself is at fault."""
+    """What to do if the file cannot be used; empty if its content is at fault."""
     if _is_locked(error):
-        return "another process holds it: `fuser` with its path names that process"
+        return "another process has locked it: run `fuser` with its path to find that process"
     if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
-        return "XDG_STATE_HOME=DIR keeps it elsewhere, on a disk with room that can be written"
+        return "set XDG_STATE_HOME to a directory on a writable disk with free space"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""The mark of a virtual fleet's directory, by which practice and field never share a journal."""
+"""Recognize the directory of a virtual fleet, so that its journal is separate from the real fleet's."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ KEY_COMMENT = "lab-operator"
 
 
 def is_lab(directory: Path) -> bool:
-    """Marked, or made by a meshctl that did not mark: then it has a fleet's description and the lab's login key."""
+    """Whether it is marked as a lab, or has the files of one from before the mark: a fleet spec and the login key."""
     if (directory / MARK).is_file():
         return True
     try:
@@ -24,7 +24,7 @@ def is_lab(directory: Path) -> bool:
 
 
 def lab_of(inventory: str) -> str:
-    """The directory of the lab whose copy `inventory` (a file or a directory) is; empty for a real one."""
+    """The directory of the lab that `inventory` (a file or a directory) belongs to; empty for a real one."""
     path = Path(inventory)
     for folder in (path, path.parent):
         if folder.name == INVENTORY and is_lab(folder.parent):

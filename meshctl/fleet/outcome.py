@@ -1,4 +1,4 @@
-"""What came of one node's work, in one word and one sentence."""
+"""The outcome of a node in a run: a result, a reason and facts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Result(Enum):
     """How a node's work ended. Every node of a run has exactly one."""
 
     DONE = "done"
-    # nothing to do: the node already is as the inventory says
+    # nothing to do: the node matches the inventory
     UNCHANGED = "unchanged"
     # the change was applied and did not prove itself: the node runs its previous state again
     ROLLED_BACK = "rolled back"
@@ -21,11 +21,11 @@ class Result(Enum):
     FAILED = "failed"
     # it did not answer, so nothing was changed
     UNREACHABLE = "unreachable"
-    # not taken up in this run (off, behind a stop or an interruption); a resume takes it up
+    # not started in this run (off, or after a stop or an interruption); a resume starts it
     PENDING = "pending"
-    # meshctl would not: wrong board, foreign changes, another operator's lock, moved on since the plan
+    # a precondition failed: wrong board, uncommitted changes, another operator's lock, a stale plan
     REFUSED = "refused"
-    # armed and out of sight: the node goes back by itself, or has already; the next contact tells
+    # armed and unreachable: the node rolls back by itself; the next observation shows it
     UNCERTAIN = "uncertain"
 
     @property
@@ -39,7 +39,7 @@ class Result(Enum):
 
     @property
     def is_failure(self) -> bool:
-        """Whether it counts towards `stop_after_failures`: something went wrong with a node that was in work."""
+        """Whether it counts toward `stop_after_failures`: a node that was started has failed."""
         return self in (Result.ROLLED_BACK, Result.FAILED, Result.UNCERTAIN, Result.UNREACHABLE)
 
 
@@ -70,7 +70,7 @@ class Totals:
 
     @property
     def none_reached(self) -> bool:
-        """Whether nothing but unreachable nodes kept the run from being good."""
+        """Whether all nodes that are not good are unreachable or pending."""
         return not self.all_good and all(
             result.is_good or result in (Result.UNREACHABLE, Result.PENDING) for result in self.counts
         )

@@ -1,6 +1,6 @@
-"""Who we are, to a journal and to the locks on nodes, and whether somebody who wrote there still runs.
+"""Names of processes in the journal and in the nodes' locks, and whether such a process is still running.
 
-A process is `host:pid:start`; `start` tells it from a later one with the same pid.
+A process is `host:pid:start`; `start` distinguishes it from a later one with the same pid.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 
 def owner() -> str:
-    """`user@host`: who holds a lock or began a run."""
+    """`user@host`: the operator who holds a lock or started a run."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):
@@ -22,29 +22,29 @@ def owner() -> str:
 
 
 def lock_owner() -> str:
-    """Names this process to the locks on nodes: `user@host:pid:start`, with nothing but letters, digits and @._:+-."""
+    """The name of this process in locks on nodes: `user@host:pid:start`, of letters, digits and @._:+- only."""
     return re.sub(r"[^A-Za-z0-9@._:+-]", "-", f"{owner().partition('@')[0]}@{this_process()}")
 
 
 def is_dead(lock: str) -> bool:
-    """Whether a lock's owner was a process of this machine that has ended: nobody will ever give it back."""
+    """Whether a lock's owner is a process of this machine that has ended, and so cannot release it."""
     return bool(lock) and not process_lives(lock.partition("@")[2])
 
 
 def this_process() -> str:
-    """`host:pid:start`, where start tells a process from a later one with the same pid."""
+    """`host:pid:start` of this process."""
     return f"{socket.gethostname()}:{os.getpid()}:{_start_ticks(os.getpid())}"
 
 
 def process_lives(process: str) -> bool:
-    """Whether the process that wrote a run still runs; one on another host counts as alive, we cannot know."""
+    """Whether a process is still running; one on another host counts as running."""
     host, _, rest = process.rpartition(":")
     host, _, pid = host.rpartition(":")
     return host != socket.gethostname() or (pid.isdigit() and _start_ticks(int(pid)) == rest)
 
 
 def _start_ticks(pid: int) -> str:
-    """Field 22 of /proc/PID/stat (proc(5)), empty for a process that is not there."""
+    """Field 22 of /proc/PID/stat (proc(5)), empty if there is no such process."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:

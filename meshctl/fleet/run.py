@@ -1,7 +1,7 @@
-"""Nodes and a function in, one outcome per node out.
+"""Run a function for every node, one outcome per node.
 
-`run` works on at most `parallel` nodes at a time, in the given order. A node's error becomes that node's outcome. When
-the failure budget is spent or an interruption is asked for, nodes not yet begun end as PENDING; those in work finish.
+`run` works on at most `parallel` nodes at a time, in the given order. A node's error becomes its outcome. When the
+failure budget is spent or an interrupt is requested, nodes that have not started end as PENDING; the others finish.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from meshctl.fleet.outcome import Outcome, Result
 
 
 class FailureBudget:
-    """Counts failures over the whole run, across stages; 0 means: never stop."""
+    """Counts failures over the whole run, across stages; a limit of 0 never stops."""
 
     def __init__(self, limit: int) -> None:
         if limit < 0:
@@ -43,7 +43,7 @@ class FailureBudget:
 
 
 def outcome_of_error(node: str, error: MeshctlError) -> Outcome:
-    """The outcome of a node whose work raised before anything on it was changed."""
+    """The outcome of a node whose work raised before it was changed."""
     result = Result.UNREACHABLE if isinstance(error, Unreachable) else Result.FAILED
     return Outcome(node, result, str(error), hint=error.hint)
 
@@ -59,8 +59,8 @@ def run(
 ) -> dict[str, Outcome]:
     """Work on every node; returns the outcomes in the given order.
 
-    `work` runs in threads; NodeError from it becomes an outcome. Anything else it raises is a bug, and is raised here
-    once the nodes in work have finished. Raises ValueError when `parallel` is below 1.
+    `work` runs in threads; its NodeError becomes an outcome. Any other exception is a bug, and is raised once the nodes
+    in progress have finished. Raises ValueError when `parallel` is below 1.
     """
     if parallel < 1:
         raise ValueError(f"parallel {parallel} is below 1")

@@ -1,4 +1,4 @@
-"""The mesh as a graph: who hears whom, how far each node is from where we stand, what each node's loss cuts off."""
+"""The mesh as a graph: links, distances to the entry, and what the loss of each node cuts off."""
 
 from meshctl.topology.alternate_macs import alternate_macs, with_alternates
 from meshctl.topology.graph import EMPTY, Graph, Link, Path, graph_of

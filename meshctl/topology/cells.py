@@ -1,7 +1,6 @@
-"""One mesh out of what nodes with several tell: an observation cut down to the interfaces of one mesh, and the cells
-that each link runs through.
+"""Separate the meshes of a node with several: observations reduced to one mesh, and the cells of each link.
 
-A node's batman-adv spans its meshes, so its tables name the neighbours of all of them; each entry names the interface.
+A node's batman-adv spans its meshes, so its tables have the neighbors of all of them, with the interface of each.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from meshctl.topology.reports import report_of
 
 @dataclass(frozen=True, slots=True)
 class LinkCell:
-    """The cell of a link: its mesh, and the channel that the radio is on (the inventory's where it did not tell)."""
+    """The cell of a link: its mesh, and the radio's channel (that of the inventory if unknown)."""
 
     mesh: str
     band: Band
@@ -28,7 +27,7 @@ class LinkCell:
 
 
 def within(seen: Observation, node: Node, mesh: str) -> Observation:
-    """What the node tells of one of its meshes; of a node with one mesh, everything."""
+    """The observation reduced to one mesh of the node; unchanged for a node with one mesh."""
     if len(node.meshes) < 2:
         return seen
     names = {name for name, joined in node.mesh_interfaces.items() if joined == mesh}
@@ -45,7 +44,7 @@ def within(seen: Observation, node: Node, mesh: str) -> Observation:
 
 
 def mesh_reports(fleet: Fleet, observations: Mapping[str, Observation], mesh: str) -> dict[str, Report]:
-    """The reports of a mesh's members about this mesh alone."""
+    """The reports of a mesh's members, reduced to this mesh."""
     return {
         name: report_of(name, within(seen, fleet.nodes[name], mesh))
         for name, seen in observations.items()

@@ -1,4 +1,4 @@
-"""An undirected graph of nodes: links in, distances, cut vertices and what each one cuts off out.
+"""An undirected graph of nodes: distances, cut vertices, and what each one cuts off.
 
 Links (name, name, quality) -> `graph_of` -> `Graph`: `paths` (hops and quality to the entry), `farthest_first`,
 `cut_vertices` and `cut_off_by` (Hopcroft and Tarjan's articulation points, CACM 16(6), 1973), `cut_off_by_all` (what
@@ -15,8 +15,8 @@ from types import MappingProxyType
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Two nodes that hear each other. `quality` 0..1 is the worse of the two directions (batman's TQ / 255); a wire
-    has quality 1 and stays up when radios do not."""
+    """Two nodes that hear each other. `quality` 0..1 is the worse of the two directions (batman-adv's TQ / 255); a wire
+    has quality 1 and does not depend on radios."""
 
     a: str
     b: str
@@ -26,7 +26,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """The best way from a node to the entry: hops over it, the product of its links' qualities, the next node."""
+    """The best path from a node to the entry: its hops, the product of its links' qualities, the next node."""
 
     hops: int
     quality: float
@@ -35,7 +35,7 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """`neighbours[name]` maps each neighbour to the best link to it. Names are sorted, so results are deterministic."""
+    """`neighbours[name]` maps each neighbor to the best link to it. Names are sorted, so results are deterministic."""
 
     neighbours: Mapping[str, Mapping[str, Link]] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -51,7 +51,7 @@ class Graph:
         return name in self.neighbours
 
     def reachable(self, entry: str, without: Iterable[str] = ()) -> frozenset[str]:
-        """Every node with a way to `entry` that avoids `without`; empty when the entry itself is not there."""
+        """Every node with a path to `entry` that avoids `without`; empty if the entry is not in the graph."""
         gone = set(without)
         if entry not in self.neighbours or entry in gone:
             return frozenset()
@@ -79,7 +79,7 @@ class Graph:
         return found
 
     def farthest_first(self, entry: str) -> tuple[str, ...]:
-        """Nodes by hops to `entry`, most first; of equals the weaker path first; unreachable ones lead."""
+        """Nodes by hops to `entry`, most first; of equals the weaker path first; unreachable ones first of all."""
         paths = self.paths(entry)
         unreachable = len(self.neighbours)
 
@@ -114,7 +114,7 @@ class Graph:
                     break
                 low[parent] = min(low[parent], low[name])
                 if parent != entry and low[name] >= order[parent]:
-                    # what was visited since `name` is its subtree, and only `parent` holds it to the entry
+                    # the nodes visited since `name` are its subtree, connected to the entry only through `parent`
                     cut.setdefault(parent, []).extend(visited[order[name] :])
         return {name: tuple(sorted(lost)) for name, lost in sorted(cut.items())}
 

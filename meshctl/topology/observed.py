@@ -1,8 +1,7 @@
-"""From what nodes tell about their neighbours to one graph of the mesh.
+"""The mesh graph from the nodes' reports about their neighbors.
 
-Each node that answered gives a `Report` (its own mesh MACs, whom it hears); `neighbours_of` turns the MACs it hears
-into nodes, each once; `observed_graph` makes both directions of a link into one; `seen_by` tells who still hears a node
-that does not answer.
+Each reachable node gives a `Report` (its mesh MACs, the neighbors it hears). `neighbours_of` maps the MACs it hears to
+nodes, `observed_graph` merges both directions of a link, `seen_by` finds the nodes that still hear an unreachable one.
 """
 
 from __future__ import annotations
@@ -12,13 +11,13 @@ from dataclasses import dataclass
 
 from meshctl.topology.graph import Graph, Link, graph_of
 
-# A neighbour that has been silent for longer is not a link: batman-adv keeps dead ones in its tables for minutes.
+# A neighbor not heard for longer is not a link: batman-adv keeps dead ones in its tables for minutes.
 NEIGHBOUR_FRESH_MS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class HeardNeighbor:
-    """A neighbour in a node's table: `quality` 0..1, None when only its presence is known."""
+    """A neighbor in a node's table: `quality` 0..1, None if unknown."""
 
     mac: str
     last_seen_ms: int
@@ -28,7 +27,7 @@ class HeardNeighbor:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What one node knows: the MACs of its mesh interfaces, the neighbours it hears (lower-case MACs)."""
+    """One node's view: the MACs of its mesh interfaces, the neighbors it hears (lower-case MACs)."""
 
     node: str
     macs: tuple[str, ...]
@@ -37,7 +36,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """Somebody heard a node: `by` whom, `age_ms` ago at the time of that node's report."""
+    """Node `by` heard a node `age_ms` before its report."""
 
     by: str
     age_ms: int
@@ -45,7 +44,7 @@ class Sighting:
 
 
 def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> dict[str, str]:
-    """MAC -> node name; what a node says of itself wins over `known_macs` (inventory, last known state)."""
+    """MAC -> node name; a node's own report takes precedence over `known_macs` (inventory, last known state)."""
     names = {mac.lower(): name for mac, name in known_macs.items()}
     names.update({mac.lower(): report.node for report in reports for mac in report.macs})
     return names
@@ -54,10 +53,10 @@ def names_by_mac(reports: Iterable[Report], known_macs: Mapping[str, str]) -> di
 def neighbours_of(
     report: Report, names: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
 ) -> dict[str, HeardNeighbor]:
-    """Whom a node hears now: neighbour -> the best of that neighbour's radios, for it carries the traffic.
+    """The neighbors a node hears now: name -> the best of the neighbor's radios, which carries the traffic.
 
-    `names` maps lower-case MACs to nodes; a MAC that nobody owns stands for itself. Neighbours not heard for longer
-    than `fresh_ms`, and the node's own radios, are left out.
+    `names` maps lower-case MACs to nodes; an unknown MAC is its own name. Neighbors not heard for longer than
+    `fresh_ms`, and the node's own radios, are left out.
     """
     best: dict[str, HeardNeighbor] = {}
     for heard in report.heard:
@@ -71,9 +70,9 @@ def neighbours_of(
 
 
 def _rank(heard: HeardNeighbor) -> tuple[float, int, int]:
-    """By measured quality, then by signal, then by how lately it was heard; what nobody measured ranks last."""
+    """By quality, then signal, then how recently it was heard; an unknown value ranks last."""
     quality = -1.0 if heard.quality is None else heard.quality
-    # no receiver hears anything at -200 dBm
+    # -200 dBm is below any receivable signal
     return quality, -200 if heard.signal_dbm is None else heard.signal_dbm, -heard.last_seen_ms
 
 
@@ -84,10 +83,10 @@ def observed_graph(
     wires: Iterable[tuple[str, str]] = (),
     fresh_ms: int = NEIGHBOUR_FRESH_MS,
 ) -> Graph:
-    """The mesh as its nodes report it. `wires` are pairs joined by cable (two radios on a robot's switch).
+    """The mesh as its nodes report it. `wires` are pairs connected by cable (two radios on a robot's switch).
 
-    A link has the worse quality of its two directions; one reported by a single side (the other did not answer) has
-    that side's. MACs nobody owns become nodes under their MAC, so that a stranger in the mesh shows.
+    A link has the worse quality of its two directions, or that of the only side that reported it. Unknown MACs become
+    nodes named by their MAC, so that foreign nodes in the mesh are visible.
     """
     known_reports = tuple(reports)
     names = names_by_mac(known_reports, known_macs or {})
@@ -103,7 +102,7 @@ def observed_graph(
 def seen_by(
     reports: Iterable[Report], known_macs: Mapping[str, str], *, fresh_ms: int = NEIGHBOUR_FRESH_MS
 ) -> dict[str, tuple[Sighting, ...]]:
-    """For every node that somebody hears: by whom and how long ago, the latest first."""
+    """Node -> the nodes that hear it and how long ago, latest first."""
     known_reports = tuple(reports)
     names = names_by_mac(known_reports, known_macs)
     known = frozenset(names.values())

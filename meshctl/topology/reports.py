@@ -1,4 +1,4 @@
-"""From one node's observation to its `Report`: which MACs it has in the mesh, whom it hears and how well."""
+"""A node's `Report` from its observation: its mesh MACs, the neighbors it hears and the link quality."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from meshctl.topology.observed import HeardNeighbor, Report
 
 # batman-adv's transmit quality is one byte (BATMAN_IV).
 TQ_MAX = 255
-# BATMAN_V tells throughput instead: at this rate and above a link counts as perfect, since a 20 MHz channel shared by
+# BATMAN_V reports throughput instead: at this rate and above a link counts as perfect, since a 20 MHz channel shared by
 # a team carries about as much (docs/facts/lab-facts.md).
 FULL_THROUGHPUT_KBIT_S = 20_000
 
 
 def report_of(node: str, seen: Observation) -> Report:
-    """What the node tells of its place in the mesh: batman-adv's tables first, the radio's where there are none."""
+    """The node's report: from batman-adv's tables, or from the radio's station entries if there are none."""
     signals = {station.mac.lower(): station.signal_dbm for station in seen.stations or ()}
     if seen.neighbours is None:
         heard = [
@@ -34,7 +34,7 @@ def report_of(node: str, seen: Observation) -> Report:
 
 
 def mesh_macs(seen: Observation) -> tuple[str, ...]:
-    """The MACs its neighbours know it by: those of batman-adv's hard interfaces, and of every mesh radio."""
+    """The MACs by which neighbors know it: those of batman-adv's hard interfaces, and of every mesh radio."""
     hard = seen.mesh.hard_interfaces if seen.mesh is not None else ()
     macs = [(seen.macs or {}).get(name, "") for name in hard]
     macs += [link.mac for link in seen.links or () if link.mode.lower() in ("ibss", "mesh point")]

@@ -1,1 +1,1 @@
-"""Pure parsers, one per tool whose output a node tells; none raises on any text."""
+"""Pure parsers, one for each tool on a node; none raises on any input."""

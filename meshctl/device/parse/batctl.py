@@ -23,31 +23,31 @@ _HEADER = re.compile(r"\[B\.A\.T\.M\.A\.N\. adv ([^,]+),.*?(BATMAN_I?V)\)?")
 
 def parse_mesh_json(text: str) -> MeshInfo | None:
     """`mesh_json`: version, algorithm and every setting as text."""
-    told = mapping(parse_json(text))
-    if not string(told.get("version")) and not string(told.get("algo_name")):
+    data = mapping(parse_json(text))
+    if not string(data.get("version")) and not string(data.get("algo_name")):
         return None
     settings = {
         key: string(value)
-        for key, value in told.items()
+        for key, value in data.items()
         if key not in {"version", "algo_name"} and isinstance(value, str | int | float)
     }
     return MeshInfo(
-        version=string(told.get("version")),
-        algorithm=string(told.get("algo_name")),
+        version=string(data.get("version")),
+        algorithm=string(data.get("algo_name")),
         settings=MappingProxyType(settings),
     )
 
 
 def parse_hardifs_json(text: str, names: Mapping[int, str]) -> tuple[str, ...] | None:
     """`hardifs_json`: the names of the hard interfaces."""
-    told = parse_json(text)
-    if not isinstance(told, list):
+    data = parse_json(text)
+    if not isinstance(data, list):
         return None
-    return tuple(name for item in maps(told) if (name := _interface(item, names)))
+    return tuple(name for item in maps(data) if (name := _interface(item, names)))
 
 
 def _interface(item: Mapping[str, object], names: Mapping[int, str]) -> str:
-    """`hard_ifname` came with batctl 2021.2; before (21.02) only the index is told, which `names` translates."""
+    """`hard_ifname` came with batctl 2021.2; before (21.02) there is only the index, which `names` translates."""
     index = integer(item.get("hard_ifindex"))
     return string(item.get("hard_ifname")) or ("" if index is None else names.get(index, ""))
 
@@ -62,8 +62,8 @@ def parse_interfaces_text(text: str) -> tuple[str, ...] | None:
 
 def parse_neighbours_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeighbour, ...] | None:
     """`neighbors_json`."""
-    told = parse_json(text)
-    if not isinstance(told, list):
+    data = parse_json(text)
+    if not isinstance(data, list):
         return None
     return tuple(
         MeshNeighbour(
@@ -71,7 +71,7 @@ def parse_neighbours_json(text: str, names: Mapping[int, str]) -> tuple[MeshNeig
             ifname=_interface(item, names),
             last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
         )
-        for item in maps(told)
+        for item in maps(data)
         if string(item.get("neigh_address"))
     )
 
@@ -91,8 +91,8 @@ def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
 
 def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Originator, ...] | None:
     """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false."""
-    told = parse_json(text)
-    if not isinstance(told, list):
+    data = parse_json(text)
+    if not isinstance(data, list):
         return None
     return tuple(
         Originator(
@@ -104,7 +104,7 @@ def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Origina
             tq=integer(item.get("tq")),
             throughput_kbit_s=integer(item.get("throughput")),
         )
-        for item in maps(told)
+        for item in maps(data)
         if string(item.get("orig_address"))
     )
 

@@ -14,7 +14,7 @@ _NUMBER = re.compile(r"\d{1,12}(?:\.\d{1,9})?")
 
 
 def parse_openwrt_release(text: str) -> ReleaseInfo | None:
-    """/etc/openwrt_release: `DISTRIB_RELEASE='19.07.10'` and its neighbours."""
+    """/etc/openwrt_release: `DISTRIB_RELEASE='19.07.10'` and the lines around it."""
     values = {match[1]: match[3] for match in _ASSIGNMENT.finditer(text)}
     if "RELEASE" not in values:
         return None

@@ -9,17 +9,17 @@ from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, st
 
 
 def parse_board(text: str) -> tuple[BoardInfo, ReleaseInfo | None] | None:
-    """`system board`: the board, and the release where this procd tells it (19.07's may not)."""
-    told = mapping(parse_json(text))
-    if not told:
+    """`system board`: the board, and the release, if procd reports it (19.07's may not)."""
+    data = mapping(parse_json(text))
+    if not data:
         return None
     board = BoardInfo(
-        board_name=string(told.get("board_name")),
-        model=string(told.get("model")),
-        hostname=string(told.get("hostname")),
-        kernel=string(told.get("kernel")),
+        board_name=string(data.get("board_name")),
+        model=string(data.get("model")),
+        hostname=string(data.get("hostname")),
+        kernel=string(data.get("kernel")),
     )
-    release = mapping(told.get("release"))
+    release = mapping(data.get("release"))
     if not string(release.get("version")):
         return board, None
     return board, ReleaseInfo(
@@ -33,8 +33,8 @@ def parse_board(text: str) -> tuple[BoardInfo, ReleaseInfo | None] | None:
 
 def parse_wireless(text: str) -> tuple[RadioState, ...] | None:
     """`network.wireless status`: an object of radios by name."""
-    told = parse_json(text)
-    if not isinstance(told, dict):
+    data = parse_json(text)
+    if not isinstance(data, dict):
         return None
     return tuple(
         RadioState(
@@ -48,15 +48,15 @@ def parse_wireless(text: str) -> tuple[RadioState, ...] | None:
                 (string(item.get("section")), string(item.get("ifname"))) for item in maps(radio.get("interfaces"))
             ),
         )
-        for name, radio in ((name, mapping(value)) for name, value in told.items())
+        for name, radio in ((name, mapping(value)) for name, value in data.items())
         if radio
     )
 
 
 def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
     """`network.interface dump`: `{"interface": [...]}`."""
-    told = parse_json(text)
-    if not isinstance(told, dict) or not isinstance(told.get("interface"), list):
+    data = parse_json(text)
+    if not isinstance(data, dict) or not isinstance(data.get("interface"), list):
         return None
     return tuple(
         NetInterface(
@@ -72,7 +72,7 @@ def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
             ),
             errors=tuple(string(error.get("code")) for error in maps(item.get("errors"))),
         )
-        for item in maps(told["interface"])
+        for item in maps(data["interface"])
     )
 
 
@@ -82,16 +82,16 @@ def parse_board_json(text: str) -> BoardInfo | None:
     `ports` where there are several, else `device` (21.02 and later) or `ifname` (19.07). A switch's VLANs are the
     places of its `roles`, counted from 1 (base-files, `config_generate`).
     """
-    told = mapping(parse_json(text))
-    if not told:
+    data = mapping(parse_json(text))
+    if not data:
         return None
-    lan = mapping(mapping(told.get("network")).get("lan"))
+    lan = mapping(mapping(data.get("network")).get("lan"))
     ports = next((found for key in ("ports", "device", "ifname") if (found := strings(lan.get(key)))), ())
     vlans = tuple(
         (name, str(vlan), string(role.get("ports")))
-        for name, switch in mapping(told.get("switch")).items()
+        for name, switch in mapping(data.get("switch")).items()
         for vlan, role in enumerate(maps(mapping(switch).get("roles")), 1)
         if string(role.get("ports"))
     )
-    label = string(mapping(told.get("system")).get("label_macaddr")).lower()
+    label = string(mapping(data.get("system")).get("label_macaddr")).lower()
     return BoardInfo("", lan_ports=ports, label_mac=label, switch_vlans=vlans)

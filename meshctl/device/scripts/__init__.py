@@ -1,4 +1,4 @@
-"""The shell scripts meshctl runs on a node, as they are in this directory (docs/device-scripts.md)."""
+"""The shell scripts that meshctl runs on a node (docs/device-scripts.md)."""
 
 from __future__ import annotations
 

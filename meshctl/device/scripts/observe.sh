@@ -1,6 +1,6 @@
-# Tells everything meshctl wants to know of a node, in one go. Sent with `N` (a nonce no output can contain) and `EXTRA`
-# (further paths) set before it; prints sections `N begin NAME`, the tool's output as it is, a newline, `N end STATUS`.
-# A tool that is missing or fails gives an empty section with its status; nothing here changes the node.
+# Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain) and `EXTRA` (further paths)
+# set before it. Each section is `N begin NAME`, the raw output of a tool, a newline, `N end STATUS`. A missing or
+# failing tool gives an empty section with its status. Nothing here changes the node.
 
 section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
@@ -27,7 +27,7 @@ bridges() {
 
 load() { cat /proc/loadavg && grep -c ^processor /proc/cpuinfo; }
 
-# opkg and apk are slow on a small processor; their databases say the same
+# opkg and apk are slow on a small processor, so read their databases
 packages() {
 	if command -v apk >/dev/null; then
 		if [ -f /lib/apk/db/installed ]; then
@@ -105,7 +105,7 @@ section host_keys host_keys
 for path in $EXTRA; do
 	section "mode $path" ls -lnd "$path"
 	[ ! -f "$path" ] || section "hash $path" sha256sum "$path"
-	# enough for any configuration; a larger file is told by its hash alone
+	# enough for any configuration; of a larger file only the hash counts
 	[ ! -f "$path" ] || section "text $path" head -c 65536 "$path"
 done
 if [ -x /usr/sbin/meshctl-deadman ]; then

@@ -1,6 +1,6 @@
-# What a change does to packages, for meshctl-deadman: `sh extra keep|do|undo DIRECTORY`. Sent with TOOL (opkg or apk),
-# FILES (package files) and REMOVE (what has to go first, because it conflicts) set before it. DIRECTORY is the change's
-# own in flash: `keep` writes there what `undo` needs, so a power cut in the middle of `do` is undone, too.
+# The package part of a change, run by meshctl-deadman: `sh extra keep|do|undo DIRECTORY`. Sent with TOOL (opkg or apk),
+# FILES (package files) and REMOVE (conflicting packages, removed first) set before it. DIRECTORY belongs to the change
+# and is in flash: `keep` saves there what `undo` needs, so a power cut during `do` is rolled back, too.
 verb=$1
 dir=$2
 
@@ -20,7 +20,7 @@ files_of() { # PACKAGE: without the leading slash
 	esac 2>/dev/null
 }
 
-# all that makes a removed package installed again: its files, the links that start it, the tool's own database
+# the files that restore a removed package: its own, its rc.d links, the package manager's database
 to_keep() {
 	for package in $REMOVE; do
 		files_of "$package" | while read -r file; do
@@ -48,7 +48,7 @@ do_it() {
 	case $TOOL in
 	apk)
 		[ -z "$REMOVE" ] || apk del --no-network $REMOVE || return 1
-		# files given by path were verified by meshctl's own hash, not by a repository's key
+		# package files are verified by meshctl's hash, not by a repository key
 		apk add --no-network --allow-untrusted $FILES || return 1
 		;;
 	*)
@@ -56,13 +56,13 @@ do_it() {
 		opkg install $FILES || return 1
 		;;
 	esac
-	# they lie in memory
+	# free the memory
 	rm -f $FILES
 }
 
 undo() {
 	[ -f "$dir/packages.before" ] || return 0
-	# at boot this runs before the script that makes it; opkg's lock lies there
+	# for opkg's lock: at boot this runs before the script that creates the directory
 	mkdir -p /var/lock
 	new=$(added | tr '\n' ' ')
 	# shellcheck disable=SC2086
@@ -76,8 +76,8 @@ undo() {
 	done
 }
 
-# Removing them stopped what they run, and a link starts it at the next boot only. At boot it is not started: the
-# machine is about to boot once more.
+# Starts the services of restored packages, which would otherwise start only at the next boot. Not during boot, because
+# the node is about to reboot.
 start_again() {
 	[ -z "$BOOTING" ] || return 0
 	for service in $(tar -tf "$dir/packages.tar" | sed -n 's|^etc/rc\.d/S[0-9][0-9]||p'); do

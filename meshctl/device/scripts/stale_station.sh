@@ -1,16 +1,16 @@
-# Removes a station entry that has become stale because the neighbor's radio restarted, and only then. Shell functions;
-# the caller appends calls of `flush_stale`, `flush_restarted` or `watch_stale`.
+# Removes a station entry only if it is stale because the neighbor's radio restarted. Shell functions; the caller
+# appends calls of `flush_stale`, `flush_restarted` or `watch_stale`.
 #
-# A radio that restarts counts its frames from 0, while the holder of an old entry goes on with the block acknowledgement
-# window it had and drops the neighbor's unicast frames; broadcasts pass. Whether that is so is observed here, on the
-# holder: the neighbor is heard, and answers no echo request of batman-adv (layer 2: no firewall has a part in it).
-# Removing the entry of a radio that did not restart does the same harm the other way round.
+# A radio that restarts counts its frames from 0, while the holder of an old entry keeps its block acknowledgement window
+# and drops the neighbor's unicast frames; broadcasts pass. The holder detects that here: it hears the neighbor, but gets
+# no reply to batman-adv echo requests (layer 2, so no firewall matters). Removing the entry of a radio that did not
+# restart causes the same loss in the other direction.
 HEARD_MS=2000  # a neighbor sends several times a second: beacons, and OGMs that it originates or repeats
-ECHOES=3       # lost all in a row by chance: after seven attempts each on the air, a link that carries nothing anyway
+ECHOES=3       # each is sent up to seven times on the air: a link that loses all of them is useless anyway
 WATCH_PAUSE_S=2
-FLUSHES=3      # by one watch, for each entry: where removing it does not help, repeating it is no remedy
+FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
 
-# station DEV MAC FIELD: the number that iw prints behind FIELD (`inactive time`, ms; `connected time`, s)
+# station DEV MAC FIELD: the number that iw prints after FIELD (`inactive time`, ms; `connected time`, s)
 station() { iw dev "$1" station get "$2" 2>/dev/null | sed -n "s/.*$3:[^0-9]*\([0-9]*\).*/\1/p"; }
 
 is_heard() {
@@ -30,11 +30,11 @@ mesh_of() { # DEV: the batman-adv interface that it is a hard interface of
 	[ -e "/sys/class/net/$mesh" ]
 }
 
-# echo_state DEV MAC: ECHO = answered, lost, or unknown where this cannot be asked
+# echo_state DEV MAC: sets ECHO to answered, lost, or unknown if no echo request can be sent
 echo_state() {
 	ECHO=unknown
 	mesh_of "$1" || return 0
-	# 19.07's takes -m, later ones say that it will go
+	# batctl of 19.07 needs -m, which later versions deprecate
 	answer=$(batctl meshif "$mesh" ping -c "${3:-$ECHOES}" -t 1 "$2" 2>/dev/null)
 	case $answer in
 	PING* | *' bytes from '* | *'timed out'* | *nreachable*) ;;
@@ -50,7 +50,7 @@ remove() { # DEV MAC
 	if iw dev "$1" station del "$2" 2>/dev/null; then echo "gone $2"; else echo "kept $2"; fi
 }
 
-# flush_stale DEVICES MAC SECONDS: removes the entry if it is that old and stale; says `gone`, `kept` (it cannot be
+# flush_stale DEVICES MAC SECONDS: removes the entry if it is that old and stale; prints `gone`, `kept` (it cannot be
 # removed), `answers`, or `unknown` MAC
 flush_stale() {
 	for dev in $1; do
@@ -59,20 +59,20 @@ flush_stale() {
 		case $ECHO in
 		answered) echo "answers $2" ;;
 		unknown) echo "unknown $2" ;;
-		# still there, still heard: not just gone out of range meanwhile
+		# check again that it has not just gone out of range
 		*) ! is_old "$dev" "$2" "$3" || ! is_heard "$dev" "$2" || remove "$dev" "$2" ;;
 		esac
 	done
 }
 
-# flush_restarted DEVICES MAC SECONDS: removes an entry that is that old; for a radio that was seen to have restarted
+# flush_restarted DEVICES MAC SECONDS: removes an entry that is that old; for a radio that was observed to restart
 flush_restarted() {
 	for dev in $1; do
 		! is_old "$dev" "$2" "$3" || remove "$dev" "$2"
 	done
 }
 
-# watch_stale SECONDS DEV/MAC...: for so long, removes those entries that are older than the watch and become stale
+# watch_stale SECONDS DEV/MAC...: for SECONDS, removes entries that are older than the watch and become stale
 watch_stale() {
 	read -r up _ </proc/uptime
 	began=${up%.*} until=$((${up%.*} + $1))
@@ -82,7 +82,7 @@ watch_stale() {
 		for entry; do
 			watched=${entry%%/*} age=$((${up%.*} - began))
 			is_old "$watched" "${entry#*/}" $age && is_heard "$watched" "${entry#*/}" || continue
-			# one echo request tells of a neighbor that answers; only one that does not is asked again
+			# one echo request suffices if the neighbor answers; otherwise flush_stale repeats it
 			echo_state "$watched" "${entry#*/}" 1
 			[ "$ECHO" = lost ] || continue
 			case $(flush_stale "$watched" "${entry#*/}" $age) in gone*) left=$((left - 1)) ;; esac

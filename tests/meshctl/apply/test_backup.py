@@ -1,4 +1,4 @@
-"""Laws of a backup: it reads back as it was, says what it is of, and nothing else is taken for one."""
+"""A backup reads back unchanged, names what it was taken from, and nothing else is accepted as one."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_paths_that_must_not_be_written_are_left_out(path: str) -> None:
     assert set(saved((path, b"x")).files) == {"/etc/config/network"}
 
 
-def test_what_would_disable_services_at_the_next_boot_is_told_and_not_put_back() -> None:
+def test_scripts_that_disable_services_at_boot_are_reported_and_not_restored() -> None:
     script = b"/etc/init.d/odhcpd disable\n/etc/init.d/meshctl-deadman disable\n\nexit 0\n"
     backup = saved(("./etc/uci-defaults/10_disable_services", script))
     assert set(backup.files) == {"/etc/config/network"}

@@ -1,4 +1,4 @@
-"""Laws of identity: a device is taken for a node only when its MACs, or the operator's word and no MAC, say so."""
+"""A device is identified by its MACs, or by the operator's word where the inventory has no MAC."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def test_what_means_no_node_is_refused(word: str) -> None:
         find_node(labelled(), word)
 
 
-def test_a_mac_tells_who_it_is() -> None:
+def test_a_mac_identifies_the_node() -> None:
     assert identify(labelled(), device(MAC.upper()), "").name == "b01"
     label = replace(device(), board=BoardInfo("compex,wpj344-16m", label_mac=MAC))
     assert identify(labelled(), label, "").name == "b01"
 
 
-def test_a_device_that_nobody_knows_needs_the_operators_word() -> None:
+def test_an_unknown_device_must_be_named_by_the_operator() -> None:
     with pytest.raises(NodeError, match="cannot identify the node"):
         identify(labelled(), device("02:00:00:00:00:42"), "")
     assert identify(labelled(), device("02:00:00:00:00:42"), "b02").name == "b02"

@@ -1,4 +1,4 @@
-"""Laws of a change: it holds what differs, knows what was there, and reloads what changed."""
+"""A change contains the files that differ and their previous hashes, and reloads what changed."""
 
 from __future__ import annotations
 

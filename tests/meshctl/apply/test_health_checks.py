@@ -1,4 +1,4 @@
-"""Laws of the proof: a node keeps its new configuration only when everything it had is there again."""
+"""A change is confirmed only when everything the node had before works again."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_what_is_not_there_is_named(after: Observation, gap: str) -> None:
     assert gaps(after) == (gap,)
 
 
-def test_half_of_the_neighbours_is_enough_since_robots_move() -> None:
+def test_half_of_the_neighbors_is_enough_since_robots_move() -> None:
     assert gaps(replace(good(), neighbours=(MeshNeighbour("02:00:00:00:00:77", "mesh0", 10),))) == ()
 
 
@@ -93,7 +93,7 @@ def test_what_was_heard_before_the_change_does_not_count() -> None:
     assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbors of the 2 it had",)
 
 
-def test_a_node_alone_on_the_bench_need_hear_nobody() -> None:
+def test_a_node_alone_on_the_bench_needs_no_neighbors() -> None:
     alone = replace(good(), neighbours=(), originators=())
     assert unmet(expectation(wanted(fleet(), "b01"), alone, [BASE]), alone) == ()
 

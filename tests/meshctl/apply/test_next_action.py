@@ -1,4 +1,4 @@
-"""Laws of following a change: the node's own word decides, and nothing is confirmed that has not proven itself."""
+"""The state of the node's switch decides the next action, and no change is confirmed that has not proven itself."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STATES = ("idle", "staged", "armed", "waiting", "applied", "restoring", "absent"
 def move(
     status: ChangeStatus, *missing: str, new: bool = True, leaving: bool = False, given_up: bool = False
 ) -> Action:
-    return next_action("c1", status, missing, is_at_new_address=new, leaving=leaving, is_given_up=given_up)
+    return next_action("c1", status, missing, is_at_new_address=new, leaving=leaving, is_abandoned=given_up)
 
 
 @st.composite
@@ -95,10 +95,10 @@ def test_a_person_reads_why_it_went_back() -> None:
     assert rollback_reason(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
 
 
-def test_that_it_let_nobody_in_counts_more_than_what_was_missing_afterwards() -> None:
+def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = rollback_reason(late, ("its LAN is down",), "b01: let root in with none of: key a")
-    assert told == "it was not confirmed in time: b01: let root in with none of: key a"
+    told = rollback_reason(late, ("its LAN is down",), "b01: login refused for root; tried: key a")
+    assert told == "it was not confirmed in time: b01: login refused for root; tried: key a"
 
 
 def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:

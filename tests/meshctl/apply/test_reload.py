@@ -1,4 +1,4 @@
-"""Laws of scripts/reload.sh: which effects it waits for, and what it does not take for one.
+"""scripts/reload.sh: which effects it waits for, and what does not count as one.
 
 The node's tools are scripts that play recorded behaviour (docs/facts): procd runs a trigger's script a moment after the
 event, `fw4 reload` ends with 0 whether or not nft took the ruleset, dropbear's instance is replaced some time after.
@@ -76,7 +76,7 @@ class Node:
     def reload(
         self, *packages: str, services: tuple[str, ...] = (), environ: Mapping[str, str] = MappingProxyType({})
     ) -> tuple[int, str]:
-        """The exit status and what was said about a failure."""
+        """The exit status and the failure messages."""
         done = subprocess.run(
             ["sh", "-c", self.script(*packages, services=services)],
             env={"PATH": f"{self.place}/bin:/usr/bin:/bin", "HERE": str(self.place), **environ},
@@ -282,7 +282,7 @@ def test_a_node_whose_network_changes_speaks_to_the_address_it_was_reached_from_
     assert (log.read_text().splitlines() if log.exists() else []) == pings
 
 
-def test_the_radios_alone_make_nobody_speak(node: Node) -> None:
+def test_a_wireless_change_alone_sends_no_ping(node: Node) -> None:
     node.tool("ping", 'echo "$@" >>"$HERE/log"')
     assert node.reload("wireless", environ={"SSH_CONNECTION": "10.42.0.2 51000 10.42.0.11 22"}) == (0, "")
     assert not [line for line in node.log if "10.42.0.2" in line]

@@ -1,4 +1,4 @@
-"""Laws of a resume's account: every node that was left uncertain is told of, with what it is now."""
+"""A resume reports what became of every uncertain node."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def prepared(verdict: Verdict) -> Prepared:
         (Verdict.AWAY, "now it is still unreachable"),
     ],
 )
-def test_each_end_of_an_uncertain_node_is_told(verdict: Verdict, text: str) -> None:
+def test_each_resolution_of_an_uncertain_node_is_reported(verdict: Verdict, text: str) -> None:
     told = resolutions(7, [Outcome("b01", Result.UNCERTAIN, "left")], prepared(verdict))
     assert told == {"b01": f"uncertain after run 7; {text}"}
 
 
-def test_one_that_stayed_in_the_old_cell_is_told_how_to_reach_it() -> None:
+def test_a_node_left_in_the_old_cell_is_reported_with_how_to_reach_it() -> None:
     left = Outcome("b01", Result.UNCERTAIN, facts={LEFT_BEHIND: "radio0: channel 6 -> 11"})
     assert resolutions(7, [left], prepared(Verdict.AWAY))["b01"].endswith(
         "still unreachable: it is still in the old cell of its mesh (radio0: channel 6 -> 11); "

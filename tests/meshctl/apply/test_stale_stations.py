@@ -1,4 +1,4 @@
-"""Laws of who is asked to forget a radio, with which words, and when."""
+"""Which nodes are queried for stale station entries, with which scripts, and when."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def itself(*macs: str) -> Observation:
     return replace(running(fleet(), "b02"), links=links, mesh=None, macs={})
 
 
-def test_those_whose_radios_know_the_node_are_asked_on_the_interface_and_by_the_mac_they_told() -> None:
+def test_holders_are_queried_with_the_interface_and_mac_they_reported() -> None:
     around = {
         "b01": knows("b01", ("mesh0", OTHER), ("mesh1", MAC.upper())),
         "b02": itself(MAC),
@@ -54,14 +54,14 @@ def test_those_whose_radios_know_the_node_are_asked_on_the_interface_and_by_the_
     assert entries_of("b02", around) == (StationEntry("b01", "mesh1", MAC.upper()), StationEntry("base", "wlan0", MAC))
 
 
-def test_every_radio_of_the_node_is_forgotten() -> None:
+def test_entries_of_every_radio_are_flushed() -> None:
     around = {"b01": knows("b01", ("mesh0", MAC), ("mesh0", OTHER)), "b02": itself(MAC, OTHER)}
     assert by_holder(entries_of("b02", around)) == {
         "b01": (StationEntry("b01", "mesh0", MAC), StationEntry("b01", "mesh0", OTHER))
     }
 
 
-def test_of_a_node_that_told_nothing_and_of_one_without_a_radio_in_a_mesh_nobody_is_asked() -> None:
+def test_an_unobserved_node_and_one_without_a_mesh_radio_have_no_holders() -> None:
     around = {"b01": knows("b01", ("mesh0", MAC))}
     assert entries_of("b02", around) == ()
     assert entries_of("b02", {**around, "b02": itself()}) == ()
@@ -73,7 +73,7 @@ def test_a_station_table_of_any_length_has_few_asked() -> None:
 
 
 @given(st.lists(st.floats(0, 30), max_size=20))
-def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldom_until_once_a_minute(
+def test_neighbors_of_an_unreachable_node_are_queried_at_once_then_with_pauses_up_to_a_minute(
     lateness: list[float],
 ) -> None:
     asked: list[float] = []
@@ -86,7 +86,7 @@ def test_a_silent_node_has_its_neighbours_asked_at_once_and_then_ever_more_seldo
     assert all(FIRST_PAUSE_S - 1e-6 <= pause <= MAX_PAUSE_S + 1e-6 for pause in pauses)
 
 
-def test_of_two_radios_only_those_who_know_the_one_that_starts_anew_are_asked() -> None:
+def test_only_holders_of_entries_of_the_restarting_radio_are_queried() -> None:
     around = {"b01": knows("b01", ("mesh0", MAC), ("mesh1", OTHER)), "b02": itself(MAC, OTHER)}
     assert entries_of("b02", around, Radios(frozenset({"mesh1"}))) == (StationEntry("b01", "mesh1", OTHER),)
     assert entries_of("b02", around, NO_RADIOS) == ()
@@ -96,7 +96,7 @@ def hears(*macs: str) -> Observation:
     return replace(itself(MAC), neighbours=(), stations=tuple(Station("mesh0", mac) for mac in macs))
 
 
-def test_whom_the_node_hears_and_who_told_nothing_may_know_it() -> None:
+def test_unobserved_neighbors_may_hold_an_entry() -> None:
     around = {
         "b01": replace(knows("b01"), macs={}, links=(WirelessLink("mesh0", "IBSS", BASE),)),
         "b02": hears(BASE, OTHER),
@@ -106,12 +106,12 @@ def test_whom_the_node_hears_and_who_told_nothing_may_know_it() -> None:
     assert current_neighbors(around["b02"], {**names, BASE: "b01"}) == ("b01", "b03")
 
 
-def test_who_answered_without_telling_of_its_stations_may_know_the_node() -> None:
+def test_a_node_observed_without_its_stations_may_hold_an_entry() -> None:
     around = {"b01": replace(knows("b01"), stations=None), "b02": hears(OTHER)}
     assert possible_holders("b02", around, {OTHER: "b01"}, ()) == ("b01",)
 
 
-def test_a_stranger_may_be_any_fellow_whose_radios_nobody_has_seen() -> None:
+def test_an_unknown_mac_may_be_any_mesh_node_without_a_known_mac() -> None:
     around = {"b01": knows("b01"), "b02": hears("02:99:00:00:00:01")}
     assert possible_holders("b02", around, {OTHER: "b03"}, ("b01", "b02", "b03", "b04")) == ("b04",)
     assert possible_holders("b02", around, {"02:99:00:00:00:01": "b02"}, ("b04",)) == ()
@@ -128,10 +128,8 @@ def at(seen: Observation, asked_at_s: float, *, uptime_s: float | None) -> Obser
 @pytest.mark.parametrize(
     ("connected_s", "is_old"), [(150, True), (104, True), (102, False), (40, False), (None, False)]
 )
-def test_who_has_known_a_radio_from_before_its_node_booted_must_forget_it(
-    connected_s: int | None, is_old: bool
-) -> None:
-    # it is up since 900, give or take what an answer takes; the neighbour knows it since 1001 - connected_s
+def test_an_entry_older_than_the_boot_of_its_node_is_unflushed(connected_s: int | None, is_old: bool) -> None:
+    # it is up since 900, give or take what an answer takes; the neighbor has its entry since 1001 - connected_s
     around = {
         "b01": at(
             replace(knows("b01"), stations=(Station("mesh0", MAC, connected_s=connected_s),)), 1000, uptime_s=9e9
@@ -225,7 +223,7 @@ def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0
 
 
 def flushed(place: Path, now: Second, *, bat: str = "bat0", has_restarted: bool = False) -> str:
-    """What a holder with such an entry prints when it is asked for entries of at least 11.2 s."""
+    """What a holder with such an entry prints when it is queried for entries of at least 11.2 s."""
     text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, has_restarted=has_restarted)
     printed, deleted = deletions(place, [now], text, bat=bat)
     assert deleted == ([f"1 mesh0 {MAC}"] if printed == f"gone {MAC}\n" else [])

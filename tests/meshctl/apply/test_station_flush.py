@@ -1,4 +1,4 @@
-"""Laws of asking a radio's neighbours to forget it: on every way a radio starts anew, and on no other."""
+"""Neighbors flush stale station entries after every kind of radio restart, and after nothing else."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def node(name: str, *hears: str, connected_s: int = 500) -> Observation:
 
 
 class Neighbours:
-    """A fleet whose neighbours answer or do not: what was asked of whom, and what the operator was told."""
+    """A fleet whose neighbors answer or do not: the queries, and the notes for the operator."""
 
     def __init__(self, around: dict[str, Observation], *, silent: tuple[str, ...] = (), answer: str = f"gone {MAC}\n"):
         self.silent = set(silent)
@@ -88,7 +88,7 @@ class Neighbours:
         return sorted(name for name, _ in self.asked)
 
 
-def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighbours_are_asked(
+def test_repeated_queries_are_journaled_and_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
@@ -103,7 +103,7 @@ def test_a_node_that_is_silent_for_long_is_told_of_once_however_often_its_neighb
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
 
 
-def test_of_a_node_whose_radios_stay_as_they_are_nobody_is_asked_unless_it_rebooted() -> None:
+def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     forgetting = StationFlush(near.job, NO_RADIOS)
     forgetting.started()
@@ -114,7 +114,7 @@ def test_of_a_node_whose_radios_stay_as_they_are_nobody_is_asked_unless_it_reboo
     assert near.names == ["b01"]
 
 
-def test_who_did_not_tell_when_the_plan_was_made_is_asked_when_the_node_is_back() -> None:
+def test_unobserved_neighbors_are_queried_when_the_node_is_back() -> None:
     near = Neighbours({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
     forgetting = StationFlush(near.job)
     forgetting.started()
@@ -122,13 +122,13 @@ def test_who_did_not_tell_when_the_plan_was_made_is_asked_when_the_node_is_back(
     assert near.names == ["b01"]
     near.silent.clear()
     forgetting.ended(node("b02", "b04"))
-    # b03 was heard before, b04 is heard now: neither told, so each looks on whatever interfaces it has
+    # b03 was heard before, b04 is heard now: neither was observed, so each checks all of its interfaces
     assert near.names == ["b01", "b01", "b03", "b04"]
     assert all("iw dev 2>/dev/null" in script for name, script in near.asked if name != "b01")
     assert near.work.unfinished_flushes == []
 
 
-def test_who_does_not_answer_then_either_is_asked_once_more_in_the_end_and_the_operator_is_told_of_the_rest() -> None:
+def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() -> None:
     near = Neighbours(
         {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
     )
@@ -159,7 +159,7 @@ def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytes
     assert f"flush_stale mesh0 {MAC} 17\n" in near.asked[0][1]
 
 
-def test_who_cannot_forget_is_told_to_the_operator() -> None:
+def test_a_neighbor_that_cannot_remove_its_entry_is_reported() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
     forgetting = StationFlush(near.job)
     forgetting.started()
@@ -167,7 +167,7 @@ def test_who_cannot_forget_is_told_to_the_operator() -> None:
     assert near.notes == ["b02: b01 cannot remove its stale entry: unicast frames to them may be lost for minutes"]
 
 
-def test_who_cannot_find_out_removes_the_entry_only_of_a_radio_that_was_seen_to_restart() -> None:
+def test_an_unverifiable_entry_is_removed_only_for_an_observed_restart() -> None:
     for index, has_restarted in ((7, False), (8, True)):
         near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
         forgetting = StationFlush(near.job)
@@ -176,7 +176,7 @@ def test_who_cannot_find_out_removes_the_entry_only_of_a_radio_that_was_seen_to_
         assert ["flush_restarted mesh0" in script for _, script in near.asked] == [False, True][: 1 + has_restarted]
 
 
-def test_a_change_whose_end_nobody_saw_is_made_up_for_if_the_radio_has_started_since() -> None:
+def test_a_change_without_an_observed_end_is_flushed_later_if_the_radio_has_restarted() -> None:
     same = Neighbours({"b02": node("b02", "b01", connected_s=500)})
     flush_later(same.job, ago_s=100.0)
     assert same.asked == []
@@ -196,7 +196,7 @@ def test_of_a_node_that_booted_since_what_was_known_before_its_boot_is_forgotten
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
 
 
-def test_beside_whom_a_node_hears_those_are_looked_at_that_it_heard_lately() -> None:
+def test_current_and_recently_heard_neighbors_are_observed() -> None:
     seen = {"b02": node("b02", "b01")}
     known = {
         "b02": LastKnown("b02", 1000.0, {"macs": MAC, "neighbours": f"{MACS['b03'].upper()} {MACS['b01']}"}),
@@ -207,7 +207,7 @@ def test_beside_whom_a_node_hears_those_are_looked_at_that_it_heard_lately() -> 
     assert known_neighbors(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S + 1) == ("b01",)
 
 
-def test_radios_are_told_apart_by_name_unless_all_are_meant() -> None:
+def test_radios_are_distinguished_by_name_unless_all_are_meant() -> None:
     assert "mesh7" in EVERY_RADIO
     assert "mesh1" not in Radios(frozenset({"mesh0"}))
 
@@ -221,7 +221,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 
 def notes(ended: Ended) -> list[str]:
-    """What was told of the node, of its radio."""
+    """The notes about the node's radio."""
     told = [event for event in ended.events if event["event"] == "note" and event["node"] == "n001"]
     return [event["text"] for event in told if "its radio" in event["text"]]
 
@@ -247,13 +247,13 @@ FORGOT = ["base removed a stale entry of its radio"]
 class TestOnAVirtualFleet:
     """The same over real SSH; each test leaves the fleet on the rig's current inventory."""
 
-    def test_after_a_change_of_a_radio_its_neighbour_has_forgotten_it(self, rig: Rig) -> None:
+    def test_after_a_radio_change_the_neighbor_has_flushed_its_entry(self, rig: Rig) -> None:
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
         assert ended.results == {"n001": "done"}, ended.out + ended.err
         assert notes(ended) == FORGOT
 
-    def test_a_change_beside_the_radio_has_nobody_forget_it(self, rig: Rig) -> None:
+    def test_a_change_of_other_files_flushes_no_entry(self, rig: Rig) -> None:
         text = rig.inventory(rig.current).read_text(encoding="utf-8")
         assert text.count("hop_penalty: 3") == 1
         rig.inventory("penalty").write_text(text.replace("hop_penalty: 3", "hop_penalty: 4"), encoding="utf-8")
@@ -263,7 +263,7 @@ class TestOnAVirtualFleet:
             assert notes(ended) == []
             assert not [event for event in ended.events if event.get("text") == "flush neighbor station entries"]
 
-    def test_a_node_that_is_put_back_from_a_backup_is_forgotten_by_its_neighbour(self, rig: Rig) -> None:
+    def test_the_neighbor_of_a_restored_node_flushes_its_entry(self, rig: Rig) -> None:
         folder = rig.directory / "backups"
         assert rig.meshctl("backup", rig.current, "n001", "--out", str(folder)).code == 0
         (file,) = folder.iterdir()
@@ -275,8 +275,8 @@ class TestOnAVirtualFleet:
         assert notes(restored) == FORGOT
         assert rig.state_of("n001", "split", rig.current) == "new"
 
-    def test_of_a_neighbour_that_is_not_reached_the_operator_is_told_unless_it_can_be_later(self, rig: Rig) -> None:
-        # its host key is not the pinned one, so nothing is asked of it until somebody has looked after that
+    def test_an_unreachable_neighbor_is_reported_unless_a_retry_succeeds(self, rig: Rig) -> None:
+        # its host key is not the pinned one, so it is not queried until that is resolved
         rig.fleet.inject_fault("base", "host-key")
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
@@ -300,7 +300,7 @@ class TestOnAVirtualFleet:
         assert ended.results == {"n001": "done"}, ended.out + ended.err
         assert notes(ended) == FORGOT
 
-    def test_after_a_reboot_the_next_run_has_the_neighbour_forget_the_radio_once(self, rig: Rig) -> None:
+    def test_after_a_reboot_the_next_run_flushes_the_neighbors_entry_once(self, rig: Rig) -> None:
         boot = rig.fleet.node("n001").boot_id
         waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
         rig.meshctl("run", rig.current, "n001", command=["reboot"])
@@ -312,7 +312,7 @@ class TestOnAVirtualFleet:
             assert ended.results["n001"] == "unchanged", ended.out + ended.err
             assert notes(ended) == told
 
-    def test_a_radio_that_started_anew_while_nobody_looked_is_made_up_for(self, rig: Rig) -> None:
+    def test_an_unobserved_radio_restart_is_flushed_later(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]
         boot = rig.fleet.node("n001").boot_id
         waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")

@@ -1,4 +1,4 @@
-"""Laws of the archive that a flashed node unpacks at its first boot."""
+"""The archive that a flashed node unpacks at its first boot."""
 
 from __future__ import annotations
 

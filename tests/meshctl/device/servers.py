@@ -33,7 +33,7 @@ def eventually(what: Callable[[], bool], *, patience_s: float = PATIENCE_S) -> N
 
 
 def free_port() -> int:
-    """A port nobody listens on: below those the kernel hands out by itself, apart for each worker of a parallel run."""
+    """A free port, below the kernel's ephemeral range and distinct for each worker of a parallel run."""
     for port in _PORTS:
         with socket.socket() as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -128,7 +128,7 @@ def host_key(node: Sandbox, key_type: str = "ed25519") -> HostKey:
 
 
 def authorize(node: Sandbox, *public_keys: Path) -> None:
-    """Let these keys in. OpenWrt reads /etc/dropbear/authorized_keys, Debian's dropbear the home directory's."""
+    """Authorize these keys. OpenWrt reads /etc/dropbear/authorized_keys, Debian's dropbear the home directory's."""
     text = "".join(path.read_text() for path in public_keys)
     node.put("/etc/dropbear/authorized_keys", text, 0o600)
     node.put("/root/.ssh/authorized_keys", text, 0o600)

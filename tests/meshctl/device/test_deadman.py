@@ -185,7 +185,7 @@ def test_an_armed_change_belongs_to_its_owner_even_after_the_lock_ran_out(node: 
     assert node.deadman("lock", OTHER, LONG).startswith("ok")
     assert refusal(node.deadman("stage", OTHER, "c2", BUNDLE)) == "busy"
     assert refusal(node.deadman("apply", OTHER, "c1", "now")) == "wrong-state"
-    # but whoever holds the lock may end what its owner left behind
+    # but the holder of the lock may abort a change that its owner left behind
     assert node.deadman("abort", OTHER, "c1").startswith("ok")
 
 
@@ -197,7 +197,7 @@ def test_a_lock_runs_out_by_itself_and_with_a_reboot(node: Sandbox) -> None:
     assert node.deadman("lock", OWNER, LONG).startswith("ok"), f"a lock of boot {boot_id} counts no more"
 
 
-def test_of_many_who_grab_the_lock_at_once_exactly_one_gets_it(node: Sandbox) -> None:
+def test_exactly_one_of_many_concurrent_lock_requests_succeeds(node: Sandbox) -> None:
     owners = [f"operator-{n}" for n in range(12)]
     for _ in range(3):
         with ThreadPoolExecutor(len(owners)) as pool:
@@ -469,7 +469,7 @@ def test_a_lock_is_given_back_although_memory_is_full(node: Sandbox) -> None:
     assert taken == "ok lock_owner=somebody@else"
 
 
-def test_the_same_change_gives_the_same_bundle_and_mistakes_are_told_before_it_travels() -> None:
+def test_a_bundle_is_deterministic_and_invalid_changes_raise_before_upload() -> None:
     assert bundle(change()) == bundle(change())
     for files in (
         {"/x": NewFile(b"")},

@@ -1,4 +1,4 @@
-"""What a node tells, as facts: recorded outputs of every release, the real script on a real ash, and any other text.
+"""A node's output as facts: recorded outputs of every release, the real script on a real ash, and any other text.
 
 The cases in recorded/ were composed after the tools' sources (docs/facts/openwrt-facts.md, section 5), not captured.
 """
@@ -77,7 +77,7 @@ def test_the_facts_a_plan_needs_are_there_for_every_release(release: str) -> Non
     assert seen.uptime_error_s == 2.0
 
 
-def test_a_node_that_tells_nothing_is_observed_as_nothing_with_a_note_for_each_fact() -> None:
+def test_an_empty_answer_is_an_empty_observation_with_a_note_for_each_fact() -> None:
     seen = interpret({}, asked_at_s=0.0, answered_at_s=1.0)
     told = as_json(seen)
     assert isinstance(told, dict)
@@ -87,7 +87,7 @@ def test_a_node_that_tells_nothing_is_observed_as_nothing_with_a_note_for_each_f
         "files",
         "notes",
     }
-    assert "the observation ended early" in seen.notes
+    assert "the observation was cut short" in seen.notes
     assert len(seen.notes) > 10
 
 
@@ -96,7 +96,7 @@ def test_an_answer_cut_anywhere_is_still_an_observation(at: int) -> None:
     whole = (RECORDED / "24.10" / "mesh" / "observe.out").read_bytes()
     seen = interpret(split_sections(whole[:at], "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
     if at < len(whole) - 10:
-        assert "the observation ended early" in seen.notes
+        assert "the observation was cut short" in seen.notes
 
 
 PARSERS = [
@@ -175,7 +175,7 @@ def test_a_section_that_another_one_pretends_to_be_needs_the_nonce() -> None:
     assert list(split_sections(output, "NONCE")) == ["config x"]
 
 
-def test_the_script_runs_on_the_real_ash_and_tells_what_is_there(connection: SshConnection, node: Sandbox) -> None:
+def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshConnection, node: Sandbox) -> None:
     node.put("/etc/config/network", "config interface 'lan'\n\toption ipaddr '192.168.1.1'\n\n")
     node.put("/etc/config/odd", b"\xff\xfe no text")
     node.put("/etc/openwrt_release", "DISTRIB_ID='OpenWrt'\nDISTRIB_RELEASE='24.10.5'\nDISTRIB_REVISION='r1'\n")
@@ -301,7 +301,7 @@ def test_batman_v_tables_give_throughput() -> None:
     assert (neighbour.mac, neighbour.ifname, neighbour.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
 
 
-def test_a_root_in_memory_is_told_from_one_in_flash() -> None:
+def test_a_root_in_memory_is_distinguished_from_one_in_flash() -> None:
     ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
     assert system.parse_root(ram)
     assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))

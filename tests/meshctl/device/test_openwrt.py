@@ -182,7 +182,7 @@ def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection
     # procd would refuse to flash it together with our archive
     node.put("/bin/ubus", UBUS.replace('"allow_backup": true', '"allow_backup": false'), 0o755)
     bare = openwrt.check_firmware(connection, "/tmp/good.bin")
-    assert (bare.valid, bare.reason) == (False, "it takes over no configuration from the running system")
+    assert (bare.valid, bare.reason) == (False, "it does not accept a configuration from the running system")
 
 
 def test_what_ends_the_connection_is_answered_first(connection: Connection, node: Sandbox) -> None:

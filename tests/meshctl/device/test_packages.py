@@ -184,7 +184,7 @@ def test_staging_and_dropping_a_change_of_packages_touches_none(node: Sandbox) -
     assert is_as_before(node)
 
 
-def test_packages_that_cannot_be_removed_hold_up_no_way_back_and_are_told(node: Sandbox) -> None:
+def test_packages_that_cannot_be_removed_do_not_block_the_rollback_and_are_reported(node: Sandbox) -> None:
     with_opkg(node)
     applied(node, wanted=change(touches_files=True))
     node.put("/harness/stuck", "")

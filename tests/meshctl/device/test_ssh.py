@@ -114,12 +114,12 @@ def test_a_command_without_end_is_stopped_by_its_deadline(connection: SshConnect
     assert not connection.is_open
 
 
-def test_a_command_whose_input_nobody_takes_is_stopped_by_its_deadline(connection: SshConnection) -> None:
+def test_a_command_that_does_not_read_its_input_ends_at_its_deadline(connection: SshConnection) -> None:
     with pytest.raises(Timeout):
         connection.run("sleep 100000", stdin=b"x" * 4_000_000, timeout_s=0.5)
 
 
-def test_a_command_killed_on_the_node_is_told_from_one_that_failed(connection: SshConnection) -> None:
+def test_a_command_killed_on_the_node_is_distinguished_from_a_failed_one(connection: SshConnection) -> None:
     with pytest.raises(ChannelClosed):
         connection.run("kill -9 $$")
     assert connection.run("echo still here").stdout == "still here\n"
@@ -230,7 +230,7 @@ def test_an_encrypted_key_opens_with_its_passphrase_and_says_so_without(
         assert ssh.run("true").exit_status == 0
     with pytest.raises(InputError, match="locked: the key is encrypted"):
         connect(server.endpoint(), credentials=only(locked), trust=trust, deadlines=PATIENT)
-    with pytest.raises(InputError, match="no such key file"):
+    with pytest.raises(InputError, match="key file not found"):
         connect(server.endpoint(), credentials=only(tmp_path / "nowhere"), trust=trust, deadlines=PATIENT)
 
 
@@ -243,7 +243,7 @@ def test_an_unknown_host_key_is_refused_before_anything_secret_is_said(
     assert caught.value.fingerprint in str(caught.value)
 
 
-def test_a_changed_host_key_is_refused_and_both_fingerprints_are_told(
+def test_a_changed_host_key_is_refused_and_both_fingerprints_are_shown(
     node: Sandbox, trust: TrustStore, key: Path
 ) -> None:
     give_dropbear(node, root_password="!")
@@ -407,7 +407,7 @@ def test_whatever_answers_there_the_error_is_ours_and_in_time(
         assert caught.value.phase == "the SSH handshake"
 
 
-def test_nobody_there_is_unreachable(trust: TrustStore) -> None:
+def test_no_answer_is_unreachable(trust: TrustStore) -> None:
     endpoint = Endpoint("127.0.0.1", free_port(), identity="b03")
     with pytest.raises(Unreachable, match=r"b03 .*cannot connect"):
         connect(endpoint, credentials=Credentials(use_agent=False), trust=trust)

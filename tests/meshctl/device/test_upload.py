@@ -152,7 +152,7 @@ def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
     upload(Spoiling(connection, 1), data, TARGET)
     assert node.path(TARGET).read_bytes() == data
     node.path(TARGET).unlink()
-    with pytest.raises(UploadFailed, match="not those sent"):
+    with pytest.raises(UploadFailed, match="the data was corrupted"):
         upload(Spoiling(connection, 1000), data, TARGET)
     assert not node.path(TARGET).exists()
 

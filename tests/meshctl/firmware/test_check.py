@@ -75,7 +75,7 @@ def test_another_board_target_or_release_is_found(folder: Path) -> None:
     assert codes(image, replace(profile(folder), release=Release.V24_10)) == ["FW006"]
 
 
-def test_an_image_without_metadata_and_a_damaged_one_are_told_apart(folder: Path) -> None:
+def test_missing_and_damaged_metadata_are_distinguished(folder: Path) -> None:
     image = folder / "image.bin"
     whole = image.read_bytes()
     plain = profile(folder, sha256="", usign_key="")
@@ -97,7 +97,7 @@ def test_a_changed_list_is_not_signed(folder: Path) -> None:
     sums.write_text(sums.read_text() + f"{'0' * 64} *other.bin\n")
     (finding,) = check(folder / "image.bin", profile(folder))
     assert finding.code == "FW008"
-    assert "does not fit" in finding.message
+    assert "does not match" in finding.message
 
 
 def test_an_image_beside_the_signed_list_is_not_signed(folder: Path) -> None:
@@ -125,7 +125,7 @@ def test_usigns_own_signature_verifies_and_no_other_message_does() -> None:
     signature = (VECTORS / "sha256sums.sig").read_text()
     message = (VECTORS / "sha256sums").read_bytes()
     verify(message, signature, key)
-    with pytest.raises(BadSignature, match="does not fit"):
+    with pytest.raises(BadSignature, match="does not match"):
         verify(message + b"x", signature, key)
     with pytest.raises(BadSignature, match="by key"):
         verify(message, signature, replace(key, name=bytes(8)))

@@ -42,7 +42,7 @@ def test_the_same_image_is_written_to_the_byte() -> None:
     assert append_signature(IMAGE[:size], b"ucert goes here") == IMAGE
 
 
-def test_metadata_tells_board_release_revision_and_target() -> None:
+def test_metadata_has_board_release_revision_and_target() -> None:
     metadata = read_metadata(IMAGE)
     assert metadata is not None
     assert metadata.boards == ("compex,wpj344-16m", "wpj344")
@@ -50,7 +50,7 @@ def test_metadata_tells_board_release_revision_and_target() -> None:
     assert (metadata.target, metadata.profile, metadata.compat_version) == ("ath79/generic", "compex_wpj344-16m", "1.0")
 
 
-def test_an_image_that_breaks_with_older_ones_tells_its_boards_elsewhere() -> None:
+def test_an_incompatible_image_has_its_boards_under_another_key() -> None:
     image = append_metadata(
         BODY,
         {"compat_version": "2.0", "supported_devices": ["Image version mismatch"], "new_supported_devices": ["a,b"]},

@@ -1,4 +1,4 @@
-"""Signals as requests: the first stops, the second leaves, and nobody has to be there to read about it."""
+"""Signals as requests: the first stops, the second leaves, also without a terminal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_signal_asks_to_stop_and_a_second_one_to_leave(number: signal.Signals)
     assert len(said) == 2
 
 
-def test_a_closed_terminal_asks_to_stop_however_often_it_is_told() -> None:
+def test_repeated_hangups_request_only_a_stop() -> None:
     interrupt = Interrupt()
     with handled(signal.SIGHUP, signal.Handlers.SIG_DFL), interrupt.on_signals(lambda text: None):
         signal.raise_signal(signal.SIGHUP)
@@ -49,7 +49,7 @@ def test_under_nohup_a_closed_terminal_asks_for_nothing() -> None:
         assert not interrupt.stopping
 
 
-def test_a_request_counts_where_nobody_can_be_told_any_more() -> None:
+def test_a_request_counts_even_if_the_terminal_is_closed() -> None:
     def closed(text: str) -> None:
         raise OSError(5, "Input/output error")
 

@@ -1,4 +1,4 @@
-"""Laws of the journal: it survives our death, holds one outcome per node, and bears two processes at once."""
+"""The journal survives a killed process, has one outcome per node, and supports two concurrent processes."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() ->
     assert process_lives("elsewhere:1:1")
 
 
-def test_a_journal_that_cannot_be_written_any_more_stops_no_work_and_is_told(path: Path) -> None:
+def test_an_unwritable_journal_stops_no_work_and_is_reported(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         journal._database.execute("PRAGMA query_only = ON")
@@ -213,7 +213,7 @@ def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
         assert (run.error, journal.outcomes(run.id)[0].result) == ("", Result.FAILED)
 
 
-def test_a_journal_that_another_process_holds_can_be_read_and_says_who_to_look_for(
+def test_a_locked_journal_can_be_read_and_hints_at_the_process(
     path: Path,
 ) -> None:
     Journal(path).close()
@@ -234,22 +234,22 @@ def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> N
 
 def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
     with Journal(path) as field, Journal(path, lab="/lab") as lab:
-        practised = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
-        with practised.step("a", "apply"):
+        practice = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
+        with practice.step("a", "apply"):
             pass
-        practised.finish_node(Outcome("a", Result.UNCERTAIN))
-        practised.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
+        practice.finish_node(Outcome("a", Result.UNCERTAIN))
+        practice.remember("f", "a", {"macs": "02:4d:00:00:00:01"}, 1.0)
         lab.remember("f", "b", {"version": "virtual"}, 1.0)
         field.remember("f", "b", {"version": "real"}, 2.0)
         assert field.unfinished_runs("f") == {}
         assert field.unfinished_changes("f") == {}
         assert {node: dict(last.facts) for node, last in field.last_known("f").items()} == {"b": {"version": "real"}}
-        assert lab.unfinished_runs("f") == {practised.id: ("a",)}
+        assert lab.unfinished_runs("f") == {practice.id: ("a",)}
         assert set(lab.unfinished_changes("f")) == {"a"}
         assert lab.last_known("f")["b"].facts == {"version": "virtual"}
         assert [(run.fleet, run.lab) for run in field.runs()] == [("f", "/lab")], "a journal without a lab lists all"
         assert (field.runs(fleet="f"), len(lab.runs(fleet="f"))) == ((), 1)
-        record = lab.run(practised.id)
+        record = lab.run(practice.id)
         assert record is not None
         assert (record.fleet, record.lab) == ("f", "/lab")
 

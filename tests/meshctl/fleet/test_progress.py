@@ -1,4 +1,4 @@
-"""What is shown of a run: plain lines, JSON lines, and live lines that never hide an outcome."""
+"""The output of a run: plain lines, JSON lines, and live lines that never hide an outcome."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
         assert out.getvalue() == ""
 
 
-STOPPING = "stopping: finishing the nodes in work, taking up no more (again to leave at once)"
+STOPPING = "stopping: finishing the nodes in progress, starting no more (again to leave at once)"
 
 
 def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() -> None:
@@ -111,7 +111,7 @@ def test_the_second_request_replaces_the_first_ones_state() -> None:
     with LiveProgress(console, 1) as progress:
         progress(EVENTS[0])
         progress.stopping(STOPPING)
-        progress.stopping("leaving: what is armed on a node goes back by itself")
+        progress.stopping("leaving: what armed changes roll back by itself")
     assert "LEAVING: finishing b01" in screen.getvalue()
 
 
@@ -128,7 +128,7 @@ def test_more_nodes_than_lines_leave_room_for_the_totals_and_the_state_of_stoppi
     assert "STOPPING: finishing b00, b01, b02, b03 ...; no other node will be started" in last
 
 
-def test_logs_and_scripts_are_told_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_terminal_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
     for kind in (PlainProgress, JsonProgress):
         out = io.StringIO()
         with kind(out) as progress:

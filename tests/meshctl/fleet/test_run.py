@@ -1,4 +1,4 @@
-"""Laws of working on many nodes: one outcome each, bounded concurrency, stopping."""
+"""Work on many nodes: one outcome each, bounded concurrency, stopping."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connections that are kept are closed together, and what they lead through after them."""
+"""Pooled connections are closed in parallel, and jump connections after them."""
 
 from __future__ import annotations
 

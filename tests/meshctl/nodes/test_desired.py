@@ -1,4 +1,4 @@
-"""What is carried over from a device that was seen."""
+"""The facts kept from an observed device."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def kinds(package: Package) -> list[str]:
     return [section.type for section in package.sections]
 
 
-def test_nothing_is_known_of_a_device_that_nobody_saw() -> None:
+def test_an_unobserved_device_has_no_facts() -> None:
     assert (device_facts(NODE, None).compat_version, device_facts(NODE, None).packages) == ("", {})
 
 
-def test_the_board_tells_the_layout_that_ports_behind_a_switch_need() -> None:
+def test_the_board_provides_the_switch_layout_that_vlan_ports_need() -> None:
     facts = device_facts(replace(NODE, lan_ports=("eth0.1",)), SEEN)
     assert kinds(facts.packages["network"]) == ["interface", "switch", "switch_vlan"]
 

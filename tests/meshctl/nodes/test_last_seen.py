@@ -1,4 +1,4 @@
-"""Laws of what is told of a node that does not answer: what was last seen, and who of the others hears it."""
+"""The report about an unreachable node: when it was last seen, and which other nodes hear it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def of(**observations: Observation) -> LastSeen:
     return last_seen_of(fleet(), ["b03"], observations, KNOWN)["b03"]
 
 
-def test_the_last_sighting_and_those_who_hear_it_are_told_the_latest_first() -> None:
+def test_the_last_sighting_and_the_nodes_that_hear_it_are_shown_latest_first() -> None:
     stations = (Station("mesh0", LOST, signal_dbm=-61, inactive_ms=40),)
     place = of(b01=hears("b01", 42_000), b02=hears("b02", 400, stations=stations), b04=running(fleet(), "b04"))
     assert place.text(NOW_S) == (
@@ -38,7 +38,7 @@ def test_the_last_sighting_and_those_who_hear_it_are_told_the_latest_first() -> 
     assert place.facts == {"last_seen_s": "10000", "heard_by": "b02:400ms b01:42000ms", "asked": "3"}
 
 
-def test_where_no_neighbour_hears_it_a_way_that_somebody_knew_is_told() -> None:
+def test_without_a_neighbor_that_hears_it_a_known_route_is_shown() -> None:
     far = replace(
         running(fleet(), "base"), originators=(Originator(LOST, "02:00:00:00:01:00", "mesh0", 12_000, True, 90),)
     )
@@ -47,7 +47,7 @@ def test_where_no_neighbour_hears_it_a_way_that_somebody_knew_is_told() -> None:
     )
 
 
-def test_nobody_who_hears_it_is_told_with_the_number_of_those_asked() -> None:
+def test_if_no_node_hears_it_the_number_of_queried_nodes_is_shown() -> None:
     assert (
         of(b01=running(fleet(), "b01"), b02=running(fleet(), "b02"))
         .text(NOW_S)
@@ -60,12 +60,12 @@ def test_what_batman_has_long_forgotten_does_not_count() -> None:
     assert of(b01=hears("b01", 200_001)).heard == ()
 
 
-def test_a_node_never_seen_is_told_as_such_and_an_old_sighting_with_its_day() -> None:
+def test_never_seen_is_shown_as_such_and_an_old_sighting_with_its_date() -> None:
     assert last_seen_of(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
         "never seen before; no other node is reachable"
     )
     assert "last seen 3 d ago (1970-01-01 02:46 UTC)" in of().text(10_000.0 + 3 * 86400)
 
 
-def test_what_the_lost_node_itself_told_earlier_is_no_witness() -> None:
+def test_the_missing_nodes_own_earlier_observation_does_not_count() -> None:
     assert of(b03=hears("b03", 10)).asked == 0

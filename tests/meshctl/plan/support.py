@@ -140,7 +140,7 @@ def running(
 
 
 def factory(team: Fleet, name: str) -> Observation:
-    """A node fresh from its box: stock wireless, off; stock network."""
+    """A factory device: stock wireless, disabled; stock network."""
     stock = {
         "wireless": "config wifi-device 'radio0'\n\toption path 'platform/ahb/18100000.wmac'\n\toption disabled '1'\n",
         "network": "config interface 'lan'\n\toption proto 'static'\n\toption ipaddr '192.168.1.1'\n",

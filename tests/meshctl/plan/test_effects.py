@@ -1,4 +1,4 @@
-"""Laws of what a change cuts: what the services of each release really take down, and what decides who can log in."""
+"""What a change interrupts: what the services of each release take down, and what affects logins."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_radio_that_is_added_or_removed_restarts() -> None:
     assert {effect.cut for effect in found} == {Cut.MESH}
 
 
-def test_what_decides_who_can_log_in_cuts_logins() -> None:
+def test_dropbear_and_firewall_changes_cut_logins() -> None:
     empty = {"firewall": Package("firewall"), "dropbear": Package("dropbear")}
     for package in empty:
         (effect,) = effects([f"etc/config/{package}"], empty, empty, Release.V24_10)

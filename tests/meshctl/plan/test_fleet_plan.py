@@ -1,4 +1,4 @@
-"""Laws of the fleet's plan: a split is one switch, nobody is left behind unasked, a saved plan binds."""
+"""The fleet plan: a cell change is one stage, no node is left behind unacknowledged, a saved plan binds."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_members_that_are_refused_in_the_old_cell_block_a_switch_however_many_th
     assert "changes its cell, but not every member can take part" in plan.refusal
 
 
-def test_even_a_base_that_hears_nobody_does_not_leave_its_mesh_unasked() -> None:
+def test_even_a_base_without_neighbors_does_not_leave_its_mesh_unacknowledged() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name, neighbours=()) if name == "base" else None for name in TEAM}
     assert "would leave behind b01" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
@@ -188,7 +188,7 @@ def test_what_is_no_json_is_refused() -> None:
         load("{", "x.json")
 
 
-def test_a_node_that_moved_on_is_told_from_one_that_did_not() -> None:
+def test_a_stale_plan_is_distinguished_from_one_that_still_applies() -> None:
     agreed = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
     assert stale_reason(agreed, agreed) == ""
     edited = running(fleet(), "b01")

@@ -1,4 +1,4 @@
-"""A plan that would shut meshctl itself out is refused before anything is sent."""
+"""A plan that would lock the operator out is refused before anything is sent."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_another_user_than_root_has_keys_of_its_own() -> None:
     assert lockout(node, contents(want), ()) is None
 
 
-def test_a_line_that_is_no_key_is_told_as_one() -> None:
+def test_an_invalid_authorized_keys_line_is_reported() -> None:
     want = wanted(TEAM, "b01")
     refused = lockout(want.node, {AUTHORIZED_KEYS: b"ssh-rsa AAAA! x\n"}, ())
     assert refused is not None

@@ -1,4 +1,4 @@
-"""Laws of one node's plan: nothing when it is right, the difference when it is not, and refusal before harm."""
+"""One node's plan: empty if the node is as desired, else the differences, or a failed precondition."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_another_channel_parts_the_node_from_its_mesh_and_says_so() -> None:
     assert "-\toption channel '6'\n+\toption channel '11'" in plan.files[0].diff
 
 
-def test_another_key_is_told_and_never_shown() -> None:
+def test_another_key_is_reported_and_never_shown() -> None:
     seen = running(fleet(), "b01")
     assert seen.uci is not None
     old = {**seen.uci, "wireless": seen.uci["wireless"].replace(PASS_PHRASE, "the old pass phrase")}

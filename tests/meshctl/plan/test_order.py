@@ -1,4 +1,4 @@
-"""Laws of the fleet's order: farthest first, cut vertices alone, nothing cut off by accident, the entry last."""
+"""The order of a fleet: farthest first, cut vertices alone, nothing cut off by accident, the entry last."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_every_node_is_in_exactly_one_stage_and_no_stage_takes_more_than_max_dow
 
 
 @given(meshes(), st.integers(1, 4))
-def test_nodes_down_together_cut_nobody_off_that_one_alone_would_not(mesh: Graph, max_down: int) -> None:
+def test_nodes_down_together_cut_off_no_node_that_one_alone_would_not(mesh: Graph, max_down: int) -> None:
     for stage in stages_of([changing(name) for name in NAMES], around(mesh, max_down=max_down)):
         lost = mesh.cut_off_by_all("base", stage.nodes)
         if stage.kind is not StageKind.LAST:
@@ -68,7 +68,7 @@ def test_a_line_goes_from_its_end_and_names_its_cut_vertices() -> None:
     assert stages[0].reason == "b02 is 3 hops away, quality 73%"
 
 
-def test_the_canary_is_the_farthest_node_that_carries_nobody() -> None:
+def test_the_canary_is_the_farthest_node_that_is_not_a_cut_vertex() -> None:
     mesh = graph("base-b00", "base-b01", "b01-b02")
     stages = stages_of([changing(name) for name in ("b00", "b01", "base")], around(mesh, canary=True))
     assert [(stage.kind, stage.nodes) for stage in stages] == [

@@ -1,4 +1,4 @@
-"""What a person reads of a plan: totals, order with reasons, what is cut, masked diffs, refusals."""
+"""The text of a plan: totals, order with reasons, what is interrupted, masked diffs, refusals."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_it_begins_with_the_totals_and_gives_every_stage_its_reason() -> None:
     assert "alone, because it is a cut vertex: while it is down b02 cannot be reached" in text
 
 
-def test_it_tells_what_is_cut_and_shows_masked_differences() -> None:
+def test_it_shows_what_is_interrupted_and_masked_diffs() -> None:
     text = read(another_host_name())
     assert "2 nodes  each cuts its mesh links\n  b01, b02\n" in text
     assert "-\toption beacon_int '200'" in text
@@ -100,7 +100,7 @@ def test_nodes_to_which_the_same_happens_are_one_block_in_the_inventory_s_order(
     assert text.index("13 nodes") < text.index("uav1-radio  refused") < text.index("odd  cuts")
 
 
-def test_the_last_lines_repeat_the_totals_and_who_is_left_out_and_why() -> None:
+def test_the_last_lines_repeat_the_totals_and_which_nodes_are_left_out_and_why() -> None:
     assert read(large(), order=ORDER).splitlines()[-3:] == [
         "14 to change, 1 away, 1 refused",
         "  refused: uav1-radio, no port eth0.1 (it has eth0)",
@@ -108,7 +108,7 @@ def test_the_last_lines_repeat_the_totals_and_who_is_left_out_and_why() -> None:
     ]
 
 
-def test_a_switch_tells_each_member_s_reason() -> None:
+def test_a_mesh_change_shows_each_members_reason() -> None:
     text = read(large(), order=ORDER)
     assert ", b11, b12: channel\n" in text
     assert "odd: changes with its mesh\n" in text

@@ -1,4 +1,4 @@
-"""Laws of which radios start anew: those whose own settings differ, and those that know nobody for longer."""
+"""Which radios restart: those whose settings differ, and those whose station entries are all younger."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def wireless(old: str = "", new: str = "") -> Package:
         ("option channel '6'", "option channel '6'\n\toption disabled '1'", "mesh0"),
     ],
 )
-def test_only_the_radio_whose_own_settings_or_interface_differ_starts_anew(old: str, new: str, ifname: str) -> None:
+def test_only_the_radio_whose_settings_or_interface_differ_restarts(old: str, new: str, ifname: str) -> None:
     assert restarting_radios(wireless(), wireless(old, new)) == Radios(frozenset({ifname}))
 
 
@@ -69,7 +69,7 @@ def test_where_names_or_files_are_not_known_every_radio_may_have_started() -> No
     assert "anything" in EVERY_RADIO
 
 
-def test_a_radio_that_knows_nobody_for_longer_has_started_since_and_one_that_knows_nobody_is_not_taken_for_it() -> None:
+def test_a_radio_with_only_younger_entries_has_restarted_and_one_without_entries_has_not() -> None:
     stations = (
         Station("mesh0", "02:00:00:00:00:01", connected_s=90),
         Station("mesh0", "02:00:00:00:00:02", connected_s=20),

@@ -69,7 +69,7 @@ def test_who_is_gone_for_good_is_reported_with_the_place_it_was_at(fleet: Fleet)
         (Timeout("b01 (10.42.0.2): no answer to connect within 5 s", phase="connect"), "unreachable"),
         (HostKeyChanged("b01 (10.42.0.2): the host key changed", fingerprint="x", key_type="y"), "host-key"),
         (HostKeyUnknown("b01 (10.42.0.2): not pinned", fingerprint="x", key_type="y"), "untrusted"),
-        (AuthenticationRefused("b01 (10.42.0.2): let root in with none of: key", hint="name a key"), "login"),
+        (AuthenticationRefused("b01 (10.42.0.2): login refused for root; tried: key", hint="name a key"), "login"),
         (NodeError("b01 (10.42.0.2): odd"), "failed"),
     ],
 )

@@ -29,7 +29,7 @@ def test_a_node_that_is_heard_by_its_other_address_is_known() -> None:
     assert names["04:18:d6:11:22:34"] == "b02"
 
 
-def test_an_address_that_may_be_two_nodes_is_nobodys() -> None:
+def test_an_ambiguous_alternate_address_is_left_out() -> None:
     names = with_alternates({"04:18:d6:11:22:33": "b01", "02:18:d6:11:22:33": "b02"})
     assert names["04:18:d6:11:22:33"] == "b01"
     assert names["02:18:d6:11:22:33"] == "b02"
@@ -37,7 +37,7 @@ def test_an_address_that_may_be_two_nodes_is_nobodys() -> None:
 
 
 @given(st.dictionaries(st.sampled_from([f"{n:02x}:aa" for n in range(0, 256, 2)]), st.sampled_from("abc"), max_size=9))
-def test_whoever_is_known_exactly_stays_known(names: dict[str, str]) -> None:
+def test_a_known_mac_takes_precedence_over_an_alternate(names: dict[str, str]) -> None:
     assert names.items() <= with_alternates(names).items()
 
 

@@ -26,7 +26,7 @@ def test_a_stranger_stands_under_its_mac() -> None:
     assert "02:00:00:00:00:03" in observed_graph([BASE, B01])
 
 
-def test_a_neighbour_silent_for_long_is_no_link() -> None:
+def test_a_neighbor_not_heard_for_long_is_no_link() -> None:
     stale = Report("b01", ("02:00:00:00:00:02",), (HeardNeighbor("02:00:00:00:00:01", 60_000, 1.0),))
     assert observed_graph([stale], known_macs={"02:00:00:00:00:01": "base"}).links == ()
 
@@ -36,11 +36,11 @@ def test_two_radios_of_a_robot_are_joined_by_their_wire() -> None:
     assert graph.links == (Link("front", "rear", 1.0, wired=True),)
 
 
-def test_who_hears_a_silent_node_is_told_with_its_age() -> None:
+def test_the_nodes_that_hear_an_unreachable_one_are_listed_with_age() -> None:
     assert seen_by([BASE, B01], {"02:00:00:00:00:03": "b02"})["b02"] == (Sighting("b01", 4000, -71),)
 
 
-def test_of_a_neighbours_radios_the_best_one_counts() -> None:
+def test_the_best_of_a_neighbors_radios_counts() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky", "02:00:00:00:00:03": "husky"}
     front, rear = HeardNeighbor("02:00:00:00:00:01", 100, 0.4, -60), HeardNeighbor("02:00:00:00:00:02", 900, 0.8, -75)
     unmeasured = HeardNeighbor("02:00:00:00:00:03", 10, None, -40)
@@ -56,6 +56,6 @@ def test_without_measured_quality_the_stronger_signal_counts_then_the_later_sigh
     assert neighbours_of(Report("base", (), (early, late)), names) == {"husky": late}
 
 
-def test_a_node_does_not_neighbour_itself() -> None:
+def test_a_node_is_not_its_own_neighbor() -> None:
     own = Report("husky", ("02:00:00:00:00:01",), (HeardNeighbor("02:00:00:00:00:02", 10, 0.9),))
     assert neighbours_of(own, {"02:00:00:00:00:02": "husky"}) == {}
