@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from meshctl.apply.health_checks import Expectation
 from meshctl.device.observation import Observation
-from meshctl.device.upload import Progress
+from meshctl.device.upload import UploadProgress
 from meshctl.fleet import Event, EventKind, Interrupt, Observer
 from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
@@ -88,7 +88,7 @@ class NodeContext:
         with self.run.journal_run.step(self.name, name):
             yield
 
-    def progress(self, uploaded: Progress) -> None:
+    def progress(self, uploaded: UploadProgress) -> None:
         """Report an upload's progress."""
         fraction = uploaded.verified / uploaded.total if uploaded.total else 1.0
         self.run.observer(Event(EventKind.PROGRESS, self.name, time.time(), fraction=fraction))

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from meshctl.fleet.journal import Journal
     from meshctl.nodes.connections import ConnectionPool, Locate
     from meshctl.nodes.desired import Renderer
-    from meshctl.report.progress import Progress
+    from meshctl.report.progress import RunProgress
 
 InventoryPath = Annotated[
     Path,
@@ -155,7 +155,7 @@ def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, 
     return tuple(node for name, node in managed.items() if any(fnmatchcase(name, pattern) for pattern in wanted))
 
 
-def progress_for(count: int, *, as_json: bool) -> Progress:
+def progress_for(count: int, *, as_json: bool) -> RunProgress:
     """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere."""
     from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 

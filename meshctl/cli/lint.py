@@ -22,7 +22,7 @@ from meshctl.regdb import SHIPPED, load, shipped_version
 from meshctl.report.findings import FORMATS, Findings
 
 
-class Format(StrEnum):
+class LintFormat(StrEnum):
     """Output format of findings."""
 
     TEXT = "text"
@@ -50,7 +50,7 @@ def lint(
         bool,
         typer.Option("--files", help="Check the inventories that contain the given files; skip other files."),
     ] = False,
-    format: Annotated[Format, typer.Option("--format", "-f", help="Output format.")] = Format.TEXT,
+    format: Annotated[LintFormat, typer.Option("--format", "-f", help="Output format.")] = LintFormat.TEXT,
     output: Annotated[Path | None, typer.Option("--out", "--output", "-o", help="Write to this file.")] = None,
     select: Annotated[
         list[str] | None, typer.Option(help="Code prefixes to report: MC3, INV020, or MC342,MC343.")
@@ -106,7 +106,7 @@ def lint(
         _write(output, report)
     else:
         # JSON and SARIF are escaped, which keeps their values; other formats are sanitized
-        is_json = json or format in (Format.JSON, Format.SARIF)
+        is_json = json or format in (LintFormat.JSON, LintFormat.SARIF)
         (echo_json if is_json else echo)(report, nl=False)
     if not all(item.is_readable for item in examined):
         raise typer.Exit(int(ExitCode.COULD_NOT_RUN))

@@ -21,7 +21,7 @@ from meshctl.topology import observed_graph, report_of
 from meshctl.topology.cells import link_cells, mesh_reports
 
 
-class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
+class TopologyFormat(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
     """Output format of `meshctl topology`."""
 
     TABLE = "table"
@@ -33,7 +33,7 @@ class Format(str, Enum):  # noqa: UP042 - typer shows the values of a str enum
 
 def topology(
     mesh: Annotated[str, typer.Option("--mesh", help="Mesh to show if the fleet has several.")] = "",
-    form: Annotated[Format, typer.Option("--format", "-f", help="Output format.")] = Format.TREE,
+    form: Annotated[TopologyFormat, typer.Option("--format", "-f", help="Output format.")] = TopologyFormat.TREE,
     inventory: InventoryPath = Path(),
     timeout: Timeout = CONNECT_S,
     as_json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,

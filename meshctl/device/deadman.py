@@ -20,7 +20,7 @@ from meshctl.device.errors import CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus
 from meshctl.device.parse.deadman import parse_answer, parse_status
 from meshctl.device.scripts import script
-from meshctl.device.upload import Progress, upload
+from meshctl.device.upload import UploadProgress, upload
 from meshctl.model import Secret
 
 PROGRAM = "/usr/sbin/meshctl-deadman"
@@ -163,7 +163,7 @@ def stage(
     change: Change,
     *,
     rate_bytes_per_s: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[UploadProgress], None] | None = None,
 ) -> None:
     """Upload and stage a change: no file changes yet, and the previous state is saved in flash.
 

@@ -30,7 +30,7 @@ from meshctl.device.observation import (
 )
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
 from meshctl.device.parse.deadman import parse_status
-from meshctl.device.parse.sections import Section, split_sections
+from meshctl.device.parse.sections import OutputSection, split_sections
 from meshctl.device.scripts import script
 
 T = TypeVar("T")
@@ -66,10 +66,10 @@ def observation_script(nonce: str, extra_paths: Iterable[str] = ()) -> str:
     return f"N={quoted(nonce)}\nEXTRA={quoted(' '.join(paths))}\n{script('observe.sh')}"
 
 
-class _Reader:
+class _OutputReader:
     """Sections by name; adds a note for each one that is missing, failed or unparsable."""
 
-    def __init__(self, sections: Mapping[str, Section]) -> None:
+    def __init__(self, sections: Mapping[str, OutputSection]) -> None:
         self._sections = sections
         self.notes: list[str] = []
         if "done" not in sections:
@@ -109,9 +109,9 @@ class _Reader:
         return None if section is None else section.status
 
 
-def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at_s: float) -> Observation:
+def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answered_at_s: float) -> Observation:
     """The sections of observe.sh as facts. Pure; any input gives an Observation."""
-    reader = _Reader(sections)
+    reader = _OutputReader(sections)
     board, release = _board(reader)
     space = reader.read("df", system.parse_df) or {}
     links, stations = _wireless(reader)
@@ -158,7 +158,7 @@ def interpret(sections: Mapping[str, Section], *, asked_at_s: float, answered_at
     )
 
 
-def _board(reader: _Reader) -> tuple[BoardInfo | None, ReleaseInfo | None]:
+def _board(reader: _OutputReader) -> tuple[BoardInfo | None, ReleaseInfo | None]:
     ubus_board, release = reader.read("ubus.board", ubus.parse_board) or (None, None)
     if release is None:
         release = reader.read("openwrt_release", system.parse_openwrt_release)
@@ -184,7 +184,7 @@ def _space(space: Mapping[str, Space], path: str) -> Space | None:
     return space.get(path) or space.get("/")
 
 
-def _wireless(reader: _Reader) -> tuple[tuple[WirelessLink, ...] | None, tuple[Station, ...] | None]:
+def _wireless(reader: _OutputReader) -> tuple[tuple[WirelessLink, ...] | None, tuple[Station, ...] | None]:
     links = reader.read("iw.dev", iw.parse_iw_dev)
     if links is None:
         return None, None
@@ -196,7 +196,7 @@ def _wireless(reader: _Reader) -> tuple[tuple[WirelessLink, ...] | None, tuple[S
 
 
 def _mesh(
-    reader: _Reader,
+    reader: _OutputReader,
 ) -> tuple[MeshInfo | None, tuple[MeshNeighbour, ...] | None, tuple[Originator, ...] | None]:
     """Of all batman-adv interfaces together; (None, None, None) without any."""
     names = reader.names("batctl.originators_json")
@@ -233,7 +233,7 @@ def _mesh(
     )
 
 
-def _uci(reader: _Reader) -> Mapping[str, str] | None:
+def _uci(reader: _OutputReader) -> Mapping[str, str] | None:
     if reader.body("config.list") is None:
         reader.notes.append("config.list: /etc/config cannot be read")
         return None
@@ -243,7 +243,7 @@ def _uci(reader: _Reader) -> Mapping[str, str] | None:
     )
 
 
-def _lines(reader: _Reader, name: str) -> tuple[str, ...] | None:
+def _lines(reader: _OutputReader, name: str) -> tuple[str, ...] | None:
     body = reader.body(name)
     if body is None:
         reader.notes.append(f"{name}: exit status {reader.status(name)}")
@@ -251,7 +251,7 @@ def _lines(reader: _Reader, name: str) -> tuple[str, ...] | None:
     return tuple(line for line in body.decode("utf-8", "replace").splitlines() if line.strip())
 
 
-def _file(reader: _Reader, path: str) -> FileInfo | None:
+def _file(reader: _OutputReader, path: str) -> FileInfo | None:
     """None for a path that does not exist or is not a regular file."""
     listed, hashed, text = (reader.body(f"{kind} {path}") for kind in ("mode", "hash", "text"))
     if listed is None or hashed is None or text is None:

@@ -32,7 +32,7 @@ MAX_SURVEYS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class UploadProgress:
     """`verified` of `total` bytes are on the node with matching hashes."""
 
     verified: int
@@ -85,7 +85,7 @@ def upload(
     *,
     mode: int = 0o644,
     rate_bytes_per_s: float | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[UploadProgress], None] | None = None,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Uploaded:
     """Write `source` to `path` on the node, with `mode`; a second call after a cut resumes.
@@ -101,11 +101,11 @@ def upload(
     for _ in range(MAX_SURVEYS):
         survey = _survey(connection, path, partial, content)
         if survey.done:
-            report(Progress(content.size, content.size))
+            report(UploadProgress(content.size, content.size))
             return Uploaded(path, content.sha256, content.size, sent, content.size - sent)
         good = survey.good_chunks
         kept_at_first = good * CHUNK_BYTES if kept_at_first is None else kept_at_first
-        report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+        report(UploadProgress(min(good * CHUNK_BYTES, content.size), content.size))
         while good < content.chunks:
             data = content.chunk(good)
             arrived = _send_chunk(connection, partial, good, data, rate_bytes_per_s, sleep)
@@ -113,7 +113,7 @@ def upload(
             if not arrived:
                 break
             good += 1
-            report(Progress(min(good * CHUNK_BYTES, content.size), content.size))
+            report(UploadProgress(min(good * CHUNK_BYTES, content.size), content.size))
         if good == content.chunks and _put_in_place(connection, partial, path, content, mode):
             return Uploaded(path, content.sha256, content.size, sent, min(kept_at_first, content.size))
     raise UploadFailed(f"{connection.endpoint.label}: {path}: the data was corrupted on the way")

@@ -38,7 +38,7 @@ _LINES_BELOW = 5
 _MAX_NAMES = 4
 
 
-class Progress(AbstractContextManager["Progress"], Protocol):
+class RunProgress(AbstractContextManager["RunProgress"], Protocol):
     """Shows events within its context."""
 
     def __call__(self, event: Event) -> None: ...
@@ -60,7 +60,7 @@ def _write_error(text: str) -> None:
         sys.stderr.flush()
 
 
-class PlainProgress(Progress):
+class PlainProgress(RunProgress):
     """One line per step and outcome, for logs and pipes."""
 
     def stopping(self, text: str) -> None:
@@ -103,7 +103,7 @@ def _raw_line(event: Event) -> str:
             return outcome_text(event.outcome) + hint
 
 
-class JsonProgress(Progress):
+class JsonProgress(RunProgress):
     """One JSON object per event: `{"event", "node", "at_s", ...}`."""
 
     def stopping(self, text: str) -> None:
@@ -143,7 +143,7 @@ def outcome_object(outcome: Outcome) -> dict[str, object]:
     }
 
 
-class LiveProgress(Progress):
+class LiveProgress(RunProgress):
     """One live line per active node, with outcomes scrolling above and totals below."""
 
     def __init__(self, console: Console, total: int) -> None:
@@ -211,14 +211,14 @@ class LiveProgress(Progress):
         )
 
 
-class ThreadedProgress(Progress):
+class ThreadedProgress(RunProgress):
     """Shows events from its own thread, so that no node waits for the terminal.
 
     A blocked reader (a pager, Ctrl-S) blocks only the output, and a closed one (`| head`) only ends it. Otherwise an
     armed change could time out, or its worker fail on the write.
     """
 
-    def __init__(self, shown: Progress) -> None:
+    def __init__(self, shown: RunProgress) -> None:
         self._shown = shown
         self._events: queue.SimpleQueue[Event | str | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._show, name="progress", daemon=True)

@@ -17,7 +17,7 @@ COMPUTER = "computer"
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class TableCell:
     """`short` replaces `text` on narrow terminals."""
 
     text: str = ""
@@ -60,77 +60,77 @@ COLUMNS = (
 )
 
 
-def row(one: NodeStatus | RobotStatus) -> dict[str, Cell]:
+def row(one: NodeStatus | RobotStatus) -> dict[str, TableCell]:
     """The cells of a device by column key."""
     return _node_row(one) if isinstance(one, NodeStatus) else _robot_row(one)
 
 
-def _node_row(node: NodeStatus) -> dict[str, Cell]:
+def _node_row(node: NodeStatus) -> dict[str, TableCell]:
     cells = {
-        "name": Cell(node.name),
-        "what": Cell(node.node.role.value),
-        "state": Cell(node.node.state.value),
-        "health": Cell(node.health.value),
-        "age": Cell(_age(node.age_s)),
+        "name": TableCell(node.name),
+        "what": TableCell(node.node.role.value),
+        "state": TableCell(node.node.state.value),
+        "health": TableCell(node.health.value),
+        "age": TableCell(_age(node.age_s)),
     }
     if node.no_answer_reason:
         return cells | _bracketed(_known_node(node.last_known or {}))
     return cells | {
-        "up": Cell(_up(node.uptime_s)),
-        "load": Cell(_share(node.load)),
-        "memory": Cell(_share(node.memory_free)),
-        "disk": Cell("" if node.flash_free_bytes is None else size(node.flash_free_bytes / 1024)),
-        "release": Cell(node.version),
-        "config": Cell(_same(node.drift)),
-        "channel": Cell(",".join(map(str, node.channels))),
-        "bridge": Cell("" if node.lan_ports is None else "+".join(node.lan_ports) or "nothing"),
+        "up": TableCell(_up(node.uptime_s)),
+        "load": TableCell(_share(node.load)),
+        "memory": TableCell(_share(node.memory_free)),
+        "disk": TableCell("" if node.flash_free_bytes is None else size(node.flash_free_bytes / 1024)),
+        "release": TableCell(node.version),
+        "config": TableCell(_same(node.drift)),
+        "channel": TableCell(",".join(map(str, node.channels))),
+        "bridge": TableCell("" if node.lan_ports is None else "+".join(node.lan_ports) or "nothing"),
         "hears": _hears(node),
-        "path": _path(node.hops, node.quality) if node.is_path_known else Cell(),
-        "via": Cell(node.via),
+        "path": _path(node.hops, node.quality) if node.is_path_known else TableCell(),
+        "via": TableCell(node.via),
     }
 
 
-def _hears(node: NodeStatus) -> Cell:
+def _hears(node: NodeStatus) -> TableCell:
     """The number of nodes heard and the best one: `3: b01 -70 dBm 62%`."""
     count = str(len(node.neighbors))
     if not node.neighbors:
-        return Cell(count)
+        return TableCell(count)
     best = node.neighbors[0]
     signal = "" if best.signal_dbm is None else f" {best.signal_dbm} dBm"
     quality = "" if best.quality is None else f" {best.quality:.0%}"
-    return Cell(f"{count}: {best.name}{signal}{quality}", count)
+    return TableCell(f"{count}: {best.name}{signal}{quality}", count)
 
 
-def _path(hops: int | None, quality: float | None) -> Cell:
+def _path(hops: int | None, quality: float | None) -> TableCell:
     if hops is None:
-        return Cell("no path", "none")
+        return TableCell("no path", "none")
     if not hops:
-        return Cell("is base", "base")
+        return TableCell("is base", "base")
     share = "" if quality is None else f" {quality:.0%}"
-    return Cell(f"{hops} hop{'s' if hops > 1 else ''}{share}", f"{hops}h{share}")
+    return TableCell(f"{hops} hop{'s' if hops > 1 else ''}{share}", f"{hops}h{share}")
 
 
-def _known_node(facts: Mapping[str, str]) -> dict[str, Cell]:
+def _known_node(facts: Mapping[str, str]) -> dict[str, TableCell]:
     heard = facts.get("heard", "").split()
     hops = facts.get("hops", "")
     return {
-        "release": Cell(facts.get("version", "")),
-        "config": Cell(facts.get("config", "")),
-        "channel": Cell(facts.get("channels", "").replace(" ", ",")),
-        "bridge": Cell(facts.get("lan_ports", "").replace(" ", "+")),
-        "hears": Cell(", ".join(heard), str(len(heard)) if heard else ""),
-        "path": Cell(f"{hops} hop{'s' if hops != '1' else ''}" if hops else "", f"{hops}h" if hops else ""),
-        "via": Cell(facts.get("via", "")),
+        "release": TableCell(facts.get("version", "")),
+        "config": TableCell(facts.get("config", "")),
+        "channel": TableCell(facts.get("channels", "").replace(" ", ",")),
+        "bridge": TableCell(facts.get("lan_ports", "").replace(" ", "+")),
+        "hears": TableCell(", ".join(heard), str(len(heard)) if heard else ""),
+        "path": TableCell(f"{hops} hop{'s' if hops != '1' else ''}" if hops else "", f"{hops}h" if hops else ""),
+        "via": TableCell(facts.get("via", "")),
     }
 
 
-def _robot_row(robot: RobotStatus) -> dict[str, Cell]:
+def _robot_row(robot: RobotStatus) -> dict[str, TableCell]:
     cells = {
-        "name": Cell(robot.name),
-        "what": Cell(COMPUTER),
-        "state": Cell("" if robot.state is None else robot.state.value),
-        "health": Cell(robot.health.value),
-        "age": Cell(_age(robot.age_s)),
+        "name": TableCell(robot.name),
+        "what": TableCell(COMPUTER),
+        "state": TableCell("" if robot.state is None else robot.state.value),
+        "health": TableCell(robot.health.value),
+        "age": TableCell(_age(robot.age_s)),
     }
     facts = robot.facts
     if facts is None:
@@ -138,42 +138,44 @@ def _robot_row(robot: RobotStatus) -> dict[str, Cell]:
     computer = facts.computer
     memory = computer.memory_free_kib / computer.memory_kib if computer.memory_kib else None
     cells |= {
-        "up": Cell(_up(computer.uptime_s)),
-        "load": Cell(_share(computer.load[0] / computer.cpus if computer.load and computer.cpus else None)),
-        "memory": Cell(_share(memory)),
-        "disk": Cell(size(computer.disk_free_kib) if computer.disk_kib else ""),
-        "release": Cell(facts.version or ("installed" if facts.release else "none")),
-        "config": Cell(_same(facts.drift) if robot.is_compared else ""),
-        "bridge": Cell("" if facts.bridge is None else f"ROS {facts.bridge.active or 'absent'}"),
+        "up": TableCell(_up(computer.uptime_s)),
+        "load": TableCell(_share(computer.load[0] / computer.cpus if computer.load and computer.cpus else None)),
+        "memory": TableCell(_share(memory)),
+        "disk": TableCell(size(computer.disk_free_kib) if computer.disk_kib else ""),
+        "release": TableCell(facts.version or ("installed" if facts.release else "none")),
+        "config": TableCell(_same(facts.drift) if robot.is_compared else ""),
+        "bridge": TableCell("" if facts.bridge is None else f"ROS {facts.bridge.active or 'absent'}"),
     }
     if not facts.answers:
-        return cells | {"hears": Cell("no daemon", "none")}
+        return cells | {"hears": TableCell("no daemon", "none")}
     waiting = [queue for queue in facts.queues if queue.messages]
     by_priority = " ".join(f"{queue.priority}:{queue.messages}" for queue in waiting)
     messages = sum(queue.messages for queue in waiting)
     bad = sum(bool(topic.problem) for topic in robot.topics)
     peers = f"{len(facts.online)} of {len(facts.peers)}"
     return cells | {
-        "hears": Cell(f"{peers} daemons", peers),
-        "path": Cell("" if robot.base_round_trip_s is None else f"{robot.base_round_trip_s * 1000:.0f} ms"),
-        "waits": Cell(by_priority or "0", str(messages)),
-        "topics": Cell(f"{bad} of {len(robot.topics)} bad" if bad else "ok" if robot.topics else ""),
+        "hears": TableCell(f"{peers} daemons", peers),
+        "path": TableCell("" if robot.base_round_trip_s is None else f"{robot.base_round_trip_s * 1000:.0f} ms"),
+        "waits": TableCell(by_priority or "0", str(messages)),
+        "topics": TableCell(f"{bad} of {len(robot.topics)} bad" if bad else "ok" if robot.topics else ""),
     }
 
 
-def _known_robot(facts: Mapping[str, str]) -> dict[str, Cell]:
+def _known_robot(facts: Mapping[str, str]) -> dict[str, TableCell]:
     online = facts.get("online", "").split()
     return {
-        "release": Cell(facts.get("version", "")),
-        "config": Cell(facts.get("config", "")),
-        "hears": Cell(", ".join(online), str(len(online)) if online else ""),
+        "release": TableCell(facts.get("version", "")),
+        "config": TableCell(facts.get("config", "")),
+        "hears": TableCell(", ".join(online), str(len(online)) if online else ""),
     }
 
 
-def _bracketed(cells: Mapping[str, Cell]) -> dict[str, Cell]:
+def _bracketed(cells: Mapping[str, TableCell]) -> dict[str, TableCell]:
     """Cells of last known facts, in parentheses."""
     return {
-        key: Cell(f"({cell.text})", f"({cell.short})" if cell.short else "") for key, cell in cells.items() if cell.text
+        key: TableCell(f"({cell.text})", f"({cell.short})" if cell.short else "")
+        for key, cell in cells.items()
+        if cell.text
     }
 
 

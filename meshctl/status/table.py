@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from meshctl.report.terminal_escapes import one_line
-from meshctl.status.rows import COLUMNS, Cell, Column
+from meshctl.status.rows import COLUMNS, Column, TableCell
 
 _GAP = "  "
 # Columns of this rank or more are dropped before cells are shortened.
@@ -33,9 +33,9 @@ class Layout:
     dropped: tuple[str, ...]
 
 
-def layout(rows: Sequence[Mapping[str, Cell]], width: int | None) -> Layout:
+def layout(rows: Sequence[Mapping[str, TableCell]], width: int | None) -> Layout:
     """The layout that fits into `width` characters (None: unlimited)."""
-    columns = [column for column in COLUMNS if any(row.get(column.key, Cell()).text for row in rows)]
+    columns = [column for column in COLUMNS if any(row.get(column.key, TableCell()).text for row in rows)]
     leaving = sorted((column for column in columns if column.rank), key=lambda column: -column.rank)
     dropped: set[str] = set()
     is_short = False
@@ -59,20 +59,20 @@ def _remaining(columns: Sequence[Column], dropped: set[str]) -> tuple[Column, ..
     return tuple(column for column in columns if column.key not in dropped)
 
 
-def _cell(row: Mapping[str, Cell], column: Column, is_short: bool) -> str:
-    cell = row.get(column.key, Cell())
+def _cell(row: Mapping[str, TableCell], column: Column, is_short: bool) -> str:
+    cell = row.get(column.key, TableCell())
     return one_line(cell.shortest if is_short else cell.text) or "-"
 
 
-def _widths(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> list[int]:
+def _widths(rows: Sequence[Mapping[str, TableCell]], columns: Sequence[Column], is_short: bool) -> list[int]:
     return [max([len(column.heading), *(len(_cell(row, column, is_short)) for row in rows)]) for column in columns]
 
 
-def _width(rows: Sequence[Mapping[str, Cell]], columns: Sequence[Column], is_short: bool) -> int:
+def _width(rows: Sequence[Mapping[str, TableCell]], columns: Sequence[Column], is_short: bool) -> int:
     return sum(_widths(rows, columns, is_short)) + len(_GAP) * (len(columns) - 1)
 
 
-def table_lines(rows: Sequence[Mapping[str, Cell]], width: int | None = None, paint: Paint = plain) -> list[str]:
+def table_lines(rows: Sequence[Mapping[str, TableCell]], width: int | None = None, paint: Paint = plain) -> list[str]:
     """The heading, one line per row, and a note on dropped columns."""
     if not rows:
         return []

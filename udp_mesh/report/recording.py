@@ -38,7 +38,7 @@ class RecordingError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class ReceivedMessage:
+class RecordedArrival:
     t: float
     at: str
     source: str
@@ -100,7 +100,7 @@ class Recording:
 
     name: str = ""
     started: float = 0.0
-    arrivals: list[ReceivedMessage] = field(default_factory=list)
+    arrivals: list[RecordedArrival] = field(default_factory=list)
     presences: list[Presence] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
@@ -116,10 +116,10 @@ def header(name: str, started: float) -> str:
     return json.dumps({"recording": VERSION, "node": name, "started": started})
 
 
-def line(item: ReceivedMessage | Presence | Sample | Place) -> str:
+def line(item: RecordedArrival | Presence | Sample | Place) -> str:
     """Encodes one line, without the line end."""
     match item:
-        case ReceivedMessage(_, _, source, topic, priority, size):
+        case RecordedArrival(_, _, source, topic, priority, size):
             kind = "received"
             what: dict[str, Any] = {"source": source, "topic": topic, "priority": priority, "bytes": size}
         case Presence(_, _, peer, online):
@@ -207,7 +207,7 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
     match kind:
         case "received":
             recording.arrivals.append(
-                ReceivedMessage(
+                RecordedArrival(
                     t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry)
                 )
             )

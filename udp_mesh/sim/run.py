@@ -161,7 +161,7 @@ class _Run:
                 total.latencies_s.append(now - _SENT.unpack_from(payload)[0])
                 if robot == self.scenario.observer:
                     self.observer_bytes[topic] += len(payload)
-                    self._record(recording.ReceivedMessage(now, robot, source, topic, priority, len(payload)))
+                    self._record(recording.RecordedArrival(now, robot, source, topic, priority, len(payload)))
             case PeerOnline(peer) | PeerOffline(peer):
                 if robot == self.scenario.observer:
                     self._record(recording.Presence(now, robot, peer, isinstance(event, PeerOnline)))
@@ -170,7 +170,7 @@ class _Run:
                 return
 
     def _record(
-        self, item: recording.ReceivedMessage | recording.Presence | recording.Sample | recording.Place
+        self, item: recording.RecordedArrival | recording.Presence | recording.Sample | recording.Place
     ) -> None:
         self.lines.append(recording.line(item))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class OutputSection:
     """What one command printed and its exit status; -1 when the output ends inside it."""
 
     body: bytes
@@ -17,9 +17,9 @@ class Section:
         return self.body.decode("utf-8", "replace")
 
 
-def split_sections(output: bytes, nonce: str) -> dict[str, Section]:
+def split_sections(output: bytes, nonce: str) -> dict[str, OutputSection]:
     """All sections by name, in order. A name that comes twice keeps its first; what is outside sections is dropped."""
-    found: dict[str, Section] = {}
+    found: dict[str, OutputSection] = {}
     begin, end = f"{nonce} begin ".encode(), f"{nonce} end ".encode()
     name: str | None = None
     body: list[bytes] = []
@@ -27,12 +27,12 @@ def split_sections(output: bytes, nonce: str) -> dict[str, Section]:
         if line.startswith(begin):
             name, body = line[len(begin) :].decode("utf-8", "replace"), []
         elif name is not None and line.startswith(end):
-            found.setdefault(name, Section(b"\n".join(body), _status(line[len(end) :])))
+            found.setdefault(name, OutputSection(b"\n".join(body), _status(line[len(end) :])))
             name = None
         elif name is not None:
             body.append(line)
     if name is not None:
-        found.setdefault(name, Section(b"\n".join(body), -1))
+        found.setdefault(name, OutputSection(b"\n".join(body), -1))
     return found
 
 

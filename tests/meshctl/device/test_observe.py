@@ -18,7 +18,7 @@ from meshctl.device.observation import Observation
 from meshctl.device.observe import interpret, observation_script, observe
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
 from meshctl.device.parse.deadman import parse_answer, parse_status
-from meshctl.device.parse.sections import Section, split_sections
+from meshctl.device.parse.sections import OutputSection, split_sections
 from meshctl.device.ssh import SshConnection
 from meshctl.model import RELEASES
 from tests.meshctl.device.sandbox import Sandbox
@@ -159,15 +159,15 @@ def test_no_text_makes_any_parser_raise(text: str) -> None:
         iw.with_link(link, text)
 
 
-@given(st.dictionaries(st.sampled_from(NAMES), st.builds(Section, st.binary(max_size=80), st.integers(-1, 255))))
-def test_any_sections_at_all_give_an_observation(sections: dict[str, Section]) -> None:
+@given(st.dictionaries(st.sampled_from(NAMES), st.builds(OutputSection, st.binary(max_size=80), st.integers(-1, 255))))
+def test_any_sections_at_all_give_an_observation(sections: dict[str, OutputSection]) -> None:
     assert interpret(sections, asked_at_s=0.0, answered_at_s=0.0).asked_at_s == 0.0
 
 
 @given(st.lists(st.binary(max_size=30).filter(lambda body: b"NONCE" not in body), max_size=5))
 def test_sections_keep_every_byte(bodies: list[bytes]) -> None:
     output = b"".join(b"NONCE begin s%d\n%s\nNONCE end %d\n" % (n, body, n) for n, body in enumerate(bodies))
-    assert split_sections(output, "NONCE") == {f"s{n}": Section(body, n) for n, body in enumerate(bodies)}
+    assert split_sections(output, "NONCE") == {f"s{n}": OutputSection(body, n) for n, body in enumerate(bodies)}
 
 
 def test_a_section_that_another_one_pretends_to_be_needs_the_nonce() -> None:
@@ -309,7 +309,7 @@ def test_a_root_in_memory_is_distinguished_from_one_in_flash() -> None:
 
 def test_a_node_without_a_package_manager_has_one_note_that_says_so() -> None:
     sections = split_sections((RECORDED / "24.10" / "mesh" / "observe.out").read_bytes(), "NONCE")
-    without = {**sections, "package_tool": Section(b"", 127), "packages": Section(b"", 127)}
+    without = {**sections, "package_tool": OutputSection(b"", 127), "packages": OutputSection(b"", 127)}
     seen = interpret(without, asked_at_s=1785311990.0, answered_at_s=1785311994.0)
     assert seen.notes == ("no package manager: neither apk nor opkg was found",)
     assert (seen.package_tool, seen.packages) == (None, None)

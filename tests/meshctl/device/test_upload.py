@@ -14,7 +14,7 @@ import pytest
 from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
 from meshctl.device.ssh import SshConnection, _Feeder
-from meshctl.device.upload import CHUNK_BYTES, Progress, upload
+from meshctl.device.upload import CHUNK_BYTES, UploadProgress, upload
 from meshctl.errors import InputError
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import Server, dropbear, log_in, ready
@@ -29,13 +29,13 @@ def leftovers(node: Sandbox) -> list[str]:
 @pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES - 1, CHUNK_BYTES, 3 * CHUNK_BYTES + 17])
 def test_what_arrives_is_what_was_sent_with_its_mode(connection: SshConnection, node: Sandbox, size: int) -> None:
     data = os.urandom(size)
-    told: list[Progress] = []
+    told: list[UploadProgress] = []
     done = upload(connection, data, TARGET, mode=0o600, progress=told.append)
     assert node.path(TARGET).read_bytes() == data
     assert node.path(TARGET).stat().st_mode & 0o777 == 0o600
     assert (done.sha256, done.sent, done.kept) == (hashlib.sha256(data).hexdigest(), size, 0)
     assert [step.verified for step in told] == sorted({0, *(step.verified for step in told)})
-    assert told[-1] == Progress(size, size)
+    assert told[-1] == UploadProgress(size, size)
     assert leftovers(node) == []
 
 
@@ -159,7 +159,7 @@ def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
 
 def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_path: Path) -> None:
     ready(node, tmp_path)
-    told: list[Progress] = []
+    told: list[UploadProgress] = []
     with dropbear(node, tmp_kib=1024) as server, log_in(server, node, tmp_path) as connected:
         with pytest.raises(UploadFailed, match=r"needs 2049 KiB, 10[0-9][0-9] KiB are free"):
             upload(connected, os.urandom(2 << 20), TARGET, progress=told.append)

@@ -27,7 +27,7 @@ from meshctl.report.plan_text import plan_lines
 from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress
 from meshctl.report.terminal_escapes import clean, clean_styled, json_safe, one_line
 from meshctl.status import Check
-from meshctl.status.rows import Cell
+from meshctl.status.rows import TableCell
 from meshctl.status.table import table_lines
 from meshctl.status.text import text
 from meshctl.status.values import Alarm, Level
@@ -115,7 +115,7 @@ def test_a_status_of_hostile_devices_steers_nothing(tmp_path: Path) -> None:
     drawn = page(text(status, 100, paint).splitlines(), 50)
     for sequence in ("\x1b[2J", "\x1b]", "\x9b", "\x07", "\u202e"):
         assert sequence not in drawn
-    assert steering("\n".join(table_lines([{"health": Cell("ok"), "name": Cell(HOSTILE)}]))) == []
+    assert steering("\n".join(table_lines([{"health": TableCell("ok"), "name": TableCell(HOSTILE)}]))) == []
 
 
 def test_history_of_a_hostile_device_steers_nothing(

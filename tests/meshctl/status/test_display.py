@@ -23,7 +23,7 @@ from meshctl.status.alarm_codes import CODES
 from meshctl.status.filters import Filter
 from meshctl.status.json_output import as_json, preflight_json
 from meshctl.status.preflight import Check
-from meshctl.status.rows import COLUMNS, Cell
+from meshctl.status.rows import COLUMNS, TableCell
 from meshctl.status.table import layout, table_lines
 from meshctl.status.text import preflight_text, summary_lines, text, topic_lines
 from meshctl.status.values import NoAnswer
@@ -85,7 +85,7 @@ def test_what_has_no_room_is_named(fleet: Fleet) -> None:
 )
 def test_columns_give_way_by_rank_and_those_without_rank_stay(cells: list[tuple[str, str]], width: int) -> None:
     rows = [
-        {column.key: Cell(name if column.key == "name" else other or "-", "s") for column in COLUMNS}
+        {column.key: TableCell(name if column.key == "name" else other or "-", "s") for column in COLUMNS}
         for name, other in cells
     ]
     shown = layout(rows, width)

@@ -13,8 +13,8 @@ from udp_mesh.bridges.ros1.publications import (
     MAX_WAITING_BYTES,
     MAX_WAITING_MESSAGES,
     Advertised,
-    OutgoingMessage,
     Publications,
+    RosPublication,
 )
 from udp_mesh.bridges.types import TypeKey
 
@@ -35,7 +35,7 @@ class Graph:
         self.withdrawn: list[str] = []
         self.publications = Publications(self._advertise, lambda name: self.subscribers, lambda: self.now)
 
-    def _advertise(self, message: OutgoingMessage) -> Advertised:
+    def _advertise(self, message: RosPublication) -> Advertised:
         assert self.answers.wait(WAIT_S)
         return Topic(self, message)
 
@@ -52,14 +52,14 @@ class Graph:
             thread.join(WAIT_S)
 
     def publish(self, name: str, payload: bytes, key: TypeKey = STRING, *, latched: bool = False) -> None:
-        self.publications.publish(OutgoingMessage(name, key, "", latched, payload))
+        self.publications.publish(RosPublication(name, key, "", latched, payload))
 
     def got(self, name: str) -> list[bytes]:
         return [payload for topic, _, payload in self.log if topic == name]
 
 
 class Topic:
-    def __init__(self, graph: Graph, message: OutgoingMessage) -> None:
+    def __init__(self, graph: Graph, message: RosPublication) -> None:
         self._graph, self._name, self._type = graph, message.name, message.key.name
 
     def connections(self) -> int:

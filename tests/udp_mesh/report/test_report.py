@@ -20,7 +20,7 @@ from udp_mesh.report.page import page
 from udp_mesh.report.recording import (
     Place,
     Presence,
-    ReceivedMessage,
+    RecordedArrival,
     Recording,
     RecordingError,
     Sample,
@@ -32,14 +32,14 @@ from udp_mesh.report.recording import (
 
 ITEMS = (
     Presence(1.0, "base", "spot1", True),
-    ReceivedMessage(1.5, "base", "spot1", "telemetry", 3, 1000),
+    RecordedArrival(1.5, "base", "spot1", "telemetry", 3, 1000),
     Sample(2.0, "base", "spot1", 0.02, 0.05, 8000.0, 2),
     Place(2.0, "spot1", 10.0, 20.5),
     Presence(3.0, "base", "spot1", False),
 )
 
 
-def lines(*items: ReceivedMessage | Presence | Sample | Place) -> list[bytes]:
+def lines(*items: RecordedArrival | Presence | Sample | Place) -> list[bytes]:
     return [text.encode() for text in (header("base", 0.0), *map(line, items))]
 
 
@@ -167,9 +167,9 @@ def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
 
 def test_the_topic_with_the_most_messages_is_shown_first_with_its_punctuality() -> None:
     often = [
-        ReceivedMessage(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)
+        RecordedArrival(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)
     ]
-    seldom = [ReceivedMessage(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
+    seldom = [RecordedArrival(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
     first, second = intervals(parse(lines(*often, *seldom), "r"))
     assert (first.topic, second.topic) == ("telemetry", "artifact")
     # each late one makes its own interval longer and the next one shorter
@@ -189,7 +189,7 @@ def test_a_long_name_is_shortened_and_shown_in_full_in_a_tooltip() -> None:
 
 
 def test_messages_that_all_come_at_once_are_not_periodic() -> None:
-    burst = [ReceivedMessage(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
+    burst = [RecordedArrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
     assert intervals(parse(lines(*burst), "r")) == []
 
 
@@ -223,7 +223,7 @@ def test_any_json_in_a_known_kind_is_an_item_or_a_problem(value: object) -> None
 
 
 def periodic(jitter: float) -> Recording:
-    items = [ReceivedMessage(i + (jitter if i % 2 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
+    items = [RecordedArrival(i + (jitter if i % 2 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
     return parse(lines(*items), "r")
 
 
@@ -232,7 +232,7 @@ def test_intervals_have_median_deviation_and_gaps() -> None:
     assert (steady.median_s, steady.deviation_s, steady.gaps) == (1.0, 0.0, 0)
     (jittered,) = intervals(periodic(0.1))
     assert jittered.deviation_s == pytest.approx(0.1, abs=0.01)
-    lonely = parse(lines(*[ReceivedMessage(t, "base", "s", "t", 1, 1) for t in [*range(30), *range(100, 130)]]), "r")
+    lonely = parse(lines(*[RecordedArrival(t, "base", "s", "t", 1, 1) for t in [*range(30), *range(100, 130)]]), "r")
     assert intervals(lonely)[0].gaps == 1
 
 
