@@ -1,4 +1,4 @@
-"""Findings for people: place, severity, message, code; the line with a caret; how to mend it; a summary."""
+"""Findings for people: place, severity, message, code; the line with a caret; how to fix it; a summary."""
 
 from __future__ import annotations
 

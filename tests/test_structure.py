@@ -1,0 +1,37 @@
+"""The structure that a reader relies on: a class name means one thing in a package, and no module imports itself around
+a circle."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import grimp
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("meshctl", "meshlab", "udp_mesh")
+# ROS 1, ROS 2 and Zenoh each have one, in a process of its own; the library's Node is the core's for a program
+SHARED = {"Bridge", "Node"}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_class_name_is_used_for_one_thing(package: str) -> None:
+    places: dict[str, list[str]] = defaultdict(list)
+    for file in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.parse(file.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(str(file.relative_to(ROOT)))
+    assert {name: files for name, files in places.items() if len(files) > 1 and name not in SHARED} == {}
+
+
+def test_no_import_circle() -> None:
+    """Imports for types alone count, too."""
+    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=False)
+    imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
