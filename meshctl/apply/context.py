@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from meshctl.apply.health_checks import Expectation
 from meshctl.device.observation import Observation
@@ -18,8 +18,21 @@ from meshctl.nodes.connections import ConnectionPool
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.topology import mesh_macs
 
-if TYPE_CHECKING:
-    from meshctl.apply.station_flush import StationFlush
+
+class UnfinishedFlush(Protocol):
+    """A station flush whose neighbors did not all answer (`station_flush.StationFlush`)."""
+
+    @property
+    def node(self) -> str: ...
+
+    def retries(self) -> Mapping[str, Callable[[], str]]:
+        """Neighbor -> the script to run there."""
+
+    def own_lines(self, answer: str) -> str:
+        """The lines of an answer that concern this node."""
+
+    def report(self, answers: Mapping[str, str]) -> None:
+        """Note what the neighbors that answered did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +57,7 @@ class RunContext:
     observations: Mapping[str, Observation] = field(default_factory=dict)
     mac_owners: Mapping[str, str] = field(default_factory=dict)
     base_macs: Sequence[str] = ()
-    unfinished_flushes: list[StationFlush] = field(default_factory=list)
+    unfinished_flushes: list[UnfinishedFlush] = field(default_factory=list)
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def record(self, name: str, seen: Observation) -> None:

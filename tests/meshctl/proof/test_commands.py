@@ -78,5 +78,10 @@ def test_the_journal_tells_every_run_with_its_steps(rig: Rig) -> None:
     first = json.loads(rig.meshctl("history", "", "1", "--json").out)
     assert (first["command"], {outcome["result"] for outcome in first["outcomes"]}) == ("bootstrap", {"done"})
     steps = [step["step"] for step in first["steps"] if step["node"] == "n001"]
-    # where a machine is slow enough for the node to seem silent, its neighbors are asked meanwhile
-    assert [step for step in steps if "neighbor station entries" not in step] == ["stage", "arm", "apply", "prove"]
+    # on a slow machine the node may seem unreachable, so that its neighbors are queried meanwhile
+    assert [step for step in steps if not step.endswith("neighbor station entries")] == [
+        "stage",
+        "arm",
+        "apply",
+        "prove",
+    ]
