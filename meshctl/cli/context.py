@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -56,7 +55,12 @@ Lab = Annotated[
     Path | None,
     typer.Option("--lab", envvar="MESHCTL_LAB", help="Connect to the virtual fleet that runs in DIR."),
 ]
-Nodes = Annotated[list[str] | None, typer.Argument(help="Nodes or patterns such as 'husky*'; default: all.")]
+Nodes = Annotated[
+    list[str] | None,
+    typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all."),
+]
+    list[str] | None, typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.")
+]
 
 Options = Mapping[str, tuple[Any, Any]]
 """Type and default of each option, by the opener's parameter name, in the order of the help."""
@@ -135,24 +139,19 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
     return virtual, locate
 
 
-def selected_nodes(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[Node, ...]:
-    """The managed nodes that match any name or pattern, in inventory order; all without patterns.
+def selected_nodes(fleet: Fleet, words: Iterable[str] | None) -> tuple[Node, ...]:
+    """The managed nodes that the words select (`inventory.selection`), in inventory order; all without words.
 
-    Raises InputError for a pattern that matches nothing.
+    Raises InputError for a word that selects nothing.
     """
-    from meshctl.inventory.suggest import did_you_mean
+    from meshctl.inventory.selection import select_nodes
 
-    wanted = list(patterns or ())
-    managed = {node.name: node for node in fleet.managed()}
-    if not wanted:
-        return tuple(managed.values())
-    for pattern in wanted:
-        if not any(fnmatchcase(name, pattern) for name in managed):
-            raise InputError(
-                f"no managed node of {fleet.name} matches {pattern!r}",
-                hint=did_you_mean(pattern, managed) or "run `meshctl inventory list` to list all nodes",
-            )
-    return tuple(node for name, node in managed.items() if any(fnmatchcase(name, pattern) for pattern in wanted))
+    return select_nodes(fleet, words or (), read_selection)
+
+
+def read_selection(path: str) -> str:
+    """The text of `@FILE`; `-` is standard input. Raises OSError."""
+    return sys.stdin.read() if path == "-" else Path(path).read_text(encoding="utf-8")
 
 
 def progress_for(count: int, *, as_json: bool) -> RunProgress:

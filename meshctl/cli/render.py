@@ -5,18 +5,18 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath, read_selection
 from meshctl.cli.git_revision import checkout
 from meshctl.cli.output import echo, echo_json
-from meshctl.errors import ExitCode, InputError
+from meshctl.errors import ExitCode
 from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore
+from meshctl.inventory.selection import LIST_HINT, attributes_of, select
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.render import (
     ImageFolder,
@@ -86,14 +86,8 @@ def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:
 def _selected_names(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
     """The nodes that match any pattern, in inventory order. Raises InputError for a pattern without a match."""
     wanted = list(patterns)
-    if not wanted:
-        return [node.name for node in fleet.managed()]
-    names = list(fleet.nodes)
-    for pattern in wanted:
-        matches = [name for name in names if fnmatchcase(name, pattern)]
-        if not matches:
-            raise InputError(f"no node matches {pattern!r}", hint="run `meshctl inventory list` to list all nodes")
-    chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in wanted)]
+    candidates = {name: attributes_of(node) for name, node in fleet.nodes.items()}
+    chosen = select(wanted, candidates, read_selection, what="node", hint=LIST_HINT)
     # patterns skip unmanaged nodes; an exact name reports why it cannot be rendered
     return [name for name in chosen if name in wanted or fleet.nodes[name].state.is_managed]
 

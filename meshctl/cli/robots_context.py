@@ -21,7 +21,17 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Session, exit_for, progress_for, session, with_options
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Session,
+    exit_for,
+    progress_for,
+    read_selection,
+    session,
+    with_options,
+)
 from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
@@ -189,7 +199,9 @@ def robots_context(
     secrets = SecretStore(os.environ, Path(fleet.base)).get
     options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
     connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
-    return RobotsContext(opened, connector, selected_robots(fleet, robots), options, inventory, wheels, as_json)
+    return RobotsContext(
+        opened, connector, selected_robots(fleet, robots, read_selection), options, inventory, wheels, as_json
+    )
 
 
 def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -19,6 +19,8 @@ from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node
 
+LIST_HINT = "run `meshctl inventory list` to list all nodes"
+
 Attributes = Mapping[str, Collection[str]]
 """What a candidate can be selected by besides its name: attribute -> values."""
 
@@ -49,20 +51,26 @@ def select_nodes(fleet: Fleet, words: Iterable[str], read_file: Callable[[str], 
     """The managed nodes that the words select; all if there are none. Raises InputError, see `select`."""
     managed = {node.name: node for node in fleet.managed()}
     candidates = {name: attributes_of(node) for name, node in managed.items()}
-    names = select(words, candidates, read_file, what=f"managed node of {fleet.name}")
+    names = select(words, candidates, read_file, what=f"managed node of {fleet.name}", hint=LIST_HINT)
     return tuple(managed[name] for name in names)
 
 
 def select(
-    words: Iterable[str], candidates: Mapping[str, Attributes], read_file: Callable[[str], str], *, what: str
+    words: Iterable[str],
+    candidates: Mapping[str, Attributes],
+    read_file: Callable[[str], str],
+    *,
+    what: str,
+    hint: str = "",
 ) -> tuple[str, ...]:
     """The names that the words select, in the candidates' order; all if there are no words.
 
-    `read_file` returns the text of a file or raises OSError; `what` names a candidate in messages. Raises InputError
-    for a term that selects nothing, an unknown attribute, an unreadable file, or a selection that leaves nothing.
+    `read_file` returns the text of a file or raises OSError; `what` names a candidate in messages, `hint` follows
+    the error for an unknown name. Raises InputError for a term that selects nothing, an unknown attribute, an
+    unreadable file, or a selection that leaves nothing.
     """
     terms = tuple(_terms(words, read_file))
-    chosen = {term: _matching(term, candidates, what) for term in terms}
+    chosen = {term: _matching(term, candidates, what, hint) for term in terms}
     included = [term for term in terms if not term.is_exclusion]
     names = {name for term in included for name in chosen[term]} if included else set(candidates)
     left = names.difference(*(chosen[term] for term in terms if term.is_exclusion))
@@ -98,7 +106,7 @@ def _terms_of_file(path: str, read_file: Callable[[str], str]) -> Iterator[Term]
         yield from _terms(line.partition("#")[0].split(), read_file, source=f"{path}:{number}: ")
 
 
-def _matching(term: Term, candidates: Mapping[str, Attributes], what: str) -> set[str]:
+def _matching(term: Term, candidates: Mapping[str, Attributes], what: str, hint: str) -> set[str]:
     if term.attribute:
         return _matching_attribute(term, candidates, what)
     by_name = {name for name in candidates if fnmatchcase(name, term.pattern)}
@@ -107,7 +115,7 @@ def _matching(term: Term, candidates: Mapping[str, Attributes], what: str) -> se
         known = [*candidates, *_values("group", candidates)]
         raise InputError(
             f"no {what} matches {term.pattern!r}",
-            hint=did_you_mean(term.pattern, known) or "`meshctl inventory list` lists all nodes",
+            hint=did_you_mean(term.pattern, known) or hint,
         )
     return found
 

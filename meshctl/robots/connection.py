@@ -10,7 +10,6 @@ import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from meshctl.device.connection import Connection, Credentials, Endpoint
@@ -18,8 +17,9 @@ from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKey
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey, HostKey, HostKeyPolicy
 from meshctl.errors import InputError, NodeError, Unreachable
+from meshctl.inventory.selection import Attributes, select
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Secret
+from meshctl.model import Fleet, Robot, Secret
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.robots.host import Host, SshHost, become_root
 from meshctl.robots.preconditions import computer_of
@@ -140,21 +140,31 @@ def _hint_for(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_writt
             return ""
 
 
-def selected_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ...]:
-    """The robots with a computer that match any name or pattern, in inventory order; all without patterns.
+def selected_robots(fleet: Fleet, words: Iterable[str] | None, read_file: Callable[[str], str]) -> tuple[str, ...]:
+    """The robots with a computer that the words select (`inventory.selection`), in inventory order; all without words.
 
-    Raises InputError for a pattern that matches nothing, and for a named robot without a computer.
+    Raises InputError for a word that selects nothing, and for a named robot without a computer.
     """
-    wanted = list(patterns or ())
+    wanted = list(words or ())
     able = [name for name, robot in fleet.robots.items() if robot.computer is not None]
     if not able:
         raise InputError(f"no robot of {fleet.name} has a computer", hint="set robots.NAME.computer")
-    for pattern in wanted:
-        if not any(fnmatchcase(name, pattern) for name in able):
-            if pattern in fleet.robots:
-                is_legacy = fleet.robots[pattern].fielded is not None
-                instead = " in place of `fielded`, and stop the legacy program there" if is_legacy else ""
-                hint = f"set robots.{pattern}.computer{instead}"
-                raise InputError(f"robot {pattern} has no computer in the inventory", hint=hint)
-            raise InputError(f"no robot of {fleet.name} matches {pattern!r}", hint=did_you_mean(pattern, able))
-    return tuple(name for name in able if not wanted or any(fnmatchcase(name, pattern) for pattern in wanted))
+    for name in wanted:
+        if name in fleet.robots and name not in able:
+            is_legacy = fleet.robots[name].fielded is not None
+            instead = " in place of `fielded`, and stop the legacy program there" if is_legacy else ""
+            raise InputError(
+                f"robot {name} has no computer in the inventory", hint=f"set robots.{name}.computer{instead}"
+            )
+    candidates = {name: _attributes_of(fleet, fleet.robots[name]) for name in able}
+    return select(wanted, candidates, read_file, what=f"robot of {fleet.name}")
+
+
+def _attributes_of(fleet: Fleet, robot: Robot) -> Attributes:
+    """A robot has the groups, states and meshes of its radios."""
+    radios = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+    return {
+        "group": {group for node in radios for group in node.groups},
+        "state": {node.state.value for node in radios},
+        "mesh": {mesh for node in radios for mesh in node.meshes},
+    }

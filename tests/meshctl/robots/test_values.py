@@ -195,10 +195,10 @@ def test_a_robot_that_has_not_moved_over_is_passed_by_and_named_with_the_way_to_
             "cart": Robot("cart", ()),
         }
     )
-    assert selected_robots(fleet, None) == ("husky1",)
+    assert selected_robots(fleet, None, str) == ("husky1",)
     with pytest.raises(InputError) as caught:
-        selected_robots(fleet, ["husky2"])
+        selected_robots(fleet, ["husky2"], str)
     assert caught.value.hint == "set robots.husky2.computer in place of `fielded`, and stop the legacy program there"
     with pytest.raises(InputError) as caught:
-        selected_robots(fleet, ["cart"])
+        selected_robots(fleet, ["cart"], str)
     assert caught.value.hint == "set robots.cart.computer"
