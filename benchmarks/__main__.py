@@ -1,7 +1,7 @@
 """Run the comparison: `python -m benchmarks [--quick] [--sets loss,cut] [--runs N] [--tables] [--fill]`.
 
-Each finished cell is appended to the results at once; one that is there already (`--runs` times) is not run again, so
-a run that was interrupted is taken up by the same command.
+Each finished cell is appended to the results at once; a cell that has `--runs` results is not run again, so the same
+command continues an interrupted run.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ def wanted(arguments: argparse.Namespace) -> list[Cell]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a few cells that tell most")
+    parser.add_argument("--quick", action="store_true", help="only the most informative cells")
     parser.add_argument("--sets", default="", help=f"comma-separated, of {', '.join(SETS)}")
     parser.add_argument("--peer", action="append", default=[], help="only this transport (repeatable)")
-    parser.add_argument("--runs", type=int, default=1, help="how often each cell is run; tables give the median")
+    parser.add_argument("--runs", type=int, default=1, help="number of runs of each cell; tables show the median")
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--fill", action="store_true", help="put the tables into docs/benchmarks.md")
-    parser.add_argument("--tables", action="store_true", help="only print the tables of what was measured")
+    parser.add_argument("--fill", action="store_true", help="write the tables to docs/benchmarks.md")
+    parser.add_argument("--tables", action="store_true", help="only print the tables of existing results")
     arguments = parser.parse_args()
     results = finished(arguments.results)
     if not arguments.tables:
         arguments.results.parent.mkdir(parents=True, exist_ok=True)
         known = Counter((r["set"], r["peer"], r["name"]) for r in results)
         chosen = wanted(arguments)
-        # Round by round, so that the runs of a cell are apart in time.
+        # round by round, so that the runs of a cell are spread over time
         todo = [
             cell for turn in range(arguments.runs) for cell in chosen if known[cell.set, cell.peer, cell.name] <= turn
         ]

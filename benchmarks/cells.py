@@ -1,7 +1,7 @@
-"""The cells of the comparison: which transport, over which link, under which load, judged by which figures.
+"""The cells of the comparison: transport, link, load, and the figures of the result.
 
-A set answers one question; `cells()` lists its cells in the order they run; `measure` runs one and returns the
-figures that `benchmarks.tables` prints and `benchmarks.goals` judges.
+A set is one experiment; `cells()` lists its cells in the order they run; `measure` runs one and returns the figures
+that `benchmarks.tables` prints and `benchmarks.goals` evaluates.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from benchmarks.trial import Load, Measured, percentile, run
 
 OURS = "udp_mesh"
 BASE = Link(rate=10e6, delay_ms=10.0, queue=100)
-# bulk without end and telemetry at 20 Hz, together; the first seconds let every transport find its rate
+# continuous bulk and telemetry at 20 Hz together; the first seconds are for finding the rate
 SATURATED = Load(seconds=20.0, bulk_bytes=-1, urgent_hz=20.0)
 BULK_ALONE = replace(SATURATED, urgent_hz=0.0)
 WARM_UP_S = 5.0
 CUT = Load(seconds=24.0, bulk_bytes=-1, urgent_hz=20.0, cut_after_s=7.0, cut_s=5.0)
-# a radio that repeats a frame up to eight times on a half-duplex channel and hides 30 % loss, 100 us per frame
+# a radio that transmits a frame up to eight times on a half-duplex channel with 30 % loss, 100 us per frame
 RADIO = Link(rate=20e6, delay_ms=1.0, loss=0.3, attempts=8, half=1, overhead_us=100.0, queue=200)
 _CHANGED = {
     "10 to 2 Mbit/s": replace(BASE, rate=2e6, loss=0.02),
@@ -36,7 +36,7 @@ _AFTER_CHANGE_S = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """`name` is unique within the set; together they name the result for ever."""
+    """`name` is unique within the set; both are the permanent key of the result."""
 
     set: str
     peer: str
@@ -69,7 +69,7 @@ def cells(set_name: str) -> list[Cell]:
             SATURATED,
             rivals,
         ),
-        # At 1 Mbit/s the urgent messages are 5 % of the link by themselves: goodput is judged without them.
+        # at 1 Mbit/s the urgent messages alone are 5 % of the link: goodput is measured without them
         "rate": chain(
             _compared("rate", {f"{name}, bulk alone": link for name, link in _RATES.items()}, BULK_ALONE, rivals),
             _compared("rate", _RATES, SATURATED, rivals),

@@ -1,8 +1,7 @@
-"""What one core does per fragment: two nodes in memory, no sockets, a bulk transfer; CPU of each side by itself.
+"""Throughput of one CPU core: a bulk transfer between two nodes in memory, without sockets; CPU time per side.
 
-Datagrams pass between the nodes in batches, as a driver with segmentation offload would hand them over. Time is
-virtual: the link has no limit but the nodes' own work. Prints fragments/s and payload Mbit/s that one core sustains on
-each side.
+Datagrams pass between the nodes in batches, as from a driver with segmentation offload. Time is virtual: the nodes'
+CPU time is the only limit. Prints fragments/s and payload Mbit/s that one CPU core sustains on each side.
 
     python benchmarks/core_throughput.py [--megabytes 200] [--profile sender|receiver]
 """
@@ -22,7 +21,7 @@ from udp_mesh.crypto import Key
 
 ADDRESSES = {"a": ("10.0.0.1", 8700), "b": ("10.0.0.2", 8700)}
 ROUND_TRIP_S = 0.001
-"""Virtual time of one exchange: that of a wired link."""
+"""Virtual time of one exchange, as on a wired link."""
 
 MESSAGE_BYTES = 20_000_000
 
@@ -61,7 +60,7 @@ def run(megabytes: int, profile: str | None) -> dict[str, float]:
     now = 0.0
 
     def carry(source: str, sink: str) -> bool:
-        """One batch, as one system call carries it; False when there was none."""
+        """Pass one batch, as one system call does; False when there was none."""
         node = nodes[source]
         with meters[source]:
             timer = node.next_timer()
@@ -76,7 +75,7 @@ def run(megabytes: int, profile: str | None) -> dict[str, float]:
         return bool(batch)
 
     def exchange() -> None:
-        """Batches in turn until both sides are silent; an answer takes half a round trip."""
+        """Pass batches in both directions until both sides are idle; each direction takes half a round trip."""
         nonlocal now
         busy = True
         while busy:

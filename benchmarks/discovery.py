@@ -1,13 +1,13 @@
 """Growth of discovery with the team: `python -m benchmarks.discovery [--nodes 2,10,50,200,1000]`.
 
 Every robot runs the transport's core in virtual time; all hear each other without loss, which is the worst case for
-discovery: each broadcast reaches everybody. They share one 20 Mbit/s channel on which one datagram follows the other.
+discovery: each broadcast reaches every robot. They share one 20 Mbit/s channel, one datagram at a time.
 
-1. The robots are switched on within two seconds; told is when everybody knows everybody.
-2. *idle*: nothing is sent but discovery. *busy*: each robot reports to the base five times a second, so that traffic
-   already proves those links. Told is what a robot other than the base sends, and what of the channel broadcasts take.
-3. The team is cut in two until both halves have reported each other offline; told is how long after the cut ends all
-   know all again.
+1. The robots are powered on within two seconds; measured is the time until all know each other.
+2. *idle*: only discovery traffic. *busy*: each robot reports to the base five times a second, so that traffic already
+   proves those links. Measured are the datagrams of a robot other than the base, and the channel share of broadcasts.
+3. The team is split in two until both halves have reported each other offline; measured is the time from the end of
+   the cut until all know each other again.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import channel
-from udp_mesh.sim.event_queue import EventQueue
+from udp_mesh.sim.event_queue import SimEventQueue
 
-# All receivers of a broadcast open it with one key and decode the same bytes to the same frozen frames: one processor,
-# which plays them all, does it once, and 1,000 robots that know each other fit into its memory.
+# All receivers of a broadcast decrypt it with one key and decode the same bytes to the same frozen frames: cached, one
+# CPU can simulate 1,000 robots that know each other, within its memory.
 receive.decode = functools.lru_cache(maxsize=64)(receive.decode)  # type: ignore[attr-defined]
 receive.parse_header = functools.lru_cache(maxsize=64)(receive.parse_header)  # type: ignore[assignment, attr-defined]
 channel.AESGCM = functools.lru_cache(maxsize=4096)(channel.AESGCM)  # type: ignore[assignment, attr-defined]
@@ -45,16 +45,16 @@ CHANNEL_BITS_PER_S = 20e6
 TRANSMISSION_S = 0.0001
 """Preamble, spacing and acknowledgement of a radio."""
 TELEMETRY_S = 0.2
-SWITCHED_ON_WITHIN_S = 2.0
-LONGEST_S = 900.0
-"""A team that has not met by then never will."""
+POWER_ON_SPREAD_S = 2.0
+MAX_DURATION_S = 900.0
+"""A team that has not discovered itself by then never will."""
 
 
 class OpenField:
-    """A team that hears itself; `cut` separates the robots of even from those of odd number."""
+    """A team of robots that all hear each other; `cut` separates even-numbered from odd-numbered robots."""
 
     def __init__(self, count: int) -> None:
-        self.event_queue = EventQueue()
+        self.event_queue = SimEventQueue()
         self.known_pairs = 0
         """Ordered pairs of robots of which the first reports the second online."""
         self.cut = False
@@ -81,24 +81,24 @@ class OpenField:
         self._wake_s = [float("inf")] * count
         for index, node in enumerate(self.nodes):
             node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, self.addresses[index], ("10.0.255.255", 8700)), 0.0)
-            self.event_queue.at(rng.random() * SWITCHED_ON_WITHIN_S, partial(self._switch_on, index))
+            self.event_queue.at(rng.random() * POWER_ON_SPREAD_S, partial(self._switch_on, index))
 
     @property
     def all_pairs(self) -> int:
         return len(self.nodes) * (len(self.nodes) - 1)
 
     def report(self, index: int) -> None:
-        """Telemetry to the base, from now on."""
+        """Send telemetry to the base from now on."""
         if self.busy:
             self.nodes[index].send("telemetry", bytes(200), destination="robot0000", now=self.event_queue.now)
             self._settle(index)
             self.event_queue.after(TELEMETRY_S, partial(self.report, index))
 
     def run_until_known(self, pairs: Callable[[int], bool]) -> float | None:
-        """Run until the number of known pairs satisfies `pairs`; returns how long that took."""
+        """Run until the number of known pairs satisfies `pairs`; returns the time this took."""
         begun = self.event_queue.now
         while not pairs(self.known_pairs):
-            if self.event_queue.now - begun > LONGEST_S:
+            if self.event_queue.now - begun > MAX_DURATION_S:
                 return None
             self.event_queue.run_until(self.event_queue.now + 0.05)
         return self.event_queue.now - begun
@@ -157,7 +157,7 @@ class OpenField:
                 if len(targets) == 1:
                     self._settle(index)
                 elif nodes[index].next_timer() != self._wake_s[index] and index not in self._arrived:
-                    # As a driver does, which looks after a batch of datagrams.
+                    # after a batch of datagrams, as a driver does
                     self._arrived.add(index)
                     self.event_queue.after(0.005, partial(self._look, index))
 
@@ -173,14 +173,14 @@ class OpenField:
 
 
 def measure(count: int) -> dict[str, Any]:
-    """Everything about a team of one size; rates are of robots other than the base."""
+    """All figures for a team of one size; rates are those of robots other than the base."""
     begun = time.process_time()
     gc.disable()
     field = OpenField(count)
     met_s = field.run_until_known(lambda pairs: pairs == field.all_pairs)
     gc.collect()
     result: dict[str, Any] = {"nodes": count, "met_s": met_s, "meeting_busiest_share": field.busiest_second_s}
-    # heartbeats of a large team are far apart: count over a round of them
+    # the heartbeat interval of a large team is long: count over one interval
     count_s = max(10.0, count / 30)
     field.event_queue.run_until(field.event_queue.now + 5.0)
     result["idle"] = _rates(field, count_s)
@@ -245,9 +245,11 @@ def _seconds(value: float | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.discovery", description=__doc__)
     parser.add_argument(
-        "--nodes", default="2,10,50,200,1000", help="sizes; 1,000 take some gigabytes and tens of minutes"
+        "--nodes", default="2,10,50,200,1000", help="team sizes; 1,000 takes some gigabytes and tens of minutes"
     )
-    parser.add_argument("--results", type=Path, default=RESULTS, help="sizes that are there already are not run again")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, help="file of results; sizes it already has are not run again"
+    )
     arguments = parser.parse_args()
     arguments.results.parent.mkdir(parents=True, exist_ok=True)
     kept = arguments.results.read_text().splitlines() if arguments.results.exists() else []

@@ -1,7 +1,7 @@
-"""What the transport is held to (docs/facts/transport-facts.md, "Goals"), as data the tables are checked against.
+"""The transport's goals (docs/facts/transport-facts.md, "Goals") as data, and their evaluation against the results.
 
-A goal names a set, a cell, a figure and a bound; a missed goal is printed as missed, never hidden. Beside them ours is
-compared with the best of the others in every cell they crossed.
+A goal has a set, a cell, a figure and a bound; a missed goal is printed as missed. In addition, our result is compared
+with the best other transport in every cell.
 """
 
 from __future__ import annotations
@@ -63,13 +63,13 @@ COMPARED: tuple[tuple[str, bool], ...] = (
     ("share_after", True),
     ("settled_p99_s", False),
 )
-# whose urgent messages do not arrive has no latency to compare
-_LEAST_ARRIVED = 0.99
+# below this, too few urgent messages arrive to compare latencies
+_MIN_ARRIVED = 0.99
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Our figure in a cell and that of the best other transport; None where nothing comparable came of it."""
+    """Our figure in a cell and that of the best other transport; None where there is no comparable result."""
 
     set: str
     cell: str
@@ -87,9 +87,9 @@ class Comparison:
 
 
 def medians(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One result per cell: the median of each figure over the runs that have it, and how many `runs` there were.
+    """One result per cell: the median of each figure over the runs that have it, and the number of `runs`.
 
-    A figure that is missing in most runs (nothing arrived) is missing.
+    A figure that most runs lack (nothing arrived) is left out.
     """
     cells: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for result in results:
@@ -106,7 +106,7 @@ def medians(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def compared(results: Iterable[Mapping[str, Any]]) -> list[Comparison]:
-    """Ours against the best of the others: each figure of every cell that at least one of them crossed."""
+    """Our figures against the best other transport, in every cell that at least one of these completed."""
     cells: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for result in medians(results):
         cells.setdefault((result["set"], result["name"]), {})[result["peer"]] = result
@@ -117,7 +117,7 @@ def compared(results: Iterable[Mapping[str, Any]]) -> list[Comparison]:
             continue
         for figure, more_is_better in COMPARED:
             if all(peer.get(figure) is None for peer in peers.values()):
-                # not asked in this cell: a load without urgent messages, or without a cut
+                # not measured in this cell: a load without urgent messages, or without a cut
                 continue
             known = {peer: value for peer, r in others.items() if (value := _comparable(r, figure)) is not None}
             best_peer = (max if more_is_better else min)(known, key=known.__getitem__) if known else ""
@@ -128,14 +128,14 @@ def compared(results: Iterable[Mapping[str, Any]]) -> list[Comparison]:
 
 def _comparable(result: Mapping[str, Any], figure: str) -> float | None:
     arrived = result.get("urgent_arrived")
-    if figure == "urgent_p99_s" and arrived is not None and arrived < _LEAST_ARRIVED:
+    if figure == "urgent_p99_s" and arrived is not None and arrived < _MIN_ARRIVED:
         return None
     value = result.get(figure)
     return None if value is None else float(value)
 
 
 def judged(results: Iterable[Mapping[str, Any]]) -> list[tuple[Goal, float | None, bool]]:
-    """Every goal whose cell was run, with our figure (the median of its runs) and whether it is met."""
+    """Every goal whose cell was run, with our figure (the median of the runs) and whether the goal is met."""
     ours = {(r["set"], r["name"]): r for r in medians(results) if r["peer"] == OURS}
     verdicts = []
     for goal in GOALS:

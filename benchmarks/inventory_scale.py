@@ -1,9 +1,8 @@
-"""How load, lint and render grow with the fleet: `python -m benchmarks.inventory_scale [--nodes 10,100] [--json]`.
+"""Scaling of load, lint and render with fleet size: `python -m benchmarks.inventory_scale [--nodes 10,100] [--json]`.
 
-For each size an inventory is written with every node spelled out (address, MAC, serial, label; 50 nodes to a mesh),
-and each step is timed on it in a process of its own, so that sizes do not share caches or memory. A step's time is
-processor time, the best of several runs; the growth is its time per node beside the smallest fleet's of at least a
-hundred nodes.
+For each size an inventory is written with an entry for every node (address, MAC, serial, label; 50 nodes per mesh), and
+each step is timed on it in a separate process, so that sizes do not share caches or memory. A step's time is CPU time,
+the best of several runs; the growth is its time per node relative to the smallest fleet of at least a hundred nodes.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from meshctl.regdb import load as load_regdb
 from meshctl.render import render_nodes
 
 SIZES = (10, 100, 1_000, 10_000)
-# A mesh of this size is what a channel carries.
+# about the largest mesh that one channel supports
 NODES_PER_MESH = 50
 
 _HEAD = """\
@@ -57,8 +56,8 @@ defaults: {hardware: rocket, state: carried, role: beacon}
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Processor seconds for one fleet: `rules_s` are lint's rules alone, `lint_s` all that `meshctl lint` does;
-    `findings` are its errors and warnings, `peak_mib` is the process's largest size."""
+    """CPU seconds for one fleet: `rules_s` for lint's rules alone, `lint_s` for all of `meshctl lint`; `findings` are
+    its errors and warnings, `peak_mib` is the peak memory of the process."""
 
     nodes: int
     file_kib: int
@@ -71,7 +70,7 @@ class Measured:
 
 
 def inventory(nodes: int) -> str:
-    """An inventory of `nodes` nodes, each with an entry of its own; the first of each mesh is a base."""
+    """An inventory of `nodes` nodes, one entry each; the first node of each mesh is a base."""
     meshes, groups, entries = ["meshes:"], ["groups:"], ["nodes:"]
     for number in range(nodes):
         mesh, place = divmod(number, NODES_PER_MESH)
@@ -98,7 +97,7 @@ def inventory(nodes: int) -> str:
 
 
 def measure(nodes: int) -> Measured:
-    """Every step on one fleet, in this process."""
+    """Time every step on one fleet, in this process."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory, "fleet.yaml")
         path.write_text(inventory(nodes))
@@ -134,7 +133,7 @@ def _best(step: Callable[[], object], runs: int) -> float:
 
 
 def table(results: list[Measured]) -> str:
-    """Markdown: seconds, and per node beside the reference in brackets."""
+    """Markdown: seconds, and in brackets the time per node relative to the reference."""
     reference = next((result for result in results if result.nodes >= 100), results[0])
 
     def cell(result: Measured, step: str) -> str:

@@ -1,16 +1,16 @@
 """Several robots at once on one half-duplex channel: `python -m benchmarks.one_channel [--quick] [--tables]`.
 
-Every robot runs the transport's core in virtual time on the simulator's medium: who sends keeps everybody else quiet.
-The channel has 10 Mbit/s and 10 ms each way, as the benchmarks' base link, so that latencies compare with that link's
-goals; losses are not hidden by retries of the radio.
+Every robot runs the transport's core in virtual time on the simulator's medium, where one robot transmits at a time.
+The channel has 10 Mbit/s and a one-way delay of 10 ms, like the benchmarks' base link, so that latencies compare with
+that link's goals; the radio does not retransmit lost frames.
 
-1. *teams*: each robot has bulk without end for the base (50 kB messages) and sends it 200 B of urgent telemetry at
-   20 Hz. Told are the bulk of all, how fairly it is shared (Jain's index: 1 is equal), and the worst robot's urgent
-   latency; with wifi's access categories and without.
-2. *guests*: one more robot has nothing but urgent telemetry; the others fill the channel. Told is its latency.
-3. *hops*: 1 Hz reports over three lossy hops; told is the standard deviation of the time between two arrivals.
-4. *acknowledgements*: one robot's bulk with an acknowledgement every so many packets; told are their share of the
-   airtime and the bulk against what the channel carries when nothing is ever acknowledged.
+1. *teams*: each robot sends the base continuous bulk (50 kB messages) and 200 B of urgent telemetry at 20 Hz. Measured
+   are the total bulk, its fairness (Jain's index: 1 is equal), and the worst robot's urgent latency; with and without
+   WMM access categories.
+2. *guests*: one additional robot sends only urgent telemetry, the others fill the channel. Measured is its latency.
+3. *hops*: 1 Hz reports over three lossy hops; measured is the standard deviation of the time between two arrivals.
+4. *acknowledgements*: one robot's bulk with an acknowledgement every N packets; measured are their share of the airtime
+   and the bulk relative to the channel's capacity without acknowledgements.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any
 from benchmarks.tables import row, verdict
 from udp_mesh.core.events import Event, MessageDelivered, MessageReceived, Rejected
 from udp_mesh.core.settings import Rates, Settings, Topic
-from udp_mesh.sim.medium import BEST_EFFORT_SLOTS, FRAME_BYTES, IP_UDP_BYTES, SLOT_S, Channel
+from udp_mesh.sim.medium import BEST_EFFORT_SLOTS, FRAME_BYTES, IP_UDP_BYTES, SLOT_S, RadioChannel
 from udp_mesh.sim.team import Team
 
 RESULTS = Path(__file__).with_name("results") / "one_channel.jsonl"
@@ -43,15 +43,15 @@ RATE_BITS_PER_S = 10e6
 DELAY_S = 0.010
 FRAGMENT_BYTES = 1400
 FULL_FRAME_BYTES = FRAGMENT_BYTES + 30 + IP_UDP_BYTES + FRAME_BYTES
-"""A full fragment with its headers of ours, IP, UDP, the mesh and the radio."""
+"""A full fragment with the headers of udp_mesh, UDP, IP, the mesh and the radio."""
 GOAL_P99_S = {0.0: 0.020, 0.05: 0.025, 0.2: 0.050}
-"""By the channel's loss: the base link's goals for one robot, asked of each of several."""
+"""By the channel's loss: the base link's goals for one robot, applied to each of several."""
 GOAL_DEVIATION_S = 0.04
 GOAL_OF_CEILING = 0.95
-LEAST_FAIRNESS = 0.95
-"""Jain's index where one robot of four gets half of what the others get is 0.93."""
-BEGIN_S = 3.0
-"""The team has met."""
+MIN_FAIRNESS = 0.95
+"""For comparison: Jain's index is 0.93 if one of four robots gets half the bulk of each other one."""
+START_S = 3.0
+"""By then the team has discovered itself."""
 COUNT_FROM_S = 6.0
 COUNT_S = 30.0
 MET_OVER_HOPS_S = 20.0
@@ -62,7 +62,7 @@ _SENT = struct.Struct("<d")
 
 @dataclass(slots=True)
 class Seen:
-    """What arrived of one robot while counting."""
+    """Messages of one robot that arrived while counting."""
 
     bulk_bytes: int = 0
     offered: int = 0
@@ -77,7 +77,7 @@ class OneChannel:
         senders: int,
         guests: int = 0,
         *,
-        channel: Channel,
+        channel: RadioChannel,
         loss: float,
         seed: int,
         rates: Rates | None = None,
@@ -95,14 +95,14 @@ class OneChannel:
         self.team = Team(settings, channel=channel, loss=lambda a, b, now: loss, seed=seed, on_event=self._on_event)
         agenda = self.team.event_queue
         for number, name in enumerate((*self.senders, *self.guests)):
-            # robots do not report at one moment
+            # robots do not report simultaneously
             if telemetry:
-                agenda.at(BEGIN_S + TELEMETRY_S * number / len(self.seen), partial(self._report, name))
+                agenda.at(START_S + TELEMETRY_S * number / len(self.seen), partial(self._report, name))
         for name in self.senders:
-            agenda.at(BEGIN_S, partial(self._fill, name))
+            agenda.at(START_S, partial(self._fill, name))
 
     def run(self) -> None:
-        """To the end; `airtime_s` is then what everybody sent while counting, `base_airtime_s` what the base sent."""
+        """Run to the end; `airtime_s` is then the airtime of all while counting, `base_airtime_s` that of the base."""
         counts = self.team.medium.counts
         self.team.event_queue.run_until(COUNT_FROM_S)
         all_before, base_before = counts.airtime_s, counts.airtime_s_of["base"]
@@ -127,7 +127,7 @@ class OneChannel:
     def _send(self, name: str, topic: str, payload: bytes) -> None:
         outcome = self.team.send(name, topic, payload, "base")
         if isinstance(outcome, Rejected):
-            raise RuntimeError(f"{name}: {topic} was refused: {outcome.reason.value} {outcome.detail}")
+            raise RuntimeError(f"{name}: {topic} was rejected: {outcome.reason.value} {outcome.detail}")
 
     def _report(self, name: str) -> None:
         now = self.team.event_queue.now
@@ -151,8 +151,10 @@ class OneChannel:
                 return
 
 
-def channel(*, access_categories: bool = True, rate: float = RATE_BITS_PER_S) -> Channel:
-    return Channel(rate=rate, attempts=1, hop_delay_s=DELAY_S, queue_frames=100, access_categories=access_categories)
+def channel(*, access_categories: bool = True, rate: float = RATE_BITS_PER_S) -> RadioChannel:
+    return RadioChannel(
+        rate=rate, attempts=1, hop_delay_s=DELAY_S, queue_frames=100, access_categories=access_categories
+    )
 
 
 def rank(values: Sequence[float], share: float) -> float:
@@ -197,7 +199,7 @@ def guest(senders: int, loss: float) -> dict[str, Any]:
 
 
 def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
-    """A rover three hops from the base; each hop loses frames, and the radio tries each four times, as few do."""
+    """A rover three hops from the base; each hop loses frames, and the radio makes only four attempts per frame."""
     row = ("base", "relay1", "relay2", "rover")
     place = {name: number for number, name in enumerate(row)}
     arrivals_s: list[float] = []
@@ -216,19 +218,19 @@ def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
 
     def send(topic: str, size_bytes: int) -> None:
         if isinstance(made.send("rover", topic, bytes(size_bytes), "base"), Rejected):
-            raise RuntimeError(f"{topic} was refused")
+            raise RuntimeError(f"{topic} was rejected")
 
     def report() -> None:
         send(TELEMETRY, TELEMETRY_BYTES)
         made.event_queue.after(1.0, report)
 
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in ("base", "rover")}
-    made = Team(settings, relays=row[1:3], channel=Channel(attempts=4), loss=lost, seed=1, on_event=note)
+    made = Team(settings, relays=row[1:3], channel=RadioChannel(attempts=4), loss=lost, seed=1, on_event=note)
     made.event_queue.at(MET_OVER_HOPS_S, report)
     if bulk:
         for _ in range(WAITING_BULKS):
             made.event_queue.at(MET_OVER_HOPS_S, partial(send, BULK, BULK_BYTES))
-    # half a second more for what was sent last
+    # half a second more for the last messages
     made.event_queue.run_until(MET_OVER_HOPS_S + HOPS_S - 0.5)
     intervals_s = [later - earlier for earlier, later in itertools.pairwise(arrivals_s)]
     return {
@@ -261,7 +263,7 @@ def acknowledgements(every: int, rate: float) -> dict[str, Any]:
 
 
 def ceiling_bits_per_s(one: OneChannel) -> float:
-    """Payload that full frames carry one after the other, if nothing else is ever sent: with their back-off."""
+    """The payload rate of full frames with back-off and no other traffic."""
     used = one.channel
     first, window = BEST_EFFORT_SLOTS
     backoff_s = (first + (window - 1) / 2) * SLOT_S
@@ -283,13 +285,13 @@ def results_of(*, quick: bool) -> Iterator[dict[str, Any]]:
 
 
 def tables(results: Sequence[dict[str, Any]]) -> str:
-    """Everything measured, one table per set, each line with its goal."""
+    """All results, one table per set, each row with its goal."""
     parts: list[list[str]] = []
     head = ["robots", "loss", "radio", "bulk of all, Mbit/s", "of the ack-free ceiling", "fairness"]
     head += ["urgent p50, ms", "urgent p99 of the worst, ms", "goal, ms", ""]
     parts.append([row(head), row(["---"] * len(head))])
     for one in (one for one in results if one["set"] == "teams"):
-        met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= LEAST_FAIRNESS
+        met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= MIN_FAIRNESS
         parts[-1].append(
             row([
                 str(one["robots"]), f"{one['loss']:.0%}",
@@ -343,8 +345,8 @@ def tables(results: Sequence[dict[str, Any]]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.one_channel", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a few cells that tell most")
-    parser.add_argument("--tables", action="store_true", help="print what was measured, measure nothing")
+    parser.add_argument("--quick", action="store_true", help="only the most informative cells")
+    parser.add_argument("--tables", action="store_true", help="only print the tables of existing results")
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     if not arguments.tables:

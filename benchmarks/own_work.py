@@ -1,7 +1,7 @@
-"""What the core itself takes of a processor on a 10 Mbit/s channel: `python -m benchmarks.own_work [--fill]`.
+"""CPU time of the transport core on a 10 Mbit/s channel: `python -m benchmarks.own_work [--fill]`.
 
-One robot's bulk and telemetry as in `one_channel`, in virtual time: no sockets, no waiting, so that nothing is cold.
-What processes on a link take beyond this is the price of system calls and of waking up for each datagram.
+One robot's bulk and telemetry as in `one_channel`, in virtual time: no sockets and no waiting, so caches stay warm. CPU
+time of processes on a link beyond this is the cost of system calls and of waking up for each datagram.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from benchmarks.tables import row
 from udp_mesh.core.node import Node
 
 ENTRIES = ("receive", "datagrams_to_send", "handle_timer", "next_timer", "next_event")
-"""Of `Node`: all that a driver calls while it carries datagrams."""
+"""The methods of `Node` that a driver calls for datagrams."""
 
 
 @contextmanager
 def timed() -> Iterator[dict[str, float]]:
-    """Processor time in seconds that the entries of all nodes take, by the node's name."""
+    """CPU seconds in these methods, by the node's name."""
     spent_s: dict[str, float] = defaultdict(float)
     kept = {entry: getattr(Node, entry) for entry in ENTRIES}
 
@@ -48,7 +48,7 @@ def timed() -> Iterator[dict[str, float]]:
 
 
 def cores() -> tuple[float, float]:
-    """Of sender and receiver."""
+    """CPU shares of sender and receiver."""
     one = OneChannel(1, channel=channel(), loss=0.0, seed=1)
     agenda = one.team.event_queue
     agenda.run_until(COUNT_FROM_S)
@@ -59,7 +59,7 @@ def cores() -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.own_work", description=__doc__)
-    parser.add_argument("--fill", action="store_true", help="put the table into docs/benchmarks.md")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     arguments = parser.parse_args()
     sender, receiver = cores()
     text = "\n".join([row(["", "cores"]), row(["---"] * 2), row(["sender", f"{sender:.3f}"]),

@@ -1,4 +1,4 @@
-"""Puts what a benchmark printed into `docs/benchmarks.md`, between the two comments that name it."""
+"""Write a benchmark's output to `docs/benchmarks.md`, between the two comments of its section."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 
 
 def fill(section: str, text: str, page: Path = PAGE) -> None:
-    """Replace what stands between `<!-- section: command -->` and `<!-- end of section -->`.
+    """Replace the text between `<!-- section: command -->` and `<!-- end of section -->`.
 
-    Raises ValueError where the page has no such pair of comments.
+    Raises ValueError when the page has no such pair of comments.
     """
     name = re.escape(section)
     between = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(\n<!-- end of {name} -->)", re.DOTALL)

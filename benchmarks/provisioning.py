@@ -1,16 +1,16 @@
-"""Time and processor time per node: `meshctl provision` against the same files pushed by ansible-core.
+"""Wall and CPU time per node: `meshctl provision` against the same files pushed by ansible-core.
 
 `python -m benchmarks.provisioning [--nodes 10,50,200] [--results FILE] [--tables]` starts a virtual fleet of each size,
-takes it in, and then changes every node twice: from configuration `a` to `b` by meshctl, and from `b` back to `a` by
-ansible's `raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use as many connections
-at once, and neither waits for one node before the next. What they do is not the same: ansible writes the files, reloads
-and looks that they are there; meshctl also observes first, keeps the previous state under a dead-man's switch, proves
-the node reachable by a new connection, checks its mesh, and confirms. The nodes run on the same machine, so wall time
-is theirs too; processor time is the tool's own.
+bootstraps it, and then changes every node twice: from configuration `a` to `b` with meshctl, and from `b` back to `a`
+with ansible's `raw` and `script` modules (dropbear has no SFTP and the nodes have no Python). Both use the same number
+of parallel connections, and neither waits for one node before the next. They do not do the same: ansible writes the
+files, reloads and checks that the files exist; meshctl also observes first, keeps the previous state under a dead-man's
+switch, proves the node reachable with a new connection, checks its mesh, and confirms. The nodes run on the same
+machine, so wall time includes them; CPU time is the tool's own.
 
-It runs unattended: every command has a limit (`LIMIT_S`, `LIMIT_PER_NODE_S`), a size that fails is told and the next
-one begun, and each size is written down as soon as it is measured. It needs ansible-core beside this interpreter (the
-extra `bench`).
+It runs unattended: every command has a time limit (`LIMIT_S`, `LIMIT_PER_NODE_S`), a size that fails is reported and
+the next one starts, and each result is written immediately. It needs ansible-core beside this interpreter (the extra
+`bench`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from tests.meshctl.proof.rig import Rig
 RESULTS = Path(__file__).with_name("results") / "provisioning.jsonl"
 ANSIBLE = Path(sys.executable).with_name("ansible-playbook")
 FORKS = 8
-# Several times what either tool took on two cores; beyond it something hangs.
+# several times the time of either tool on two cores; a longer run hangs
 LIMIT_S, LIMIT_PER_NODE_S = 120.0, 15.0
 PLAYBOOK = """\
 - hosts: all
@@ -67,7 +67,7 @@ def ran(command: Sequence[str], environ: Mapping[str, str], limit_s: float) -> d
             limit.cancel()
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode == -signal.SIGKILL:
-            raise RuntimeError(f"{command[0]} had not ended after {limit_s:.0f} s")
+            raise RuntimeError(f"{command[0]} did not finish within {limit_s:.0f} s")
         if process.returncode:
             output.seek(0)
             raise RuntimeError(f"{command[0]} ended with {process.returncode}:\n{output.read().decode()[-3000:]}")
@@ -84,7 +84,7 @@ def limit_s(rig: Rig) -> float:
 
 
 def by_ansible(rig: Rig, variant: str) -> dict[str, float]:
-    """The same files, by a script per node, as an operator would write it."""
+    """Push the same files with one script per node, as an operator would write it."""
     place = rig.directory / "ansible"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
@@ -138,18 +138,18 @@ def _address(fleet: VirtualFleet, name: str) -> str:
 
 
 def measure(count: int) -> dict[str, Any]:
-    """Both tools over one fleet of `count` nodes and a base."""
+    """Run both tools on one fleet of `count` nodes and a base."""
     with tempfile.TemporaryDirectory(prefix="provisioning-") as directory, Rig(
         Path(directory), count - 1, window_s=60, parallel=FORKS
     ) as rig:  # fmt: skip
         taken = rig.take_in("a")
         if taken.code:
-            raise RuntimeError(f"the fleet could not be taken in:\n{taken.out}{taken.err}")
+            raise RuntimeError(f"cannot bootstrap the fleet:\n{taken.out}{taken.err}")
         ours = by_meshctl(rig, "b")
         ansible = by_ansible(rig, "a")
         wrong = [name for name in ("base", *rig.names) if rig.state_of(name, "b", "a") != "new"]
         if wrong:
-            raise RuntimeError(f"ansible left {', '.join(wrong)} as they were")
+            raise RuntimeError(f"ansible did not change {', '.join(wrong)}")
     return {"nodes": count, "meshctl": ours, "ansible": ansible}
 
 
@@ -172,7 +172,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.provisioning", description=__doc__)
     parser.add_argument("--nodes", default="10,50,200")
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
+    parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
     arguments = parser.parse_args()
     if arguments.tables:
         print(table(recorded(arguments.results)))
@@ -196,7 +196,7 @@ def main() -> int:
 
 
 def recorded(path: Path) -> list[dict[str, Any]]:
-    """The latest measurement of each size."""
+    """The latest result of each size."""
     lines = path.read_text().splitlines() if path.exists() else []
     return list({result["nodes"]: result for result in map(json.loads, lines)}.values())
 

@@ -1,10 +1,10 @@
-"""The fleet of `reconvergence_udp_mesh`: five real radios in one machine, two relays side by side.
+"""The fleet of `reconvergence_udp_mesh`: five of the kernel's radios in one machine, with two parallel relays.
 
-    base - near - one   - far        (each hears only its neighbours; a computer is behind base and behind far)
+    base - near - one   - far        (each hears only its neighbors; base and far have a computer behind them)
                \\ other /
 
-It is configured through the nodes' own UCI files, made to settle, overheard, and loses the relay that far's telemetry
-passes on its way to base.
+It is configured through the nodes' UCI files; when it has settled, its traffic is captured, and then the active relay
+between far and base is silenced.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ LINKS = (
     LinkSpec("base", "near"),
     LinkSpec("near", "one"),
     LinkSpec("one", "far"),
-    # so that one of the two ways is the better one: between equal ones BATMAN_IV changes over at the first missed round
+    # makes one route the better one: between equal ones BATMAN_IV switches at the first missed round
     LinkSpec("near", "other", loss=0.1),
     LinkSpec("other", "far", loss=0.1),
 )
 TELEMETRY_S = 0.1
 OVERHEARD_S = 20.0
-# under emulation, on a machine that may have other things to do
+# under emulation on a busy host
 _START_S = 600.0
 # loop avoidance alone holds a new bat0 for half a minute
 _SETTLE_S = 150.0
 _COMMAND_S = 60.0
-# batman-adv gives up a way after some five rounds of announcements
+# batman-adv gives up a route after about five missed originator intervals
 _ROUNDS = 6
-# so many rounds go into BATMAN_IV's quality of a link (net/batman-adv/main.h: BATADV_TQ_LOCAL_WINDOW_SIZE)
+# the window of BATMAN_IV's link quality, in intervals (net/batman-adv/main.h: BATADV_TQ_LOCAL_WINDOW_SIZE)
 _WINDOW_ROUNDS = 64
-# a pause is over when telemetry has flowed for so long after it
+# a pause has ended when telemetry has flowed for this long after it
 _FLOWED_S = 4.0
-# telemetry stops at once when its relay does: so long without a pause, it had taken the other way in the last moment
+# telemetry stops at once with its relay: without a pause for this long, it had just switched to the other route
 _NO_PAUSE_S = 8.0
 _PAUSE_S = 90.0
 _POLL_S = 0.3
@@ -107,7 +107,7 @@ main(["run", "/run/mesh-{name}/config.toml"])
 END
 {program} /run/mesh-{name}/run.py >/run/mesh-{name}/log 2>&1 </dev/null &
 """
-# both daemons share it, nobody else ever does
+# only used by the two daemons of this benchmark
 _KEY = "be" * 32
 _PYTHON = "PYTHONPATH=/opt/reconvergence python3"
 
@@ -124,11 +124,11 @@ class Case:
 
 
 class NoPauseError(Exception):
-    """The relay that fell silent was not, or no longer, the one that telemetry passed."""
+    """The silenced relay was not, or no longer, on the route of the telemetry."""
 
 
 def spec() -> FleetSpec:
-    """Five nodes; a LAN with a computer at either end."""
+    """Five nodes; a LAN with a computer at each end."""
     nodes = tuple(
         NodeSpec(
             name,
@@ -149,7 +149,7 @@ def _mac(name: str) -> str:
 
 @contextmanager
 def bench(directory: Path) -> Iterator[Bench]:
-    """The fleet, with telemetry ready to flow as soon as a mesh lets it."""
+    """The fleet, with telemetry that flows as soon as there is a mesh."""
     fleet = QemuFleet(spec(), directory).up(wait_s=_START_S)
     try:
         made = Bench(fleet)
@@ -161,7 +161,7 @@ def bench(directory: Path) -> Iterator[Bench]:
 
 
 class Bench:
-    """The running fleet with daemons on both computers. Nothing waits longer than until `ends_s` (monotonic)."""
+    """The running fleet with daemons on both computers. All waits end at `ends_s` (monotonic)."""
 
     def __init__(self, fleet: QemuFleet) -> None:
         self._fleet = fleet
@@ -171,7 +171,7 @@ class Bench:
     # -- once --
 
     def put_programs(self) -> None:
-        """udp_mesh, what it needs of this Python's packages, and the programs of `in_machine`, into the machine."""
+        """Copy udp_mesh, its dependencies and the programs of `in_machine` into the machine."""
         python = self._machine("python3 -c 'import sys; print(sys.version_info[:2])'").strip()
         if python != str(sys.version_info[:2]):
             raise RuntimeError(
@@ -205,33 +205,33 @@ class Bench:
     # -- each case --
 
     def configure(self, case: Case) -> None:
-        """Give every node this algorithm and interval; batman-adv takes an algorithm only when it is made anew."""
-        # BATMAN_V measures links with ELP, by default twice in an interval of its OGMs
+        """Set algorithm and interval on every node; batman-adv uses an algorithm only when bat0 is recreated."""
+        # BATMAN_V measures links with ELP, by default twice per OGM interval
         elp = f"set network.mesh0.elp_interval={case.interval_ms // 2}" if case.algorithm == "BATMAN_V" else ""
 
-        def tell(number: int) -> None:
+        def set_node(number: int) -> None:
             words = _CONFIGURE.format(
                 address=f"10.42.0.{101 + number}", algorithm=case.algorithm, interval_ms=case.interval_ms, elp=elp
             )
             self._fleet.node(NODES[number]).exec(words, timeout_s=_COMMAND_S).check(f"configure {NODES[number]}")
 
         with ThreadPoolExecutor(len(NODES)) as pool:
-            list(pool.map(tell, range(len(NODES))))
+            list(pool.map(set_node, range(len(NODES))))
         self._configured_s = time.monotonic()
         for name in NODES:
-            told = json.loads(self._on(name, "batctl meshif bat0 mesh_json"))
-            found = (told["algo_name"], told["orig_interval"])
+            mesh = json.loads(self._on(name, "batctl meshif bat0 mesh_json"))
+            found = (mesh["algo_name"], mesh["orig_interval"])
             if found != (case.algorithm, case.interval_ms):
-                raise RuntimeError(f"{name} runs {found} and not {case}")
+                raise RuntimeError(f"{name}: expected {case}, found {found}")
 
     def settle(self, case: Case) -> None:
-        """Wait until qualities are those of a mesh that has stood for a while, both relays have been heard from both
-        sides for several rounds, and telemetry flows."""
+        """Wait until link qualities have converged, both relays have been heard from both sides for several intervals,
+        and telemetry flows."""
 
         def is_settled() -> bool:
             relays = {_mac(name) for name in RELAYS}
             return (
-                all(relays <= self._neighbours(name, case) for name in ("near", "far"))
+                all(relays <= self._neighbors(name, case) for name in ("near", "far"))
                 and self._next_hop("far", "base") in relays
                 and self._next_hop("near", "far") in relays
                 and self._flows()
@@ -244,7 +244,7 @@ class Bench:
         self._until(is_settled, "the mesh to stay settled", _SETTLE_S)
 
     def overheard(self) -> list[dict[str, Any]]:
-        """What batman-adv itself sent in `OVERHEARD_S`."""
+        """The packets of batman-adv itself in `OVERHEARD_S`."""
         lines = self._machine(f"{_PYTHON} /opt/reconvergence/overhear.py {OVERHEARD_S}", timeout_s=OVERHEARD_S + 60)
         return [
             {"kind": kind, "rate": int(rate), "bytes": int(length), "count": int(count)}
@@ -252,13 +252,13 @@ class Bench:
         ]
 
     def pause_s(self) -> float:
-        """Silence the relay that telemetry passes; the longest pause between two messages from then on, in seconds.
+        """Silence the active relay; returns the longest pause between two messages from then on, in seconds.
 
         Raises NoPauseError when there was none.
         """
         relay = next((name for name in RELAYS if _mac(name) == self._next_hop("far", "base")), "")
         if not relay:
-            raise NoPauseError("far had no relay towards base")
+            raise NoPauseError("far has no relay towards base")
         before = self._now_s()
         self._fleet.inject_fault(relay, "sever")
         try:
@@ -267,15 +267,15 @@ class Bench:
         finally:
             self._fleet.repair(relay)
         if not pause_s:
-            raise NoPauseError(f"telemetry did not pause when {relay} fell silent")
+            raise NoPauseError(f"telemetry did not pause when {relay} was silenced")
         return pause_s
 
     def check_runs(self) -> None:
-        """Raises MeshctlError when the machine is gone."""
+        """Raises MeshctlError when the machine has ended."""
         self._fleet.status()
 
     def _pause_since(self, before_s: float) -> float | None:
-        """The longest pause since then once it is over; 0 when there is none; None as long as that is open."""
+        """The longest pause since then once it has ended; 0 when there is none; None while this is undecided."""
         arrivals = self._arrivals(before_s - 5 * TELEMETRY_S)
         return longest_pause(arrivals, before_s, self._now_s())
 
@@ -295,7 +295,7 @@ class Bench:
         hops = [one["neigh_address"] for one in known if one.get("best") and one["orig_address"] == _mac(target)]
         return str(hops[0]) if hops else ""
 
-    def _neighbours(self, name: str, case: Case) -> set[str]:
+    def _neighbors(self, name: str, case: Case) -> set[str]:
         known = json.loads(self._on(name, "batctl meshif bat0 neighbors_json") or "[]")
         return {one["neigh_address"] for one in known if one["last_seen_msecs"] < 500 + 2 * case.interval_ms}
 
@@ -310,7 +310,7 @@ class Bench:
             source.write(data)
             source.seek(0)
             descriptors = (source.fileno(), said.fileno(), said.fileno())
-            answer = self._fleet.ask_with(descriptors, 300.0, "machine", command=command)
+            answer = self._fleet.request_with_fds(descriptors, 300.0, "machine", command=command)
             said.seek(0)
             Completed(b"", said.read(), int(answer["status"])).check(command)
 
@@ -324,7 +324,7 @@ class Bench:
 
 
 def longest_pause(arrivals_s: list[float], before_s: float, now_s: float) -> float | None:
-    """The longest time between two of the messages, once they have flowed again for a while; in seconds.
+    """The longest time between two messages, in seconds, once they have flowed again for a while.
 
     0 when there is no pause since `before_s` and none may be expected any more; None as long as that is open.
     """
@@ -333,7 +333,7 @@ def longest_pause(arrivals_s: list[float], before_s: float, now_s: float) -> flo
     if not after or not pauses:
         return None
     longest_s, ended_s = max(pauses)
-    # a relay that falls silent between two messages costs one at least
+    # a relay that is silenced between two messages loses at least one
     if longest_s > 3 * TELEMETRY_S:
         return longest_s if after[-1] - ended_s > _FLOWED_S and now_s - after[-1] < 1.0 else None
     return 0.0 if after[-1] - before_s > _NO_PAUSE_S else None

@@ -1,13 +1,13 @@
-"""How long telemetry stops when a relay dies: `python -m benchmarks.reconvergence_udp_mesh [--fill] [--tables]`.
+"""Pause of telemetry when a relay dies: `python -m benchmarks.reconvergence_udp_mesh [--fill] [--tables]`.
 
-For each of batman-adv's routing algorithms and intervals, in one machine of real 802.11 radios (`reconvergence_fleet`):
+For each routing algorithm and interval of batman-adv, on the kernel's 802.11 radios (`reconvergence_fleet`):
 
-    configure -> wait until the mesh has settled -> listen to what batman-adv itself sends
-      -> again and again: silence the relay that telemetry passes; the longest pause between two messages; it returns
+    configure -> wait until the mesh has settled -> capture batman-adv's own packets
+      -> for each run: silence the active relay, measure the longest pause between two messages, restore the relay
 
-Each run is appended to the results at once, and so is what failed; a case that has its runs is not measured again. A
-case that fails is told and the next one begun, a machine that ends is started once more. `--within` divides the time
-that is given among the cases left: each gets one run at least, and as many more as there is time for.
+Each run and each failure is appended to the results at once; a case that has its runs is not measured again. A case
+that fails is reported and the next one starts; a machine that ends is restarted once. `--within` divides the time among
+the remaining cases: each gets at least one run, and more if there is time.
 """
 
 from __future__ import annotations
@@ -33,21 +33,23 @@ ALGORITHMS = ("BATMAN_IV", "BATMAN_V")
 INTERVALS_MS = (1000, 500, 250, 100)
 CASES = tuple(Case(algorithm, interval_ms) for algorithm in ALGORITHMS for interval_ms in INTERVALS_MS)
 _BOOTS = 2
-# one case, whatever happens in it
+# the time limit of one case
 _CASE_S = 420.0
-# runs in which telemetry had just taken the other way by itself
+# tolerated runs in which telemetry had just switched to the other route by itself
 _MISSES = 6
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.reconvergence_udp_mesh", description=__doc__)
-    parser.add_argument("--case", action="append", default=[], help="only this one, such as BATMAN_IV:250 (repeatable)")
-    parser.add_argument("--runs", type=int, default=5, help="how often a relay dies in each case")
-    parser.add_argument("--within", type=float, default=0.0, help="minutes for everything; 0: as long as it takes")
-    parser.add_argument("--again", action="store_true", help="forget what was measured of these cases, measure anew")
+    parser.add_argument(
+        "--case", action="append", default=[], help="only this case, such as BATMAN_IV:250 (repeatable)"
+    )
+    parser.add_argument("--runs", type=int, default=5, help="number of runs of each case")
+    parser.add_argument("--within", type=float, default=0.0, help="total time limit in minutes; 0: no limit")
+    parser.add_argument("--again", action="store_true", help="discard the results of these cases and measure again")
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
-    parser.add_argument("--fill", action="store_true", help="put the table into docs/reconvergence.md")
+    parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/reconvergence.md")
     arguments = parser.parse_args()
     unknown = [name for name in arguments.case if name not in map(str, CASES)]
     if unknown:
@@ -69,7 +71,7 @@ def main() -> None:
 
 
 class Measuring:
-    """Measures cases one after the other until `ends_s` (monotonic), and writes down each run in the file `results`."""
+    """Measures cases in order until `ends_s` (monotonic), and appends each run to the file `results`."""
 
     def __init__(self, results: Path, runs: int, ends_s: float) -> None:
         self._results = results
@@ -77,7 +79,7 @@ class Measuring:
         self._ends_s = ends_s
 
     def all(self, cases: list[Case]) -> None:
-        """Every case that lacks runs; each is begun once."""
+        """Measure every case that lacks runs; each is started once."""
         todo = [case for case in cases if self._done(case) < self._runs]
         for boot in range(1, _BOOTS + 1):
             if not todo or time.monotonic() >= self._ends_s:
@@ -91,7 +93,7 @@ class Measuring:
             self._write(case, failed="not begun: no machine, or no time left")
 
     def _in_machine(self, made: Bench, todo: list[Case]) -> None:
-        """Take cases off `todo` until none is left. Raises what ends the machine."""
+        """Measure and remove the cases of `todo`. Raises the error with which the machine ended."""
         while todo and time.monotonic() < self._ends_s:
             case = todo[0]
             share_s = (self._ends_s - time.monotonic()) / len(todo)
@@ -109,7 +111,7 @@ class Measuring:
                 _say(f"{case} took {time.monotonic() - begun_s:.0f} s")
 
     def _case(self, made: Bench, case: Case, share_ends_s: float) -> None:
-        """Its runs; more than one only as long as each is likely to end before `share_ends_s` (monotonic)."""
+        """Measure the runs of a case; after the first, only runs that are likely to end before `share_ends_s`."""
         made.configure(case)
         made.settle(case)
         overheard = made.overheard()
@@ -147,9 +149,9 @@ def _say(text: str) -> None:
 
 
 def airtime_us(rate: int, length: int, kind: str) -> float:
-    """How long one transmission takes the air, in microseconds: DIFS, the mean back-off, the frame, a probe's ack.
+    """Airtime of one transmission in microseconds: DIFS, the mean back-off, the frame, and a probe's acknowledgement.
 
-    IEEE 802.11-2020 clauses 15 (DSSS), 17 (OFDM) and 19 (HT, where the rate is not told: MCS 7, 65 Mbit/s); slots of
+    IEEE 802.11-2020 clauses 15 (DSSS), 17 (OFDM) and 19 (HT, if the rate is unknown: MCS 7, 65 Mbit/s); slots of
     9 us, a first contention window of 15 slots.
     """
     spacing_us = 28 + 7.5 * 9
@@ -161,13 +163,13 @@ def airtime_us(rate: int, length: int, kind: str) -> float:
         frame_us = 20 + 4 * -(-(22 + bits) // int(4 * mbit_s)) + 6
     else:
         frame_us = 36 + 4 * -(-(22 + bits) // 260) + 6
-    # broadcasts get no acknowledgement; a probe's goes at 6 Mbit/s
+    # broadcasts are not acknowledged; a probe's acknowledgement is sent at 6 Mbit/s
     acknowledged_us = 10 + 44 if kind == "probe" else 0
     return spacing_us + frame_us + acknowledged_us
 
 
 def share_of_air(overheard: list[dict[str, Any]]) -> float:
-    """What batman-adv itself takes of a channel that all nodes share, 0..1."""
+    """The share (0..1) of a common channel that batman-adv's own packets use."""
     total_us: float = sum(one["count"] * airtime_us(one["rate"], one["bytes"], one["kind"]) for one in overheard)
     return total_us / (OVERHEARD_S * 1e6)
 
@@ -176,7 +178,7 @@ def share_of_air(overheard: list[dict[str, Any]]) -> float:
 
 
 def recorded(path: Path) -> list[dict[str, Any]]:
-    """Every run, and every failure, in the order of measuring."""
+    """Every recorded run and failure, in order."""
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
@@ -185,13 +187,13 @@ def is_of(result: dict[str, Any], case: Case) -> bool:
 
 
 def forget(path: Path, cases: list[Case]) -> None:
-    """Take out everything that was recorded of these cases."""
+    """Remove all results of these cases."""
     kept = [one for one in recorded(path) if not any(is_of(one, case) for case in cases)]
     path.write_text("".join(f"{json.dumps(one)}\n" for one in kept), encoding="utf-8")
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """One row per case: pauses with their number and range, and what batman-adv costs."""
+    """One row per case: number, median and range of the pauses, and batman-adv's overhead."""
     lines = [
         "| algorithm | interval | runs | telemetry pauses for: median (range) | packets/s of its own | of the air |",
         "| --- | --- | --- | --- | --- | --- |",

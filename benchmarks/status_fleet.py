@@ -1,10 +1,9 @@
-"""Many devices that cost little, for timing who asks them: one real OpenSSH server, and answers that were made before.
+"""Many cheap devices to measure their client with: one real OpenSSH server, with prepared answers.
 
-In a network namespace of its own, the server holds the addresses of all radios and robots. A radio's answer to the
-observation is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbours, a path to
-every other radio in its originator table, and the files that the inventory wants of it. A robot runs meshctl's own
-script in a real shell, and finds stand-ins for `systemctl` and for the daemon that tell what those of a team of that
-size tell.
+In its own network namespace, the server has the addresses of all radios and robots. A radio's answer to the observation
+is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbors, a path to every other
+radio in its originator table, and its files from the inventory. A robot runs meshctl's own script in a real shell, with
+stand-ins for `systemctl` and the daemon that answer as in a team of that size.
 """
 
 from __future__ import annotations
@@ -56,13 +55,13 @@ nodes:
 {robots}topics:
 {topics}"""
 _RADIO = """#!/bin/sh
-# Stand-in for a radio: the first line of what is sent names the nonce; the answer was made before.
+# Stand-in for a radio: the first line of the input has the nonce; the answer is prepared.
 IFS= read -r first
 set -- $SSH_CONNECTION
 exec sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$3"
 """
 _DAEMON = """#!/bin/sh
-# Stand-in for the release's Python asking the daemon: what it would tell, by the address that was called.
+# Stand-in for the release's Python that queries the daemon: its answer, by the address of the connection.
 set -- $SSH_CONNECTION
 for word in status topics; do
 	echo "== $word"
@@ -71,7 +70,7 @@ for word in status topics; do
 done
 """
 _SYSTEMCTL = """#!/bin/sh
-# Stand-in for systemctl show: a unit that is up.
+# Stand-in for systemctl show: a running unit.
 while [ $# -gt 1 ]; do shift; done
 printf 'Id=%s\\nLoadState=loaded\\nActiveState=active\\nSubState=running\\nUnitFileState=enabled\\n' "$1"
 printf 'NRestarts=0\\nResult=success\\n'
@@ -80,7 +79,7 @@ _ENTER = r"""
 mount --make-rprivate /
 mount --bind "$1/opt" /opt
 mount -t tmpfs tmpfs /run
-# what this machine's own shells do when they start is no part of it
+# without the start-up files of this machine's shells
 mount -t tmpfs tmpfs /root
 mkdir -p /run/sshd
 exec /usr/sbin/sshd -D -e -f "$1/sshd_config"
@@ -89,7 +88,7 @@ exec /usr/sbin/sshd -D -e -f "$1/sshd_config"
 
 @dataclass(slots=True)
 class Devices:
-    """`start` makes everything in `directory` and listens; only inside a network namespace of one's own."""
+    """`start` creates everything in `directory` and listens; requires a network namespace of its own."""
 
     directory: Path
     radios: int
@@ -116,7 +115,7 @@ class Devices:
     def start(self) -> None:
         for prefix in (FIRST_HALF, SECOND_HALF, COMPUTERS):
             _ip("route", "add", "local", f"{prefix}.0/24", "dev", "lo")
-        # what is sent there is never answered, as by a radio without power
+        # packets to it are never answered, as from a radio without power
         _ip("link", "add", "nowhere", "type", "veth", "peer", "name", "void")
         _ip("link", "set", "nowhere", "up")
         _ip("link", "set", "void", "up")
@@ -137,12 +136,12 @@ class Devices:
 
     def stop(self) -> None:
         if self._server is not None:
-            # unshare takes the server and its namespace along
+            # the server and its namespace end with unshare
             self._server.kill()
             self._server.wait(60)
 
     def switch_off_half(self) -> int:
-        """The second half of the radios answers nothing any more; how many those are."""
+        """Silence the second half of the radios; returns their number."""
         _ip("route", "del", "local", f"{SECOND_HALF}.0/24", "dev", "lo")
         _ip("route", "add", f"{SECOND_HALF}.0/24", "dev", "nowhere")
         return self.radios // 2
@@ -188,8 +187,8 @@ class Devices:
             path.write_text(text)
             path.chmod(0o755)
         for number, robot in enumerate(self.crew, 1):
-            for word, told in (("status", self._status(robot)), ("topics", {"topics": self._topics()})):
-                (root / "opt/stand-in" / f"{COMPUTERS}.{number}.{word}.json").write_text(json.dumps(told))
+            for word, reply in (("status", self._status(robot)), ("topics", {"topics": self._topics()})):
+                (root / "opt/stand-in" / f"{COMPUTERS}.{number}.{word}.json").write_text(json.dumps(reply))
 
     def _status(self, robot: str) -> dict[str, Any]:
         queues = [{"priority": priority, "messages": 0, "bytes": 0, "oldest_s": 0.0} for priority in (0, 3, 6)]
@@ -249,7 +248,7 @@ class Devices:
 
 
 def programs_missing() -> tuple[str, ...]:
-    """What has to be installed first."""
+    """The programs that must be installed."""
     return tuple(name for name in ("sshd", "ssh-keygen", "unshare", "ip") if not shutil.which(name, path=_PATH))
 
 
@@ -265,7 +264,7 @@ def _mac(number: int) -> str:
 
 
 def _place(number: int, count: int) -> dict[str, str]:
-    """The sections that tell a radio's place in a ring where each hears the two on either side."""
+    """The sections of a radio in a ring in which each hears the two on either side."""
     mac = _mac(number)
     around = sorted({(number + step) % count for step in (-2, -1, 1, 2)} - {number})
     seen = {"hard_ifindex": 7, "hard_ifname": "mesh0", "last_seen_msecs": 120}
@@ -300,7 +299,7 @@ def _place(number: int, count: int) -> dict[str, str]:
 
 
 def _files(files: Any) -> Iterator[tuple[str, str]]:
-    """What the inventory wants, as the sections in which a node tells it."""
+    """The files of the inventory, as the sections of a node's observation."""
     for file in files:
         text = file.content.decode()
         if file.path.startswith("etc/config/"):

@@ -1,14 +1,14 @@
-"""How long `meshctl status` takes for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]`.
+"""Duration of `meshctl status` for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]`.
 
-The devices are those of `status_fleet`: a real SSH server in a network namespace of its own, answers made before. The
-command runs as its users run it, in a process of its own, over real connections:
+The devices are those of `status_fleet`: a real SSH server in its own network namespace, with prepared answers. The
+command runs in a separate process, over real connections:
 
-- a look at the radios alone, and one at radios and robots, with new connections to everybody;
-- the looks after the first of `--watch`, whose connections stand;
-- a look while half of the radios are off: what is sent to them is lost, as over the air.
+- once for the radios alone, and once for radios and robots, with new connections to all;
+- the rounds of `--watch` after the first, with established connections;
+- once while half of the radios are off: packets to them are lost, as in the field.
 
-Devices and meshctl share this machine's processors, so the seconds have the server's work in them; the processor
-seconds are meshctl's own.
+Devices and meshctl share this machine's CPUs, so the wall time includes the server's work; the CPU time is meshctl's
+own.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from benchmarks.status_fleet import Devices, programs_missing
 
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
 RUNS = 3
-LOOKS_WATCHED = 4
+WATCH_ROUNDS = 4
 
 
 def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, float, dict[str, Any]]:
-    """Wall and processor seconds of a status, and what it told."""
+    """Wall and CPU seconds of a status, and its output."""
     began = time.monotonic()
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(command, env=dict(environ), stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
@@ -46,16 +46,16 @@ def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, floa
         errors.seek(0)
         text = output.read()
         if not text:
-            raise RuntimeError(f"status ended with {process.returncode}: {errors.read().decode()[-2000:]}")
+            raise RuntimeError(f"status exited with {process.returncode}: {errors.read().decode()[-2000:]}")
     return took_s, used.ru_utime + used.ru_stime, json.loads(text)
 
 
 def repeated(command: Sequence[str], environ: Mapping[str, str], answering: int) -> dict[str, float]:
-    """The median of several runs. Raises RuntimeError unless exactly so many devices answered in each."""
+    """The median of several runs. Raises RuntimeError unless exactly `answering` devices answered in each."""
     walls, processors = [], []
     for _ in range(RUNS):
-        wall_s, cpu_s, told = run(command, environ)
-        devices = [*told["nodes"], *told["robots"]]
+        wall_s, cpu_s, document = run(command, environ)
+        devices = [*document["nodes"], *document["robots"]]
         answered = sum(one["answers"] for one in devices)
         if answered != answering:
             why = {one["silent_because"] for one in devices if not one["answers"]}
@@ -66,7 +66,7 @@ def repeated(command: Sequence[str], environ: Mapping[str, str], answering: int)
 
 
 def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
-    """The looks after the first one of `--watch`, as the command itself timed them."""
+    """The rounds of `--watch` after the first, as timed by the command itself."""
     with subprocess.Popen(
         [*command, "--watch", "1"],
         env=dict(environ),
@@ -76,14 +76,14 @@ def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, flo
         text=True,
     ) as process:
         assert process.stdout is not None
-        looks = [json.loads(process.stdout.readline()) for _ in range(LOOKS_WATCHED)]
+        looks = [json.loads(process.stdout.readline()) for _ in range(WATCH_ROUNDS)]
         process.send_signal(signal.SIGINT)
         process.wait(60)
     return {"seconds": statistics.median(look["took_s"] for look in looks[1:])}
 
 
 def measure(radios: int, robots: int) -> dict[str, Any]:
-    """Every figure for one fleet, its base among the radios."""
+    """All figures for one fleet, whose radios include the base."""
     with tempfile.TemporaryDirectory(prefix="status-scale-") as directory:
         devices = Devices(Path(directory, "fleet"), radios, robots)
         devices.directory.mkdir()
@@ -125,7 +125,7 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
 
 
 def in_own_network(radios: int, robots: int) -> dict[str, Any]:
-    """`measure` in a process of its own, in a network where only the fleet's own addresses are."""
+    """Run `measure` in a separate process, in a network namespace with only the fleet's addresses."""
     inner = 'ip link set lo up && exec "$@"'
     command = ["unshare", "--net", "sh", "-ec", inner, "sh", sys.executable, "-m", "benchmarks.status_scale"]
     done = subprocess.run([*command, "--inside", f"{radios},{robots}"], stdout=subprocess.PIPE, check=True)
@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("--radios", default="50,200")
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--tables", action="store_true", help="only print the table of what was measured")
+    parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
     parser.add_argument("--inside", default="", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.inside:

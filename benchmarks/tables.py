@@ -1,6 +1,6 @@
 """Results as Markdown: one table per set, then every goal with our figure, met or missed.
 
-A cell that was run several times is one row: the median of each figure over its runs.
+A cell with several runs is one row with the median of each figure.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
 
 
 def report(results: Sequence[Mapping[str, Any]]) -> str:
-    """Everything measured, as one Markdown text."""
+    """All results as one Markdown text."""
     sets = list(dict.fromkeys(result["set"] for result in results))
     parts = [f"### {name}\n\n{table([r for r in results if r['set'] == name])}" for name in sets]
     goals = [row(["set", "link", "figure", "goal", "measured", ""]), row(["---"] * 6)]

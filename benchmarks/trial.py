@@ -1,7 +1,7 @@
-"""One trial: one transport over one link under one load, and what came of it.
+"""One trial: one transport over one link under one load.
 
-`run` starts both ends in a laboratory, waits until the way is open, makes the link what the trial says, lets the load
-run, optionally cuts the link for a while, and returns plain figures; `benchmarks.goals` judges them.
+`run` starts both ends in a laboratory, waits until they are connected, configures the link, runs the load, optionally
+cuts or changes the link, and returns the measurements, which `benchmarks.goals` evaluates.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from benchmarks.link.laboratory import Count, Laboratory, Link, compiled
 from benchmarks.peers import peer_called
 
 READY_TIMEOUT_S = 60.0
-# the sender has ended before the receiver, if it can
+# the sender ends before the receiver, unless it hangs
 END_TIMEOUT_S = 15.0
-# after the sender stops, what is still under way may arrive
+# the time for packets in flight to arrive after the sender stops
 DRAIN_S = 4.0
 _CONGESTION_CONTROL = Path(__file__).with_name("peers") / "congestion_control.c"
 
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """`bulk_bytes` in all (0 none, -1 without end); `cut_after_s`: the link is down for `cut_s` from then;
-    `change_after_s`: the link becomes `change` then."""
+    """`bulk_bytes` in total (0 none, -1 unlimited); the link is down for `cut_s` from `cut_after_s` on, or becomes
+    `change` at `change_after_s`."""
 
     seconds: float
     bulk_bytes: int = 0
@@ -65,7 +65,7 @@ class Measured:
         return (inside[-1][1] - inside[0][1]) * 8 / (inside[-1][0] - inside[0][0])
 
     def latencies_s(self, since_s: float, until_s: float) -> list[float]:
-        """Of the urgent messages handed over between two moments, sorted; those that never arrived are absent."""
+        """Latencies of the urgent messages sent between two moments, sorted, without lost ones."""
         return sorted(arrived - sent for _, sent, arrived in self.urgent if since_s <= sent <= until_s)
 
 
@@ -75,7 +75,7 @@ def percentile(ordered: Sequence[float], share: float) -> float | None:
 
 
 def run(lab: Laboratory, peer: str, link: Link, load: Load) -> Measured:
-    """Raises RuntimeError when an end does not get ready, or leaves no result."""
+    """Run the trial. Raises RuntimeError when an end does not get ready or writes no result."""
     lab.become(replace(link, loss=0.0, burst_enter=0.0, up=1))
     results = [lab.directory / "sent.json", lab.directory / "received.json"]
     for result in results:
@@ -97,12 +97,12 @@ def run(lab: Laboratory, peer: str, link: Link, load: Load) -> Measured:
         ends[0].wait(receive_s + READY_TIMEOUT_S)
         count = lab.count()
         if not (load.bulk_bytes > 0):
-            # a sender that hangs on a bad link is a result, too: what arrived is known without it
+            # a sender that hangs on a bad link is a result, too: the receiver knows what arrived
             with contextlib.suppress(subprocess.TimeoutExpired):
                 ends[1].wait(END_TIMEOUT_S)
     finally:
         for end in ends:
-            # a sender of a fixed amount has nothing more to say once the receiver has it all
+            # a sender of a fixed amount is done once the receiver has everything
             _stop(end)
     return _read(results, count, went_s, changed_s)
 
@@ -122,7 +122,7 @@ def _while_it_runs(lab: Laboratory, load: Load) -> float | None:
 
 
 def _start(lab: Laboratory, host: int, peer: str, role: str, *words: str) -> subprocess.Popen[bytes]:
-    """An end in its host, with the congestion control that the comparison says."""
+    """Start an end in its host, with the congestion control of the peer."""
     environ = dict(os.environ)
     chosen = peer_called(peer).congestion_control
     if chosen:
@@ -135,7 +135,7 @@ def _start(lab: Laboratory, host: int, peer: str, role: str, *words: str) -> sub
 def _ready(end: subprocess.Popen[bytes]) -> None:
     assert end.stdout is not None
     if end.stdout.readline() != b"ready\n":
-        raise RuntimeError(f"{end.args!r} ended with {end.wait()} before it was ready")
+        raise RuntimeError(f"{end.args!r} exited with {end.wait()} before it was ready")
 
 
 def _stop(end: subprocess.Popen[bytes]) -> None:
@@ -153,7 +153,7 @@ def _stop(end: subprocess.Popen[bytes]) -> None:
 def _read(results: Sequence[Path], count: Count, went_s: float, changed_s: float | None) -> Measured:
     received = _load(results[1])
     if received is None:
-        raise RuntimeError("the receiver left no result")
+        raise RuntimeError("the receiver wrote no result")
     sent = _load(results[0]) or {"errors": ["the sender did not end"]}
     first = received["first_sent_s"][0] if received["first_sent_s"] else None
     return Measured(

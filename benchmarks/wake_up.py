@@ -1,5 +1,5 @@
-"""What it costs to wake up for a datagram: processes that only receive, one datagram at a time, as a 10 Mbit/s link
-delivers them. The least that a receiver in Python can take, whatever it does with them.
+"""CPU cost of waking up for a datagram: processes that only receive, one datagram at a time, as from a 10 Mbit/s link.
+The minimum for any receiver in Python.
 
     python -m benchmarks.wake_up [--fill]
 """
@@ -21,8 +21,8 @@ from benchmarks.tables import row
 DATAGRAMS_PER_S = 900
 DATAGRAM_BYTES = 1430
 SECONDS = 8.0
-# what a sender that sleeps too long falls short by would be taken for a cheaper receiver
-_LEAST_SENT = 0.95
+# below this the sender slept too long, which would make the receiver look cheaper
+_MIN_SENT_SHARE = 0.95
 _BUFFER_BYTES = 1 << 16
 _ANCILLARY_BYTES = 256
 
@@ -38,7 +38,7 @@ def _send(port: int) -> None:
 
 
 def waiting(receiver: socket.socket) -> int:
-    """A system call that waits for the next datagram; how many came."""
+    """Receive with one blocking system call per datagram; returns their number."""
     buffer, count = bytearray(_BUFFER_BYTES), 0
     end = time.monotonic() + SECONDS
     while time.monotonic() < end:
@@ -48,7 +48,7 @@ def waiting(receiver: socket.socket) -> int:
 
 
 def in_a_loop(receiver: socket.socket) -> int:
-    """asyncio's loop, which reads until nothing is left; how many came."""
+    """Receive with asyncio, which reads until the socket is empty; returns their number."""
     buffer, count = bytearray(_BUFFER_BYTES), 0
     receiver.setblocking(False)
 
@@ -70,7 +70,7 @@ def in_a_loop(receiver: socket.socket) -> int:
 
 
 def cores(receive: Callable[[socket.socket], int]) -> tuple[float, float]:
-    """(share of a core, microseconds per datagram) that this process takes to receive."""
+    """(share of a core, microseconds per datagram) of this process."""
     with socket.socket(type=socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         sender = multiprocessing.Process(target=_send, args=(receiver.getsockname()[1],), daemon=True)
@@ -82,15 +82,17 @@ def cores(receive: Callable[[socket.socket], int]) -> tuple[float, float]:
         finally:
             sender.terminate()
             sender.join()
-    if count < _LEAST_SENT * DATAGRAMS_PER_S * SECONDS:
-        raise RuntimeError(f"expected {DATAGRAMS_PER_S} datagrams a second, found {count / took_s:.0f}: a busy machine")
+    if count < _MIN_SENT_SHARE * DATAGRAMS_PER_S * SECONDS:
+        raise RuntimeError(
+            f"expected {DATAGRAMS_PER_S} datagrams a second, found {count / took_s:.0f}; is the machine busy?"
+        )
     cpu_s = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
     return cpu_s / took_s, cpu_s / count * 1e6
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.wake_up", description=__doc__)
-    parser.add_argument("--fill", action="store_true", help="put the table into docs/benchmarks.md")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     arguments = parser.parse_args()
     lines = [row(["receives by", "cores", "us per datagram"]), row(["---"] * 3)]
     for name, receive in (("a call that waits", waiting), ("asyncio, reading until nothing is left", in_a_loop)):

@@ -1,7 +1,7 @@
-"""What a core on each side carries: the transports between two namespaces on a veth pair, with no emulator in between.
+"""Throughput with one core per side: the transports between two namespaces on a veth pair, without the emulator.
 
-At a gigabit the emulator needs a core of its own, so that on a machine of two the cells of the comparison tell of the
-machine. Here each end has one: bulk without end and urgent messages at 20 Hz, as there.
+At a gigabit the emulator needs a core of its own, so on a machine with two cores the cells of the comparison measure
+the machine. Here each end has a core: continuous bulk and urgent messages at 20 Hz, as there.
 
     python -m benchmarks.wire [--runs N] [--fill]
 """
@@ -27,8 +27,8 @@ FIGURES = ("set", "name", "peer", "goodput", "urgent_p50_s", "urgent_p99_s", "se
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.wire", description=__doc__)
-    parser.add_argument("--runs", type=int, default=3, help="how often each is run; the table gives the median")
-    parser.add_argument("--fill", action="store_true", help="put the table into docs/benchmarks.md")
+    parser.add_argument("--runs", type=int, default=3, help="number of runs of each; the table shows the median")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     arguments = parser.parse_args()
     results: list[dict[str, Any]] = []
     with wire() as lab:
@@ -36,7 +36,7 @@ def main() -> None:
             for peer in PEERS:
                 print(f"[{number}/{arguments.runs}] {peer}", file=sys.stderr, flush=True)
                 figures = measure(lab, Cell("wire", peer, "veth", Link(), LOAD))
-                # nothing is counted on it, and it has no rate
+                # this link has no counters and no rate
                 results.append({figure: figures[figure] for figure in FIGURES})
     text = table(results)
     print(text)

@@ -1,6 +1,6 @@
-"""What a check says about an input: a severity, a stable code, a place, a message and a remedy.
+"""Diagnostics of an input: severity, stable code, position, message and hint.
 
-Readers collect diagnostics instead of stopping at the first; reports turn them into text, JSON, SARIF, JUnit XML or
+Parsers collect all diagnostics instead of stopping at the first; reports turn them into text, JSON, SARIF, JUnit XML or
 GitHub annotations.
 """
 
@@ -28,7 +28,7 @@ class Severity(Enum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Position:
-    """A place in a text file; `line` and `column` count from 1, 0 means unknown."""
+    """A position in a text file; `line` and `column` count from 1, 0 means unknown."""
 
     file: str
     line: int = 0
@@ -42,7 +42,7 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One finding. `path` is the dotted place in the inventory (`nodes.b03.radios.radio0.channel`), may be empty."""
+    """One finding. `path` is the dotted path in the inventory (`nodes.b03.radios.radio0.channel`), or empty."""
 
     code: str
     severity: Severity
@@ -55,7 +55,7 @@ class Diagnostic:
 
     @property
     def text(self) -> str:
-        """The message with what was expected and found, without the place."""
+        """The message with what was expected and found, without the position."""
         sides = [
             part
             for part in (self.expected and f"expected {self.expected}", self.found and f"found {self.found}")
@@ -72,7 +72,7 @@ class Diagnostic:
 
 
 class InvalidInput(InputError):
-    """An input with at least one error; carries every diagnostic, not only the first."""
+    """An input with at least one error; has all diagnostics, not only the first."""
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = sorted_diagnostics(diagnostics)
@@ -80,10 +80,10 @@ class InvalidInput(InputError):
 
 
 def sorted_diagnostics(diagnostics: Iterable[Diagnostic]) -> tuple[Diagnostic, ...]:
-    """By place in the file, then by severity and code, so that reports are deterministic."""
+    """Sorted by position, severity and code, so that reports are deterministic."""
     return tuple(sorted(diagnostics, key=lambda d: (d.position, d.severity.rank, d.code, d.path, d.message, d.found)))
 
 
 def worst(diagnostics: Iterable[Diagnostic]) -> Severity | None:
-    """The most severe severity present, or None when there is no diagnostic."""
+    """The highest severity, or None without diagnostics."""
     return min((item.severity for item in diagnostics), key=lambda severity: severity.rank, default=None)

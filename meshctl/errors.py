@@ -1,7 +1,7 @@
-"""The errors that meshctl itself raises, each with the exit code a script sees.
+"""The errors of meshctl, each with its exit code.
 
-Foreign exceptions (paramiko, OSError, yaml) are translated once, at the edge, into one of these. One node's failure is
-an outcome, not an error: it never stops a fleet.
+Foreign exceptions (paramiko, OSError, yaml) are translated into one of these at the boundary. One node's failure is an
+outcome, not an error: it never stops a fleet.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import ClassVar
 
 
 class ExitCode(IntEnum):
-    """What a script can tell from the exit status of every command."""
+    """The exit codes of all commands."""
 
     OK = 0
     # the command ran and found something to act on: lint findings, drift, a degraded or partly failed fleet
     FINDINGS = 1
-    # the command could not do its work: bad usage, unreadable or invalid input, missing tools
+    # the command could not run: bad usage, unreadable or invalid input, missing tools
     COULD_NOT_RUN = 2
     # nodes that were needed could not be reached
     UNREACHABLE = 3
@@ -25,7 +25,7 @@ class ExitCode(IntEnum):
 
 
 class MeshctlError(Exception):
-    """Anything meshctl reports to a person; `str()` is the whole message, `hint` says how to mend it."""
+    """Base of all errors; `str()` is the message, `hint` says how to fix it."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.COULD_NOT_RUN
 
@@ -35,16 +35,16 @@ class MeshctlError(Exception):
 
 
 class InputError(MeshctlError):
-    """A file or argument from the user that cannot be used; names file, line, what was expected, what was found."""
+    """An invalid file or argument; the message has file, line, what was expected and what was found."""
 
 
 class NodeError(MeshctlError):
-    """One node's failure; fleets turn it into that node's outcome."""
+    """A failure of one node; becomes that node's outcome."""
 
     exit_code = ExitCode.FINDINGS
 
 
 class Unreachable(NodeError):
-    """A node that did not answer within its deadline."""
+    """A node did not answer within its deadline."""
 
     exit_code = ExitCode.UNREACHABLE

@@ -1,7 +1,6 @@
-"""Files that ship with meshctl: templates, example inventories, lint pages.
+"""Files shipped with meshctl: templates, example inventories, lint pages.
 
-In a checkout they stand at the top of the repository, in an installed wheel below the package (pyproject.toml maps
-one to the other).
+In a checkout they are at the top of the repository, in an installed wheel inside the package (see pyproject.toml).
 """
 
 from __future__ import annotations

@@ -24,13 +24,13 @@ def request(
     the fleet rejects the request.
     """
     try:
-        folder = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        directory_fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise LabError(f"no virtual fleet in {directory}", hint="run `meshctl lab up` to start one") from error
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
             connection.settimeout(timeout_s)
-            connection.connect(address_of(directory, folder))
+            connection.connect(address_of(directory, directory_fd))
             socket.send_fds(connection, [json.dumps(message).encode()], list(descriptors))
             answer = connection.recv(MESSAGE_BYTES * 4)
     except TimeoutError as error:
@@ -38,7 +38,7 @@ def request(
     except OSError as error:
         raise LabError(f"no virtual fleet runs in {directory}", hint="run `meshctl lab up` to start one") from error
     finally:
-        os.close(folder)
+        os.close(directory_fd)
     if not answer:
         raise LabError(f"the fleet in {directory} ended before it answered {message['op']}")
     result: dict[str, Any] = json.loads(answer)

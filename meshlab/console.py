@@ -24,7 +24,7 @@ def run_shell(fleet: VirtualFleet, node: str, command: str) -> int:
     Returns its exit status. On a terminal the node gets its own pseudo-terminal, so that Ctrl-C goes to the node.
     """
     if command or not sys.stdin.isatty():
-        answer = fleet.ask_with((0, 1, 2), None, "exec", node=node, command=command)
+        answer = fleet.request_with_fds((0, 1, 2), None, "exec", node=node, command=command)
         return _status(answer, node)
     ours, theirs = pty.openpty()
     with contextlib.suppress(OSError):
@@ -33,7 +33,7 @@ def run_shell(fleet: VirtualFleet, node: str, command: str) -> int:
 
     def ask() -> None:
         try:
-            answers.append(fleet.ask_with((theirs, theirs, theirs), None, "exec", node=node, command=""))
+            answers.append(fleet.request_with_fds((theirs, theirs, theirs), None, "exec", node=node, command=""))
         finally:
             os.close(theirs)
 

@@ -84,8 +84,8 @@ def become_node(container: Container, report: int, gate: int | None = None) -> N
         if gate is not None and not os.read(gate, 1):
             os._exit(111)
         _restore_signals()
-        _own_uptime()
-        _mounts(container)
+        _reset_uptime()
+        _mount_all(container)
         if container.deny_setgroups:
             ns.accept_setgroups()
         os.execve("/bin/sh", ["/bin/sh", "/rom/lab/init"], _ENVIRONMENT)
@@ -101,7 +101,7 @@ def _restore_signals() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
 
-def _own_uptime() -> None:
+def _reset_uptime() -> None:
     """Start the node's uptime clocks at zero. Kernels before 5.6 have no time namespaces: the host's uptime stays."""
     if not os.path.exists("/proc/self/timens_offsets"):
         return
@@ -114,7 +114,7 @@ def _own_uptime() -> None:
         offsets.write(f"monotonic {monotonic[0]} {monotonic[1]}\nboottime {boottime[0]} {boottime[1]}\n")
 
 
-def _mounts(container: Container) -> None:
+def _mount_all(container: Container) -> None:
     ns.make_private()
     root, home = container.mount_point, container.home
     rom = container.fleet / "rom"

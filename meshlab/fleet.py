@@ -45,7 +45,7 @@ class VirtualNode:
         self.spec = fleet.spec.node(name)
 
     def _state(self) -> dict[str, Any]:
-        return self._fleet.ask("node", node=self.name)
+        return self._fleet.request("node", node=self.name)
 
     @property
     def address(self) -> str | None:
@@ -77,7 +77,7 @@ class VirtualNode:
 
     def console(self, lines: int = 40) -> str:
         """The last lines of its console: each boot, each boot script and its output."""
-        return str(self._fleet.ask("console", node=self.name, lines=lines)["text"])
+        return str(self._fleet.request("console", node=self.name, lines=lines)["text"])
 
     @property
     def bench(self) -> Endpoint:
@@ -93,7 +93,7 @@ class VirtualNode:
             source.write(stdin)
             source.seek(0)
             descriptors = (source.fileno(), out.fileno(), err.fileno())
-            answer = self._fleet.ask_with(descriptors, timeout_s, "exec", node=self.name, command=command)
+            answer = self._fleet.request_with_fds(descriptors, timeout_s, "exec", node=self.name, command=command)
             if answer["reason"]:
                 raise LabError(f"{self.name}: {answer['reason']}")
             out.seek(0)
@@ -112,13 +112,13 @@ class VirtualNode:
         `back` restores the power and waits until the node is up (or its firmware fails to start).
         """
         boots = self._state()["boots"]
-        self._fleet.ask("power_cut", node=self.name, unsynced=unsynced, back=back)
+        self._fleet.request("power_cut", node=self.name, unsynced=unsynced, back=back)
         if back:
             self.wait_up(after_boots=boots, wait_s=wait_s)
 
     def power_on(self, *, wait_s: float = 60.0) -> None:
         """Restore its power; returns when it is up (or its firmware fails to start)."""
-        self._fleet.ask("power_on", node=self.name)
+        self._fleet.request("power_on", node=self.name)
         self.wait_up(wait_s=wait_s)
 
     def wait_up(self, *, after_boots: int = 0, wait_s: float = 60.0) -> None:
@@ -147,11 +147,11 @@ class VirtualNode:
 
     def plug(self, plugged: bool = True) -> None:
         """Connect its LAN port to the operator's machine, or disconnect it: then only the mesh reaches the node."""
-        self._fleet.ask("plug", node=self.name, plugged=plugged)
+        self._fleet.request("plug", node=self.name, plugged=plugged)
 
     def record_steps(self) -> None:
         """Record each external command it runs from now on, for `steps()`. `sleep` and shells are not counted."""
-        self._fleet.ask("record_steps", node=self.name)
+        self._fleet.request("record_steps", node=self.name)
 
     def steps(self) -> tuple[str, ...]:
         """The external commands since `record_steps()`, in order; `power-cut@n` cuts at the n-th (from 1)."""
@@ -261,7 +261,7 @@ class VirtualFleet:
     def port(self) -> int:
         """The TCP port of all its loopback addresses."""
         if not self._port:
-            self._port = int(self.ask("status")["port"])
+            self._port = int(self.request("status")["port"])
         return self._port
 
     def endpoint(self, address: str, *, identity: str = "") -> Endpoint:
@@ -281,29 +281,29 @@ class VirtualFleet:
 
     def inject_fault(self, where: str, what: str) -> None:
         """`where` is a node or a link (`b01-b02`), `what` one of `faults.FAULTS` (`power-cut@7`, `full-flash`, ...)."""
-        self.ask("do_break", where=where, what=what)
+        self.request("do_break", where=where, what=what)
 
     def repair(self, where: str = "") -> None:
         """Repair everything (or one node or link): links up, power on, flash freed, bricked nodes recovered."""
-        self.ask("mend", where=where)
+        self.request("mend", where=where)
 
     def link(self, a: str, b: str, **changes: Any) -> None:
         """Change a link's fields as seen from `a` (`spec.changed_link`), or add a link; `repair` undoes it."""
-        self.ask("link", a=a, b=b, changes=changes)
+        self.request("link", a=a, b=b, changes=changes)
 
     def status(self) -> dict[str, Any]:
         """The content of `meshctl lab status --json`: fleet, pid, port, and per node power, address, mesh, faults."""
-        return self.ask("status")
+        return self.request("status")
 
-    def ask(self, operation: str, **words: Any) -> dict[str, Any]:
+    def request(self, operation: str, **arguments: Any) -> dict[str, Any]:
         """One request to the supervisor (`control.Operations`)."""
-        return request(self.directory, {"op": operation, **words})
+        return request(self.directory, {"op": operation, **arguments})
 
-    def ask_with(
-        self, descriptors: tuple[int, ...], timeout_s: float | None, operation: str, **words: Any
+    def request_with_fds(
+        self, descriptors: tuple[int, ...], timeout_s: float | None, operation: str, **arguments: Any
     ) -> dict[str, Any]:
         """A request that passes descriptors for a process on a node."""
-        return request(self.directory, {"op": operation, **words}, descriptors, timeout_s=timeout_s)
+        return request(self.directory, {"op": operation, **arguments}, descriptors, timeout_s=timeout_s)
 
     def __enter__(self) -> Self:
         return self.up()

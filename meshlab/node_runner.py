@@ -34,7 +34,7 @@ from meshlab.errors import LabError
 
 # the longest request or event; the longest are commands of `lab shell NODE -- ...`
 MESSAGE_BYTES = 1 << 17
-_SPACES = (("mnt", ns.CLONE_NEWNS), ("net", ns.CLONE_NEWNET), ("uts", ns.CLONE_NEWUTS), ("ipc", ns.CLONE_NEWIPC))
+_NAMESPACES = (("mnt", ns.CLONE_NEWNS), ("net", ns.CLONE_NEWNET), ("uts", ns.CLONE_NEWUTS), ("ipc", ns.CLONE_NEWIPC))
 _SHELL_ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root", "TERM": "vt102", "USER": "root"}
 
 
@@ -198,7 +198,7 @@ def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int])
     try:
         ns.die_with_parent()
         _close_all_except(descriptors)
-        spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _SPACES]
+        spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _NAMESPACES]
         pid_space = os.open(f"/proc/{node.pid}/ns/pid", os.O_RDONLY)
         with contextlib.suppress(FileNotFoundError):
             time_space = os.open(f"/proc/{node.pid}/ns/time_for_children", os.O_RDONLY)

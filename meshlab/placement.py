@@ -50,9 +50,9 @@ def move(fleet: VirtualFleet, name: str, to: Point) -> None:
 def set_power(fleet: VirtualFleet, name: str, on: bool) -> None:
     """Switch a node off, with everything synced, or on, without waiting for its boot."""
     if on:
-        fleet.ask("power_on", node=name)
+        fleet.request("power_on", node=name)
     elif fleet.node(name).power is not Power.OFF:
-        fleet.ask("power_cut", node=name, unsynced="kept", back=False)
+        fleet.request("power_cut", node=name, unsynced="kept", back=False)
 
 
 def flush_stations(fleet: VirtualFleet, name: str) -> None:
@@ -77,7 +77,7 @@ def _apply(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
     links = [asdict(link) for link in links_of(environment) if link.ends <= names]
     parts = [links[first : first + _LINKS_PER_REQUEST] for first in range(0, len(links), _LINKS_PER_REQUEST)] or [[]]
     for number, part in enumerate(parts, 1):
-        fleet.ask("links", part=part, is_last=number == len(parts))
+        fleet.request("links", part=part, is_last=number == len(parts))
     path = fleet.directory / _FILE_NAME
     new = path.with_name(f"{_FILE_NAME}.new")
     new.write_text(propagation_file.dump(environment), encoding="utf-8")

@@ -49,11 +49,11 @@ class PortForwarder:
         self.port = fleet.spec.port
         self._port_lock: socket.socket | None = None
         # a fixed seed, so that losses are the same in every run
-        self._dice = random.Random(1)
+        self._rng = random.Random(1)
 
     def open(self) -> None:
         """Choose a port and hold it on 127.255.255.254 while the fleet runs. Raises LabError when it is in use."""
-        self._port_lock, self.port = claim_port(self.port)
+        self._port_lock, self.port = lock_port(self.port)
 
     async def close(self) -> None:
         for listener, task in self._listening.values():
@@ -146,7 +146,7 @@ class PortForwarder:
         def shape() -> Shape | None:
             return None if state.hung else path_shape(port.node, port.address)
 
-        await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._dice).run()
+        await Tunnel(client, node, shape, self._link_state.condition, lambda: state.boots == boots, self._rng).run()
 
     async def _hang(self, client: socket.socket) -> None:
         """Keep the connection open and send nothing until the client closes it."""
@@ -160,12 +160,12 @@ class PortForwarder:
             client.close()
 
 
-def claim_port(wanted: int) -> tuple[socket.socket, int]:
+def lock_port(requested: int) -> tuple[socket.socket, int]:
     """A socket that holds the fleet's port, and the port: `wanted`, or a free one for 0.
 
     Raises LabError when the port (or every port of the range) is in use.
     """
-    for port in (wanted,) if wanted else range(_FIRST_PORT, _LAST_PORT + 1):
+    for port in (requested,) if requested else range(_FIRST_PORT, _LAST_PORT + 1):
         claim = socket.socket()
         try:
             claim.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -175,9 +175,9 @@ def claim_port(wanted: int) -> tuple[socket.socket, int]:
             claim.close()
             continue
         return claim, port
-    if wanted:
+    if requested:
         raise LabError(
-            f"port {wanted} on 127.255.255.254 is in use", hint="another fleet may run; choose another --port"
+            f"port {requested} on 127.255.255.254 is in use", hint="another fleet may run; choose another --port"
         )
     raise LabError(
         f"ports {_FIRST_PORT} to {_LAST_PORT} on 127.255.255.254 are all in use",

@@ -44,7 +44,7 @@ def parse(text: str, file: str) -> RadioEnvironment:
 
 def _environment(root: YamlEntry) -> RadioEnvironment:
     environment = environment_in(root.mapping(("nodes", "walls", "air", "links")))
-    if not root.is_there:
+    if not root.is_present:
         root.problem("a mapping")
     root.finish()
     return environment
@@ -73,14 +73,14 @@ def _position(entry: YamlEntry) -> NodePosition:
     power = keys["tx_power_dbm"]
     minimum, maximum = _PATH_LOSS_BOUNDS["tx_power_dbm"]
     return NodePosition(
-        keys["at"].point() if keys["at"].is_there else (0.0, 0.0),
-        power.number(0.0, minimum, maximum) if power.is_there else None,
+        keys["at"].point() if keys["at"].is_present else (0.0, 0.0),
+        power.number(0.0, minimum, maximum) if power.is_present else None,
     )
 
 
 def _wall(entry: YamlEntry) -> Wall:
     keys = entry.mapping(("a", "b", "loss_db"), required=("a", "b"))
-    ends = [keys[end].point() if keys[end].is_there else (0.0, 0.0) for end in ("a", "b")]
+    ends = [keys[end].point() if keys[end].is_present else (0.0, 0.0) for end in ("a", "b")]
     return Wall(ends[0], ends[1], keys["loss_db"].number(Wall(ends[0], ends[1]).loss_db, 0.0, 1000.0))
 
 
@@ -96,7 +96,7 @@ def _link(entry: YamlEntry) -> LinkSpec | None:
     keys = entry.mapping(("between", *_LINK_KEYS), required=("between",))
     ends = [item.text() for item in keys["between"].items()]
     if len(ends) != 2 or ends[0] == ends[1] or not all(ends):
-        if keys["between"].is_there:
+        if keys["between"].is_present:
             keys["between"].problem("two different nodes")
         return None
     rate, loss_back, signal_back = keys["rate_kbps"], keys["loss_back"], keys["signal_back_dbm"]
@@ -108,10 +108,10 @@ def _link(entry: YamlEntry) -> LinkSpec | None:
         signal_dbm=keys["signal_dbm"].integer(standard.signal_dbm, -120, 30),
         delay_ms=keys["delay_ms"].number(standard.delay_ms, 0.0, 60_000.0),
         loss=keys["loss"].share(standard.loss),
-        rate_kbps=rate.integer(1, 1, 10_000_000) if rate.is_there else None,
+        rate_kbps=rate.integer(1, 1, 10_000_000) if rate.is_present else None,
         up=keys["up"].flag(standard.up),
-        loss_back=loss_back.share(0.0) if loss_back.is_there else None,
-        signal_back_dbm=signal_back.integer(0, -120, 30) if signal_back.is_there else None,
+        loss_back=loss_back.share(0.0) if loss_back.is_present else None,
+        signal_back_dbm=signal_back.integer(0, -120, 30) if signal_back.is_present else None,
     )
 
 

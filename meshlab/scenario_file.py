@@ -72,7 +72,7 @@ def _scenario(root: YamlEntry, path: Path) -> Scenario:
 def _environment(keys: dict[str, YamlEntry], path: Path) -> RadioEnvironment:
     """The file that `ground` names, extended and overridden by this file's nodes, walls, air and links."""
     own = propagation_file.environment_in(keys)
-    if not keys["ground"].is_there:
+    if not keys["ground"].is_present:
         return own
     other = propagation_file.load(path.parent / keys["ground"].text())
     ends = {link.ends for link in own.links}
@@ -80,7 +80,7 @@ def _environment(keys: dict[str, YamlEntry], path: Path) -> RadioEnvironment:
         other,
         positions={**other.positions, **own.positions},
         walls=(*other.walls, *own.walls),
-        path_loss=own.path_loss if keys["air"].is_there else other.path_loss,
+        path_loss=own.path_loss if keys["air"].is_present else other.path_loss,
         links=(*(link for link in other.links if link.ends not in ends), *own.links),
     )
 
@@ -93,7 +93,7 @@ def _trajectory(entry: YamlEntry) -> Trajectory:
     try:
         return trajectory(points)
     except ValueError as error:
-        if keys["path"].is_there and all(rows):
+        if keys["path"].is_present and all(rows):
             keys["path"].problem("[[seconds, x, y], ...] with increasing times", str(error))
         return Trajectory((0.0,), ((0.0, 0.0),))
 

@@ -30,9 +30,9 @@ class Shape:
     loss: float = 0.0
     rate_bytes_s: float | None = None
 
-    def hold_s(self, size: int, dice: random.Random) -> float:
+    def hold_s(self, size: int, rng: random.Random) -> float:
         """The time for `size` bytes at the path's rate, plus one retransmission timeout per lost packet."""
-        lost = sum(dice.random() < self.loss for _ in range(-(-size // _PACKET_BYTES))) if self.loss else 0
+        lost = sum(rng.random() < self.loss for _ in range(-(-size // _PACKET_BYTES))) if self.loss else 0
         return (size / self.rate_bytes_s if self.rate_bytes_s else 0.0) + lost * (_RETRANSMIT_S + 2 * self.delay_s)
 
 
@@ -50,14 +50,14 @@ class Tunnel:
         shape: Callable[[], Shape | None],
         changed: asyncio.Condition,
         is_same_boot: Callable[[], bool],
-        dice: random.Random,
+        rng: random.Random,
     ) -> None:
         self._client = client
         self._node = node
         self._shape = shape
         self._changed = changed
         self._is_same_boot = is_same_boot
-        self._dice = dice
+        self._rng = rng
 
     async def run(self) -> None:
         """Forward until the connection ends; closes both sockets."""
@@ -89,10 +89,10 @@ class Tunnel:
                     if not from_node:
                         raise
                     data = b""
-                shape = await self._path()
+                shape = await self._wait_for_path()
                 if from_node and not data and not self._is_same_boot():
                     raise ConnectionResetError("the node has restarted")
-                line_free = max(line_free, loop.time()) + shape.hold_s(len(data), self._dice)
+                line_free = max(line_free, loop.time()) + shape.hold_s(len(data), self._rng)
                 await flying.put((line_free + shape.delay_s, data))
                 if not data:
                     return
@@ -101,7 +101,7 @@ class Tunnel:
             while True:
                 due, data = await flying.get()
                 await asyncio.sleep(max(0.0, due - loop.time()))
-                await self._path()
+                await self._wait_for_path()
                 if not from_node and not self._is_same_boot():
                     raise ConnectionResetError("the node has restarted")
                 if not data:
@@ -118,7 +118,7 @@ class Tunnel:
                 half.cancel()
             await asyncio.gather(*halves, return_exceptions=True)
 
-    async def _path(self) -> Shape:
+    async def _wait_for_path(self) -> Shape:
         """Wait until there is a path; returns it."""
         shape = self._shape()
         while shape is None:

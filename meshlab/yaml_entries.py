@@ -27,7 +27,7 @@ class YamlEntry:
         self._problems = problems
 
     @property
-    def is_there(self) -> bool:
+    def is_present(self) -> bool:
         return self.tree is not None
 
     @property
@@ -37,7 +37,7 @@ class YamlEntry:
     def problem(self, expected: str, found: str = "") -> None:
         """Add the problem that this entry is not `expected`."""
         place = Position("") if self._where is None else position(self._where)
-        self._note(codes.WRONG_VALUE, place, expected, found or self._seen())
+        self._add(codes.WRONG_VALUE, place, expected, found or self._found())
 
     def finish(self) -> None:
         """Raises InvalidInput when the file has problems."""
@@ -47,18 +47,18 @@ class YamlEntry:
     def mapping(self, known: tuple[str, ...] | None = None, required: tuple[str, ...] = ()) -> dict[str, YamlEntry]:
         """The entries by key. A `known` key (None: any key is) that is missing gets an absent entry."""
         if not isinstance(self.tree, MappingNode):
-            if self.is_there or required:
+            if self.is_present or required:
                 self.problem("a mapping")
-            return {key: self._below(None, key) for key in known or ()}
-        entries = {key: self._below(None, key) for key in known or ()}
+            return {key: self._child(None, key) for key in known or ()}
+        entries = {key: self._child(None, key) for key in known or ()}
         for key, value in self.tree.values.items():
             if known is not None and key not in known:
-                self._note(codes.UNKNOWN_KEY, position(self.tree.keys[key]), f"one of {', '.join(known)}", repr(key))
+                self._add(codes.UNKNOWN_KEY, position(self.tree.keys[key]), f"one of {', '.join(known)}", repr(key))
             else:
-                entries[key] = self._below(value, key)
+                entries[key] = self._child(value, key)
         for key in required:
             if key not in self.tree.values:
-                self._note(codes.MISSING_KEY, position(self.tree), f"the key {key}", "no such key")
+                self._add(codes.MISSING_KEY, position(self.tree), f"the key {key}", "no such key")
         return entries
 
     def items(self) -> Iterator[YamlEntry]:
@@ -66,7 +66,7 @@ class YamlEntry:
         if isinstance(self.tree, SequenceNode):
             for number, item in enumerate(self.tree.items):
                 yield YamlEntry(item, f"{self.path}[{number}]", self._problems)
-        elif self.is_there:
+        elif self.is_present:
             self.problem("a list")
 
     def text(self, default: str = "", one_of: tuple[str, ...] | None = None) -> str:
@@ -123,12 +123,12 @@ class YamlEntry:
         values = [item.number(0.0) for item in self.items()]
         return values if len(self._problems) == before else []
 
-    def _below(self, tree: Tree | None, key: str) -> YamlEntry:
+    def _child(self, tree: Tree | None, key: str) -> YamlEntry:
         entry = YamlEntry(tree, f"{self.path}.{key}" if self.path else key, self._problems)
         entry._where = tree or self._where
         return entry
 
-    def _seen(self) -> str:
+    def _found(self) -> str:
         match self.tree:
             case None:
                 return "nothing"
@@ -139,7 +139,7 @@ class YamlEntry:
             case tree:
                 return describe(tree)
 
-    def _note(self, code: str, place: Position, expected: str, found: str) -> None:
+    def _add(self, code: str, place: Position, expected: str, found: str) -> None:
         self._problems.append(codes.error(code, place, "", path=self.path, expected=expected, found=found))
 
 

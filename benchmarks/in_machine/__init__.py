@@ -1,1 +1,1 @@
-"""Programs that `benchmarks.reconvergence_udp_mesh` runs inside the machine of real radios, with its Python alone."""
+"""Programs that benchmarks run inside the QEMU machine, with its own Python only."""

@@ -1,7 +1,7 @@
-"""What batman-adv itself sends: `overhear.py SECONDS` listens on hwsim's monitor, where every transmission shows once.
+"""batman-adv's own packets: `overhear.py SECONDS` captures on hwsim's monitor, which shows every transmission once.
 
-Prints a line `KIND RATE BYTES COUNT` for each kind of packet (ogm, elp, ogm2; probe: an ELP packet to one neighbour):
-rate in units of 500 kbit/s as radiotap has it (0: not told, an 802.11n rate), length of the frame without checksum.
+Prints a line `KIND RATE BYTES COUNT` for each kind of packet (ogm, elp, ogm2; probe: an ELP packet to one neighbor):
+rate in radiotap's units of 500 kbit/s (0: unknown, an 802.11n rate), length of the frame without checksum.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections import Counter
 KINDS = {0x00: "ogm", 0x03: "elp", 0x04: "ogm2"}
 _ETH_P_ALL = 3
 _BATMAN = b"\xaa\xaa\x03\x00\x00\x00\x43\x05"
-# of hwsim's radiotap header: version, length, which fields, time, flags, then the rate
+# hwsim's radiotap header: version, length, present fields, time, flags, then the rate
 _RATE_AT = 17
 
 
@@ -38,7 +38,7 @@ def main(seconds: float) -> None:
             at = 26 if body[:1] == b"\x88" else 24
             if body[at : at + 8] == _BATMAN and body[at + 8] in KINDS:
                 kind = KINDS[body[at + 8]]
-                # the receiver's address, of which the lowest bit of the first byte says whether it is a group
+                # the receiver's address: the lowest bit of its first byte is the group bit
                 if kind == "elp" and not body[4] & 1:
                     kind = "probe"
                 found[kind, frame[_RATE_AT], len(body)] += 1

@@ -1,9 +1,9 @@
-"""ARP on the air: `overhear_arp.py SECONDS` listens on hwsim's monitor, where every transmission shows once.
+"""ARP on the channel: `overhear_arp.py SECONDS` captures on hwsim's monitor, which shows every transmission once.
 
-Prints `listening` once it does, then a line `KIND RATE BYTES COUNT` for each kind of packet that carries ARP through
-batman-adv (broadcast; unicast: to one node; table: a question to the distributed ARP table, or an answer into it) and,
-to compare, for batman-adv's own (ogm); then `requests N`, how many different broadcasts those transmissions were.
-Rate as radiotap has it, in units of 500 kbit/s (0: not told, an 802.11n rate); bytes: the frame without checksum.
+Prints `listening` when the capture has started, then a line `KIND RATE BYTES COUNT` for each kind of packet that has
+ARP inside batman-adv (broadcast; unicast: to one node; table: a request to the distributed ARP table, or an entry for
+it) and, for comparison, for batman-adv's own (ogm); then `requests N`, the number of distinct broadcasts. Rate in
+radiotap's units of 500 kbit/s (0: unknown, an 802.11n rate); bytes: the frame without checksum.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from collections import Counter
 
 # net/batman-adv: include/uapi/linux/batadv_packet.h
 _OGM, _BROADCAST, _UNICAST, _UNICAST_4ADDR = 0x00, 0x01, 0x40, 0x42
-# the lengths of their headers, behind which the Ethernet frame begins
+# the lengths of their headers, which precede the Ethernet frame
 _HEADERS = {_BROADCAST: 14, _UNICAST: 10, _UNICAST_4ADDR: 18}
-# of a 4-address packet: what it is for; 1 is data of its own
+# subtype of a 4-address packet; 1 is data
 _SUBTYPE_AT, _PLAIN_DATA = 16, 1
 _ARP = b"\x08\x06"
 _ETH_P_ALL = 3
 _BATMAN = b"\xaa\xaa\x03\x00\x00\x00\x43\x05"
-# of hwsim's radiotap header: version, length, which fields, time, flags, then the rate
+# hwsim's radiotap header: version, length, present fields, time, flags, then the rate
 _RATE_AT = 17
 
 
 def kind_of(packet: bytes) -> str:
-    """The kind of a batman-adv packet; empty for what is none of them."""
+    """The kind of a batman-adv packet; empty for any other packet."""
     kind = packet[0] if packet else -1
     if kind == _OGM:
         return "ogm"
@@ -65,7 +65,7 @@ def main(seconds: float) -> None:
             if kind:
                 found[kind, frame[_RATE_AT], len(body)] += 1
             if kind == "broadcast":
-                # its number, and whose it is
+                # sequence number and originator
                 requests.add(packet[4:14])
     subprocess.run(["ip", "link", "set", "hwsim0", "down"], check=True)
     for (kind, rate, length), count in sorted(found.items()):

@@ -1,7 +1,7 @@
 """Telemetry through two udp_mesh daemons: `telemetry.py send SOCKET PERIOD_S` or `telemetry.py record SOCKET FILE`.
 
-The recorder writes one line per message: when it arrived on the machine's monotonic clock, which all its network
-namespaces share, and the number it carries.
+The recorder writes one line per message: its arrival on the machine's monotonic clock, which all its network namespaces
+share, and its number.
 """
 
 from __future__ import annotations

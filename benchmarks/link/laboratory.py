@@ -1,8 +1,8 @@
-"""Network namespaces joined by the emulated link: make, tune while running, count, take down.
+"""Network namespaces joined by the emulated link: create, tune while running, count, remove.
 
-`Laboratory` compiles the emulator if its source is newer, makes one namespace per host, starts the emulator with one
-port in each, gives addresses 10.99.0.1, .2, ... and fixed neighbour entries (so that ARP under loss is not what is
-measured). Needs root. All names carry the process id, so two laboratories never meet.
+`Laboratory` compiles the emulator if its source is newer, creates one namespace per host, starts the emulator with one
+port in each, sets addresses 10.99.0.1, .2, ... and permanent neighbor entries (so that ARP under loss is not measured).
+Needs root. All names contain the process id, so that laboratories do not conflict.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ with socket.socket(type=socket.SOCK_DGRAM) as teacher:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """What the link is like. `queue` is in frames, `attempts` are those of the radio itself, `half` shares one
-    transmitter among all hosts; `burst_*` are the Gilbert-Elliott chain's probabilities per frame."""
+    """`queue` is in frames, `attempts` are the radio's transmissions per frame, `half` shares one transmitter among all
+    hosts; `burst_*` are the Gilbert-Elliott chain's probabilities per frame."""
 
     rate: float = 10e6
     delay_ms: float = 10.0
@@ -75,11 +75,11 @@ class Count:
 
 
 class LaboratoryError(RuntimeError):
-    """The emulator or a namespace could not be set up, or the emulator answered with something else than `ok`."""
+    """The emulator or a namespace could not be set up, or the emulator did not answer `ok`."""
 
 
 def compiled(source: Path, directory: Path, *flags: str) -> Path:
-    """The program (or, with `-shared`, the library) made from one C source, in `directory`."""
+    """Compile one C source to a program (or, with `-shared`, a library) in `directory`."""
     program = directory / source.stem
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
@@ -93,7 +93,7 @@ def compiled(source: Path, directory: Path, *flags: str) -> Path:
 
 
 class Laboratory:
-    """Hosts on one link. Use `laboratory(...)`; it takes everything down again."""
+    """Hosts on one link. Use `laboratory(...)`, which removes everything afterwards."""
 
     def __init__(self, hosts: int, seed: int, directory: Path, prefix: str) -> None:
         self.namespaces = tuple(f"{prefix}{index}" for index in range(hosts))
@@ -112,14 +112,14 @@ class Laboratory:
         self._join()
         for namespace, address in zip(self.namespaces, self.addresses, strict=True):
             _ip("-n", namespace, "addr", "add", f"{address}/24", "brd", "10.99.0.255", "dev", INTERFACE)
-            # IPv6's own chatter would be counted as the transport's
+            # IPv6's background traffic would be counted as the transport's
             self.run(self.namespaces.index(namespace), ["sysctl", "-qw", "net.ipv6.conf.all.disable_ipv6=1"])
-            # the only queue that may overflow is the emulator's
+            # only the emulator's queue may overflow
             _ip("-n", namespace, "link", "set", INTERFACE, "mtu", "1500", "txqueuelen", "20000", "up")
-        self._fix_neighbours()
+        self._set_permanent_neighbors()
 
     def _join(self) -> None:
-        """Put an interface into each namespace, all on one link."""
+        """Create an interface in each namespace, all on one link."""
         program = compiled(SOURCE, self.directory)
         path = str(self.directory / "control")
         self._emulator = subprocess.Popen(
@@ -136,7 +136,7 @@ class Laboratory:
         self._control.connect(path)
         self._control.settimeout(ANSWER_TIMEOUT_S)
 
-    def _fix_neighbours(self) -> None:
+    def _set_permanent_neighbors(self) -> None:
         macs = []
         for namespace in self.namespaces:
             shown = json.loads(_ip("-n", namespace, "-j", "link", "show", INTERFACE))
@@ -146,7 +146,7 @@ class Laboratory:
                 if there != here:
                     _ip("-n", namespace, "neigh", "replace", address, "lladdr", macs[there], "dev", INTERFACE,
                         "nud", "permanent")  # fmt: skip
-        # one datagram from each host teaches the emulator where every address is
+        # one datagram from each host teaches the emulator the port of every address
         for here, _ in enumerate(self.namespaces):
             self.run(here, ["python3", "-c", _TEACH, self.addresses[(here + 1) % len(self.addresses)]])
 
@@ -157,7 +157,7 @@ class Laboratory:
             raise LaboratoryError(answer)
 
     def become(self, link: Link) -> None:
-        """Make the link exactly this."""
+        """Set all parameters of the link."""
         self.set(**link.as_settings())
 
     def count(self) -> Count:
@@ -174,16 +174,16 @@ class Laboratory:
         return self._control.recv(65536).decode()
 
     def inside(self, host: int, command: Sequence[str]) -> list[str]:
-        """The command line that runs `command` on a host."""
+        """The command line to run `command` on a host."""
         return ["ip", "netns", "exec", self.namespaces[host], *command]
 
     def run(self, host: int, command: Sequence[str]) -> str:
-        """Run to the end; the output."""
+        """Run to the end; returns the output."""
         return subprocess.run(self.inside(host, command), check=True, capture_output=True, text=True).stdout
 
     def popen(self, host: int, command: Sequence[str], environ: Mapping[str, str] | None = None,
               stderr: int | None = None) -> subprocess.Popen[bytes]:  # fmt: skip
-        """Start and return at once; the caller ends it."""
+        """Start a process, which the caller must end."""
         return subprocess.Popen(self.inside(host, command), env={**os.environ, **(environ or {})}, stderr=stderr)
 
     def stop(self) -> None:
@@ -200,21 +200,21 @@ class Laboratory:
 
 
 class Wire(Laboratory):
-    """Two hosts on a veth pair, as fast as the kernel: no emulator takes a core, and nothing is counted."""
+    """Two hosts on a veth pair at the kernel's speed: no emulator, and no counters."""
 
     def _join(self) -> None:
         here, there = self.namespaces
         _ip("link", "add", INTERFACE, "netns", here, "type", "veth", "peer", "name", INTERFACE, "netns", there)
 
     def set(self, **settings: float) -> None:
-        """It is what it is."""
+        """Not supported: a veth pair has no parameters."""
 
     def count(self) -> Count:
         nothing = PortCount(0, 0, 0, 0, 0, 0, 0, 0)
         return Count(0.0, (nothing, nothing))
 
     def reset(self) -> None:
-        """There is no count."""
+        """Not supported: a veth pair has no counters."""
 
 
 L = TypeVar("L", bound=Laboratory)
@@ -233,14 +233,14 @@ def _started(kind: type[L], hosts: int, seed: int) -> Iterator[L]:
 
 @contextmanager
 def wire() -> Iterator[Wire]:
-    """A started wire; everything is gone afterwards, also after a failure."""
+    """A started wire; everything is removed afterwards, also after a failure."""
     with _started(Wire, 2, 1) as made:
         yield made
 
 
 @contextmanager
 def laboratory(hosts: int = 2, *, seed: int = 1, link: Link | None = None) -> Iterator[Laboratory]:
-    """A started laboratory; everything is gone afterwards, also after a failure."""
+    """A started laboratory; everything is removed afterwards, also after a failure."""
     with _started(Laboratory, hosts, seed) as made:
         made.become(link or Link())
         yield made

@@ -1,8 +1,8 @@
-"""The transports that are compared, each behind the same two roles.
+"""The compared transports behind one interface.
 
-A `Sender` carries two kinds of message to one receiver: `bulk` (returns when the transport will take more, so that a
-sender never queues without end) and `urgent`. A receiver calls `on_message` with each message as it was sent. Every
-message starts with the header of `benchmarks.peers.message`.
+A `Sender` sends two kinds of message to one receiver: `bulk` (returns when the transport accepts more, so that a
+sender's queue is bounded) and `urgent`. A receiver calls `on_message` with each message. Every message starts with the
+header of `benchmarks.peers.message`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PORT = 7447
 
 
 class Sender(Protocol):
-    """One open way to the receiver."""
+    """An open connection to the receiver."""
 
     async def bulk(self, data: bytes) -> None: ...
 
@@ -25,7 +25,7 @@ class Sender(Protocol):
 
 
 class Transport(Protocol):
-    """What a module of this package offers for one variant of a transport."""
+    """The interface of each module of this package, for one variant of a transport."""
 
     def sender(self, address: str) -> AbstractAsyncContextManager[Sender]: ...
 
@@ -34,12 +34,12 @@ class Transport(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """`variant` is handed to the module's `transport(variant)`."""
+    """`variant` is the argument of the module's `transport(variant)`."""
 
     name: str
     module: str
     variant: str
-    # set for every TCP socket of a program that has no setting of its own for it
+    # set on every TCP socket of a program that cannot configure it
     congestion_control: str = ""
 
 
@@ -58,7 +58,7 @@ PEERS: dict[str, Peer] = {
 
 
 def peer_called(name: str) -> Peer:
-    """A peer by its name in the tables; `udp_mesh, window N` is ours with a fixed number in flight."""
+    """A peer by its name in the tables; `udp_mesh, window N` has a fixed number of packets in flight."""
     ours, _, window = name.partition(", window ")
     return PEERS[name] if name in PEERS else Peer(name, PEERS[ours].module, window)
 

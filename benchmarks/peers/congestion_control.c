@@ -1,5 +1,5 @@
-/* Preloaded into a program that cannot be told which TCP congestion control to use: every TCP socket it opens uses the
- * one named by BENCHMARK_CONGESTION_CONTROL. A kernel's default differs from machine to machine, a comparison must not.
+/* Preloaded into a program that cannot configure its TCP congestion control: every TCP socket it opens uses the one in
+ * BENCHMARK_CONGESTION_CONTROL, because the kernel's default differs between machines.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>

@@ -1,10 +1,10 @@
-"""One end of a trial, a process of its own inside a laboratory's host.
+"""One end of a trial, a separate process in a laboratory's host.
 
 usage: python -m benchmarks.peers.end receive PEER RESULT SECONDS BULK_BYTES
        python -m benchmarks.peers.end send PEER ADDRESS RESULT SECONDS BULK_BYTES URGENT_HZ
 
-The receiver prints `ready`, then notes every message's arrival until SECONDS have passed, or BULK_BYTES (> 0) of bulk
-have arrived. The sender prints `ready` once the way is open, waits for a line on its standard input, then sends bulk
+The receiver prints `ready`, then records every message's arrival until SECONDS have passed, or BULK_BYTES (> 0) of bulk
+have arrived. The sender prints `ready` once it is connected, waits for a line on its standard input, then sends bulk
 (BULK_BYTES in all; 0 none, -1 without end) and URGENT_HZ urgent messages a second. Each writes RESULT as JSON.
 """
 
@@ -21,7 +21,7 @@ from typing import Any
 from benchmarks import peers
 from benchmarks.peers import message
 
-# what is written when bulk is done: a moment for the last acknowledgements to leave
+# the time for the last acknowledgements to be sent after the bulk
 _LINGER_S = 0.2
 
 
@@ -52,7 +52,7 @@ async def receive(name: str, result: Path, seconds: float, bulk_bytes: int) -> N
             first_sent_s.append(seen.sent_s)
         bulk.append((now, (bulk[-1][1] if bulk else 0) + seen.size))
         if 0 < bulk_bytes <= bulk[-1][1]:
-            # some transports call from a thread of their own
+            # some transports call from their own thread
             loop.call_soon_threadsafe(done.set)
 
     async with peers.transport(name).receiver(on_message):
@@ -62,7 +62,7 @@ async def receive(name: str, result: Path, seconds: float, bulk_bytes: int) -> N
             await asyncio.wait_for(done.wait(), seconds)
             await asyncio.sleep(_LINGER_S)
         except TimeoutError:
-            # the time is up: what has arrived by now is the result
+            # time is up: the messages so far are the result
             done.set()
         write(result, bulk=bulk, urgent=urgent, first_sent_s=first_sent_s, cpu_s=cpu_s() - started_cpu_s)
 

@@ -1,11 +1,11 @@
-"""The messages that benchmarks send: a header that says what it is and when it was handed over, then filling."""
+"""The messages that benchmarks send: a header with kind, number and send time, then padding."""
 
 from __future__ import annotations
 
 import struct
 from typing import NamedTuple
 
-# kind, number, CLOCK_MONOTONIC at the hand-over; all hosts of a laboratory share one kernel, so one clock
+# kind, number, CLOCK_MONOTONIC when it was sent; all hosts of a laboratory share one kernel and so one clock
 _HEADER = struct.Struct("<BQd")
 BULK = 1
 URGENT = 2

@@ -13,10 +13,10 @@ from udp_mesh.core.events import MessageReceived
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.crypto import Key
 
-# both ends of a benchmark share it, nobody else ever does
+# only used by the two ends of a benchmark
 _KEY = Key.parse("be" * 32)
 _TOPICS = (Topic("urgent", priority=0), Topic("bulk", priority=8))
-# enough to keep a fast link busy, as the other transports' buffers do
+# enough to keep a fast link busy, like the other transports' buffers
 _UNDER_WAY = 40
 _DISCOVERY_S = 30.0
 
@@ -63,7 +63,7 @@ class _Transport:
     async def sender(self, address: str) -> AsyncIterator[_Sender]:
         async with Node(_settings("sender", self.variant)) as node:
             async with asyncio.timeout(_DISCOVERY_S):
-                # the receiver is known by its heartbeat, not by the address that other transports need
+                # the receiver is discovered by its heartbeat; the address is for the other transports
                 while not any(peer.name == "receiver" and peer.online for peer in node.conditions().peers):  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
             sender = _Sender(node)

@@ -23,7 +23,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from benchmarks.peers import PORT
 
-# what may wait inside aioquic before `bulk` holds its caller back
+# aioquic's send buffer above which `bulk` blocks
 _BUFFER_BYTES = 400_000
 
 
@@ -44,7 +44,7 @@ class _Sender:
     async def bulk(self, data: bytes) -> None:
         self._quic.send_stream_data(self._stream, len(data).to_bytes(4, "little") + data)
         self._protocol.transmit()
-        # aioquic tells nobody when its buffer drains
+        # aioquic does not report when its buffer drains
         while len(self._quic._streams[self._stream].sender._buffer) > _BUFFER_BYTES:  # noqa: ASYNC110
             await asyncio.sleep(0.002)
 
@@ -94,7 +94,7 @@ class _Transport:
 
 
 def _certificate(directory: Path) -> tuple[Path, Path]:
-    """A certificate for this one run, signed by itself."""
+    """A self-signed certificate for this run."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "benchmark")])
     today = datetime.datetime.now(datetime.UTC)

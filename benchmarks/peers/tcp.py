@@ -1,4 +1,4 @@
-"""TCP with a length before each message: one connection for bulk, one for what is urgent, as a careful user would."""
+"""TCP with length-prefixed messages: one connection for bulk, one for urgent messages, as a careful user would do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from benchmarks.peers import PORT
 
 _LENGTH = struct.Struct("<I")
-# enough to keep a link busy, little enough not to be a queue of its own (two bulk messages)
+# enough to keep a link busy, without adding a long queue (two bulk messages)
 _WRITE_BUFFER_BYTES = 100_000
 
 
@@ -65,7 +65,7 @@ class _Transport:
                     (length,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
                     on_message(await reader.readexactly(length))
             except (asyncio.IncompleteReadError, ConnectionError, asyncio.CancelledError):
-                # the sender is done, or this end is being closed
+                # the sender has ended, or this end is closing
                 writer.transport.abort()
 
         listening = self._socket()

@@ -1,4 +1,4 @@
-"""Zenoh over TCP, tuned as its documentation advises: what is urgent at REAL_TIME and express, bulk at BACKGROUND."""
+"""Zenoh over TCP, tuned as its documentation advises: urgent at REAL_TIME and express, bulk at BACKGROUND."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class _Transport:
                 )
             ]  # fmt: skip
             async with asyncio.timeout(_MATCH_TIMEOUT_S):
-                # matching is a state to ask for
+                # matching can only be polled
                 while not all(publisher.matching_status.matching for publisher in publishers):  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
             yield _Sender(*publishers)

@@ -59,14 +59,14 @@ def backup(
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
             raise InputError(f"cannot create {out}: {error.strerror}") from error
 
         def work(name: str) -> Outcome:
-            with opened.access.borrow(wanted[name]) as connection:
+            with opened.access.borrow(selected[name]) as connection:
                 seen = observe_cleared(connection, (), opened.interrupt)
                 data = fetch(connection, name, seen)
             path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(seen.answered_at_s))}.tgz"
@@ -75,11 +75,11 @@ def backup(
             return Outcome(name, Result.DONE, str(path))
 
         with (
-            progress_for(len(wanted), as_json=as_json) as progress,
+            progress_for(len(selected), as_json=as_json) as progress,
             opened.interrupt.on_signals(progress.stopping),
         ):
             ended = run(
-                wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
+                selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
             )
         raise typer.Exit(exit_for(ended.values(), opened.interrupt))
 
@@ -174,8 +174,8 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Out
                 return restore_backup(job, connection, saved)
 
             ended = run([name], one, parallel=1, interrupt=opened.interrupt, observer=progress)
-            for silent in retry_unanswered(work).values():
-                ended[name] = replace(ended[name], facts={UNFLUSHED: " ".join(silent)})
+            for unasked in retry_unanswered(work).values():
+                ended[name] = replace(ended[name], facts={UNFLUSHED: " ".join(unasked)})
             journal_run.finish_node(ended[name])
     finally:
         journal_run.end(ended[name].result.value if ended else "could not run")

@@ -121,8 +121,8 @@ def bootstrap(
 
 def _print_failure(outcome: Outcome) -> None:
     echo(f"{outcome_text(outcome)}", err=True)
-    is_silent = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
-    hint = outcome.hint or (NO_ANSWER_HINT if is_silent else "")
+    is_unreachable = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
+    hint = outcome.hint or (NO_ANSWER_HINT if is_unreachable else "")
     if hint:
         echo(f"  hint: {hint}", err=True)
 

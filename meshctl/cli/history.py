@@ -50,22 +50,22 @@ class _RunFilter:
         return self.fleet in (None, record.fleet) and self.is_virtual in (None, bool(record.lab))
 
 
-def _list_runs(journal: Journal, wanted: _RunFilter, limit: int, *, as_json: bool) -> None:
-    found = journal.runs(node=wanted.node, limit=None)
-    records = tuple(islice((record for record in found if wanted.matches(record)), limit))
+def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json: bool) -> None:
+    found = journal.runs(node=run_filter.node, limit=None)
+    records = tuple(islice((record for record in found if run_filter.matches(record)), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
         return
     # several fleets may have a node of this name: group its runs by fleet
     by_fleet: dict[tuple[str, str], list[RunRecord]] = {}
     for record in records:
-        by_fleet.setdefault((record.fleet, record.lab) if wanted.node is not None else ("", ""), []).append(record)
+        by_fleet.setdefault((record.fleet, record.lab) if run_filter.node is not None else ("", ""), []).append(record)
     for number, (key, group) in enumerate(by_fleet.items()):
-        if wanted.node is not None and len(by_fleet) > 1:
-            echo(("\n" if number else "") + f"{wanted.node} of {_fleet_text(*key)}")
-        _list_group(journal, group, wanted.node)
+        if run_filter.node is not None and len(by_fleet) > 1:
+            echo(("\n" if number else "") + f"{run_filter.node} of {_fleet_text(*key)}")
+        _list_group(journal, group, run_filter.node)
     if not records:
-        echo("no runs yet" if wanted.node is None else f"no runs of {wanted.node} yet")
+        echo("no runs yet" if run_filter.node is None else f"no runs of {run_filter.node} yet")
 
 
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:

@@ -71,8 +71,8 @@ def _root(
     """Manage a fleet of OpenWrt mesh radios from one inventory."""
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         echo(f"meshctl {__version__}")
         raise typer.Exit
 

@@ -174,11 +174,11 @@ def resume(
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
     """Advice for unreachable nodes of a bootstrap: resume uses their inventory address, which they may not have yet."""
-    silent = [node.node for node in plan.of(Verdict.AWAY)]
-    if record.command not in ("bootstrap", "replace") or not silent:
+    unreachable = [node.node for node in plan.of(Verdict.AWAY)]
+    if record.command not in ("bootstrap", "replace") or not unreachable:
         return ()
     return (
-        f"run {record.id} was a {record.command}: {', '.join(silent)} may still have factory defaults",
+        f"run {record.id} was a {record.command}: {', '.join(unreachable)} may still have factory defaults",
         f"hint: connect such a device on the bench and run `meshctl {record.command}` again",
     )
 

@@ -79,10 +79,10 @@ def status_command(context: RobotsContext) -> None:
     Example: meshctl robots status
     """
     found: dict[str, RobotFacts] = {}
-    wanted = {name: expected_release(context.fleet, name, context.options.secrets) for name in context.robots}
+    expected = {name: expected_release(context.fleet, name, context.options.secrets) for name in context.robots}
 
     def work(host: Host, robot: str) -> Outcome:
-        found[robot] = collect_facts(host, robot, wanted[robot], now_s=time.time())
+        found[robot] = collect_facts(host, robot, expected[robot], now_s=time.time())
         return Outcome(robot, Result.DONE if found[robot].is_healthy else Result.FAILED)
 
     outcomes = context.run_on_each(work)

@@ -188,8 +188,8 @@ def robots_context(
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
     options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
-    reach = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
-    return RobotsContext(opened, reach, selected_robots(fleet, robots), options, inventory, wheels, as_json)
+    connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
+    return RobotsContext(opened, connector, selected_robots(fleet, robots), options, inventory, wheels, as_json)
 
 
 def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

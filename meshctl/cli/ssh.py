@@ -46,8 +46,8 @@ def trust(
         for item in shown:
             left += not _pin_key(opened, item, may_replace=change, yes=yes, quiet=as_json)
         if left:
-            silent = all(item.key is None for item in shown)
-            raise typer.Exit(ExitCode.UNREACHABLE if silent else ExitCode.FINDINGS)
+            none_answered = all(item.key is None for item in shown)
+            raise typer.Exit(ExitCode.UNREACHABLE if none_answered else ExitCode.FINDINGS)
 
 
 def _key_object(item: HostKeyState) -> dict[str, str]:
@@ -123,11 +123,11 @@ def run(
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        wanted = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
-            with opened.access.borrow(wanted[name]) as connection:
+            with opened.access.borrow(selected[name]) as connection:
                 done = connection.run(command, timeout_s=timeout)
             facts = {"exit_status": str(done.exit_status), "stdout": done.stdout, "stderr": done.stderr}
             with out:
@@ -142,7 +142,7 @@ def run(
             )
 
         with opened.interrupt.on_signals(echo_error):
-            ended = run_on_all(wanted, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
+            ended = run_on_all(selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
                 if as_json:

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from pydantic import PlainValidator, WithJsonSchema
 
-from meshctl.inventory.fields import wrong
+from meshctl.inventory.fields import expected_error
 
 _TERM = re.compile(
     r"\s*([+-])?\s*(?:(\d{1,9})\s*\*\s*)?(network|index|\d{1,3}(?:\.\d{1,3}){3}|\d{1,9})(?:\s*\*\s*(\d{1,9}))?\s*"
@@ -58,23 +58,25 @@ def parse_address(value: object) -> AddressValue:
             start = _static(str(text))
             if isinstance(start, IPv4Address) and not isinstance(start, IPv4Interface):
                 return AddressRule(start, -1, 1)
-            raise wrong("an IPv4 address without a prefix length under `from`")
+            raise expected_error("an IPv4 address without a prefix length under `from`")
         case {"rule": str() as text, **others} if not others:
             return parse_rule(str(text))
         case _:
-            raise wrong("an IPv4 address, {from: ADDRESS} or {rule: network + NUMBER + index}")
+            raise expected_error("an IPv4 address, {from: ADDRESS} or {rule: network + NUMBER + index}")
 
 
 def _static(text: str) -> IPv4Interface | IPv4Address:
     try:
         return IPv4Interface(text) if "/" in text else IPv4Address(text)
     except (AddressValueError, NetmaskValueError):
-        raise wrong("an IPv4 address such as 10.42.0.11 or 10.42.0.11/24") from None
+        raise expected_error("an IPv4 address such as 10.42.0.11 or 10.42.0.11/24") from None
 
 
 def parse_rule(text: str) -> AddressRule:
     """Parse a sum of one start (`network` or an address), numbers and multiples of `index`."""
-    refused = wrong("a sum such as network + 100 + index, of `network` or an address, numbers and multiples of index")
+    refused = expected_error(
+        "a sum such as network + 100 + index, of `network` or an address, numbers and multiples of index"
+    )
     start: list[IPv4Address | None] = []
     offset = factor = at = 0
     while at < len(text):

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
-from meshctl.inventory.compose import shown
+from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import (
     ComputerDocument,
     HardwareDocument,
@@ -26,7 +26,7 @@ from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
-from meshctl.inventory.tree import MappingNode, descend, place_of
+from meshctl.inventory.tree import MappingNode, descend, position_of
 from meshctl.model import (
     ApplyPolicy,
     Batman,
@@ -217,7 +217,7 @@ def _robots(document: InventoryDocument, root: MappingNode, diagnostics: list[Di
         robot = robots[name] = _robot(name, item, root, diagnostics)
         count += len(robot.nodes) + len(robot.carries)
         if count > MAX_NAMES:
-            place = place_of(root, ("robots", name)) or Position(root.file)
+            place = position_of(root, ("robots", name)) or Position(root.file)
             message = f"the robots list more than {MAX_NAMES} nodes"
             diagnostics.append(codes.error(codes.BAD_RANGE, place, message, path=f"robots.{name}"))
         if diagnostics:
@@ -250,10 +250,10 @@ def _names(
             diagnostics.append(
                 codes.error(
                     codes.BAD_RANGE,
-                    place_of(root, (*path, number)) or Position(root.file),
+                    position_of(root, (*path, number)) or Position(root.file),
                     f"invalid range (expected e.g. b[01-12]): {reason}",
                     path=".".join(path),
-                    found=f"'{shown(pattern)}'",
+                    found=f"'{printable(pattern)}'",
                 )
             )
             break

@@ -229,7 +229,7 @@ class _Composer:
                 codes.error(
                     codes.DUPLICATE_KEY,
                     position(key),
-                    f"duplicate key '{shown(key.text)}', first set on line {first.line}",
+                    f"duplicate key '{printable(key.text)}', first set on line {first.line}",
                 )
             )
         else:
@@ -239,7 +239,7 @@ class _Composer:
     def _refuse_tag(self, event: yaml.ScalarEvent | yaml.MappingStartEvent | yaml.SequenceStartEvent) -> None:
         if event.tag is not None:
             hint = "remove it; quote a value that must stay text"
-            self._refuse(event, f"YAML tags are not supported: {shown(event.tag)}", hint=hint)
+            self._refuse(event, f"YAML tags are not supported: {printable(event.tag)}", hint=hint)
 
     def _refuse(self, event: yaml.Event, message: str, *, hint: str) -> None:
         self._note(codes.error(codes.YAML_FEATURE, self._place(event), message, hint=hint))
@@ -255,7 +255,7 @@ class _Composer:
         return Position(self.file, start.line + 1, start.column + 1)
 
 
-def shown(text: str, limit: int = 60) -> str:
+def printable(text: str, limit: int = 60) -> str:
     """Text for a message: on one line, of bounded length."""
     flat = "".join(letter if letter.isprintable() else "?" for letter in text)
     return flat if len(flat) <= limit else flat[: limit - 3] + "..."

@@ -33,7 +33,7 @@ from meshctl.inventory.text_edit import (
     replace_value,
 )
 from meshctl.inventory.tree import MappingNode, Plain, Scalar, descend, plain_data
-from meshctl.inventory.yaml_text import Value, data, is_bare
+from meshctl.inventory.yaml_text import Value, is_bare, parsed_data
 from meshctl.model import NodeState
 
 _BOM = "\ufeff"
@@ -88,7 +88,11 @@ class Editor:
         mapping, or after the entry `after`. Raises InputError if the layout does not allow it."""
         file = self._file_of(path)
         root = self._roots[file]
-        self._replace(file, _with(plain_data(root), path, data(value)), self._set_text(file, root, path, value, after))
+        self._replace(
+            file,
+            _with_value(plain_data(root), path, parsed_data(value)),
+            self._set_text(file, root, path, value, after),
+        )
 
     def remove(self, path: tuple[str, ...]) -> None:
         """Remove the entry at `path`. Raises InputError if there is none, or the layout does not allow it."""
@@ -98,7 +102,7 @@ class Editor:
         if not isinstance(mapping, MappingNode) or path[-1] not in mapping.keys:
             raise InputError(f"{file}: no entry {'.'.join(path)} to remove")
         text = remove_entry(self._text(file), mapping, path[-1])
-        self._replace(file, _without(plain_data(root), path), text)
+        self._replace(file, _without_key(plain_data(root), path), text)
 
     def changes(self) -> tuple[FileEdit, ...]:
         """The edits of each changed file. Raises InvalidInput if the edited inventory does not load."""
@@ -170,7 +174,7 @@ class Editor:
     def _replace(self, file: Path, meant: object, text: str) -> None:
         """Replace `file` by `text` if it contains the intended data."""
         root = _compose(file, text)
-        if root is None or not _same(plain_data(root), meant):
+        if root is None or not _equal_data(plain_data(root), meant):
             raise InputError(
                 f"{file}: the layout does not allow this edit without changing other values",
                 hint="edit the file by hand, or simplify the layout of the entry first",
@@ -264,31 +268,33 @@ def _append(text: str, key: str, value: Value) -> str:
             return append_value(text, key, value)
 
 
-def _with(old: object, path: tuple[str, ...], value: object) -> object:
+def _with_value(old: object, path: tuple[str, ...], value: object) -> object:
     """`old` with `value` at `path`; missing containers are created."""
     if not path:
         return value
     if isinstance(old, list):
-        return [_with(item, path[1:], value) if str(number) == path[0] else item for number, item in enumerate(old)]
+        return [
+            _with_value(item, path[1:], value) if str(number) == path[0] else item for number, item in enumerate(old)
+        ]
     mapping = old if isinstance(old, dict) else {}
-    return {**mapping, path[0]: _with(mapping.get(path[0]), path[1:], value)}
+    return {**mapping, path[0]: _with_value(mapping.get(path[0]), path[1:], value)}
 
 
-def _without(old: object, path: tuple[str, ...]) -> object:
+def _without_key(old: object, path: tuple[str, ...]) -> object:
     if not isinstance(old, dict):
         return old
     if len(path) == 1:
         return {key: item for key, item in old.items() if key != path[0]}
-    return {key: _without(item, path[1:]) if key == path[0] else item for key, item in old.items()}
+    return {key: _without_key(item, path[1:]) if key == path[0] else item for key, item in old.items()}
 
 
-def _same(one: object, other: object) -> bool:
+def _equal_data(one: object, other: object) -> bool:
     """Whether two values are equal, ignoring key order; text that could be a number must be quoted in both."""
     match one, other:
         case dict(), dict():
-            return one.keys() == other.keys() and all(_same(one[key], other[key]) for key in one)
+            return one.keys() == other.keys() and all(_equal_data(one[key], other[key]) for key in one)
         case list(), list():
-            return len(one) == len(other) and all(map(_same, one, other))
+            return len(one) == len(other) and all(map(_equal_data, one, other))
         case str(), str():
             return one == other and (isinstance(one, Plain) == isinstance(other, Plain) or is_bare(one))
         case _:

@@ -26,7 +26,7 @@ _SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
 
 
-def wrong(expected: str) -> PydanticCustomError:
+def expected_error(expected: str) -> PydanticCustomError:
     """The error that a field type raises; `expected` completes `expected ...` in the message."""
     return PydanticCustomError("meshctl", "expected {expected}", {"expected": expected})
 
@@ -34,27 +34,27 @@ def wrong(expected: str) -> PydanticCustomError:
 def _whole(value: object) -> object:
     if isinstance(value, Plain) and _WHOLE.fullmatch(value):
         return int(value)
-    raise wrong("a whole number")
+    raise expected_error("a whole number")
 
 
 def _real(value: object) -> object:
     if isinstance(value, Plain) and _REAL.fullmatch(value):
         return float(value)
-    raise wrong("a number")
+    raise expected_error("a number")
 
 
 def _flag(value: object) -> object:
     known = _FLAGS.get(value.lower()) if isinstance(value, Plain) else None
     if known is None:
-        raise wrong("true or false")
+        raise expected_error("true or false")
     return known
 
 
 def _text(value: object) -> str:
     if not isinstance(value, str):
-        raise wrong("text")
+        raise expected_error("text")
     if "\0" in value:
-        raise wrong("text without NUL characters")
+        raise expected_error("text without NUL characters")
     return str(value)
 
 
@@ -66,39 +66,41 @@ def is_name(value: str) -> bool:
 def _name(value: str) -> str:
     if is_name(value):
         return value
-    raise wrong("a name of at most 63 letters, digits, '.', '_' and '-', starting and ending with a letter or digit")
+    raise expected_error(
+        "a name of at most 63 letters, digits, '.', '_' and '-', starting and ending with a letter or digit"
+    )
 
 
 def _mac(value: str) -> str:
     if _MAC.fullmatch(value):
         return value.lower().replace("-", ":")
-    raise wrong("a MAC address such as 02:ca:fe:00:00:01")
+    raise expected_error("a MAC address such as 02:ca:fe:00:00:01")
 
 
 def _country(value: str) -> str:
     if re.fullmatch("[A-Z]{2}", value):
         return value
-    raise wrong("a country code of two capital letters such as US")
+    raise expected_error("a country code of two capital letters such as US")
 
 
 def _vlan(value: str) -> str:
     # swconfig drivers accept VLANs up to 127 or 4094; 802.1Q allows 4094
     if re.fullmatch("[1-9][0-9]{0,3}", value) and int(value) <= 4094:
         return value
-    raise wrong("a VLAN from 1 to 4094")
+    raise expected_error("a VLAN from 1 to 4094")
 
 
 def _switch_ports(value: str) -> str:
     if re.fullmatch(_SWITCH_PORTS, value):
         return value
-    raise wrong("port numbers, with 't' after a tagged one, such as 3 0t")
+    raise expected_error("port numbers, with 't' after a tagged one, such as 3 0t")
 
 
 def _address(value: object) -> IPv4Address:
     try:
         return IPv4Address(_text(value))
     except AddressValueError:
-        raise wrong("an IPv4 address such as 10.42.0.1") from None
+        raise expected_error("an IPv4 address such as 10.42.0.1") from None
 
 
 def _interface(value: object) -> IPv4Interface:
@@ -108,7 +110,7 @@ def _interface(value: object) -> IPv4Interface:
             return IPv4Interface(text)
         except (AddressValueError, NetmaskValueError):
             pass
-    raise wrong("an IPv4 address with its prefix length such as 10.42.0.100/24")
+    raise expected_error("an IPv4 address with its prefix length such as 10.42.0.100/24")
 
 
 def _network(value: object) -> IPv4Network:
@@ -117,8 +119,8 @@ def _network(value: object) -> IPv4Network:
     except (AddressValueError, NetmaskValueError):
         pass
     except ValueError:
-        raise wrong("a network address, with all host bits zero") from None
-    raise wrong("an IPv4 network such as 10.42.0.0/24")
+        raise expected_error("a network address, with all host bits zero") from None
+    raise expected_error("an IPv4 network such as 10.42.0.0/24")
 
 
 def _window(value: object) -> object:
@@ -126,13 +128,13 @@ def _window(value: object) -> object:
         return None
     if isinstance(value, Plain) and _WHOLE.fullmatch(value) and 1 <= int(value) <= 1024:
         return int(value)
-    raise wrong("'adaptive' or a number of fragments from 1 to 1024")
+    raise expected_error("'adaptive' or a number of fragments from 1 to 1024")
 
 
 def _version(value: object) -> object:
     if isinstance(value, Plain) and value == str(FORMAT_VERSION):
         return FORMAT_VERSION
-    raise wrong(f"{FORMAT_VERSION}, the version of this format")
+    raise expected_error(f"{FORMAT_VERSION}, the version of this format")
 
 
 def empty_mapping(value: object) -> object:

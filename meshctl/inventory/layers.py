@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 
 from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
-from meshctl.inventory.compose import shown
+from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, NodeDocument, NodeLayer
 from meshctl.inventory.fields import is_name
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand, is_range
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.inventory.tree import MappingNode, Tree, descend, place_of, position
+from meshctl.inventory.tree import MappingNode, Tree, descend, position, position_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,9 +28,9 @@ class Layer:
     tree: Tree
     place: Position
 
-    def place_of(self, path: Sequence[str | int]) -> Position:
+    def position_of(self, path: Sequence[str | int]) -> Position:
         """The position of `path` in the layer; the layer's own position if it does not set `path`."""
-        return (place_of(self.tree, path) if path else None) or self.place
+        return (position_of(self.tree, path) if path else None) or self.place
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class _LayerResolver:
         if tree is None:
             # `defaults` is not set.
             tree = MappingNode(self.root.file, self.root.line, self.root.column, 0, 0, is_flow=True)
-        return Layer(title, path, document, tree, place_of(self.root, path) or position(self.root))
+        return Layer(title, path, document, tree, position_of(self.root, path) or position(self.root))
 
     def _find_cycles(self) -> None:
         """Depth-first search over the parents; an edge back to the trail closes a cycle."""
@@ -132,18 +132,20 @@ class _LayerResolver:
         layer = self._groups[names[0]]
         message = f"inheritance cycle of groups: {' -> '.join(names[:20])}"
         self.diagnostics.append(
-            codes.error(codes.GROUP_CYCLE, layer.place_of(("inherits",)), message, path=f"groups.{names[0]}.inherits")
+            codes.error(
+                codes.GROUP_CYCLE, layer.position_of(("inherits",)), message, path=f"groups.{names[0]}.inherits"
+            )
         )
 
     def _check_known(self, name: str, layer: Layer, key: str, number: int) -> None:
         if name in self._groups:
             return
-        place = layer.place_of((key, number))
+        place = layer.position_of((key, number))
         self.diagnostics.append(
             codes.error(
                 codes.UNKNOWN_GROUP,
                 place,
-                f"unknown group '{shown(name)}'",
+                f"unknown group '{printable(name)}'",
                 path=".".join((*layer.path, key)),
                 hint=did_you_mean(name, self._groups),
             )
@@ -212,9 +214,11 @@ class _LayerResolver:
             return ()
         wrong = next((name for name in names if not is_name(name)), None)
         if wrong is not None:
-            self._refuse(layer, f"'{shown(wrong)}' is not a name of at most 63 letters, digits, '.', '_' and '-'")
+            self._refuse(layer, f"'{printable(wrong)}' is not a name of at most 63 letters, digits, '.', '_' and '-'")
             return ()
         return names
 
     def _refuse(self, layer: Layer, message: str) -> None:
-        self.diagnostics.append(codes.error(codes.BAD_RANGE, layer.place, message, path=shown(".".join(layer.path))))
+        self.diagnostics.append(
+            codes.error(codes.BAD_RANGE, layer.place, message, path=printable(".".join(layer.path)))
+        )

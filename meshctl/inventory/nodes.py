@@ -60,7 +60,7 @@ def build_nodes(
     return BuiltNodes(nodes, tuple(building.diagnostics))
 
 
-def joined(layers: tuple[Layer, ...]) -> dict[str, Any]:
+def merge_layers(layers: tuple[Layer, ...]) -> dict[str, Any]:
     """The values of all layers by precedence; mappings (`radios`, `ssh`, `extra_uci`) merge key by key."""
     values: dict[str, Any] = {}
     for layer in reversed(layers):
@@ -126,7 +126,7 @@ class _Building:
         return index_of
 
     def _template(self, spec: NodeSpec) -> _Template | None:
-        values = joined(spec.layers)
+        values = merge_layers(spec.layers)
         profile = self._profile(spec, values)
         address_layer = next((layer for layer in spec.layers if "address" in layer.document.model_fields_set), None)
         if address_layer is None:
@@ -231,7 +231,7 @@ class _Building:
         expected: str = "",
         hint: str = "",
     ) -> None:
-        place = layer.place_of(below)
+        place = layer.position_of(below)
         diagnostic = codes.error(
             code, place, message, path=".".join((*layer.path, *below)), expected=expected, hint=hint
         )

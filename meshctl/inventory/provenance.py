@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.ranges import expand
-from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, descend, place_of
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, child, descend, position_of
 from meshctl.model import Origin
 
 # Layer name of each section; `{}` is the entry's name.
@@ -62,7 +62,7 @@ class Provenance(Mapping[tuple[str, ...], Origin]):
     def _section(self, path: tuple[str, ...]) -> Origin | None:
         if path[:1] == ("robots",) and len(path) == 4 and path[2] in _NODE_LISTS:
             path = (*path[:3], self._element(path[:3]).get(path[3], path[3]))
-        place = place_of(self._root, path) if path else None
+        place = position_of(self._root, path) if path else None
         if place is None:
             return None
         title = _TITLES.get(path[0], "fleet")
@@ -90,7 +90,7 @@ class Provenance(Mapping[tuple[str, ...], Origin]):
             if below and not _writes(layer, below):
                 continue
             is_rule = below == ("address",) and isinstance(child(layer.tree, "address"), MappingNode)
-            return Origin(layer.place_of(below), "rule" if is_rule else layer.title)
+            return Origin(layer.position_of(below), "rule" if is_rule else layer.title)
         robot = self._robot_of.get(spec.name)
         if below == ("robot",) and robot is not None:
             return self._section(("robots", robot))

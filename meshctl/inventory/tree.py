@@ -117,7 +117,7 @@ def key_position(tree: MappingNode, key: str) -> Position:
     return position(tree if written is None else written)
 
 
-def place_of(root: Tree, path: Sequence[str | int]) -> Position | None:
+def position_of(root: Tree, path: Sequence[str | int]) -> Position | None:
     """The position of `path`: of a scalar itself; of the key of a list, mapping or null."""
     tree, place = root, position(root)
     for part in path:

@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 
 from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
-from meshctl.inventory.compose import shown
+from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, SecretDocument
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
@@ -64,17 +64,17 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
     path = location[:-1] if is_key else location
     kind = error["type"]
     place = _place(root, path, is_key=is_key or kind == "extra_forbidden")
-    dotted = ".".join(shown(str(part)) for part in path)
+    dotted = ".".join(printable(str(part)) for part in path)
     if kind == "missing":
-        dotted = ".".join(shown(str(part)) for part in path[:-1])
+        dotted = ".".join(printable(str(part)) for part in path[:-1])
         return codes.error(codes.MISSING_KEY, place, f"missing key '{path[-1]}'", path=dotted)
     if kind == "extra_forbidden":
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
         hint = did_you_mean(wrong, known) or f"known keys: {', '.join(known)}"
-        return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{shown(wrong)}'", path=dotted, hint=hint)
+        return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
     expected = _expected(error)
-    found = f"'{shown(str(path[-1]))}'" if is_key else _found(root, path, kind)
+    found = f"'{printable(str(path[-1]))}'" if is_key else _found(root, path, kind)
     hint = _enum_hint(root, path, error) if kind == "enum" else ""
     return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
 
@@ -123,7 +123,7 @@ def _found(root: MappingNode, path: tuple[int | str, ...], kind: str) -> str:
     is_secret = any(part in _SECRET_KEYS for part in path)
     if not isinstance(tree, Scalar) or tree.is_null or is_secret or kind in _CONTAINERS:
         return describe(tree)
-    return f"'{shown(tree.text)}'" if tree.is_plain else f'"{shown(tree.text)}" in quotes'
+    return f"'{printable(tree.text)}'" if tree.is_plain else f'"{printable(tree.text)}" in quotes'
 
 
 def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetails) -> str:

@@ -46,7 +46,7 @@ def block(key: str, value: Value, indent: int, step: int, newline: str) -> str:
     return newline.join((f"{' ' * indent}{_key(key)}:", *lines))
 
 
-def data(value: Value) -> object:
+def parsed_data(value: Value) -> object:
     """The expected result of parsing the text; compare with `tree.plain_data`."""
     match value:
         case None:
@@ -56,9 +56,9 @@ def data(value: Value) -> object:
         case str():
             return value
         case Mapping():
-            return {key: data(item) for key, item in value.items()}
+            return {key: parsed_data(item) for key, item in value.items()}
         case _:
-            return [data(item) for item in value]
+            return [parsed_data(item) for item in value]
 
 
 def is_bare(text: str) -> bool:

@@ -1,7 +1,7 @@
-"""The fleet as frozen values: what an inventory means once ranges, groups, defaults and addresses are worked out.
+"""The fleet as frozen values: the inventory with ranges, groups, defaults and addresses resolved.
 
-Everything above (lint, resolve, plan, status) reads these and nothing else of the inventory's text, except through
-`Fleet.where`, which tells the file, line and column a value came from.
+Higher layers (lint, resolve, plan, status) use only these values, and `Fleet.where` for the file, line and column of a
+value.
 """
 
 from meshctl.model.fleet import (

@@ -1,4 +1,4 @@
-"""Nodes, robots and the fleet that holds them, with the place every value came from."""
+"""Nodes, robots and the fleet, with the origin of every value."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from meshctl.model.topic import Topic
 
 
 class Role(Enum):
-    """BASE is the operator's radio, ROBOT rides on a robot, BEACON is dropped behind it."""
+    """BASE is the operator's radio, ROBOT is mounted on a robot, BEACON is dropped by one."""
 
     BASE = "base"
     ROBOT = "robot"
@@ -25,7 +25,7 @@ class Role(Enum):
 
 
 class NodeState(Enum):
-    """CARRIED: in its rack, may be off. DEPLOYED: must answer. SPARE: in the box. LOST and RETIRED: not managed."""
+    """CARRIED: in its rack, may be off. DEPLOYED: must answer. SPARE: in storage. LOST and RETIRED: not managed."""
 
     CARRIED = "carried"
     DEPLOYED = "deployed"
@@ -48,12 +48,12 @@ class Origin:
 
 
 class MissingOrigin(LookupError):
-    """A path that the inventory does not have."""
+    """A path that is not in the inventory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """One radio of a node: its hardware, the mesh it joins (None: switched off) and the drive level UCI gets."""
+    """One radio of a node: its hardware, the mesh it joins (None: off) and its drive level for UCI."""
 
     hardware: RadioHardware
     mesh: str | None
@@ -66,7 +66,7 @@ class Radio:
 
     @property
     def conducted_dbm(self) -> float:
-        """Power at the antenna's connector: drive level, amplifier and cable, at most what the box is rated for."""
+        """Power at the antenna connector: drive level plus amplifier, at most the rating, minus cable loss."""
         driven = self.tx_power_dbm + self.hardware.amplifier_gain_db
         return min(driven, self.hardware.rated_power_dbm) - self.hardware.cable_loss_db
 
@@ -77,7 +77,7 @@ class Radio:
 
 @dataclass(frozen=True, slots=True)
 class SshSettings:
-    """How to reach a device: `host` empty means its own address; `jump` names another node to go through."""
+    """SSH access to a device: an empty `host` means its own address; `jump` is a node used as jump host."""
 
     host: str = ""
     port: int = 22
@@ -113,7 +113,7 @@ class Node:
 
     @property
     def unswitched_ports(self) -> tuple[str, ...]:
-        """Ports such as eth0.1 whose VLAN no switch has, as far as the inventory knows."""
+        """Ports such as eth0.1 whose VLAN is on no switch in the inventory."""
         if "switch_vlan" in self.extra_uci.values():
             return ()
         vlans = {vlan for vlan, _ in self.hardware.switch_vlans}
@@ -144,9 +144,9 @@ class Computer:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot, or the operator's base station (`is_base`): the peer that udp_mesh knows by `name`.
+    """A robot, or the operator's base station (`is_base`): the udp_mesh peer `name`.
 
-    `fielded` is the address of one that still runs the fielded program, of which nothing is ours.
+    `fielded` is the address of a robot that still runs the legacy udp_mesh, which meshctl does not manage.
     """
 
     name: str
@@ -159,7 +159,7 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class Operators:
-    """Who may log in: public keys for root on every node; whether passwords stay allowed (they should not)."""
+    """Login to the nodes: public keys for root, and whether passwords are allowed."""
 
     ssh_keys: tuple[str, ...] = ()
     password_login: bool = False
@@ -168,7 +168,7 @@ class Operators:
 
 @dataclass(frozen=True, slots=True)
 class SystemSettings:
-    """OpenWrt's system package, the same on all nodes."""
+    """OpenWrt system settings of all nodes."""
 
     timezone: str = "UTC"
     zonename: str = "UTC"
@@ -180,7 +180,7 @@ class SystemSettings:
 
 @dataclass(frozen=True, slots=True)
 class ApplyPolicy:
-    """How carefully a fleet is changed: nodes down at once, a canary first, when to stop."""
+    """Rollout policy of changes: nodes down at the same time, canary, when to stop."""
 
     max_down: int = 1
     canary: bool = True
@@ -191,7 +191,7 @@ class ApplyPolicy:
 
 @dataclass(frozen=True, slots=True)
 class UdpMesh:
-    """The transport's settings for all robots; `keys` are the live fleet keys, the first seals."""
+    """Transport settings of all robots; `keys` are the live fleet keys, of which the first encrypts."""
 
     port: int = 8700
     keys: tuple[SecretRef, ...] = ()
@@ -205,7 +205,7 @@ class UdpMesh:
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Everything an inventory says. Mappings are read-only and in the inventory's order."""
+    """A whole inventory. Mappings are read-only and in the inventory's order."""
 
     name: str
     country: str
@@ -223,10 +223,10 @@ class Fleet:
     base: str = ""
 
     def where(self, *path: str) -> Origin:
-        """The origin of a value, or of the nearest thing around it that was written down.
+        """The origin of a value, or of its innermost container that has one.
 
-        `path` is the dotted place in parts: `("nodes", "b03", "radios", "radio0", "tx_power_dbm")`. Raises
-        MissingOrigin when not even its first part is known.
+        `path` is the dotted path in parts: `("nodes", "b03", "radios", "radio0", "tx_power_dbm")`. Raises
+        MissingOrigin if even its first part is unknown.
         """
         for end in range(len(path), 0, -1):
             origin = self.provenance.get(path[:end])

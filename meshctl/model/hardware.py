@@ -1,4 +1,4 @@
-"""What a box of one kind is: board, radios, ports, power, firmware."""
+"""Hardware profiles: board, radios, ports, power, firmware."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshctl.model.release import Release
 
 
 class Band(Enum):
-    """A band by UCI's own names."""
+    """A frequency band by its UCI name."""
 
     G2 = "2g"
     G5 = "5g"
@@ -24,13 +24,12 @@ class AntennaKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RadioHardware:
-    """One radio of a board: `name` is the UCI section (`radio0`), `path` the kernel's device path, read off a device.
+    """One radio of a board: `name` is the UCI section (`radio0`), `path` the kernel's device path.
 
-    Powers are separate numbers, because the kernel knows nothing of an external amplifier: UCI's txpower is the drive
-    level, `max_drive_dbm` its highest value (what the driver offers), `amplifier_gain_db` what an amplifier adds,
-    `rated_power_dbm` what the box is sold as (30 for 1 W, 33 for 2 W), `antenna_gain_dbi` less `cable_loss_db` what the
-    antenna adds. `driver` is the kernel's module by its name in OpenWrt (`ath9k`, `ath10k-ct`), empty where it is not
-    written.
+    Powers are separate values because the kernel does not account for an external amplifier: UCI's txpower is the
+    drive level, `max_drive_dbm` the driver's maximum, `amplifier_gain_db` the gain of the amplifier, `rated_power_dbm`
+    the rated power (30 for 1 W, 33 for 2 W), and `antenna_gain_dbi` minus `cable_loss_db` the gain behind the
+    connector. `driver` is the kernel module by its name in OpenWrt (`ath9k`, `ath10k-ct`), empty if not set.
     """
 
     name: str
@@ -60,9 +59,9 @@ class Firmware:
 
 @dataclass(frozen=True, slots=True)
 class HardwareProfile:
-    """`board` is what the device calls itself (`ubus call system board`: `compex,wpj344-16m`), `profile` the
+    """`board` is the device's own name (`ubus call system board`: `compex,wpj344-16m`), `profile` the
     ImageBuilder's name (`compex_wpj344-16m`), `target` e.g. `ath79/generic`; `lan_ports` are bridged into the LAN;
-    `switch_vlans` are the VLANs of `switch0` with their ports (`("1", "3 0t")`) where swconfig drives it."""
+    `switch_vlans` are the VLANs of `switch0` with their ports (`("1", "3 0t")`) if swconfig drives it."""
 
     name: str
     board: str

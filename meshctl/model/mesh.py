@@ -1,4 +1,4 @@
-"""A mesh: one radio cell that all its radios share, and the routing above it."""
+"""A mesh: one radio cell and its routing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from meshctl.model.secret import SecretRef
 
 
 class MeshMode(Enum):
-    """What runs below the routing: an IBSS cell or 802.11s without its own forwarding."""
+    """The link layer below the routing: an IBSS cell, or 802.11s without its own forwarding."""
 
     ADHOC = "adhoc"
     MESH = "mesh"
@@ -30,9 +30,9 @@ class Backend(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Batman:
-    """batman-adv's options by their UCI names; `orig_interval_ms` None means: chosen from `Mesh.reconnect_s`.
+    """batman-adv's options by their UCI names; `orig_interval_ms` None means derived from `Mesh.reconnect_s`.
 
-    They are the kernel's defaults, but for the table of ARP answers (docs/decisions/0012-arp.md).
+    Defaults are the kernel's, except for the distributed ARP table (docs/decisions/0012-arp.md).
     """
 
     routing_algo: str = "BATMAN_IV"
@@ -49,8 +49,8 @@ class Batman:
 
 @dataclass(frozen=True, slots=True)
 class OperatorParts:
-    """What the operator supplies for meshmerize, which has no public package or schema (openwrt-facts.md section 8):
-    a directory of templates, package files, the service's name, a command that prints its status."""
+    """Parts that the operator supplies for meshmerize, which has no public package or schema (openwrt-facts.md section
+    8): templates, package files, the service's name, a command that prints its status."""
 
     templates: str = ""
     package_files: tuple[str, ...] = ()
@@ -63,9 +63,9 @@ class OperatorParts:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """`channel` and `htmode` as UCI has them; `network` holds every node's management address; `mtu` is the hard
-    interface's (batman-adv needs 32 bytes around 1500, and warns below 60); `reconnect_s` is the wanted time to heal
-    after a cut."""
+    """`channel` and `htmode` as in UCI; `network` contains the nodes' management addresses; `mtu` is that of the hard
+    interface (batman-adv needs 1500 + 32 bytes, and warns below 1500 + 60); `reconnect_s` is the target time to heal
+    after a link fails."""
 
     name: str
     ssid: str

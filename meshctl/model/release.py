@@ -1,4 +1,4 @@
-"""OpenWrt releases, ordered, with the differences rendering and applying depend on (docs/facts/openwrt-facts.md)."""
+"""OpenWrt releases in order, with the differences that matter to meshctl (docs/facts/openwrt-facts.md)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class PackageTool(Enum):
 
 @total_ordering
 class Release(Enum):
-    """A release series; compares by age, so `release >= Release.V21_02` reads as it sounds."""
+    """A release series, ordered by age: `release >= Release.V21_02`."""
 
     V19_07 = "19.07"
     V21_02 = "21.02"
@@ -48,7 +48,7 @@ class Release(Enum):
 
     @property
     def has_ed25519(self) -> bool:
-        """dropbear knows ed25519 keys (21.02 and later); 19.07 has RSA with SHA-1 only."""
+        """dropbear supports ed25519 keys (21.02 and later); 19.07 supports RSA with SHA-1 only."""
         return self >= Release.V21_02
 
 

@@ -1,4 +1,4 @@
-"""Secrets by reference: an inventory says where a secret is, never what it is; nothing prints one."""
+"""Secrets: references from the inventory, and values that are never printed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MASK = "********"
 
 
 class SecretKind(Enum):
-    """Where a secret lives: an environment variable, a file outside the repository, an age-encrypted file."""
+    """The location of a secret: an environment variable, a file outside the repository, an age-encrypted file."""
 
     ENV = "env"
     FILE = "file"
@@ -35,7 +35,7 @@ class SecretRef:
 
 
 class Secret:
-    """A secret's value; its text forms are masked, only `reveal()` gives it away."""
+    """A secret value; its text forms are masked, only `reveal()` returns it."""
 
     __slots__ = ("_value",)
 
@@ -43,7 +43,7 @@ class Secret:
         self._value = value
 
     def reveal(self) -> str:
-        """The value itself; call it only where the bytes leave for a node or a file the user asked for."""
+        """The value; call it only to write it to a node or to a file that the user requested."""
         return self._value
 
     def __repr__(self) -> str:
@@ -62,4 +62,4 @@ class Secret:
         return hash(("Secret", self._value))
 
     def __reduce__(self) -> str:
-        raise TypeError("a secret is never serialized")
+        raise TypeError("secrets must not be serialized")

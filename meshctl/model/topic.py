@@ -1,4 +1,4 @@
-"""What the robots say to each other: the topics that udp_mesh carries."""
+"""Topics that udp_mesh carries between robots."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import Enum
 
 
 class TopicClass(Enum):
-    """What a topic is for; lint holds the order of priorities against it."""
+    """The purpose of a topic; lint checks priorities against it."""
 
     EMERGENCY_STOP = "emergency_stop"
     COMMAND = "command"
@@ -19,7 +19,7 @@ class TopicClass(Enum):
 
 
 class Outbox(Enum):
-    """What is kept for a peer that is offline: nothing, the last value, or all of it (bounded)."""
+    """Messages kept for an offline peer: none, the last one, or all up to a limit."""
 
     NONE = "none"
     LAST = "last"

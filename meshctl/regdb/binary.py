@@ -1,9 +1,8 @@
 """Decode the kernel's binary regulatory database, `regulatory.db`, format version 20.
 
 The layout is big-endian, with pointers in units of four bytes from the start of the file (Linux net/wireless/reg.c,
-struct fwdb_header, fwdb_country, fwdb_collection, fwdb_rule): a header, a list of countries that a zero entry ends,
-then collections of rule pointers and the rules they point at. Longer collections and rules than known here are
-allowed, their extra bytes are skipped.
+struct fwdb_header, fwdb_country, fwdb_collection, fwdb_rule): a header, a list of countries terminated by a zero entry,
+then collections of rule pointers, and rules. Unknown extra bytes of collections and rules are skipped.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from meshctl.regdb.values import Country, DfsRegion, Flag, FrequencyRule, Regdb
 # "RGDB"
 _MAGIC = 0x52474442
 _VERSION = 20
-# the database is some 6 KiB; a pointer reaches 256 KiB (16 bits of 4-byte words), so nothing beyond can be meant
+# the database is about 6 KiB; pointers (16-bit counts of 4-byte words) reach 256 KiB
 MAX_BYTES = 1 << 18
 
 _HEADER = struct.Struct(">II")
@@ -31,7 +30,7 @@ _MBM_PER_DBM = 100
 
 
 class RegdbError(InputError):
-    """A file that is not a regulatory database of version 20; says where in it."""
+    """Not a regulatory database of version 20; the message has the byte offset."""
 
 
 def decode(data: bytes, source: str) -> Regdb:
@@ -52,7 +51,7 @@ def decode(data: bytes, source: str) -> Regdb:
             break
         alpha2 = _alpha2(raw, offset, source)
         if alpha2 in countries:
-            raise RegdbError(f"{source}: country {alpha2} at byte {offset} is there twice")
+            raise RegdbError(f"{source}: duplicate country {alpha2} at byte {offset}")
         if pointer not in collections:
             collections[pointer] = _collection(data, pointer * _WORD_BYTES, source)
         countries[alpha2] = Country(alpha2, *collections[pointer])
@@ -71,7 +70,7 @@ def _collection(data: bytes, offset: int, source: str) -> tuple[DfsRegion, tuple
     length, count, region = _unpack(_COLLECTION, data, offset, source)
     if length < _COLLECTION.size:
         raise RegdbError(f"{source}: expected at least {_COLLECTION.size} bytes in the rules at byte {offset}")
-    # only the two low bits hold the region
+    # the region is in the two low bits
     dfs_region = DfsRegion(region & 3)
     pointers = offset + length + length % 2
     rules = []

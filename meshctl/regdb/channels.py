@@ -1,7 +1,7 @@
 """Channels and the frequencies they occupy: numbers by IEEE 802.11-2020 annex E, widths by UCI's htmode.
 
-`center_mhz` and `channel_at` convert a 20 MHz channel; `occupied` gives the whole range that a channel of an htmode
-takes, or None where no such channel exists.
+`center_mhz` and `channel_at` convert a 20 MHz channel; `occupied_span` returns the whole range of a channel with an
+htmode, or None if there is no such channel.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _GROUPS_40 = (36, 44, 52, 60, 100, 108, 116, 124, 132, 140, 149, 157, 165, 173)
 _GROUPS_80 = (36, 52, 100, 116, 132, 149, 165)
 _GROUPS_160 = (36, 100, 149)
 
-# 2.4 GHz: a bonded channel's secondary lies four numbers away; OpenWrt takes the upper one below channel 7
+# 2.4 GHz: the secondary channel is four numbers away; OpenWrt uses the upper one below channel 7
 _HT40_STEP = 4
 _HT40_UPPER_BELOW = 7
 
@@ -43,7 +43,7 @@ class Span:
 
 
 def center_mhz(band: Band, channel: int) -> int:
-    """The centre frequency of a 20 MHz channel. Raises ValueError for a number the band does not have."""
+    """The center frequency of a 20 MHz channel. Raises ValueError for an unknown channel."""
     if channel not in CHANNELS[band]:
         raise ValueError(f"band {band.value} has no channel {channel}")
     if band is Band.G5:
@@ -52,7 +52,7 @@ def center_mhz(band: Band, channel: int) -> int:
 
 
 def channel_at(mhz: int) -> tuple[Band, int] | None:
-    """The 20 MHz channel whose centre is `mhz`, None when there is none."""
+    """The 20 MHz channel centered at `mhz`, None if there is none."""
     if mhz == 2484:
         return Band.G2, 14
     band, base = (Band.G2, 2407) if mhz < 3000 else (Band.G5, 5000)
@@ -61,18 +61,18 @@ def channel_at(mhz: int) -> tuple[Band, int] | None:
 
 
 def width_mhz(htmode: str) -> int:
-    """The width an htmode (`HT20`, `HT40-`, `VHT80`, `HE40`, `NOHT`) asks for. Raises ValueError for another word."""
+    """The width of an htmode (`HT20`, `HT40-`, `VHT80`, `HE40`, `NOHT`). Raises ValueError for an unknown one."""
     if htmode == "NOHT":
         return 20
     match = _HTMODE.fullmatch(htmode)
     if match is None:
-        raise ValueError(f"no such htmode: {htmode}")
+        raise ValueError(f"unknown htmode {htmode}")
     return int(match[1])
 
 
-def occupied(band: Band, channel: int, htmode: str) -> Span | None:
-    """What a channel occupies at this htmode, or None when the two cannot go together (`HT40+` on 165, 80 MHz at
-    2.4 GHz). Raises ValueError for a channel or htmode that does not exist at all."""
+def occupied_span(band: Band, channel: int, htmode: str) -> Span | None:
+    """The range that a channel occupies with this htmode; None if they are incompatible (`HT40+` on 165, 80 MHz at
+    2.4 GHz). Raises ValueError for an unknown channel or htmode."""
     width = width_mhz(htmode)
     center = center_mhz(band, channel)
     if width == 20:
@@ -84,7 +84,7 @@ def occupied(band: Band, channel: int, htmode: str) -> Span | None:
     first = next((low for low in groups if low <= channel < low + 4 * size and low + 4 * (size - 1) <= 177), None)
     if first is None:
         return None
-    # an explicit side must be the one the group has
+    # an explicit side must match the group
     if (htmode.endswith("+") and channel != first) or (htmode.endswith("-") and channel == first):
         return None
     low = center_mhz(band, first) - 10

@@ -1,7 +1,7 @@
-"""Find and read the regulatory database: a given file, the machine's own, or the copy shipped here.
+"""Find and read the regulatory database: a given file, the system's, or the copy shipped here.
 
-The shipped copy is the database of Debian's package wireless-regdb (ISC licence, beside it), so that lint works on
-machines without it; `scripts/update-regdb` brings in a newer one.
+The shipped copy comes from Debian's package wireless-regdb (ISC license, next to it), so that lint works on machines
+without it; `scripts/update-regdb` updates it.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ SHIPPED = Path(__file__).with_name("regulatory.db")
 
 
 def shipped_version() -> str:
-    """Where the shipped copy comes from: the package and its version."""
+    """The package and version of the shipped copy."""
     return SHIPPED.with_name("regulatory.db.version").read_text(encoding="utf-8").strip()
 
 
 def load(path: Path | None = None) -> Regdb:
-    """The database at `path`; by default the machine's, or the shipped one where the machine has none.
+    """The database at `path`; by default the system's, or else the shipped copy.
 
-    Raises RegdbError naming the file, and what is wrong with it.
+    Raises RegdbError with the file and the problem.
     """
     chosen = path or (SYSTEM if SYSTEM.is_file() else SHIPPED)
     try:

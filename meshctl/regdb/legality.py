@@ -9,16 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from meshctl.model import Band
-from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied, width_mhz
+from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied_span, width_mhz
 from meshctl.regdb.values import NO_FLAGS, Country, Flag, FrequencyRule
 
 
 @dataclass(frozen=True, slots=True)
 class Legality:
-    """What a country says about a channel of a width.
+    """What a country allows on a range of frequencies.
 
-    `covered` is False when some of the range lies outside every rule (`flags` and `max_eirp_dbm` then mean nothing).
-    `max_bandwidth_khz` is the widest channel that the rules at this place allow, `max_eirp_dbm` the least of them.
+    `covered` is False if part of the range is outside every rule (`flags` and `max_eirp_dbm` are then meaningless).
+    `max_bandwidth_khz` is the widest channel allowed there, `max_eirp_dbm` the lowest limit of the rules.
     """
 
     covered: bool
@@ -31,7 +31,7 @@ class Legality:
 
 
 def check_span(country: Country, span: Span, *, ofdm: bool = True) -> Legality:
-    """The rules' verdict on the range `span`; `ofdm` False asks for the rules of 802.11b too (channel 14 in Japan)."""
+    """Check the range `span`; `ofdm` False includes rules for 802.11b only (channel 14 in Japan)."""
     low, high = span.low_mhz * 1000, span.high_mhz * 1000
     whole = _covering_rule(country, low, high, ofdm=ofdm)
     if whole is not None:
@@ -47,14 +47,14 @@ def check_span(country: Country, span: Span, *, ofdm: bool = True) -> Legality:
 
 
 def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag) -> tuple[int, ...]:
-    """The channels of `band` that carry `htmode` in the country under rules with none of the `forbidden` flags.
+    """The channels of `band` allowed with `htmode` in the country, by rules without `forbidden` flags.
 
-    Raises ValueError for an htmode that does not exist.
+    Raises ValueError for an unknown htmode.
     """
     width = width_mhz(htmode)
     legal = []
     for channel in CHANNELS[band]:
-        span = occupied(band, channel, htmode)
+        span = occupied_span(band, channel, htmode)
         if span is None:
             continue
         verdict = check_span(country, span)
@@ -63,14 +63,14 @@ def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag
     return tuple(legal)
 
 
-def primary(band: Band, channel: int) -> Span:
-    """The channel's own 20 MHz. Raises ValueError for a number the band does not have."""
+def primary_span(band: Band, channel: int) -> Span:
+    """The primary 20 MHz of a channel. Raises ValueError for an unknown channel."""
     center = center_mhz(band, channel)
     return Span(center - 10, center + 10)
 
 
 def _covering_rule(country: Country, low_khz: int, high_khz: int, *, ofdm: bool) -> FrequencyRule | None:
-    """The first rule that covers the range alone, the one with the fewest restrictions if several do."""
+    """The rule that covers the whole range; the least restrictive one if there are several."""
     covering = [
         rule
         for rule in country.rules
@@ -80,7 +80,7 @@ def _covering_rule(country: Country, low_khz: int, high_khz: int, *, ofdm: bool)
 
 
 def _auto_bw_chain(country: Country, low_khz: int, high_khz: int) -> tuple[FrequencyRule, ...]:
-    """Adjoining AUTO_BW rules that cover the range together, empty when there are none."""
+    """Adjacent AUTO_BW rules that cover the range together; empty if there are none."""
     chain: list[FrequencyRule] = []
     reached = low_khz
     for rule in sorted(country.rules, key=lambda rule: rule.start_khz):
@@ -93,13 +93,13 @@ def _auto_bw_chain(country: Country, low_khz: int, high_khz: int) -> tuple[Frequ
 
 
 def _joined_khz(country: Country, rule: FrequencyRule) -> int:
-    """The width of the unbroken AUTO_BW range that `rule` is part of."""
+    """The width of the contiguous AUTO_BW range that contains `rule`."""
     low, high = rule.start_khz, rule.end_khz
-    neighbours = [other for other in country.rules if other.flags & Flag.AUTO_BW]
-    for other in sorted(neighbours, key=lambda other: other.start_khz):
+    adjacent = [other for other in country.rules if other.flags & Flag.AUTO_BW]
+    for other in sorted(adjacent, key=lambda other: other.start_khz):
         if other.start_khz <= high < other.end_khz:
             high = other.end_khz
-    for other in sorted(neighbours, key=lambda other: other.end_khz, reverse=True):
+    for other in sorted(adjacent, key=lambda other: other.end_khz, reverse=True):
         if other.start_khz < low <= other.end_khz:
             low = other.start_khz
     return high - low

@@ -1,4 +1,4 @@
-"""A regulatory database as frozen values: countries, each with the rules for its frequency ranges."""
+"""A regulatory database as frozen values: countries and their rules."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import Enum, IntFlag
 
 
 class Flag(IntFlag):
-    """A rule's restrictions by the kernel's bits (net/wireless/reg.c, enum fwdb_flags)."""
+    """Restrictions of a rule, as in the kernel (net/wireless/reg.c, enum fwdb_flags)."""
 
     NO_OFDM = 1
     NO_OUTDOOR = 2
@@ -21,7 +21,7 @@ NO_FLAGS = Flag(0)
 
 
 class DfsRegion(Enum):
-    """Whose radar rules a country follows (enum nl80211_dfs_regions)."""
+    """The radar detection rules of a country (enum nl80211_dfs_regions)."""
 
     UNSET = 0
     FCC = 1
@@ -31,7 +31,7 @@ class DfsRegion(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrequencyRule:
-    """One frequency range: its edges, the widest channel, the highest power and the restrictions."""
+    """One frequency range: its edges, maximum bandwidth, maximum power and restrictions."""
 
     start_khz: int
     end_khz: int
@@ -49,11 +49,11 @@ class Country:
 
 @dataclass(frozen=True, slots=True)
 class Regdb:
-    """All countries by their ISO 3166-1 alpha-2 code; `source` says which file they came from."""
+    """All countries by their ISO 3166-1 alpha-2 code; `source` is the file they come from."""
 
     countries: Mapping[str, Country]
     source: str
 
     def country(self, alpha2: str) -> Country | None:
-        """The country's rules, None when the database has none."""
+        """The country's rules; None if the database has none."""
         return self.countries.get(alpha2)

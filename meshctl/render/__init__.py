@@ -1,4 +1,4 @@
-"""Intent -> the files of a node, deterministic to the byte, each UCI file parsed back before it leaves."""
+"""Intent -> the files of a node, byte-for-byte deterministic; each UCI file is parsed back before use."""
 
 from meshctl.render.compare import (
     FileDifference,

@@ -1,7 +1,7 @@
-"""Two fleets -> what changes on which node: rendered, compared tree by tree, secrets masked.
+"""Two fleets -> the differences of each node: render both, compare tree by tree, mask secrets.
 
-Comparing needs no secret: each is stood in for by a text made from its reference, so a key that is looked for somewhere
-else shows as changed, and a key whose value changed in its store does not.
+No secret is needed: each is replaced by a placeholder derived from its reference. A changed reference shows as a
+change; a value that changed in its store does not.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class NodeChange(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FileDifference:
-    """One file that differs; `lines` are for people and hold no secret."""
+    """One file that differs; `lines` are for display and contain no secret."""
 
     path: str
     change: NodeChange
@@ -35,7 +35,7 @@ class FileDifference:
 
 @dataclass(frozen=True, slots=True)
 class NodeDifference:
-    """One node that differs; the package lists name what its image gains and loses."""
+    """One node that differs; the package lists are packages added to and removed from its image."""
 
     node: str
     change: NodeChange
@@ -46,7 +46,7 @@ class NodeDifference:
 
 
 def compare_fleets(before: Fleet, after: Fleet) -> Iterator[NodeDifference]:
-    """The nodes that differ: those of `before` in its order, then new ones. Raises InvalidInput from rendering."""
+    """The nodes that differ, in the order of `before`, then new ones. Raises InvalidInput from rendering."""
     old = {item.node: item for item in render_fleet(before, placeholder_secret)}
     new = {item.node: item for item in render_fleet(after, placeholder_secret)}
     for name in dict.fromkeys((*old, *new)):
@@ -56,12 +56,12 @@ def compare_fleets(before: Fleet, after: Fleet) -> Iterator[NodeDifference]:
 
 
 def placeholder_secret(ref: SecretRef) -> Secret:
-    """A text that stands for a secret: as long as the longest key, of the letters that every kind of key may have."""
+    """A placeholder for a secret: as long as the longest key, and valid for every kind of key."""
     return Secret(hashlib.sha256(str(ref).encode()).hexdigest())
 
 
 def compare_nodes(old: Rendered | None, new: Rendered | None) -> NodeDifference | None:
-    """What differs between two renderings of a node; None on one side means that it is new or gone."""
+    """The difference of two renderings of a node; None on one side means that it is added or removed."""
     if old is None or new is None:
         present = new or old
         if present is None:
@@ -92,7 +92,7 @@ def _files(old: Rendered, new: Rendered) -> Iterator[FileDifference]:
     before = {file.path: file for file in old.files}
     after = {file.path: file for file in new.files}
     for path in sorted(before.keys() | after.keys()):
-        # the marker changes exactly when something else does
+        # the marker changes exactly if another file changes
         if path == MARKER_PATH:
             continue
         left, right = before.get(path), after.get(path)
@@ -104,22 +104,22 @@ def _files(old: Rendered, new: Rendered) -> Iterator[FileDifference]:
 
 
 def compare_files(old: RenderedFile | None, new: RenderedFile | None) -> Iterator[str]:
-    """The difference of two versions of a file in lines for people, without a secret."""
+    """The difference of two versions of a file in lines for display, without secrets."""
     if old is not None and new is not None and old.mode != new.mode:
         yield f"mode {old.mode:04o} -> {new.mode:04o}"
     left, right = _package(old, new), _package(new, old)
     if left is not None and right is not None:
-        yield from (_hidden(line, old, new) for line in uci.diff(left, right).lines())
+        yield from (_masked(line, old, new) for line in uci.diff(left, right).lines())
         return
     old_text, new_text = (file.masked if file is not None else "" for file in (old, new))
     if old is not None and new is not None and old_text == new_text and old.content != new.content:
-        yield "~ a secret in it"
+        yield "~ a secret"
     lines = difflib.unified_diff(old_text.splitlines(), new_text.splitlines(), lineterm="", n=1)
-    # the first two lines only repeat the file's name
+    # the first two lines are the file names
     yield from list(lines)[2:]
 
 
-def _hidden(line: str, *files: RenderedFile | None) -> str:
+def _masked(line: str, *files: RenderedFile | None) -> str:
     """The line with the secrets of both versions masked, in options of any name."""
     for file in files:
         line = file.hide(line) if file is not None else line
@@ -127,7 +127,7 @@ def _hidden(line: str, *files: RenderedFile | None) -> str:
 
 
 def _package(file: RenderedFile | None, other: RenderedFile | None) -> uci.Package | None:
-    """The file's tree; an empty one when only the other side is UCI."""
+    """The file's tree; an empty one if only the other side is UCI."""
     if file is not None:
         return file.package
     if other is not None and other.package is not None:

@@ -1,8 +1,8 @@
-"""Fleet -> the files of the udp_mesh daemon on one robot's computer: its configuration (TOML) and its key file.
+"""Fleet -> the files of the udp_mesh daemon on a robot's computer: its configuration (TOML) and its key file.
 
-Every robot gets the same topics, because a message's way is decided where it is sent and a broadcast's repair where it
-is received. The daemon speaks on the interface that has the computer's address, and on no other. docs/udp-mesh.md
-describes the format; a test loads what is written here with the daemon's own reader.
+All robots get the same topics, because the sender selects a message's destinations and the receiver requests repair of
+a broadcast. The daemon uses only the interface with the computer's address. docs/udp-mesh.md describes the format; a
+test loads the output with the daemon's own reader.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.errors import InputError
 from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, UdpMesh
 
-# The code of what the daemon would not take (docs/render.md).
+# Values that the daemon would reject (docs/render.md).
 DAEMON = "RND030"
 
 CONFIG_NAME = "udp-mesh.toml"
 KEY_NAME = "fleet.key"
 
-# What the wire and the daemon's reader hold to.
+# Limits of the wire format and the daemon's reader.
 _MAX_NAME_BYTES = 63
 _MAX_TOPIC_BYTES = 255
 _RESERVED_PREFIX = "~mesh/"
@@ -30,16 +30,16 @@ _MAX_FRAGMENT_BYTES = 8192
 _MAX_WINDOW = 4096
 _MAX_KEYS = 2
 _KEY_BYTES = 32
-# Heartbeats grow this sparse at most, unless the team wants to be told sooner (udp_mesh's default).
+# Maximum heartbeat interval of idle peers, unless offline_after_s requires a shorter one (udp_mesh's default).
 _MAX_SPARSE_HEARTBEAT_S = 3.0
-# Silence after which unkept messages end as lost (udp_mesh's default): longer than a tunnel's shadow.
+# Silence after which messages without an outbox count as lost (udp_mesh's default).
 _PEER_LOST_S = 60.0
 
 
 def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> bytes:
-    """The daemon's configuration on the robot's computer; `key_name` is the key file's path as seen from it.
+    """The daemon's configuration on the robot's computer; `key_name` is the path of the key file, relative to it.
 
-    Raises InvalidInput for an unknown robot, one without a computer, and every value that the daemon would refuse.
+    Raises InvalidInput for an unknown robot, one without a computer, and every value that the daemon would reject.
     """
     computer = _computer(fleet, robot)
     problems = [*_check_robot(fleet, robot), *_check_transport(fleet), *_check_topics(fleet)]
@@ -59,15 +59,15 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         *(line for topic in fleet.topics for line in _topic(topic, robot)),
     ]
     if transport.metrics_port is not None:
-        # the daemon's metrics are for this machine; whoever collects them comes through SSH or an exporter
+        # metrics are local; collect them through SSH or an exporter
         lines += ["", "[daemon]", f'metrics_address = "127.0.0.1:{transport.metrics_port}"']
     return "".join(f"{line}\n" for line in lines).encode()
 
 
 def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes | None:
-    """The key file, one key a line, the sealing one first; None for a fleet without keys. To be kept at mode 0600.
+    """The key file: one key per line, the sending key first; None for a fleet without keys. Store it with mode 0600.
 
-    Raises InvalidInput, which shows nothing of a key, for one that is none.
+    Raises InvalidInput for an invalid key, without showing the key.
     """
     lines = []
     problems = []
@@ -80,7 +80,7 @@ def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes |
             continue
         if key_bytes(text) is None:
             found = f"{len(text)} characters"
-            hint = "make one with `openssl rand -hex 32`, or `udp-mesh keygen FILE`"
+            hint = "generate one with `openssl rand -hex 32` or `udp-mesh keygen FILE`"
             expected = f"a key of {_KEY_BYTES} bytes as 64 hex digits or 44 characters of base64"
             problems.append(_problem(fleet, path, expected, found, hint=hint))
         lines.append(f"{text}\n")
@@ -90,12 +90,12 @@ def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes |
 
 
 def key_text(secret: Secret) -> str:
-    """A fleet key as udp_mesh reads it from a line of a key file: `udp-mesh keygen` writes the key's id behind `#`."""
+    """The key on a line of a key file, without the key id that `udp-mesh keygen` writes after `#`."""
     return secret.reveal().split("#", 1)[0].strip()
 
 
 def key_bytes(text: str) -> bytes | None:
-    """The 32 bytes of a key in hexadecimal or base64, None for anything else."""
+    """The 32 bytes of a hexadecimal or base64 key; None for anything else."""
     try:
         raw = bytes.fromhex(text) if len(text) == 2 * _KEY_BYTES else base64.b64decode(text, validate=True)
     except (ValueError, binascii.Error):
@@ -108,12 +108,12 @@ def _computer(fleet: Fleet, name: str) -> Computer:
     if robot is None:
         raise InvalidInput([_problem(fleet, ("robots",), "a robot of the fleet", repr(name))])
     if robot.computer is None:
-        raise InvalidInput([_problem(fleet, ("robots", name, "computer"), "the robot's computer", "none")])
+        raise InvalidInput([_problem(fleet, ("robots", name, "computer"), "a robot with a computer", "none")])
     return robot.computer
 
 
 def _check_robot(fleet: Fleet, name: str) -> Iterator[Diagnostic]:
-    """What udp_mesh takes as a peer's name: names are parts of topic names, so no slash."""
+    """Check the peer name. Names are parts of topic names, so slashes are not allowed."""
     if not _is_name(name, _MAX_NAME_BYTES) or "/" in name:
         expected = f"a name of 1 to {_MAX_NAME_BYTES} bytes without space or slash"
         yield _problem(fleet, ("robots", name), expected, repr(name))
@@ -150,7 +150,7 @@ def _rates(transport: UdpMesh) -> Iterator[str]:
     yield ""
     yield "[rates]"
     yield f"heartbeat_s = {_number(transport.heartbeat_s)}"
-    # three heartbeats may be missed before a peer is called offline, however sparse they are
+    # three missed heartbeats fit into offline_s at any rate
     yield f"heartbeat_sparse_s = {_number(sparse_s)}"
     yield f"offline_s = {_number(transport.offline_after_s)}"
     yield f"peer_lost_s = {_number(max(_PEER_LOST_S, transport.offline_after_s))}"
@@ -170,8 +170,8 @@ def _neighbor(name: str, address: str) -> tuple[str, ...]:
 
 
 def _legacy_peers(fleet: Fleet, robot: str) -> Iterator[str]:
-    """Robots that still run the fielded program: spoken with in its format. A single one on the network obliges every
-    daemon there to know it, or that daemon's broadcasts would end the program."""
+    """Robots with the legacy udp_mesh, addressed in its format. Every daemon on the network must know each of them:
+    broadcasts of one that does not would crash the legacy program."""
     for peer in _others(fleet, robot):
         if peer.fielded is not None:
             yield from (*_neighbor(peer.name, str(peer.fielded)), "legacy = true")
@@ -205,8 +205,8 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
 
 
 def _destinations(topic: Topic, robot: str) -> tuple[str, ...]:
-    """Whom this robot's messages go to; none means everyone. A topic for this robot alone keeps its name, since it is
-    no broadcast when others send it."""
+    """The destinations of this robot's messages; none means all. A topic for this robot alone keeps its name, because
+    messages from others are not broadcasts."""
     if "all" in topic.destinations:
         return ()
     others = tuple(name for name in topic.destinations if name != robot)

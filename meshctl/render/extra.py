@@ -1,7 +1,7 @@
-"""The inventory's own options on top of what the templates give: `network.lan.mtu: "1400"`.
+"""Apply `extra_uci` of the inventory to the rendered packages: `network.lan.mtu: "1400"`.
 
-A key of two parts makes a section, with its type as the value (`network.switch0: switch`), a key of three sets an
-option, an empty value removes it: what `uci set` means by the same words. Sections are made before options are set.
+As with `uci set`, a key of two parts creates a section with its type as the value (`network.switch0: switch`), a key of
+three parts sets an option, and an empty value removes it. Sections are created before options are set.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.resolve import Intent
 from meshctl.uci import Package, Section
 
-# The code of what cannot be set (docs/render.md).
+# Options that cannot be set (docs/render.md).
 EXTRA = "RND013"
 
 
 def with_extra(packages: Mapping[str, Package], intent: Intent) -> dict[str, Package]:
-    """The packages with `intent.extra_uci` applied, new ones last. Raises InvalidInput with every key that fails."""
+    """The packages with `intent.extra_uci` applied, new ones last. Raises InvalidInput with all invalid keys."""
     result = dict(packages)
     failed: list[Diagnostic] = []
     for key, value in sorted(intent.extra_uci.items(), key=lambda item: item[0].count(".")):
@@ -46,7 +46,7 @@ def _make(package: Package, name: str, type_name: str) -> Package:
 def _set_option(package: Package, key: str, option: str, value: str) -> Package:
     keys = package.keys()
     if key not in keys:
-        raise ValueError(f"expected a section of {package.name} ({', '.join(keys) or 'it has none'}), found {key!r}")
+        raise ValueError(f"expected a section of {package.name} ({', '.join(keys) or 'which has none'}), found {key!r}")
     index = keys.index(key)
     old = package.sections[index]
     options = {name: before for name, before in old.options.items() if name != option or value}

@@ -1,12 +1,12 @@
-"""What only the device knows and its new configuration keeps: the node's own packages -> the sections carried over.
+"""Keep board-specific sections: a node's current packages -> the sections to keep in its new configuration.
 
-meshctl replaces a package whole, but some of what stands in it was written by the board's own scripts at its first boot
-(`/etc/board.d`, `config_generate`) or at any (`wifi config`), from what no inventory holds. Without the layout of a
-switch that `swconfig` drives, its ports lead nowhere after the next reboot. What the inventory writes itself is the
-inventory's whole: a section of the same kind is not carried over then.
+meshctl replaces whole packages, but the board's own scripts write some sections at first boot (`/etc/board.d`,
+`config_generate`) or at every boot (`wifi config`) from data that is not in the inventory. Without the layout of a
+swconfig switch, for example, its ports are dead after the next reboot. If the inventory defines sections of a kind,
+the device's sections of that kind are not kept.
 
-What is replaced all the same, because a mesh node lives without it: other interfaces than the rendered ones, `globals`
-(an IPv6 prefix of its own), routes, DSL. firewall, dhcp and dropbear hold nothing of a board's.
+A mesh node works without the rest, which is replaced: interfaces that are not rendered, `globals` (a ULA prefix),
+routes, DSL. firewall, dhcp and dropbear contain nothing board-specific.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from types import MappingProxyType
 
 from meshctl.uci import Package, Section
 
-# Kinds of sections that belong together; generate_switch, generate_led, generate_rssimon and generate_gpioswitch of
+# Related section types; generate_switch, generate_led, generate_rssimon and generate_gpioswitch of
 # base-files' `bin/config_generate`. A gpio_switch may feed another box (PoE passthrough).
 _SWITCH = frozenset({"switch", "switch_vlan", "switch_port"})
 _LIGHTS = frozenset({"led", "rssid"})
@@ -26,7 +26,7 @@ _GPIO = frozenset({"gpio_switch"})
 
 @dataclass(frozen=True, slots=True)
 class DeviceFacts:
-    """`compat_version`, which sysupgrade reads, and the node's `packages` by name as they stand there."""
+    """`compat_version`, which sysupgrade reads, and the node's current `packages` by name."""
 
     compat_version: str = ""
     packages: Mapping[str, Package] = field(default_factory=lambda: MappingProxyType({}), repr=False)
@@ -36,8 +36,8 @@ NO_FACTS = DeviceFacts()
 
 
 def with_switch(network: Package, vlans: Iterable[tuple[str, str, str]]) -> Package:
-    """A node's own package `network` with the layout of its switches (switch, VLAN, ports), as config_generate writes
-    it, where it has lost every trace of them."""
+    """A node's current `network` package; if it has no switch sections, add `vlans` (switch, VLAN, ports) as
+    config_generate writes them."""
     if any(section.type in _SWITCH for section in network.sections):
         return network
     layout = tuple(vlans)
@@ -52,7 +52,7 @@ def with_switch(network: Package, vlans: Iterable[tuple[str, str, str]]) -> Pack
 
 
 def with_board_sections(package: Package, facts: DeviceFacts) -> Package:
-    """The rendered package with what the node's own one has to keep, in the node's order behind the rest."""
+    """The rendered package, followed by the sections to keep of the node's current one, in the node's order."""
     keep = _KEEPERS.get(package.name)
     own = facts.packages.get(package.name)
     if keep is None or own is None:
@@ -70,12 +70,12 @@ def _network(package: Package, own: Package) -> Iterator[Section]:
 
 
 def _is_of(section: Section, kinds: frozenset[str], package: Package) -> bool:
-    """Whether it is of these kinds, and the inventory writes none of them."""
+    """Whether the section is of these kinds, and the rendered package has none of them."""
     return section.type in kinds and not any(written.type in kinds for written in package.sections)
 
 
 def _ports(package: Package) -> frozenset[str]:
-    """The ports of rendered bridges that no rendered device section speaks of."""
+    """The ports of rendered bridges without a rendered device section."""
     lists = [
         word
         for s in package.sections
@@ -87,7 +87,7 @@ def _ports(package: Package) -> frozenset[str]:
 
 
 def _is_port_address(section: Section, ports: frozenset[str]) -> bool:
-    """A port's MAC address as the board's manufacturer wrote it into flash; the driver may have drawn another one."""
+    """Whether the section sets a port's MAC address from flash, which the driver may not use by itself."""
     return section.type == "device" and section.options.keys() == {"name", "macaddr"} and section.get("name") in ports
 
 
@@ -96,15 +96,15 @@ def _system(package: Package, own: Package) -> Iterator[Section]:
 
 
 def _wireless(package: Package, own: Package) -> Iterator[Section]:
-    """Radios that the inventory leaves out, switched off: `wifi config` runs at every boot and adds what is not named.
+    """Radios that the inventory omits, disabled: `wifi config` runs at every boot and adds missing ones.
 
-    What it adds is left as it is, with the interface it has; of a radio that somebody switched on nothing else is kept.
+    A disabled radio keeps its interface; an enabled radio is disabled and loses its interfaces.
     """
     radios = [section for section in package.sections if section.type == "wifi-device"]
     names, paths = {radio.name for radio in radios}, {radio.get("path") for radio in radios} - {""}
     off: set[str | None] = set()
     for section in own.sections:
-        # a device with several radios has one path for all; `wifi config` misses those that do not say which they are
+        # radios of one device share a path; `wifi config` identifies them by `radio`
         is_other = section.get("path") not in paths or bool(section.get("radio"))
         if section.type == "wifi-device" and section.name not in names and is_other:
             if section.get("disabled") == "1":

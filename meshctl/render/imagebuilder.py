@@ -1,8 +1,8 @@
-"""What OpenWrt's ImageBuilder needs to bake nodes' configurations and packages into images.
+"""Input for OpenWrt's ImageBuilder: images with nodes' configurations and packages.
 
-Per hardware and release one folder: `files/NODE/` overlays, `packages.txt`, and `build.sh` with the exact `make image`
-call of every node, to be run inside the unpacked ImageBuilder. Nodes in the field have no internet, so the packages go
-into the image.
+One folder per hardware and release: `files/NODE/` overlays, `packages.txt`, and `build.sh` with the `make image` call
+of every node, to be run inside the unpacked ImageBuilder. Nodes in the field have no internet access, so packages are
+part of the image.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ class ImageFolder:
 
     @property
     def packages_text(self) -> str:
-        """Every package that any of the nodes wants, and with `-` in front those that it removes, one a line."""
+        """All packages of the nodes, and removed packages prefixed with `-`, one per line."""
         wanted = sorted({name for node in self.overlays for name in node.packages})
         removed = sorted({f"-{name}" for node in self.overlays for name in node.removed_packages})
         return "".join(f"{name}\n" for name in (*wanted, *removed))
 
     @property
     def script(self) -> str:
-        """The shell script with the call of every node."""
+        """The shell script with the calls of all nodes."""
         return "".join(f"{line}\n" for line in (*_HEAD, *self._about(), *_SETUP, *self._copies(), *self._calls()))
 
     def make_call(self, rendered: Rendered) -> str:
-        """`make image` for one node, as it stands in the script."""
+        """The `make image` call of one node."""
         packages = " ".join((*rendered.packages, *(f"-{name}" for name in rendered.removed_packages)))
         return (
             f"make image PROFILE={shlex.quote(self.hardware.profile)} PACKAGES={shlex.quote(packages)}"
@@ -104,7 +104,7 @@ def _absolute(base: str, path: str) -> Path:
 
 
 def folder_files(folder: ImageFolder) -> tuple[RenderedFile, ...]:
-    """Everything of the folder as files, the overlays below `files/NODE/`."""
+    """All files of the folder, with overlays below `files/NODE/`."""
     files = [
         RenderedFile(f"files/{node.node}/{file.path}", file.mode, file.content, file.masked, file.secrets)
         for node in folder.overlays

@@ -1,7 +1,7 @@
-"""Intent -> templates -> text -> parsed back -> canonical files, with the marker that names them.
+"""Intent -> templates -> text -> parsed tree -> canonical files, with a marker that identifies them.
 
-What is diffed and pushed is the parsed tree's own text, never the template's: a file that leaves here has been read by
-our UCI parser, and looks the same however its template is laid out.
+Diffs and uploads use the text of the parsed tree, never the template's output: every UCI file has passed our parser,
+and does not depend on the layout of its template.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, Render
 from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
 from meshctl.resolve import Intent, resolve
 
-# A WEP key has 5 letters; what is shorter, such as the index in wireless' `key '1'`, is no secret.
+# A WEP key has 5 characters; shorter values, such as the index in wireless' `key '1'`, are not secret.
 _MIN_SECRET_CHARACTERS = 5
 
 
 class UnknownNode(InvalidInput):
-    """A node that the inventory does not have, or that it has given up."""
+    """A node that is not in the inventory, or not managed."""
 
 
 def render_fleet(
@@ -38,7 +38,7 @@ def render_fleet(
 def render_nodes(
     fleet: Fleet, names: Iterable[str], secrets: Callable[[SecretRef], Secret], templates: Templates | None = None
 ) -> tuple[Rendered, ...]:
-    """The nodes named, all or none: raises InvalidInput with what is wrong with any of them, each thing once."""
+    """The named nodes. Raises InvalidInput with the errors of all of them, without duplicates."""
     shared = templates if templates is not None else Templates.of(fleet)
     rendered = []
     problems: dict[Diagnostic, None] = {}
@@ -59,7 +59,7 @@ def render_node(
     templates: Templates | None = None,
     device_facts: DeviceFacts | None = None,
 ) -> Rendered:
-    """One node's files. Raises UnknownNode, or InvalidInput with every value that cannot be written down."""
+    """One node's files. Raises UnknownNode, or InvalidInput with all invalid values."""
     node = _managed(fleet, name)
     shared = templates if templates is not None else Templates.of(fleet)
     return render(resolve(fleet, node, secrets), shared, device_facts)
@@ -73,7 +73,7 @@ def _managed(fleet: Fleet, name: str) -> Node:
             [Diagnostic("RND020", Severity.ERROR, place, "", expected="a node of the fleet", found=repr(name))]
         )
     if not node.state.is_managed:
-        message = f"{name} is {node.state.value}: it has no configuration"
+        message = f"{name} is {node.state.value} and has no configuration"
         place = fleet.where("nodes", name).position
         raise UnknownNode([Diagnostic("RND021", Severity.ERROR, place, message)])
     return node
@@ -82,11 +82,11 @@ def _managed(fleet: Fleet, name: str) -> Node:
 def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | None = None) -> Rendered:
     """The files of one node, the same bytes for the same intent, facts and templates.
 
-    Raises InvalidInput for a template that fails, or whose text is no UCI.
+    Raises InvalidInput for a template that fails, or whose output is not UCI.
     """
     facts = device_facts or NO_FACTS
     files = list(_files(intent, templates, facts))
-    # what the device brought itself is no part of what the hash names
+    # the hash does not cover board-specific sections
     config_hash = _config_hash(files if facts == NO_FACTS else list(_files(intent, templates, NO_FACTS)))
     marker = f"fleet={intent.fleet}\nnode={intent.node}\nconfig={config_hash}\n"
     files.append(RenderedFile(MARKER_PATH, 0o644, marker.encode(), marker))
@@ -121,7 +121,7 @@ def _parsed(file: TemplateFile, text: str) -> uci.Package:
         return uci.parse(text, file.path, name=name)
     except InvalidInput as error:
         place = Position(str(file.source))
-        message = f"the rendered text is no UCI: {error}"
+        message = f"template output is not UCI: {error}"
         raise InvalidInput([Diagnostic(NOT_UCI, Severity.ERROR, place, message)]) from error
 
 
@@ -129,13 +129,13 @@ def _file(path: str, text: str, mode: int, secrets: tuple[Secret, ...], package:
     known = dict.fromkeys((*secrets, *(_written_secrets(package) if package is not None else ())))
     inside = tuple(secret for secret in known if replace_secrets(text, (secret,), lambda _: MASK) != text)
     masked = replace_secrets(text, inside, lambda _: MASK)
-    # keys that log in, and keys of the mesh, are root's business alone
+    # login keys and mesh keys are readable by root only
     is_private = bool(inside) or path.startswith("etc/dropbear/")
     return RenderedFile(path, mode & 0o700 if is_private else mode, text.encode(), masked, inside, package)
 
 
 def _written_secrets(package: uci.Package) -> Iterator[Secret]:
-    """Keys and passwords that came as plain text, from `extra_uci` or an operator's template: hidden all the same."""
+    """Keys and passwords in plain text, from `extra_uci` or an operator's template, which must be masked, too."""
     for section in package.sections:
         for name in section.options:
             if uci.is_secret_option(name):
@@ -145,7 +145,7 @@ def _written_secrets(package: uci.Package) -> Iterator[Secret]:
 def _config_hash(files: list[RenderedFile]) -> str:
     """SHA-256 over every file, with each secret replaced by its fingerprint.
 
-    The hash is shown to everybody and kept in logs, so it must not let anyone try passwords against it cheaply.
+    The hash is public (logs, status), so it must not allow cheap password guessing.
     """
     digest = hashlib.sha256()
     for file in sorted(files, key=lambda file: file.path):
@@ -155,7 +155,7 @@ def _config_hash(files: list[RenderedFile]) -> str:
     return digest.hexdigest()
 
 
-# One derivation per key and process: about 50 ms each.
+# Each derivation takes about 50 ms.
 @lru_cache(maxsize=64)
 def _fingerprint(secret: Secret) -> str:
     return hashlib.scrypt(secret.reveal().encode(), salt=b"meshctl config hash", n=2**14, r=8, p=1, dklen=32).hex()

@@ -1,7 +1,7 @@
-"""The one way a value gets into a template: `{{ value | uci }}`. An expression without it is an error.
+"""Quote template values: every expression in a UCI template must be `{{ value | uci }}`.
 
-Jinja2 itself is told to accept nothing but the filter's own results in UCI templates (`require_quoted`), so a template
-cannot forget to quote.
+Jinja2 is configured to accept only the filter's results in UCI templates (`require_quoted`), so a missing filter is an
+error.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from meshctl.model import Secret
 
 
 class Quoted(str):
-    """Text that the filter has made."""
+    """The result of the `uci` filter."""
 
     __slots__ = ()
 
@@ -25,13 +25,13 @@ class UnquotedValue(ValueError):
 
 
 def quoted(value: object) -> Quoted:
-    """`value` as one UCI argument in quotes: text, numbers, addresses, booleans as 1 and 0, secrets revealed.
+    """`value` as one quoted UCI argument: text, numbers, addresses, booleans as 1 and 0, secrets in plain text.
 
-    Raises ValueError for empty text, which UCI reads as no option at all, and for a NUL; TypeError for anything else.
+    Raises ValueError for empty text, which UCI treats as a missing option, and for NUL; TypeError for other types.
     """
     match value:
         case Undefined():
-            # raises jinja2's own error, which names what is missing
+            # raises jinja2's own error with the missing name
             return Quoted(str(value))
         case bool():
             return Quoted(uci.quote("1" if value else "0"))
@@ -47,12 +47,12 @@ def quoted(value: object) -> Quoted:
 
 def _not_empty(value: str) -> str:
     if not value:
-        raise ValueError("expected a value, found empty text, which UCI reads as no option at all")
+        raise ValueError("expected a value, found empty text, which UCI treats as a missing option")
     return value
 
 
 def require_quoted(value: object) -> str:
-    """What jinja2 calls on every expression of a UCI template. Raises UnquotedValue."""
+    """Jinja2's `finalize` hook for expressions of UCI templates. Raises UnquotedValue."""
     if isinstance(value, Quoted):
         return value
     if isinstance(value, Undefined):
@@ -61,7 +61,7 @@ def require_quoted(value: object) -> str:
 
 
 def revealed(value: object) -> str:
-    """The filter `reveal`, for files that are not UCI: a secret's text. Raises TypeError for anything else."""
+    """The filter `reveal`, for files that are not UCI: a secret in plain text. Raises TypeError for other types."""
     if not isinstance(value, Secret):
         raise TypeError(f"expected a secret, found {type(value).__name__}")
     return value.reveal()

@@ -1,4 +1,4 @@
-"""What rendering gives: a node's files, with the bytes for the node and a text for people."""
+"""The result of rendering: a node's files, as bytes for the node and as masked text for display."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from meshctl import uci
 from meshctl.model import MASK, Secret
 
-# The marker that tells which node's and which configuration a device carries: lines of `key=value`.
+# The marker that identifies a device's node and configuration: lines of `key=value`.
 MARKER_PATH = "etc/meshctl/node"
 CONFIG_FOLDER = "etc/config/"
 
@@ -17,8 +17,8 @@ CONFIG_FOLDER = "etc/config/"
 class RenderedFile:
     """One file: `path` from the device's root without a leading slash, `content` with secrets, `masked` without.
 
-    `package` is the tree of a UCI file (under etc/config), None of any other; `secrets` are those in it: a file with
-    any is open to root alone.
+    `package` is the tree of a UCI file (under etc/config), None for others. `secrets` are the secrets in the file; a
+    file with secrets is readable by root only.
     """
 
     path: str
@@ -29,13 +29,13 @@ class RenderedFile:
     package: uci.Package | None = field(default=None, repr=False)
 
     def hide(self, text: str) -> str:
-        """`text`, for instance a line of a difference, with this file's secrets masked."""
+        """`text`, such as a line of a diff, with this file's secrets masked."""
         return replace_secrets(text, self.secrets, lambda _: MASK)
 
 
 def replace_secrets(text: str, secrets: tuple[Secret, ...], replacement: Callable[[Secret], str]) -> str:
-    """`text` with every secret replaced, both as it is written in UCI and as it is."""
-    # the longest first, so that no secret inside another leaves half of it behind
+    """`text` with every secret replaced, both in UCI quoting and in plain text."""
+    # longest first, in case one secret contains another
     for secret in sorted(secrets, key=lambda secret: -len(secret.reveal())):
         for form in (uci.quote(secret.reveal())[1:-1], secret.reveal()):
             text = text.replace(form, replacement(secret))
@@ -44,8 +44,8 @@ def replace_secrets(text: str, secrets: tuple[Secret, ...], replacement: Callabl
 
 @dataclass(frozen=True, slots=True)
 class Rendered:
-    """All files of one node, sorted by path, the marker among them; `packages` to install on top of a stock image,
-    `removed_packages` to take out of it. `config_hash` names this configuration (64 hex digits)."""
+    """All files of one node, sorted by path, including the marker; `packages` to install on a stock image, and
+    `removed_packages` to remove from it. `config_hash` identifies the configuration (64 hex digits)."""
 
     node: str
     release: str
@@ -65,5 +65,5 @@ class Rendered:
 
     @property
     def masked_text(self) -> str:
-        """All files for a person to read, secrets masked."""
+        """All files for display, secrets masked."""
         return "".join(f"# /{file.path} ({file.mode:04o})\n{file.masked.rstrip()}\n\n" for file in self.files)

@@ -1,11 +1,11 @@
-"""Templates of an inventory, rendered in a process of their own that is limited in memory, time and output.
+"""Render an inventory's templates in a separate process with limits on memory, time and output.
 
-A template may come with an untrusted inventory. Jinja's sandbox keeps it from files and programs; it does not keep
-`{{ "A" * 10**10 }}` from taking all memory, or three nested loops from running for hours, and neither does a check of
-single operators: text grows by `~`, `center`, `join`, `replace` and formats as well. Only the kernel bounds all of it.
-Shipped templates are our own, and are rendered without this.
+A template may come from an untrusted inventory. Jinja's sandbox prevents access to files and programs, but not that `{{
+"A" * 10**10 }}` uses all memory or that nested loops run for hours. Checking single operators is not enough, as text
+also grows through `~`, `center`, `join`, `replace` and formatting; only kernel limits cover everything. The shipped
+templates are trusted and rendered in process.
 
-`Renderer.text` sends a request to `meshctl.render.sandbox_worker`, which lives as long as the renderer; a worker
+`SandboxRenderer.text` sends a request to `meshctl.render.sandbox_worker`, which runs as long as the renderer; a worker
 that exceeds a limit is replaced.
 """
 
@@ -27,22 +27,22 @@ from typing import Any
 
 from meshctl.model import Secret
 
-# Python with jinja2 takes some 100 MiB of address space; a node's configuration is some 10 KiB.
+# Python with jinja2 needs about 100 MiB of address space; a node's configuration is about 10 KiB.
 MEMORY_BYTES = 1024 * 1024 * 1024
-# A template takes milliseconds. Waiting is longer than computing: the machine may have much else to do.
+# A template takes milliseconds of CPU time; the wall clock limit allows for a busy machine.
 CPU_S = 10
 WAIT_S = 60.0
-# OpenWrt's flash holds 16 MiB in all.
+# The flash of a typical device is 16 MiB.
 OUTPUT_BYTES = 4 * 1024 * 1024
 LENGTH_BYTES = 8
 
 
 class LimitExceeded(Exception):
-    """A template exceeded a limit; the text says which."""
+    """A template exceeded a limit; the message says which."""
 
 
 class SandboxRenderer:
-    """One worker process and the requests to it. Safe to use from several threads."""
+    """One worker process and the requests to it. Thread-safe."""
 
     def __init__(self, *, cpu_s: int = CPU_S, memory_bytes: int = MEMORY_BYTES, wait_s: float = WAIT_S) -> None:
         self._limits = (str(cpu_s), str(memory_bytes))
@@ -65,12 +65,12 @@ class SandboxRenderer:
     def _cause_of_death(self, process: subprocess.Popen[bytes]) -> str:
         status = process.wait()
         if status == -signal.SIGXCPU:
-            return f"it does not end: it takes more than {self._cpu_s} s of processor time"
+            return f"the template exceeds {self._cpu_s} s of CPU time"
         assert process.stderr is not None
         last = _last_line(process.stderr.read())
         if last.startswith("MemoryError") or status == -signal.SIGSEGV:
-            return f"it takes more than {self._memory_bytes >> 20} MiB of memory"
-        return f"the process that renders it ended with status {status}: {last}"
+            return f"the template exceeds {self._memory_bytes >> 20} MiB of memory"
+        return f"the rendering process ended with status {status}: {last}"
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
@@ -79,7 +79,7 @@ class SandboxRenderer:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                # Ctrl-C is for meshctl, which decides what is still finished
+                # Ctrl-C goes to meshctl only
                 start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
             )
@@ -94,21 +94,21 @@ class SandboxRenderer:
             process.stdin.flush()
             length = int.from_bytes(_read(process.stdout.fileno(), LENGTH_BYTES, self._wait_s), "big")
             if length > 2 * OUTPUT_BYTES:
-                raise LimitExceeded(f"it renders more than {OUTPUT_BYTES} bytes")
+                raise LimitExceeded(f"the template's output exceeds {OUTPUT_BYTES} bytes")
             answer: dict[str, Any] = json.loads(_read(process.stdout.fileno(), length, self._wait_s))
         except (EOFError, BrokenPipeError):
             raise LimitExceeded(self._cause_of_death(process)) from None
         except TimeoutError:
-            raise LimitExceeded(f"it does not end within {self._wait_s:g} s") from None
+            raise LimitExceeded(f"the template does not finish within {self._wait_s:g} s") from None
         return answer
 
 
 def _last_line(text: bytes) -> str:
-    return (text.decode("utf-8", "replace").strip().splitlines() or ["it said nothing"])[-1]
+    return (text.decode("utf-8", "replace").strip().splitlines() or ["no output"])[-1]
 
 
 def _pickled(request: object) -> bytes:
-    """For our own worker's eyes: secrets, which refuse to be serialized, go with their value."""
+    """Pickle a request for the worker, including secrets, which otherwise refuse to be serialized."""
     out = io.BytesIO()
     pickler = pickle.Pickler(out, pickle.HIGHEST_PROTOCOL)
     pickler.dispatch_table = {Secret: _secret_parts, MappingProxyType: _mapping_parts}
@@ -125,12 +125,12 @@ def _mapping_parts(mapping: Mapping[object, object]) -> tuple[Callable[..., obje
 
 
 def read_only(mapping: dict[object, object]) -> Mapping[object, object]:
-    """What pickle cannot name itself."""
+    """A named constructor of MappingProxyType for pickle."""
     return MappingProxyType(mapping)
 
 
 def _read(descriptor: int, count: int, wait_s: float) -> bytes:
-    """Exactly `count` bytes. Raises EOFError at the end, TimeoutError when none come for `wait_s`."""
+    """Read exactly `count` bytes. Raises EOFError at the end, TimeoutError after `wait_s` without data."""
     parts = []
     while count:
         ready, _, _ = select.select([descriptor], [], [], wait_s)
@@ -145,7 +145,7 @@ def _read(descriptor: int, count: int, wait_s: float) -> bytes:
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    """It holds nothing that could be lost."""
+    """Kill the worker, which has no state to lose."""
     process.kill()
     process.wait()
     for stream in (process.stdin, process.stdout, process.stderr):
@@ -153,5 +153,5 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
             try:
                 stream.close()
             except BrokenPipeError:
-                # what was left to write has no reader
+                # unsent output
                 continue

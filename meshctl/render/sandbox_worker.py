@@ -1,7 +1,7 @@
-"""The process that renders an inventory's own templates: requests on standard input, answers on standard output.
+"""Worker process that renders an inventory's templates: requests on standard input, answers on standard output.
 
-A request is pickled by `meshctl.render.sandbox`, the process that started this one. An answer is JSON: a
-process that rendered an untrusted template is trusted no further.
+Requests are pickled by `meshctl.render.sandbox` in the parent process. Answers are JSON, because a process that has
+rendered an untrusted template is not trusted.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from meshctl.render.templates import TemplateSet
 
 
 def main(cpu_s: int, memory_bytes: int) -> None:
-    """Answer until standard input ends. Memory is bounded for good, processor time per request."""
+    """Answer requests until end of input. The memory limit is permanent, the CPU limit is per request."""
     resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sets: dict[tuple[object, ...], TemplateSet] = {}
@@ -29,7 +29,7 @@ def main(cpu_s: int, memory_bytes: int) -> None:
     while head := source.read(LENGTH_BYTES):
         folders, backend, parts, boundary, file, context = pickle.loads(source.read(int.from_bytes(head, "big")))
         used = resource.getrusage(resource.RUSAGE_SELF)
-        # the kernel counts whole seconds
+        # the limit is in whole seconds
         limit_s = math.ceil(used.ru_utime + used.ru_stime) + cpu_s
         resource.setrlimit(resource.RLIMIT_CPU, (limit_s, resource.RLIM_INFINITY))
         key = (folders, backend, parts)
@@ -46,7 +46,7 @@ def _answer(templates: TemplateSet, file: Any, context: Any) -> dict[str, object
     except InvalidInput as error:
         return {"diagnostics": [{**asdict(one), "severity": one.severity.value} for one in error.diagnostics]}
     if len(text) > OUTPUT_BYTES:
-        return {"exceeded": f"it renders {len(text)} characters, more than {OUTPUT_BYTES}"}
+        return {"exceeded": f"the template's output of {len(text)} characters exceeds {OUTPUT_BYTES}"}
     return {"text": text}
 
 

@@ -1,9 +1,9 @@
-"""Where templates come from and how they run: folders searched in order, one sandbox, nothing undefined.
+"""Find and render templates: folders searched in order, one sandbox, undefined names are errors.
 
-A folder holds `common/`, rendered for every back end, and one folder per back end (`batman-adv/`, `meshmerize/`);
-below them a template stands where its file goes on the device, with `.j2` behind its name. What begins with `_` is
-included by others and is no file of its own. The inventory's `templates/` comes before what ships with meshctl, file
-by file, and the operator's parts of a back end before both.
+A folder has `common/`, for all back ends, and one folder per back end (`batman-adv/`, `meshmerize/`). Below them, a
+template has the path of its file on the device plus `.j2`. Templates that start with `_` are only included by others.
+For each file, the operator's parts of a back end take precedence over the inventory's `templates/`, and these over the
+shipped templates.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from meshctl.render.rendered import CONFIG_FOLDER
 from meshctl.render.sandbox import LimitExceeded, SandboxRenderer
 from meshctl.resources import shipped
 
-# The codes of this package, each with what it means (docs/render.md).
+# Codes of this module, described in docs/render.md.
 TEMPLATE = "RND010"
 NOT_UCI = "RND011"
 NO_TEMPLATE = "RND012"
@@ -47,7 +47,7 @@ _SUFFIX = ".j2"
 
 @dataclass(frozen=True, slots=True)
 class TemplateFile:
-    """A template that makes a file: `path` on the device, `name` for the loader, `source` on disk."""
+    """A template of a file: `path` on the device, `name` for the loader, `source` on disk."""
 
     path: str
     name: str
@@ -59,12 +59,12 @@ class TemplateFile:
 
     @property
     def is_executable(self) -> bool:
-        """Whether the template's own file may be executed: then the rendered one may, too."""
+        """Whether the template file is executable; then the rendered file is, too."""
         return bool(self.source.stat().st_mode & 0o100)
 
 
 class Templates:
-    """The templates of one fleet. Compiles each once, so share one between the nodes."""
+    """The templates of one fleet, compiled once; share the object between nodes."""
 
     def __init__(self, folders: tuple[Path, ...], boundary: Boundary | None = None) -> None:
         self._folders = folders
@@ -75,9 +75,9 @@ class Templates:
 
     @classmethod
     def of(cls, fleet: Fleet) -> Templates:
-        """The inventory's own folder `templates`, when it has one, before the shipped templates.
+        """The inventory's `templates` folder, if there is one, before the shipped templates.
 
-        Raises InvalidInput for a folder in it that no back end has the name of: its templates would count for nothing.
+        Raises InvalidInput for a folder in it that is not named after a back end: its templates would be ignored.
         """
         boundary = Boundary.of(Path(fleet.base), os.environ)
         own = Path(fleet.base) / "templates"
@@ -88,7 +88,7 @@ class Templates:
         return cls((own, shipped("templates")), boundary)
 
     def files(self, backend: Backend, parts: OperatorParts) -> tuple[TemplateFile, ...]:
-        """The templates that make files for a back end, sorted by path. Raises InvalidInput when parts are missing."""
+        """The templates of a back end's files, sorted by path. Raises InvalidInput if parts are missing."""
         return self._set(backend, parts).files
 
     def text(self, file: TemplateFile, backend: Backend, parts: OperatorParts, context: Mapping[str, object]) -> str:
@@ -117,16 +117,16 @@ class Templates:
 
 
 def _refuse_outside(path: Path, boundary: Boundary) -> None:
-    """Raises InvalidInput for a folder or file of templates that an inventory may not name."""
+    """Raises InvalidInput for a template folder or file outside the inventory's boundary."""
     if refusal := boundary.refusal(path):
         hint = HINT if refusal.startswith("outside") else ""
         raise InvalidInput(
-            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"it is {refusal}", hint=hint)]
+            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"not allowed: {refusal}", hint=hint)]
         )
 
 
 class _BoundedLoader(FileSystemLoader):
-    """A folder of templates whose links lead nowhere else, and whose files are files."""
+    """A loader of regular files inside the inventory's boundary."""
 
     def __init__(self, folder: Path, boundary: Boundary) -> None:
         super().__init__(folder)
@@ -185,12 +185,12 @@ class TemplateSet:
         except InvalidInput:
             raise
         except Exception as error:
-            # a template can raise anything; whatever it is, the person who wrote the template needs the place
+            # a template can raise any exception; report all of them with the position
             raise InvalidInput([_diagnostic(file, error)]) from error
 
 
 def _files(layers: list[tuple[str, Path]], boundary: Boundary) -> tuple[TemplateFile, ...]:
-    """One template per path on the device: the first layer that has it wins. Raises InvalidInput."""
+    """One template per path on the device, from the first layer that has it. Raises InvalidInput."""
     found: dict[str, TemplateFile] = {}
     for prefix, folder in layers:
         for source in sorted(folder.rglob(f"*{_SUFFIX}")):
@@ -222,7 +222,7 @@ def _environment(loader: BaseLoader, *, is_uci: bool = False) -> ImmutableSandbo
 
 
 def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
-    """The error at the innermost template line it passed through."""
+    """The error, at the innermost template line of its traceback."""
     place = Position(str(file.source))
     match error:
         case TemplateSyntaxError():

@@ -1,7 +1,7 @@
-"""A node's files onto the disk: all of them or none, with their modes, and no secret where others can read it.
+"""Write a node's files to disk: all or none, with their modes, and secrets unreadable by others.
 
-A folder is written beside its place and then put there in one rename, so what stands there is always one whole
-rendering and nothing else. A folder that meshctl did not write is never replaced.
+A folder is written next to its destination and renamed, so the destination always is exactly one rendering. A folder
+that meshctl did not write is never replaced.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from meshctl.render.rendered import MARKER_PATH, Rendered, RenderedFile
 
 
 def write_node(rendered: Rendered, out: Path) -> Path:
-    """Write the node's files to `out/NODE/`, exactly them, and return that folder.
+    """Write the node's files, and no others, to `out/NODE/`; returns that folder.
 
-    Raises InputError when the place cannot be written, is not ours to replace, or cannot keep a secret.
+    Raises InputError if the folder cannot be written, was not written by meshctl, or cannot keep a secret.
     """
     return write_folder(rendered.files, out / rendered.node, marker=MARKER_PATH)
 
 
 def write_folder(files: Iterable[RenderedFile], place: Path, *, marker: str) -> Path:
-    """Put the files, and nothing else, at `place`. Raises InputError as `write_node` does.
+    """Write the files, and no others, to `place`. Raises InputError as `write_node` does.
 
-    What stands there already is replaced only if it holds the file `marker`, by which meshctl knows its own.
+    An existing folder is replaced only if it contains the file `marker`, which identifies meshctl's own folders.
     """
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def write_folder(files: Iterable[RenderedFile], place: Path, *, marker: str) -> 
 
 def _refuse_foreign(place: Path, marker: str) -> None:
     if place.is_symlink() or (place.exists() and not place.is_dir()):
-        raise InputError(f"{place}: expected a folder or nothing, found something else")
+        raise InputError(f"{place}: exists and is not a folder")
     if place.is_dir() and any(place.iterdir()) and not (place / marker).is_file():
         raise InputError(
             f"{place}: expected a folder that meshctl rendered, found one without {marker}",
@@ -58,7 +58,7 @@ def _refuse_foreign(place: Path, marker: str) -> None:
     is_sticky = place.parent.stat().st_mode & stat.S_ISVTX
     if others_may_write and not is_sticky:
         raise InputError(
-            f"{place.parent}: others may write here, and could exchange a node's files",
+            f"{place.parent}: writable by others, who could replace a node's files",
             hint=f"chmod go-w {place.parent}, or choose another --out",
         )
 
@@ -66,7 +66,7 @@ def _refuse_foreign(place: Path, marker: str) -> None:
 def _write(file: RenderedFile, root: Path) -> None:
     path = root / file.path
     _make_folders(path.parent, root)
-    # closed to others from its first moment, whatever the umask
+    # unreadable by others from creation, regardless of the umask
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
     with os.fdopen(handle, "wb") as stream:
         os.fchmod(stream.fileno(), file.mode)
@@ -82,15 +82,15 @@ def _write(file: RenderedFile, root: Path) -> None:
 
 
 def _make_folders(folder: Path, root: Path) -> None:
-    """The folders below `root` with the modes they have on a device, whatever the umask: the ImageBuilder copies them.
+    """Create the folders below `root` with their modes on the device, which the ImageBuilder copies.
 
-    `root` itself is closed to others, so nothing below it is open to them here.
+    `root` itself is closed to others, and so is everything below it.
     """
     if folder == root:
         return
     _make_folders(folder.parent, root)
     folder.mkdir(exist_ok=True)
-    # as OpenWrt has it: dropbear's keys are root's alone
+    # as in OpenWrt: dropbear's keys are for root only
     folder.chmod(0o700 if folder.name == "dropbear" else 0o755)
 
 
@@ -104,6 +104,6 @@ def _swap(fresh: Path, place: Path) -> None:
         fresh.rename(place)
     finally:
         if not place.exists():
-            # the second rename failed: put back what stood there
+            # the second rename failed: restore the old folder
             (old / place.name).rename(place)
         shutil.rmtree(old, ignore_errors=True)

@@ -1,1 +1,1 @@
-"""What meshctl says: to people on a terminal, to scripts as JSON, to other tools in their formats. Output only."""
+"""Output: text for terminals, JSON for scripts, and the formats of other tools."""

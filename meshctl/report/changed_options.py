@@ -1,6 +1,6 @@
-"""Which settings a file's diff changes, in a few words: `radio0: channel 149 -> 157, txpower 27 -> 25`.
+"""Summarize a file's diff by its settings: `radio0: channel 149 -> 157, txpower 27 -> 25`.
 
-Reads the unified diff of a plan, whose secrets are masked; for a file that is not UCI, the number of changed lines.
+Parses the unified diff of a plan, in which secrets are masked; for other files than UCI, counts the changed lines.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from meshctl.plan import FileChange
 
-# more settings of a file than these are counted
+# above this, settings are only counted
 MAX_SETTINGS = 8
 
 _SECTION = re.compile(r"config\s+(\S+)(?:\s+'(.*)')?")
@@ -18,13 +18,13 @@ _OPTION = re.compile(r"(?:option|list)\s+(\S+)\s+'(.*)'")
 
 
 def changed_lines(change: FileChange) -> tuple[str, ...]:
-    """The lines that go and come, without their places and what stands around them."""
+    """The added and removed lines, without hunk headers and context."""
     body = change.diff.splitlines()
     return tuple(line for line in body[2:] if line[:1] in "+-" and line[1:].strip()) or tuple(body[:1])
 
 
 def settings(change: FileChange) -> tuple[str, ...]:
-    """One text for each setting that changes, by section; empty for a file that comes or goes as a whole."""
+    """One text per changed setting, by section; empty for an added or removed file."""
     if change.kind != "changed":
         return ()
     body = change.diff.splitlines()
@@ -41,7 +41,7 @@ def _by_section(lines: Iterable[str]) -> Iterator[str]:
     whole: dict[str, str] = {}
     for line in lines:
         if line.startswith("@@"):
-            # the section that goes on here may begin further above
+            # the section may start above the hunk
             section = ""
             continue
         sign, text = line[:1], line[1:].strip()
@@ -70,7 +70,7 @@ def _change(old: list[str], new: list[str]) -> str:
 
 
 def summary(change: FileChange) -> str:
-    """The settings as one line; empty for a file that comes or goes as a whole."""
+    """The settings as one line; empty for an added or removed file."""
     found = settings(change)
     if len(found) > MAX_SETTINGS:
         return f"{len(found)} settings"

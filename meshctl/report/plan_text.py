@@ -1,7 +1,7 @@
-"""A plan for a person: a line of totals, the stages in order with their reasons, what happens to which nodes, and in
-the end the totals once more with who is left out.
+"""A plan as text: totals, the stages in order with their reasons, the changes per node, and the totals again with the
+nodes left out.
 
-`plan_lines` gives plain text lines with a style name each; the command line prints them, coloured on a terminal.
+`plan_lines` yields plain text lines with a style name; the command line prints them, in color on a terminal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
 from meshctl.report.changed_options import changed_lines, summary
 from meshctl.report.terminal_escapes import clean
 
-# narrower than this, words are no longer kept whole
+# below this width, words are broken
 _MIN_WIDTH = 20
 
 
@@ -29,10 +29,10 @@ class Line(NamedTuple):
 def plan_lines(
     plan: Plan, *, with_diffs: bool = True, width: int | None = None, order: Iterable[str] = ()
 ) -> Iterator[Line]:
-    """The whole plan, safe for a terminal. Nodes to which the same happens are one block.
+    """The whole plan, safe for a terminal. Nodes with the same changes share one block.
 
-    `with_diffs` False leaves out the files' contents, and says which settings change all the same. Lines are broken
-    at `width`, but for those of diffs. `order` is the inventory's order of nodes.
+    Without `with_diffs`, changed settings are listed but diffs are not. Lines other than diffs are wrapped at `width`.
+    `order` is the inventory's order of nodes.
     """
     for line in _plan_lines(plan, with_diffs=with_diffs, order=order):
         text = clean(line.text)
@@ -69,7 +69,7 @@ def _plan_lines(plan: Plan, *, with_diffs: bool, order: Iterable[str]) -> Iterat
 
 _WORDS = {
     Verdict.CHANGE: "to change",
-    Verdict.SAME: "as wanted",
+    Verdict.SAME: "up to date",
     Verdict.AWAY: "away",
     Verdict.REFUSED: "refused",
 }
@@ -81,13 +81,13 @@ def _totals(plan: Plan) -> str:
 
 
 def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
-    """The totals, and who is left out and why: the first lines have left the screen."""
+    """The totals and the nodes left out, repeated since the first lines have scrolled off the screen."""
     yield Line("")
     yield Line(_totals(plan), "bold")
     for node in nodes:
         if node.verdict in (Verdict.AWAY, Verdict.REFUSED):
             style = "yellow" if node.verdict is Verdict.AWAY else "red"
-            # a failed connection names its node itself
+            # the error of a failed connection starts with the node
             who = "" if node.reason.startswith(node.node) else f"{node.node}, "
             yield Line(f"  {node.verdict.value}: {who}{node.reason}", style)
 
@@ -108,7 +108,7 @@ def _stages(plan: Plan) -> Iterator[Line]:
 
 
 def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
-    """The nodes in their order, each with the later ones to which the same happens."""
+    """Nodes with the same changes grouped, in the order of their first node."""
     groups: dict[object, list[NodePlan]] = {}
     for node in nodes:
         groups.setdefault(_effect_key(node, with_diffs=with_diffs), []).append(node)
@@ -171,7 +171,7 @@ def _diff_line(text: str) -> Line:
 
 
 def question(plan: Plan) -> str:
-    """What a person is asked before the plan is applied."""
+    """The confirmation prompt for the plan."""
     todo = len(plan.of(Verdict.CHANGE))
     switched = sum(len(stage.nodes) for stage in plan.stages if stage.kind is StageKind.SWITCH)
     flashed = sum(1 for node in plan.nodes.values() if node.firmware is not None)

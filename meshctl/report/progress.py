@@ -1,7 +1,6 @@
-"""A run while it goes on: one live line per node in work on a terminal, plain lines elsewhere, JSON lines for scripts.
+"""Progress of a run: live lines per active node on a terminal, plain lines elsewhere, JSON lines for scripts.
 
-Each class is an observer of `meshctl.fleet` events and guards itself with a lock, since events come from threads;
-`Aside` lets one of them write from a thread of its own.
+Each class observes `meshctl.fleet` events and is thread-safe; `ThreadedProgress` writes from its own thread.
 """
 
 from __future__ import annotations
@@ -32,30 +31,30 @@ _STYLES = {
     Result.REFUSED: "yellow",
     Result.UNCERTAIN: "bold red",
 }
-# Often enough to look alive, seldom enough to leave the processor to the work.
+# Smooth enough, at little CPU time.
 REFRESH_PER_SECOND = 4
-# the totals, the state of stopping (which may take two lines), and the cursor's own
+# the totals, the stop message (up to two lines), and the cursor line
 _LINES_BELOW = 5
 _MAX_NAMES = 4
 
 
 class Progress(AbstractContextManager["Progress"], Protocol):
-    """Shows events between entering and leaving."""
+    """Shows events within its context."""
 
     def __call__(self, event: Event) -> None: ...
 
     def stopping(self, text: str) -> None:
-        """A stop, or leaving at once, was requested; `text` explains it. May be called from a signal handler."""
+        """Show that a stop was requested; `text` explains it. May be called from a signal handler."""
 
 
 def outcome_text(outcome: Outcome) -> str:
-    """`b03: rolled back: no neighbour came back (12.3 s)`."""
+    """`b03: rolled back: no neighbor came back (12.3 s)`."""
     took = f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""
     return f"{outcome}{took}"
 
 
 def _write_error(text: str) -> None:
-    # the terminal may be closed, and the work still has to be finished
+    # the terminal may be closed, but the work must be finished
     with suppress(OSError):
         sys.stderr.write(f"{clean(text)}\n")
         sys.stderr.flush()
@@ -85,7 +84,7 @@ class PlainProgress(Progress):
 
 
 def _line(event: Event) -> str:
-    """Clean; later lines of a text are indented, so that none looks like another node's."""
+    """The sanitized line; further lines are indented so that none looks like another node's."""
     return clean(_raw_line(event)).replace("\n", "\n  ")
 
 
@@ -115,15 +114,15 @@ class JsonProgress(Progress):
         self._lock = threading.Lock()
 
     def __call__(self, event: Event) -> None:
-        told: dict[str, object] = {"event": event.kind.value, "node": event.node, "at_s": round(event.at_s, 3)}
+        line: dict[str, object] = {"event": event.kind.value, "node": event.node, "at_s": round(event.at_s, 3)}
         if event.text:
-            told["text"] = event.text
+            line["text"] = event.text
         if event.fraction is not None:
-            told["fraction"] = round(event.fraction, 3)
+            line["fraction"] = round(event.fraction, 3)
         if event.outcome is not None:
-            told["outcome"] = outcome_object(event.outcome)
+            line["outcome"] = outcome_object(event.outcome)
         with self._lock:
-            self._out.write(json_safe(json.dumps(told, ensure_ascii=False)) + "\n")
+            self._out.write(json_safe(json.dumps(line, ensure_ascii=False)) + "\n")
             self._out.flush()
 
     def __exit__(
@@ -133,7 +132,7 @@ class JsonProgress(Progress):
 
 
 def outcome_object(outcome: Outcome) -> dict[str, object]:
-    """An outcome for JSON."""
+    """An outcome as JSON."""
     return {
         "node": outcome.node,
         "result": outcome.result.value,
@@ -145,7 +144,7 @@ def outcome_object(outcome: Outcome) -> dict[str, object]:
 
 
 class LiveProgress(Progress):
-    """A line per node in work that changes in place, with outcomes scrolling above and totals below."""
+    """One live line per active node, with outcomes scrolling above and totals below."""
 
     def __init__(self, console: Console, total: int) -> None:
         self._total = total
@@ -185,7 +184,7 @@ class LiveProgress(Progress):
 
     def stopping(self, text: str) -> None:
         with self._lock:
-            # stays on the screen, also when the live lines are gone
+            # stays on the screen after the live lines
             self._live.console.print(Text(clean(text), "bold yellow"))
             self._stopping = text.partition(":")[0]
             self._live.update(self._render(), refresh=True)
@@ -196,25 +195,27 @@ class LiveProgress(Progress):
             Text(f"{name:<{width}}  {one_line(text)}" + (f" {fraction:.0%}" if fraction is not None else ""))
             for name, (text, fraction) in self._active.items()
         ]
-        # what does not fit is cut off at the bottom, where the totals and the state of stopping stand
+        # overflow would cut off the bottom lines: the totals and the stop message
         room = max(1, self._live.console.height - _LINES_BELOW)
         if len(lines) > room:
-            lines = [*lines[: room - 1], Text(f"... and {len(lines) - room + 1} more in work")]
+            lines = [*lines[: room - 1], Text(f"... and {len(lines) - room + 1} more in progress")]
         ended = sum(self._counts.values())
         counts = ", ".join(f"{self._counts[result]} {result.value}" for result in Result if self._counts[result])
         totals = Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold")
         if not self._stopping:
             return Group(*lines, totals)
         names = ", ".join(list(self._active)[:_MAX_NAMES]) + (" ..." if len(self._active) > _MAX_NAMES else "")
-        doing = f"finishing {names}" if names else "nothing is in work any more"
-        return Group(*lines, totals, Text(f"{self._stopping.upper()}: {doing}; no other node is begun", "bold yellow"))
+        doing = f"finishing {names}" if names else "no node in progress"
+        return Group(
+            *lines, totals, Text(f"{self._stopping.upper()}: {doing}; no other node will be started", "bold yellow")
+        )
 
 
 class ThreadedProgress(Progress):
-    """Shows events from a thread of its own, so that no node's work waits for a screen.
+    """Shows events from its own thread, so that no node waits for the terminal.
 
-    A reader that stands still (a pager, Ctrl-S) holds up nothing but the lines; one that is gone (a closed terminal,
-    `| head`) only ends them. An armed change would run out meanwhile, or its worker die of the failed write.
+    A blocked reader (a pager, Ctrl-S) blocks only the output, and a closed one (`| head`) only ends it. Otherwise an
+    armed change could time out, or its worker fail on the write.
     """
 
     def __init__(self, shown: Progress) -> None:
@@ -250,5 +251,5 @@ class ThreadedProgress(Progress):
                     self._shown(event)
 
 
-# EPIPE and EIO; rich makes SystemExit of the former
+# EPIPE and EIO; rich turns the former into SystemExit
 _READER_GONE = (OSError, SystemExit)

@@ -1,4 +1,4 @@
-"""Fleet -> Intent per node: what each node shall be, worked out completely, before any template sees it."""
+"""Fleet -> Intent of each node: its complete desired configuration, as input for templates."""
 
 from meshctl.resolve.airtime import originator_airtime
 from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent

@@ -1,4 +1,4 @@
-"""What one node shall be, complete and frozen: everything that templates need, and nothing they must work out."""
+"""The desired configuration of one node, complete and frozen: everything that templates need."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from meshctl.model import (
 
 @dataclass(frozen=True, slots=True)
 class MeshInterface:
-    """A radio's interface in a mesh. `name` is section, device and ifname at once; `master` the batman-adv interface
-    it belongs to, empty with another back end; `key` is set exactly when the mesh is encrypted."""
+    """A radio's interface in a mesh. `name` is its section, device and ifname; `master` is its batman-adv interface,
+    empty with another back end; `key` is set exactly if the mesh is encrypted."""
 
     name: str
     mesh: str
@@ -43,7 +43,7 @@ class MeshInterface:
 
 @dataclass(frozen=True, slots=True)
 class RadioIntent:
-    """A radio; `interface` None means switched off, `channel` is None then."""
+    """A radio; `interface` and `channel` are None if it is off."""
 
     name: str
     path: str
@@ -58,13 +58,13 @@ class RadioIntent:
 
     @property
     def hwmode(self) -> str:
-        """The name that 19.07 has for the band."""
+        """The band's name in 19.07."""
         return "11g" if self.band is Band.G2 else "11a"
 
 
 @dataclass(frozen=True, slots=True)
 class BatmanInterface:
-    """A batman-adv interface (`bat0`) with its options, and the interval that the reconnect target asks for."""
+    """A batman-adv interface (`bat0`) with its options, and the originator interval for the reconnect target."""
 
     name: str
     mesh: str
@@ -74,8 +74,8 @@ class BatmanInterface:
 
 @dataclass(frozen=True, slots=True)
 class Lan:
-    """The bridge that joins the node's wired ports with its mesh; it carries the management address. `switch_vlans` are
-    the VLANs of `switch0` and their ports, empty where no swconfig drives it or where only the device knows them."""
+    """The bridge of the node's wired ports and its mesh, with the management address. `switch_vlans` are the VLANs of
+    `switch0` and their ports, empty without swconfig or if only the device has them."""
 
     bridge: str
     ports: tuple[str, ...]
@@ -87,7 +87,7 @@ class Lan:
 
 @dataclass(frozen=True, slots=True)
 class Login:
-    """Who may log in over SSH, and how."""
+    """SSH login to the node."""
 
     port: int
     is_password_allowed: bool
@@ -96,8 +96,8 @@ class Login:
 
 @dataclass(frozen=True, slots=True)
 class Intent:
-    """One node, written at `position`. `extra_uci` holds options by their full names (`wireless.radio0.rts`), set
-    on top of what the templates give; `extra_positions` tells where each was written."""
+    """One node, defined at `position`. `extra_uci` are options by their full names (`wireless.radio0.rts`), applied
+    after the templates; `extra_positions` are their positions."""
 
     fleet: str
     node: str
@@ -126,5 +126,5 @@ class Intent:
 
     @property
     def secrets(self) -> tuple[Secret, ...]:
-        """Every secret that a file of this node may hold."""
+        """Every secret that a file of this node may contain."""
         return tuple(dict.fromkeys(interface.key for interface in self.interfaces if interface.key is not None))

@@ -1,7 +1,7 @@
-"""From a wanted reconnect time to batman-adv's intervals.
+"""Target reconnect time -> batman-adv's intervals.
 
-BATMAN_IV notices a dead path by originator messages that stay away, so the time to heal follows from their interval.
-The figures were measured on the Linux kernel's own batman-adv: a diamond of four nodes, one of the two paths cut.
+BATMAN_IV detects a dead path by missing originator messages, so the time to heal depends on their interval. The values
+were measured with the Linux kernel's batman-adv: a diamond of four nodes, with one of the two paths cut.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from itertools import pairwise
 
 from meshctl.model import Mesh
 
-# Originator interval in ms -> the longest time to heal that was measured, in s.
+# Originator interval in ms -> the longest measured time to heal, in s.
 MEASURED_HEAL_S: dict[int, float] = {1000: 5.0, 500: 2.9, 250: 1.35, 100: 0.6}
 
-# batman-adv's default for the ELP interval, which BATMAN_V measures links with (bat_v_elp.c).
+# batman-adv's default ELP interval, used by BATMAN_V (bat_v_elp.c).
 DEFAULT_ELP_INTERVAL_MS = 500
 
 
@@ -27,7 +27,7 @@ class Intervals:
 
 
 class UnreachableTarget(ValueError):
-    """A reconnect time shorter than any that was measured; `fastest_s` is the shortest."""
+    """A reconnect time shorter than any measured one; `fastest_s` is the shortest."""
 
     def __init__(self, wanted_s: float, fastest_s: float) -> None:
         super().__init__(f"expected at least {fastest_s:g} s, found {wanted_s:g} s")
@@ -35,7 +35,7 @@ class UnreachableTarget(ValueError):
 
 
 def batman_intervals(mesh: Mesh) -> Intervals:
-    """The intervals written in the inventory, or else the longest that heals within `mesh.reconnect_s`.
+    """The intervals set in the inventory, or else the longest that heals within `mesh.reconnect_s`.
 
     The longest, because every originator message costs airtime (`originator_airtime`). Raises UnreachableTarget.
     """
@@ -43,13 +43,13 @@ def batman_intervals(mesh: Mesh) -> Intervals:
     orig_ms = written if written is not None else originator_interval_ms(mesh.reconnect_s)
     elp_ms = mesh.batman.elp_interval_ms
     if elp_ms is None:
-        # a link must be measured at least twice per originator interval, or routes follow stale links
+        # links must be probed at least twice per originator interval, or routes use stale links
         elp_ms = min(DEFAULT_ELP_INTERVAL_MS, orig_ms // 2)
     return Intervals(orig_ms, elp_ms)
 
 
 def originator_interval_ms(reconnect_s: float) -> int:
-    """The longest measured interval that heals within `reconnect_s`. Raises UnreachableTarget when none does."""
+    """The longest measured interval that heals within `reconnect_s`. Raises UnreachableTarget if there is none."""
     fitting = [interval for interval, heal_s in MEASURED_HEAL_S.items() if heal_s <= reconnect_s]
     if not fitting:
         raise UnreachableTarget(reconnect_s, min(MEASURED_HEAL_S.values()))
@@ -57,7 +57,7 @@ def originator_interval_ms(reconnect_s: float) -> int:
 
 
 def heal_s(orig_interval_ms: int) -> float:
-    """The longest time to heal to expect: as measured, interpolated between the points, in proportion beyond them."""
+    """The expected maximum time to heal: interpolated between the measurements, proportional beyond them."""
     points = sorted(MEASURED_HEAL_S.items())
     first_ms, first_s = points[0]
     last_ms, last_s = points[-1]

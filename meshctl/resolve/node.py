@@ -1,9 +1,9 @@
-"""Fleet -> one node's Intent: meshes grouped under routing interfaces, the bridge put together, intervals chosen.
+"""Fleet -> one node's Intent: group meshes by routing interface, build the bridge, select intervals.
 
-A radio that joins a mesh gets the interface `mesh0`, `mesh1`, ... in the radios' order. Meshes of one network and
-routing algorithm share one batman-adv interface (`bat0`), so that a node with two radios, or one in each band, routes
-between them; any other mesh gets an interface of its own, which relays but is not bridged. The bridge joins the wired
-ports with the routing interface of the mesh whose network holds the node's address.
+A radio in a mesh gets the interface `mesh0`, `mesh1`, ... in the radios' order. Meshes with the same network and
+routing algorithm share one batman-adv interface (`bat0`), so that a node with several radios routes between them; any
+other mesh gets its own interface, which relays but is not bridged. The bridge connects the wired ports to the routing
+interface of the mesh whose network contains the node's address.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SSH_PORT = 22
 
 
 def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) -> Intent:
-    """Everything the templates need for `node`.
+    """The desired configuration of `node`.
 
-    Raises InvalidInput with every value that the node's files cannot hold, each at its place (docs/render.md).
+    Raises InvalidInput with all values that the node's files cannot contain (docs/render.md).
     """
     checks = ValueChecks(fleet)
     meshes = tuple(fleet.meshes[name] for name in node.meshes)
@@ -70,7 +70,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
 
 
 def _primary(meshes: tuple[Mesh, ...], node: Node) -> Mesh | None:
-    """The mesh that the node's address belongs to, or else its first."""
+    """The mesh of the node's address, or else its first mesh."""
     holding = (mesh for mesh in meshes if node.address.ip in mesh.network)
     return next(holding, meshes[0] if meshes else None)
 
@@ -92,7 +92,7 @@ def _keys(
 
 
 def _masters(meshes: tuple[Mesh, ...]) -> dict[str, str]:
-    """Mesh -> the batman-adv interface above it."""
+    """Mesh -> its batman-adv interface."""
     names: dict[tuple[IPv4Network, str], str] = {}
     for mesh in meshes:
         if mesh.backend is Backend.BATMAN:
@@ -163,7 +163,7 @@ def _radio(country: str, radio: Radio, mesh: Mesh | None, interface: MeshInterfa
 def _batman(
     meshes: tuple[Mesh, ...], masters: dict[str, str], intervals: dict[str, Intervals]
 ) -> tuple[BatmanInterface, ...]:
-    """One interface per group; where meshes share one, the first mesh's options hold and the shortest interval."""
+    """One interface per group, with the options of its first mesh and the shortest interval."""
     interfaces: dict[str, BatmanInterface] = {}
     for mesh in meshes:
         if mesh.name not in masters:
@@ -194,7 +194,7 @@ def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tupl
 
 
 def _ssh_port(node: Node) -> int:
-    """Where dropbear listens: the port we log in at, unless that is the port of a host in front of the node."""
+    """Dropbear's port: the login port, unless that is the port of a host in front of the node."""
     return SSH_PORT if node.ssh.host else node.ssh.port
 
 

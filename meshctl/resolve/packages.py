@@ -1,4 +1,4 @@
-"""Which OpenWrt packages a node needs for what the inventory asks of it, and which stock ones they replace."""
+"""The OpenWrt packages that a node needs, and the stock packages that they replace."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, Node, Rele
 
 @dataclass(frozen=True, slots=True)
 class PackageNeed:
-    """One of `any_of` must be installed (the first is taken when the inventory names none), because of `reason`."""
+    """One of `any_of` must be installed for `reason`; the first is the default."""
 
     any_of: tuple[str, ...]
     reason: str
@@ -24,7 +24,7 @@ class PackagePlan:
 
 
 def package_plan(fleet: Fleet, node: Node) -> PackagePlan:
-    """What the inventory names for the node and its hardware, completed by what its meshes need."""
+    """The packages listed for the node and its hardware, plus those that its meshes need."""
     named = {package for package in (*node.hardware.packages, *node.packages) if not package.startswith("-")}
     dropped = {package[1:] for package in (*node.hardware.packages, *node.packages) if package.startswith("-")}
     for need in package_needs(fleet, node):
@@ -36,7 +36,7 @@ def package_plan(fleet: Fleet, node: Node) -> PackagePlan:
 
 
 def package_needs(fleet: Fleet, node: Node) -> tuple[PackageNeed, ...]:
-    """Every need of the node's meshes, each once, in the meshes' order."""
+    """The needs of the node's meshes, without duplicates, in the meshes' order."""
     needs: dict[PackageNeed, None] = {}
     for name in node.meshes:
         mesh = fleet.meshes[name]
@@ -53,7 +53,7 @@ def _backend_needs(mesh: Mesh) -> tuple[PackageNeed, ...]:
         case Backend.BATMAN:
             return (
                 PackageNeed(("kmod-batman-adv",), f"mesh {mesh.name} routes with batman-adv"),
-                # batctl-tiny prints no JSON and knows no loop avoidance tables
+                # batctl-tiny has no JSON output and no loop avoidance tables
                 PackageNeed(("batctl-default", "batctl-full"), f"meshctl reads the routes of mesh {mesh.name} with it"),
                 *tools,
             )
@@ -63,7 +63,7 @@ def _backend_needs(mesh: Mesh) -> tuple[PackageNeed, ...]:
 
 
 # wpa_supplicant builds with CONFIG_IBSS_RSN; `wpad-basic*` and `wpad-mini` do not have it. SAE and 802.11s are in all
-# but the one without a TLS library, `wpad` (hostapd's Makefile and wpa_supplicant-full.config, 19.07 to 25.12).
+# builds except `wpad`, which has no TLS library (hostapd's Makefile and wpa_supplicant-full.config, 19.07 to 25.12).
 _WITHOUT_MESH = "wpad"
 FULL_SUPPLICANTS = (
     "wpad-mesh-mbedtls",
@@ -77,22 +77,22 @@ FULL_SUPPLICANTS = (
 
 
 def supplicant_need(mesh: Mesh, release: Release) -> PackageNeed | None:
-    """The supplicant that an encrypted mesh needs, in the build that the release ships with its own TLS library."""
+    """The supplicant that an encrypted mesh needs, by default the build with the release's TLS library."""
     if mesh.encryption is Encryption.NONE:
         return None
     library = "mbedtls" if release >= Release.V23_05 else "wolfssl"
     preferred = f"wpad-mesh-{library}"
     offered = tuple(name for name in FULL_SUPPLICANTS if release >= Release.V23_05 or not name.endswith("mbedtls"))
     what = "an encrypted ad-hoc cell" if mesh.mode is MeshMode.ADHOC else "an encrypted 802.11s mesh"
-    # where it cannot join the mesh, 23.05 and later join it in the open, without a word (wifi-scripts, mac80211.sh)
+    # without support for it, 23.05 and later silently join the mesh unencrypted (wifi-scripts, mac80211.sh)
     lacking = () if mesh.mode is MeshMode.ADHOC else (_WITHOUT_MESH,)
     rest = tuple(name for name in offered if name != preferred and name not in lacking)
     return PackageNeed((preferred, *rest), f"mesh {mesh.name} is {what}, which wpad-basic cannot join")
 
 
 def wireless_scripts(release: Release) -> str | None:
-    """The package with /usr/share/hostap/wdev.uc, without which netifd's mac80211.sh brings up no mesh interface,
-    encrypted or not. kmod-mac80211 depends on it, so only an image put together by hand lacks it. None: no such file.
+    """The package with /usr/share/hostap/wdev.uc, which netifd's mac80211.sh needs for every mesh interface.
+    kmod-mac80211 depends on it, so only manually assembled images lack it. None: the release has no such file.
 
     Source: package/network/services/hostapd/Makefile (23.05), package/network/config/wifi-scripts (main).
     """
@@ -102,7 +102,7 @@ def wireless_scripts(release: Release) -> str | None:
 
 
 def stock_supplicant(release: Release) -> str:
-    """The supplicant in the release's stock images, which conflicts with a full one."""
+    """The supplicant in the release's stock images, which conflicts with a full build."""
     if release >= Release.V23_05:
         return "wpad-basic-mbedtls"
     return "wpad-basic-wolfssl" if release >= Release.V21_02 else "wpad-basic"

@@ -1,7 +1,7 @@
-"""Values that a node's files cannot hold, or that would lock the operator out: found here, with their place.
+"""Refuse values that a node's files cannot contain, or that would lock the operator out.
 
-Lint judges whether a configuration is wise; this judges only whether it can be written down and read back by the node
-as it was meant. UCI itself holds any text, but the programs behind it (netifd's shell, wpa_supplicant's file) do not.
+Lint checks whether a configuration is sensible; this module only checks whether the node would read it as intended. UCI
+can hold any text, but its consumers (netifd's shell scripts, wpa_supplicant's file) cannot.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, MissingOrigin, Release, Secret
 
-# The codes of this package, each with what it means (docs/render.md).
+# Codes of this module, described in docs/render.md.
 VALUE = "RND001"
 COMBINATION = "RND002"
 LOCKED_OUT = "RND003"
@@ -20,7 +20,7 @@ SECRET = "RND005"
 
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _HOSTNAME = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(?<!-)")
-# the package's name is the name of a file; a section may be addressed as `@TYPE[INDEX]`
+# a package is named like its file; a section may be `@TYPE[INDEX]`
 _UCI_KEY = re.compile(r"[A-Za-z0-9_-]+\.([A-Za-z0-9_]+|@[A-Za-z0-9_-]+\[\d+\])(\.[A-Za-z0-9_]+)?")
 _WORD = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+-]*")
 _SECTION = re.compile(r"[A-Za-z0-9_]+")
@@ -34,19 +34,19 @@ _RAW_PSK = re.compile(r"[0-9A-Fa-f]{64}")
 _PASSPHRASE = re.compile(r"[ -~]{8,63}")
 # 802.11: an SSID has at most 32 bytes
 _MAX_SSID_BYTES = 32
-# what hostapd and wpa_supplicant take in one line of their configuration
+# limit of hostapd and wpa_supplicant for one line of their configuration
 _MAX_SAE_CHARACTERS = 128
 
 
 class ValueChecks:
-    """Collects what is wrong with one fleet's values; `found` holds every diagnostic."""
+    """Collects diagnostics of invalid values in `found`."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self.found: list[Diagnostic] = []
 
     def position(self, *path: str) -> Position:
-        """Where a value was written, or else the inventory's first file."""
+        """The position of a value, or else the inventory's first file."""
         try:
             return self._fleet.where(*path).position
         except MissingOrigin:
@@ -55,15 +55,15 @@ class ValueChecks:
     def add(
         self, code: str, path: tuple[str, ...], expected: str, found: str, *, message: str = "", hint: str = ""
     ) -> None:
-        """One refusal at the place of `path`."""
+        """Report a value at `path`."""
         self.found.append(
             Diagnostic(code, Severity.ERROR, self.position(*path), message, ".".join(path), expected, found, hint)
         )
 
     def text(self, path: tuple[str, ...], value: str, *, is_required: bool = False) -> None:
-        """Any text of one line."""
+        """Text on one line."""
         if _CONTROL.search(value):
-            self.add(VALUE, path, "text without line breaks and control characters", repr(value))
+            self.add(VALUE, path, "text without line breaks or control characters", repr(value))
         if is_required and not value:
             self.add(VALUE, path, "a value", "none")
 
@@ -73,7 +73,7 @@ class ValueChecks:
             self.add(VALUE, path, "PACKAGE.SECTION.OPTION or PACKAGE.SECTION", repr(value))
 
     def word(self, path: tuple[str, ...], value: str) -> None:
-        """A word from a fixed list that the node's scripts put into commands unquoted."""
+        """A word that the node's scripts use unquoted in commands."""
         if not _WORD.fullmatch(value):
             self.add(VALUE, path, "a word of letters, digits, _, + and -", repr(value))
 
@@ -83,9 +83,9 @@ class ValueChecks:
             self.add(VALUE, path, "a UCI section's name of letters, digits and _", repr(value))
 
     def hostname(self, path: tuple[str, ...], value: str) -> None:
-        """A host name by RFC 1123, without dots."""
+        """A hostname by RFC 1123, without dots."""
         if not _HOSTNAME.fullmatch(value):
-            self.add(VALUE, path, "a host name of letters, digits and inner hyphens, at most 63", repr(value))
+            self.add(VALUE, path, "a hostname of at most 63 letters, digits and inner hyphens", repr(value))
 
     def device(self, path: tuple[str, ...], value: str) -> None:
         """The name of a network device."""
@@ -93,13 +93,13 @@ class ValueChecks:
             self.add(VALUE, path, "a network device's name of at most 15 characters", repr(value))
 
     def tx_power(self, path: tuple[str, ...], value: int, release: Release) -> None:
-        """A drive level that the radio's scripts set, and do not take for none at all."""
+        """A drive level that the radio's scripts do not treat as unset."""
         if release >= Release.V25_12 and value == 0:
-            message = f"OpenWrt {release} takes 0 for no limit, and sends as strongly as it may"
-            self.add(VALUE, path, "another number", "0", message=message)
+            message = f"OpenWrt {release} treats 0 as unset and transmits at full power"
+            self.add(VALUE, path, "at least 1", "0", message=message)
 
     def mesh(self, mesh: Mesh, release: Release) -> None:
-        """A mesh's name on air, its cell, and whether this release can join it."""
+        """A mesh's SSID and BSSID, and whether this release can join it."""
         path = ("meshes", mesh.name)
         self._ssid((*path, "ssid"), mesh.ssid, release)
         self.word((*path, "htmode"), mesh.htmode)
@@ -115,7 +115,7 @@ class ValueChecks:
                 self.add(COMBINATION, (*path, "encryption"), "none or sae in 802.11s mode", "psk2+ccmp")
             case (MeshMode.ADHOC, Encryption.PSK2) if release >= Release.V25_12:
                 hint = "use mode: mesh with encryption: sae, or an earlier release"
-                message = f"OpenWrt {release} joins an encrypted ad-hoc cell open, without a word"
+                message = f"OpenWrt {release} silently joins an encrypted ad-hoc cell without encryption"
                 self.add(COMBINATION, (*path, "encryption"), "none", "psk2+ccmp", message=message, hint=hint)
             case _:
                 pass
@@ -128,10 +128,10 @@ class ValueChecks:
             self.add(VALUE, path, f"1 to {_MAX_SSID_BYTES} bytes", f"{size} bytes in {ssid!r}")
         self.text(path, ssid)
         if release >= Release.V25_12 and "'" in ssid:
-            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", repr(ssid))
+            self.add(VALUE, path, f"no single quote (OpenWrt {release} passes it to a shell)", repr(ssid))
 
     def key(self, mesh: Mesh, key: Secret, release: Release) -> None:
-        """A mesh's key by the rules of its encryption; a refusal never shows it."""
+        """A mesh's key by the rules of its encryption; diagnostics never show it."""
         path = ("meshes", mesh.name, "key")
         value = key.reveal()
         if mesh.encryption is Encryption.PSK2:
@@ -140,10 +140,10 @@ class ValueChecks:
         elif not 1 <= len(value) <= _MAX_SAE_CHARACTERS or _CONTROL.search(value):
             self.add(VALUE, path, f"1 to {_MAX_SAE_CHARACTERS} characters without line breaks", _describe_secret(value))
         if release >= Release.V25_12 and "'" in value:
-            self.add(VALUE, path, f"no single quote (OpenWrt {release} hands it to a shell)", _describe_secret(value))
+            self.add(VALUE, path, f"no single quote (OpenWrt {release} passes it to a shell)", _describe_secret(value))
 
     def login(self, keys: tuple[str, ...], *, is_password_allowed: bool, release: Release) -> None:
-        """Public keys of one line each, at least one of which this release's dropbear knows."""
+        """Public keys on one line each, at least one of which this release's dropbear supports."""
         usable = 0
         for index, key in enumerate(keys):
             found = _PUBLIC_KEY.fullmatch(key)
@@ -153,14 +153,16 @@ class ValueChecks:
                 usable += 1
         if usable == 0 and not is_password_allowed:
             kinds = (
-                "an OpenSSH public key" if release.has_ed25519 else f"an RSA key, the only kind OpenWrt {release} knows"
+                "an OpenSSH public key"
+                if release.has_ed25519
+                else f"an RSA key, the only type that OpenWrt {release} supports"
             )
-            message = "nobody could log in to the node any more"
+            message = "no operator could log in to the node"
             path = ("operators", "ssh_keys")
             self.add(LOCKED_OUT, path, kinds, "none", message=message, hint="add a key to operators.ssh_keys")
 
 
 def _describe_secret(secret: str) -> str:
-    """A secret's shape, for a message: nothing of its letters."""
-    plain = "" if secret.isascii() and secret.isprintable() else ", some of them not printable ASCII"
+    """A description of a secret for messages: length and character set only."""
+    plain = "" if secret.isascii() and secret.isprintable() else ", some not printable ASCII"
     return f"{len(secret)} characters{plain}"

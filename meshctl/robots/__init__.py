@@ -1,6 +1,6 @@
-"""udp_mesh on the robots' computers: put there, proved, watched, taken away, over SSH and systemd.
+"""Deploy, inspect and remove udp_mesh on the robots' computers, over SSH and systemd.
 
-inventory + wheels -> `bundle` (what one computer gets, named by its content) -> `probe` (what the computer is and has)
--> `objections` (why it cannot take it) -> upload -> install beside what runs -> switch by one rename -> health -> kept,
-or back to the release before. Everything that runs on a robot is a script in `scripts/`.
+`probe` (facts of the computer) -> `unmet_preconditions` -> inventory + wheels -> `bundle` (content-addressed release)
+-> upload -> install beside the running release -> switch by one rename -> health check -> kept, or rolled back. All
+code that runs on a robot is in `scripts/`.
 """

@@ -1,7 +1,7 @@
-"""What one robot's computer gets: wheels, the release's own files, a manifest of hashes, and a name made of them.
+"""The release for one robot: wheels, configuration files, a manifest of hashes, and an ID derived from them. Pure.
 
-Pure. Two bundles with the same name hold the same bytes, which is what makes a second deploy do nothing. The wheels
-travel by themselves and are shared between releases; a change of topics or keys is a new release of a few kilobytes.
+Bundles with the same ID have the same content, so a repeated deploy does nothing. Wheels are uploaded separately and
+shared between releases; a change of topics or keys is a new release of a few kilobytes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from meshctl.robots.wheels import Wheel
 UNIT_NAME = "udp-mesh.service"
 BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"
 _CURRENT = "/opt/udp-mesh/current"
-# Half of a SHA-256: nobody makes two bundles meet by accident, and people read it.
+# 64 bits of the SHA-256: short enough to read, long enough against accidental collisions.
 _ID_DIGITS = 16
 _SECRET_MODE = 0o600
 
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """A file of a release by its path in it; what is secret is not shown."""
+    """A file of a release, by its path in it."""
 
     path: str
     content: bytes = field(repr=False)
@@ -46,7 +46,7 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """A release for one robot. `tree` names the set of wheels, for one Python, that it runs from."""
+    """A release for one robot. `tree` is the ID of the unpacked wheels, for one Python, that it runs from."""
 
     robot: str
     tree: str
@@ -55,12 +55,12 @@ class Bundle:
 
     @property
     def hashes(self) -> tuple[tuple[str, str], ...]:
-        """Path and hash of every file, as the manifest lists them."""
+        """Path and hash of every file, in manifest order."""
         return tuple((file.path, file.sha256) for file in self.files)
 
     @property
     def manifest(self) -> bytes:
-        """As `sha256sum` writes and checks it."""
+        """The manifest in the format of `sha256sum`."""
         return "".join(f"{digest}  {path}\n" for path, digest in self.hashes).encode()
 
     @property
@@ -70,16 +70,16 @@ class Bundle:
 
     @property
     def unpacked_bytes(self) -> int:
-        """What a computer without any of it needs: the wheels, unpacked and as they came."""
+        """Disk space for all wheels, packed and unpacked."""
         return sum(wheel.unpacked_bytes + len(wheel.content) for wheel in self.wheels)
 
     def file(self, path: str) -> File | None:
         return next((file for file in self.files if file.path == path), None)
 
     def archive(self) -> bytes:
-        """The release's own files as a tar, with its manifest and the link to its tree."""
+        """The release's files as a tar, with its manifest and the links to its tree."""
         directories = [TarMember(name, mode=0o755, is_directory=True) for name in ("bin", "etc", "ros1")]
-        # ROS's Python finds our package in ros1/, and none of the wheels that are built for another one
+        # ROS's Python finds our package in ros1/, without the wheels built for another Python
         links = [
             TarMember("lib", link_to=f"../../trees/{self.tree}"),
             TarMember("ros1/udp_mesh", link_to="../lib/udp_mesh"),
@@ -97,9 +97,9 @@ def bundle(
     executable: str,
     units: Mapping[str, str],
 ) -> Bundle:
-    """The bundle for one robot; `executable` is the absolute path of its Python, `units` the unit files we ship.
+    """The bundle for one robot; `executable` is the absolute path of its Python, `units` the shipped unit files.
 
-    Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
+    Raises InvalidInput for settings the daemon would reject, and for missing keys.
     """
     listed = "".join(f"{wheel.sha256}  {wheel.stored}\n" for wheel in wheels).encode()
     tree = hashlib.sha256(listed + executable.encode()).hexdigest()[:_ID_DIGITS]
@@ -115,7 +115,7 @@ def bundle(
 def configuration(
     fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret], units: Mapping[str, str]
 ) -> tuple[File, ...]:
-    """The files of a release that the inventory alone decides, whatever Python and wheels the computer has.
+    """The files of a release that depend only on the inventory, not on the computer's Python and wheels.
 
     Raises InvalidInput as `bundle` does.
     """
@@ -140,21 +140,21 @@ def configuration(
 
 
 def has_bridge(fleet: Fleet, robot: str) -> bool:
-    """Whether a ROS 1 bridge belongs there. Raises InputError for a `ros` that is unknown, or older than the bridge."""
+    """Whether the robot gets a ROS 1 bridge. Raises InputError for an unknown or unsupported `ros`."""
     computer = fleet.robots[robot].computer
     ros = "" if computer is None else computer.ros
     place = f"robots.{robot}.computer.ros"
     if ros in ROS_TOO_OLD:
-        hint = "leave `ros` out: no bridge is deployed then"
+        hint = "remove `ros`: no bridge is deployed then"
         raise InputError(f"{place}: the Python of {ros} is older than 3.8, which the bridge needs", hint=hint)
     if ros not in ("", ROS_1, *ROS_2):
-        hint = did_you_mean(ros, (ROS_1, *ROS_2)) or "leave `ros` out: no bridge is deployed then"
-        raise InputError(f"{place}: expected {ROS_1} or a release of ROS 2, found {ros!r}", hint=hint)
+        hint = did_you_mean(ros, (ROS_1, *ROS_2)) or "remove `ros`: no bridge is deployed then"
+        raise InputError(f"{place}: expected {ROS_1} or a ROS 2 release, found {ros!r}", hint=hint)
     return ros == ROS_1
 
 
 def service_unit(stock: str, start: str) -> str:
-    """A unit of udp_mesh's own, started by `start`. Raises ValueError when it has not one start command."""
+    """A unit of udp_mesh with the start command `start`. Raises ValueError unless it has exactly one ExecStart."""
     lines = stock.splitlines()
     places = [number for number, line in enumerate(lines) if line.startswith("ExecStart=")]
     if len(places) != 1:

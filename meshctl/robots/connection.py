@@ -1,6 +1,6 @@
-"""The way to a robot's computer: its endpoint in the inventory -> SSH, through its radio if need be -> root -> `Host`.
+"""Connect to a robot's computer: endpoint in the inventory -> SSH, with an optional jump host -> root -> `Host`.
 
-Host keys are pinned in the fleet's own file under `robot.NAME`, since a node may have the robot's name.
+Host keys are pinned in the fleet's known_hosts as `robot.NAME`, since a node may have the same name as the robot.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def _no_password() -> Secret | None:
 
 @dataclass(frozen=True, slots=True)
 class RobotConnector:
-    """How to get at the computers of a fleet. `access` holds its pins, keys and the way through radios; `password` is
-    what sudo gets where it wants one; `owner` names us to the robots' locks. Safe for many threads."""
+    """Connects to the computers of a fleet. `access` holds pins, keys and connections to jump hosts; `password` returns
+    the sudo password; `owner` is our name in the robots' locks. Thread-safe."""
 
     fleet: Fleet
     access: ConnectionPool
@@ -51,7 +51,7 @@ class RobotConnector:
     ) -> Iterator[Host]:
         """The robot's computer, as root. Raises what `ssh.connect` and `become_root` raise.
 
-        `opened` gets the connection as soon as it stands, for somebody else to close when all shall end at once.
+        `opened` gets the connection once it is established, so that it can be closed from another thread.
         """
         settings = computer_of(self.fleet, robot).ssh
         named = tuple(self._path(text) for text in settings.key_files)
@@ -81,25 +81,25 @@ class RobotConnector:
             yield stack.enter_context(connection)
 
     def _jump(self, robot: str) -> SshConnection | None:
-        """The radio on the way, logged in; None where there is none."""
+        """The connection to the jump host; None without one."""
         name = computer_of(self.fleet, robot).ssh.jump
         if not name:
             return None
         radio = self.fleet.nodes.get(name)
         if radio is None:
             place = f"robots.{robot}.computer.ssh.jump"
-            raise InputError(f"{place}: there is no node {name!r}", hint=did_you_mean(name, self.fleet.nodes))
+            raise InputError(f"{place}: node {name!r} does not exist", hint=did_you_mean(name, self.fleet.nodes))
         return self.access.open(radio)
 
     def presented_key(self, robot: str) -> HostKey | None:
-        """The host key that the computer shows, believed by nobody. Raises what `ssh.connect` raises."""
+        """The unverified host key that the computer presents. Raises what `ssh.connect` raises."""
         recorder = AcceptAnyKey()
         try:
-            # without credentials: the key is shown before anyone logs in
+            # without credentials: the key is presented before the login
             with self._connected(robot, Credentials(use_agent=False), recorder):
                 return recorder.key
         except AuthenticationRefused:
-            # expected of the computer, which has shown its key before; the radio on the way must let us in
+            # expected from the computer, which has presented its key; a jump host must accept the login
             if recorder.key is None:
                 raise
             return recorder.key
@@ -110,54 +110,51 @@ class RobotConnector:
 
 
 def local_user(robot: str) -> str:
-    """Who logs in where the inventory names nobody: the operator, as OpenSSH has it. Raises InputError for a process
-    without a name, as in a container."""
+    """The default login name: the local user, as in OpenSSH. Raises InputError if it has no name, as in a container."""
     try:
         return getpass.getuser()
     except (KeyError, OSError, ImportError):
         place = f"robots.{robot}.computer.ssh.user"
-        raise InputError(
-            f"{place}: names nobody, and whoever runs this has no name either", hint=f"write {place}"
-        ) from None
+        raise InputError(f"{place} is not set, and the current user has no name", hint=f"set {place}") from None
 
 
 def _hint_for(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written: bool) -> str:
-    """What helps with a computer, where the device layer knows radios; empty for what is the same."""
+    """The hint for a computer in place of the one for a radio; empty to keep that."""
     place = f"robots.{robot}.computer.ssh"
     match error:
         case AuthenticationRefused():
-            keys = f"put your public key into ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id)"
+            keys = f"add your public key to ~{endpoint.user}/.ssh/authorized_keys there (ssh-copy-id)"
             if is_user_written:
-                return f"{keys}, or name another in {place}"
-            return f"the inventory names no user, so {endpoint.user} was tried, your own: write {place}.user, or {keys}"
+                return f"{keys}, or set another user in {place}"
+            return f"the inventory has no user, so your own, {endpoint.user}, was tried: set {place}.user, or {keys}"
         case HostKeyUnknown():
-            return f"compare it with the computer's own, then run `meshctl robots trust {robot}`"
+            return f"compare the fingerprint on the computer, then run `meshctl robots trust {robot}`"
         case HostKeyChanged():
-            again = f"`meshctl robots trust --replace {robot}` once you know"
-            return f"another computer, a new installation, or an attack; {again}"
+            again = f"verify, then run `meshctl robots trust --replace {robot}`"
+            return f"another computer, a new installation, or an attack: {again}"
         case Unreachable() if isinstance(error.__cause__, socket.gaierror):
-            return f"no address is known here for {endpoint.host}: write one into {place}.host, or take that away"
+            return f"{endpoint.host} cannot be resolved: set an address in {place}.host, or remove it"
         case Unreachable():
-            return f"is it on, does sshd run there, and is robots.{robot}.computer right?"
+            return f"check that it is on, that sshd runs, and robots.{robot}.computer"
         case _:
             return ""
 
 
 def selected_robots(fleet: Fleet, patterns: Iterable[str] | None) -> tuple[str, ...]:
-    """The robots with a computer that a name or pattern selects, in the inventory's order; all when none is given.
+    """The robots with a computer that match any name or pattern, in inventory order; all without patterns.
 
-    Raises InputError for a pattern that selects nothing, and for a robot named that has no computer.
+    Raises InputError for a pattern that matches nothing, and for a named robot without a computer.
     """
     wanted = list(patterns or ())
     able = [name for name, robot in fleet.robots.items() if robot.computer is not None]
     if not able:
-        raise InputError(f"no robot of {fleet.name} has a computer", hint="write robots.NAME.computer")
+        raise InputError(f"no robot of {fleet.name} has a computer", hint="set robots.NAME.computer")
     for pattern in wanted:
         if not any(fnmatchcase(name, pattern) for name in able):
             if pattern in fleet.robots:
-                fielded = fleet.robots[pattern].fielded is not None
-                instead = " in place of `fielded`, and stop the fielded program there" if fielded else ""
-                hint = f"write robots.{pattern}.computer{instead}"
+                is_legacy = fleet.robots[pattern].fielded is not None
+                instead = " in place of `fielded`, and stop the legacy program there" if is_legacy else ""
+                hint = f"set robots.{pattern}.computer{instead}"
                 raise InputError(f"robot {pattern} has no computer in the inventory", hint=hint)
-            raise InputError(f"no robot of {fleet.name} is called {pattern!r}", hint=did_you_mean(pattern, able))
+            raise InputError(f"no robot of {fleet.name} matches {pattern!r}", hint=did_you_mean(pattern, able))
     return tuple(name for name in able if not wanted or any(fnmatchcase(name, pattern) for pattern in wanted))

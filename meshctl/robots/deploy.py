@@ -1,7 +1,7 @@
-"""One robot brought to what the inventory says: probe -> object -> bundle -> send -> install -> switch -> `Outcome`.
+"""Deploy one robot: probe -> check preconditions -> bundle -> send -> install -> switch -> `Outcome`.
 
-Until `switch` nothing that runs is touched, and a deploy that is cut anywhere before is simply done again: what has
-arrived stays and is not sent twice. `switch` runs to its end on the robot whatever happens to the link.
+The running release is not touched before `switch`, so an interrupted deploy can be repeated; files already uploaded are
+not sent again. `switch` completes on the robot even if the connection breaks.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"
 PROBE_TIMEOUT_S = 120.0
 # Unpacking and compiling cryptography on a small ARM board with a slow card.
 INSTALL_TIMEOUT_S = 600.0
-# What systemd may take to stop and start the daemon (TimeoutStopSec, TimeoutStartSec of the unit), both ways.
+# systemd stops and starts the daemon (TimeoutStopSec, TimeoutStartSec of the unit), once for the switch and once back.
 _RESTARTS_S = 240.0
 
 
 @dataclass(slots=True)
 class Wheelhouse:
-    """Where wheels come from: the directory the operator named, or pip's downloads in `cache`, one folder a target."""
+    """Source of wheels: the `named` directory, or pip downloads in `cache`, one directory per target."""
 
     named: Path | None
     cache: Path
@@ -50,7 +50,7 @@ class Wheelhouse:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def wheels(self, target: Target) -> tuple[Wheel, ...]:
-        """All that a target needs. Raises InputError."""
+        """All wheels for a target. Raises InputError."""
         with self._lock:
             if target not in self._chosen:
                 self._chosen[target] = self._find(target)
@@ -63,7 +63,7 @@ class Wheelhouse:
             chosen = select_wheels(target, self.named)
             cache_wheels(chosen, kept)
             return chosen
-        # kept from before: the same robots get the same wheels, with or without internet
+        # prefer cached wheels: the same robots get the same wheels, with or without internet
         if not has_all(target, kept):
             download_wheels(target, kept)
         return select_wheels(target, kept)
@@ -73,9 +73,9 @@ class Wheelhouse:
 class DeployOptions:
     """What all robots of one deploy share.
 
-    `now_s` reads the operator's clock (Unix time); `wait_s` is how long a daemon may take to prove itself; with
-    `only_configuration` a robot that would get other code is refused; `step` gets a robot, the step's name and a few
-    words more, and is left when the step ends.
+    `now_s` returns our clock (Unix time); `wait_s` is the time a daemon has to become healthy; `only_configuration`
+    refuses robots that would get other code; `step` is entered with robot, step name and detail, and left when the step
+    ends.
     """
 
     fleet: Fleet
@@ -88,20 +88,20 @@ class DeployOptions:
 
 
 def probe(host: Host, fleet: Fleet, robot: str) -> HostFacts:
-    """What the computer is and has. Changes nothing."""
+    """Collect the facts of a computer. Changes nothing."""
     ros = ROS_1 if has_bridge(fleet, robot) else ""
     return parse_facts(host.run("probe", computer_of(fleet, robot).python, ros, timeout_s=PROBE_TIMEOUT_S))
 
 
 def desired_bundle(options: DeployOptions, robot: str, facts: HostFacts) -> Bundle:
-    """The bundle for a probed computer. Raises InputError where a wheel or a key is missing."""
-    assert facts.target is not None, "objections come first"
+    """The bundle for a probed computer. Raises InputError for a missing wheel or key."""
+    assert facts.target is not None, "preconditions are checked first"
     wheels = options.wheels(facts.target)
     return bundle(options.fleet, robot, options.secrets, wheels, executable=facts.executable, units=stock_units())
 
 
 def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFacts, Bundle] | Outcome:
-    """The probed computer and what it shall have; an outcome for one that cannot have it. Changes nothing."""
+    """The facts of a computer and its bundle, or a refusal. Changes nothing."""
     facts = probe(host, options.fleet, robot)
     computer = computer_of(options.fleet, robot)
     reasons = list(unmet_preconditions(facts, robot=robot, arch=computer.arch, python=computer.python))
@@ -123,7 +123,7 @@ def _refused(robot: str, reasons: list[tuple[str, str]]) -> Outcome:
 
 
 def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
-    """Bring one robot to its bundle. Raises NodeError where it fails before anything that runs was touched."""
+    """Deploy the bundle to one robot. Raises NodeError for a failure before the running release was touched."""
     with options.step(robot, "look", ""):
         plan = plan_deploy(host, robot, options)
     if isinstance(plan, Outcome):
@@ -144,14 +144,14 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
         how = "reload" if _only_configuration(facts, release) else "restart"
         with options.step(robot, "switch", f"to {release.id} ({how})"):
             outcome = switch(host, robot, release.id, how, options.wait_s)
-    told = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
-    return _with_clock_warning(replace(outcome, facts=told), facts, options)
+    details = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
+    return _with_clock_warning(replace(outcome, facts=details), facts, options)
 
 
 def _transfer(
     host: Host, robot: str, options: DeployOptions, release: Bundle, *, is_new: bool, with_wheels: bool
 ) -> int:
-    """Put the release beside what runs; the bytes of packages that had to travel."""
+    """Upload and install the release beside the running one; returns the package bytes sent."""
     sent = 0
     if with_wheels:
         size_kib = sum(len(wheel.content) for wheel in release.wheels) >> 10
@@ -174,7 +174,7 @@ def _with_clock_warning(outcome: Outcome, facts: HostFacts, options: DeployOptio
 
 
 def _only_configuration(facts: HostFacts, release: Bundle) -> bool:
-    """Whether the running daemon can take the new release by reading its files again, losing nothing it holds."""
+    """Whether a reload of the running daemon suffices, which keeps all messages."""
     return facts.is_sound and not _other_files(facts, release)
 
 
@@ -185,79 +185,77 @@ def _other_files(facts: HostFacts, release: Bundle) -> list[str]:
 
 def _more_than_configuration(facts: HostFacts, release: Bundle) -> tuple[str, str]:
     if not facts.current:
-        return "udp_mesh is not installed there", "`meshctl robots deploy` first"
+        return "udp_mesh is not installed", "run `meshctl robots deploy` first"
     if not facts.is_sound:
-        return "the daemon there does not run as it was deployed", "`meshctl robots diff`, then `meshctl robots deploy`"
+        return "the daemon does not run as deployed", "run `meshctl robots diff`, then `meshctl robots deploy`"
     other = ", ".join(_other_files(facts, release))
-    return f"more than the configuration would change ({other})", "`meshctl robots deploy` first"
+    return f"more than the configuration would change ({other})", "run `meshctl robots deploy` first"
 
 
 @contextmanager
 def claim(host: Host, *, current: str = "-") -> Iterator[None]:
-    """Hold a robot against other operators and processes, from one script to the next.
+    """Lock a robot against other operators and processes, from one script to the next.
 
-    With `current` it must still run that release. Raises Refused for one that another process holds or has changed. A
-    claim whose process on this computer has died is taken over; others end by themselves (scripts/common.sh).
+    With `current` it must still run that release. Raises ScriptRefused if another process holds or has changed it. A
+    claim of a dead local process is taken over; others expire (scripts/common.sh).
     """
-    told = host.run("claim", current, "", timeout_s=PROBE_TIMEOUT_S).split()
-    if told[:1] == ["held"] and is_dead(told[1]):
-        told = host.run("claim", current, told[1], timeout_s=PROBE_TIMEOUT_S).split()
-    if told[:1] != ["claimed"]:
-        _, holder, seconds = (*told, "", "", "")[:3]
-        hint = "wait until it is done; a claim that nobody gives back ends by itself after 15 minutes"
-        raise ScriptRefused(f"{host.label}: {holder} changes this robot, for {seconds} s now", code="busy", hint=hint)
+    reply = host.run("claim", current, "", timeout_s=PROBE_TIMEOUT_S).split()
+    if reply[:1] == ["held"] and is_dead(reply[1]):
+        reply = host.run("claim", current, reply[1], timeout_s=PROBE_TIMEOUT_S).split()
+    if reply[:1] != ["claimed"]:
+        _, holder, seconds = (*reply, "", "", "")[:3]
+        hint = "wait until it is done; an abandoned claim expires after 15 minutes"
+        raise ScriptRefused(f"{host.label}: locked by {holder} for {seconds} s", code="busy", hint=hint)
     try:
         yield
     finally:
-        # where the link broke, the claim ends as said above
+        # if the connection broke, the claim expires
         with suppress(NodeError):
             host.run("release", timeout_s=PROBE_TIMEOUT_S)
 
 
 def switch(host: Host, robot: str, release: str, how: str, wait_s: int) -> Outcome:
-    """Make an installed release the current one, or stay with the one before."""
+    """Make an installed release the current one, or roll back."""
     try:
-        told = host.run("switch", release, how, str(wait_s), timeout_s=2 * wait_s + _RESTARTS_S)
+        output = host.run("switch", release, how, str(wait_s), timeout_s=2 * wait_s + _RESTARTS_S)
     except (Timeout, ConnectionLost) as error:
-        hint = "the robot finishes or undoes the switch by itself; deploy again to see which"
+        hint = "the robot completes or rolls back the switch by itself; deploy again to find out"
         return Outcome(robot, Result.UNCERTAIN, f"{error}", hint=hint)
-    return parse_switch(robot, release, told)
+    return parse_switch(robot, release, output)
 
 
-def parse_switch(robot: str, release: str, told: str) -> Outcome:
-    """The outcome in what `scripts/switch.sh` prints."""
-    lines = [line.partition("=") for line in told.splitlines()]
+def parse_switch(robot: str, release: str, output: str) -> Outcome:
+    """Parse the output of `scripts/switch.sh`."""
+    lines = [line.partition("=") for line in output.splitlines()]
     one = {name: value for name, _, value in lines}
     log = "\n".join(value for name, _, value in lines if name == "log" and value)
     reason = one.get("reason", "")
-    hint = f"its last words:\n{log}" if log else ""
+    hint = f"last log lines:\n{log}" if log else ""
     match one.get("result"):
         case "switched":
             peers = one.get("online", "")
-            told_peers = f", {len(peers.split())} peers online" if peers else ""
-            return Outcome(robot, Result.DONE, f"runs {release}{told_peers}", facts={"peers": peers})
+            peer_text = f", {len(peers.split())} peers online" if peers else ""
+            return Outcome(robot, Result.DONE, f"runs {release}{peer_text}", facts={"peers": peers})
         case "rolled-back":
-            return Outcome(robot, Result.ROLLED_BACK, f"{reason}; the release before runs again", hint)
+            return Outcome(robot, Result.ROLLED_BACK, f"{reason}; the previous release runs again", hint)
         case "rolled-back-ill":
-            still = one.get("still", "") or "it does not prove itself"
-            why = f"{reason}; went back to the release before, which is not well either: {still}"
+            still = one.get("still", "") or "it does not become healthy"
+            why = f"{reason}; the previous release is not healthy either: {still}"
             return Outcome(robot, Result.ROLLED_BACK, why, hint)
         case "removed":
-            return Outcome(robot, Result.ROLLED_BACK, f"{reason}; there was no release before, so it was removed", hint)
+            return Outcome(robot, Result.ROLLED_BACK, f"{reason}; removed, since there is no previous release", hint)
         case _:
-            return Outcome(robot, Result.FAILED, f"{reason or 'the switch said nothing'}; nothing to go back to", hint)
+            return Outcome(robot, Result.FAILED, f"{reason or 'no reason given'}; no release to roll back to", hint)
 
 
 def roll_back(host: Host, robot: str, options: DeployOptions) -> Outcome:
-    """Go back to the release before, which stays installed for this."""
+    """Roll back to the previous release, which stays installed."""
     facts = probe(host, options.fleet, robot)
-    hint = "`meshctl robots deploy` brings what the inventory says"
+    hint = "run `meshctl robots deploy`"
     if facts.previous and facts.previous not in facts.releases:
-        told = f"{host.label}: the release before, {facts.previous}, is damaged there, or gone"
-        raise ScriptRefused(told, code="no-release", hint=hint)
+        reply = f"{host.label}: the previous release {facts.previous} is damaged or missing"
+        raise ScriptRefused(reply, code="no-release", hint=hint)
     if not facts.previous:
-        raise ScriptRefused(
-            f"{host.label}: there is no release before {facts.current or 'this'}", code="no-release", hint=hint
-        )
+        raise ScriptRefused(f"{host.label}: there is no previous release", code="no-release", hint=hint)
     with claim(host, current=facts.current), options.step(robot, "switch", f"back to {facts.previous}"):
         return switch(host, robot, facts.previous, "restart", options.wait_s)

@@ -1,8 +1,7 @@
-"""How one robot fares, in one round trip: `scripts/facts.sh` -> sections -> `RobotFacts`.
+"""The state of one robot, in one round trip: `scripts/facts.sh` -> sections -> `RobotFacts`.
 
-`expectation` says what the inventory wants there, `gather` asks a robot, `parse_robot_facts` reads what it told, and
-`facts_object` is all of it for programs. Ages are the robot's own, by a clock that never jumps; nothing here believes
-its wall clock.
+`expected_release` is the desired state, `collect_facts` queries a robot, `parse_robot_facts` parses the reply,
+`facts_object` is its JSON. Ages are measured by the robot's monotonic clock; its wall clock is not trusted.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from meshctl.robots.bundle import BRIDGE_UNIT_NAME, UNIT_NAME, configuration
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import own_wheel, stock_units
 
-# Two Python programs start and answer there, on a small ARM board that computes all it can.
+# Two Python programs start and answer, possibly on a small, busy ARM board.
 FACTS_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedRelease:
-    """What the inventory wants of one robot: `files` are hashes by path in the release, `wheel` is the hash of our own
-    packages; `bridge` says whether a ROS 1 bridge belongs there."""
+    """The desired release of one robot: `files` are hashes by path, `wheel` is the hash of our own package; `bridge`:
+    whether it has a ROS 1 bridge."""
 
     files: Mapping[str, str] = field(default_factory=dict)
     wheel: str = ""
@@ -35,8 +34,8 @@ class ExpectedRelease:
 
 @dataclass(frozen=True, slots=True)
 class ServiceFacts:
-    """A unit as systemd tells it: `active` is `active`, `activating`, `failed`, `inactive`; `enabled` is empty for a
-    unit that is not installed; `restarts` counts those that systemd did by itself."""
+    """A systemd unit: `active` is `active`, `activating`, `failed` or `inactive`; `enabled` is empty for a unit that is
+    not installed; `restarts` counts automatic restarts."""
 
     active: str = ""
     enabled: str = ""
@@ -50,7 +49,7 @@ class ServiceFacts:
 
 @dataclass(frozen=True, slots=True)
 class PeerFacts:
-    """Another robot as this one sees it; times in seconds, None where nothing is known."""
+    """A peer as this robot sees it; times in seconds, None if unknown."""
 
     name: str
     online: bool
@@ -62,7 +61,7 @@ class PeerFacts:
 
 @dataclass(frozen=True, slots=True)
 class QueueFacts:
-    """What waits on one priority level, for all peers together; `oldest_s` is the age of the oldest message."""
+    """The queue of one priority over all peers; `oldest_s` is the age of the oldest message."""
 
     priority: int
     messages: int
@@ -72,8 +71,8 @@ class QueueFacts:
 
 @dataclass(frozen=True, slots=True)
 class TopicFacts:
-    """One topic at this daemon; `priority` is None for one that only arrives. Ages are None before the first message,
-    and where the daemon is too old to tell."""
+    """One topic at this daemon; `priority` is None for a topic that is only received. Ages are None before the first
+    message, and for older daemons."""
 
     name: str
     priority: int | None
@@ -84,14 +83,14 @@ class TopicFacts:
 
     @property
     def last_ago_s(self) -> float | None:
-        """Since the last message in either direction."""
+        """Time since the last message in either direction."""
         return min((age for age in (self.sent_ago_s, self.received_ago_s) if age is not None), default=None)
 
 
 @dataclass(frozen=True, slots=True)
 class ComputerFacts:
-    """The computer itself. `load` is the average of running processes over 1, 5 and 15 minutes; `clock_ahead_s` is its
-    clock against ours, the way there included."""
+    """The computer itself. `load` is the average over 1, 5 and 15 minutes; `clock_ahead_s` is its clock minus ours,
+    latency included."""
 
     uptime_s: float | None = None
     load: tuple[float, float, float] | None = None
@@ -107,9 +106,9 @@ class ComputerFacts:
 class RobotFacts:
     """One robot at `seen_s` (our clock, Unix time).
 
-    `trouble` is why the computer could not be asked, and then all else is empty. `drift` has one line for each way in
-    which it is not as the inventory says. `bridge` is None where no ROS 1 bridge is wanted and none is installed.
-    `status` is what `udp-mesh status --json` prints, empty where no daemon answers.
+    `trouble` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
+    the inventory. `bridge` is None if no ROS 1 bridge is expected or installed. `status` is the output of
+    `udp-mesh status --json`, empty if the daemon does not answer.
     """
 
     robot: str
@@ -133,7 +132,7 @@ class RobotFacts:
 
     @property
     def answers(self) -> bool:
-        """Whether the daemon itself was heard."""
+        """Whether the daemon answered."""
         return bool(self.status)
 
     @property
@@ -142,46 +141,46 @@ class RobotFacts:
 
     @property
     def is_healthy(self) -> bool:
-        """Whether everything that belongs there runs and has proved itself; drift does not make it ill."""
+        """Whether all expected services run and are proven; drift does not count."""
         bridge_is_well = self.bridge is None or self.bridge.is_up
         return not self.trouble and self.service.is_up and self.is_proven and self.answers and bridge_is_well
 
     @property
     def remark(self) -> str:
-        """What an operator should know, in one line; empty when there is nothing."""
+        """What is wrong, in one line; empty if nothing is."""
         if self.trouble:
             return self.trouble
         if not self.service.enabled and not self.release:
-            return "not installed: `meshctl robots deploy`"
-        told = []
+            return "not installed: run `meshctl robots deploy`"
+        problems = []
         if not self.is_proven:
-            told.append("a switch was cut short: deploy again")
+            problems.append("a switch was interrupted: deploy again")
         if self.service.is_up and not self.answers:
-            told.append("the daemon does not answer")
+            problems.append("the daemon does not answer")
         if self.bridge is not None and not self.bridge.is_up:
-            told.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
-        told += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
+            problems.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
+        problems += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
         away = [peer.name for peer in self.peers if not peer.online]
-        told += [f"away: {', '.join(away)}"] if away else []
-        return "; ".join(told)
+        problems += [f"offline peers: {', '.join(away)}"] if away else []
+        return "; ".join(problems)
 
 
 def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret]) -> ExpectedRelease:
-    """What the inventory wants of one robot, without the wheels that only a deploy needs.
+    """The desired release of one robot, without the wheels that only a deploy needs.
 
-    Raises InvalidInput for what the daemon would refuse, and for keys that cannot be had.
+    Raises InvalidInput for settings the daemon would reject, and for missing keys.
     """
     files = {file.path: file.sha256 for file in configuration(fleet, robot, secrets, stock_units())}
     return ExpectedRelease(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
 
 
-def collect_facts(host: Host, robot: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
-    """Ask one robot, in one round trip; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
-    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), wanted, now_s=now_s)
+def collect_facts(host: Host, robot: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
+    """Query one robot; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
+    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), expected, now_s=now_s)
 
 
-def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: float) -> RobotFacts:
-    """The sections of `scripts/facts.sh`; a section that is missing or no JSON counts as no answer."""
+def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
+    """Parse the sections of `scripts/facts.sh`; a missing section or invalid JSON counts as no answer."""
     sections = _sections(text)
     services = _services(sections.get("services", ()))
     release = _values(sections.get("release", ()))
@@ -192,11 +191,11 @@ def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: 
         robot,
         seen_s=now_s,
         service=services.get(UNIT_NAME, ServiceFacts()),
-        bridge=bridge if wanted.bridge or bridge.enabled else None,
+        bridge=bridge if expected.bridge or bridge.enabled else None,
         release=_last(release, "current"),
         previous=_last(release, "previous"),
         is_proven=_last(release, "proven") != "no",
-        drift=drift(release, wanted, services),
+        drift=drift(release, expected, services),
         version=str(status.get("version", "")),
         daemon_uptime_s=_float(status.get("uptime_s")),
         keys=tuple(str(key) for key in status.get("keys", ()) or ()),
@@ -210,20 +209,20 @@ def parse_robot_facts(robot: str, text: str, wanted: ExpectedRelease, *, now_s: 
 
 
 def drift(
-    release: Mapping[str, list[str]], wanted: ExpectedRelease, services: Mapping[str, ServiceFacts]
+    release: Mapping[str, list[str]], expected: ExpectedRelease, services: Mapping[str, ServiceFacts]
 ) -> tuple[str, ...]:
-    """One line for each way in which what is deployed is not what the inventory says, or not what was deployed."""
+    """One line per difference between the installed release and the inventory, or the release as deployed."""
     if not _last(release, "current"):
-        return ("nothing is installed",)
+        return ("not installed",)
     here = {path: digest for digest, _, path in (row.partition("  ") for row in release.get("file", ()))}
     lines = [f"changed on the robot: {path}" for path in release.get("damaged", ())]
-    lines += [f"differs from the inventory: {path}" for path, sha in wanted.files.items() if here.get(path) != sha]
-    if BRIDGE_UNIT_NAME in here and not wanted.bridge:
+    lines += [f"differs from the inventory: {path}" for path, sha in expected.files.items() if here.get(path) != sha]
+    if BRIDGE_UNIT_NAME in here and not expected.bridge:
         lines.append(f"not in the inventory: {BRIDGE_UNIT_NAME}")
     wheels = {row.split()[0] for row in release.get("wheel", ()) if row.strip()}
-    if wanted.wheel and wanted.wheel not in wheels:
-        lines.append("another version of udp-mesh than ours")
-    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if wanted.bridge else (UNIT_NAME,)
+    if expected.wheel and expected.wheel not in wheels:
+        lines.append("another version of udp-mesh than in this meshctl")
+    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if expected.bridge else (UNIT_NAME,)
     for unit in units:
         if services.get(unit, ServiceFacts()).enabled != "enabled":
             lines.append(f"{unit} will not start at boot")
@@ -231,10 +230,10 @@ def drift(
 
 
 def facts_object(facts: RobotFacts) -> dict[str, Any]:
-    """For programs: every field under its name, with what follows from them."""
-    told = dataclasses.asdict(facts)
+    """As JSON: every field by name, and the derived values."""
+    fields = dataclasses.asdict(facts)
     return {
-        **told,
+        **fields,
         "well": facts.is_healthy,
         "answers": facts.answers,
         "online": list(facts.online),
@@ -268,7 +267,7 @@ def _last(values: Mapping[str, list[str]], name: str) -> str:
 
 
 def _services(lines: Iterable[str]) -> dict[str, ServiceFacts]:
-    """`systemctl show` prints one property a line and no unit twice; an empty line ends a unit."""
+    """Parse `systemctl show`: one property per line, units separated by an empty line."""
     found = {}
     unit: dict[str, str] = {}
     for line in (*lines, ""):
@@ -277,7 +276,7 @@ def _services(lines: Iterable[str]) -> dict[str, ServiceFacts]:
             unit[name] = value
         elif unit:
             found[unit.get("Id", "")] = ServiceFacts(
-                # systemd calls a unit it does not know inactive, and its file state empty
+                # systemd reports an unknown unit as inactive, with an empty UnitFileState
                 "" if unit.get("LoadState") == "not-found" else unit.get("ActiveState", ""),
                 unit.get("UnitFileState", ""),
                 int(_number(unit.get("NRestarts", "")) or 0),

@@ -1,7 +1,7 @@
-"""The seam between meshctl and a robot's computer: run one of our scripts, put a file. `SshHost` is the real one.
+"""The interface to a robot's computer: run a script, upload a file. `SshHost` implements it over SSH.
 
-An `SshHost` finds out once how it becomes root: it is root, or sudo asks nothing, or sudo wants a password, which goes
-in on standard input before anything else and is never part of a command line.
+`become_root` finds out once how to get root: logged in as root, passwordless sudo, or sudo with a password, which is
+sent on standard input and never part of a command line.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from meshctl.robots.scripts import script
 
 
 class ScriptRefused(NodeError):
-    """A script on the robot would not go on; `code` is its reason's word (`no-space`, `busy`, `check`, ...)."""
+    """A script on the robot refused to continue; `code` is the reason (`no-space`, `busy`, `check`, ...)."""
 
     def __init__(self, message: str, *, code: str, hint: str = "") -> None:
         super().__init__(message, hint=hint)
@@ -36,32 +36,31 @@ class Host(Protocol):
         ...
 
     def run(self, verb: str, *words: str, stdin: bytes = b"", timeout_s: float) -> str:
-        """What `scripts/VERB.sh`, called with `words`, prints. Raises Refused, CommandFailed and what SSH raises."""
+        """Output of `scripts/VERB.sh` with arguments `words`. Raises ScriptRefused, CommandFailed and SSH errors."""
         ...
 
     def put(self, content: bytes, path: str, mode: int = 0o644) -> int:
-        """Make `path` hold `content`; gives the bytes that had to travel. A put that was cut goes on where it was."""
+        """Upload `content` to `path`, resuming an interrupted upload; returns the bytes sent."""
         ...
 
 
 _HINTS = {
-    "no-space": "make room at /opt, then deploy again",
+    "no-space": "free disk space in /opt, then deploy again",
     "busy": "wait until it is done, then run the command again",
-    "moved": "look with `meshctl robots diff`, then run the command again",
-    "not-installed": "`meshctl robots deploy` installs it",
-    "service": "`meshctl robots logs` shows why",
-    "masked": "ask who did, then `systemctl unmask` it there",
-    "check": "the release is not installed; what runs there was not touched",
-    "account": "look at /etc/passwd there, and whether its disk is writable",
-    "no-release": "`meshctl robots deploy` brings what the inventory says",
-    "damaged": "deploy again; if it happens again, look at the disk",
+    "moved": "run `meshctl robots diff`, then the command again",
+    "not-installed": "run `meshctl robots deploy`",
+    "service": "run `meshctl robots logs` for the reason",
+    "masked": "find out why, then `systemctl unmask` it there",
+    "check": "the release was not installed; the running one was not touched",
+    "account": "check /etc/passwd there, and that its disk is writable",
+    "no-release": "run `meshctl robots deploy`",
+    "damaged": "deploy again; if it recurs, check the disk",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class SshHost(Host):
-    """`connection` is logged in as any user who is root or may use sudo; see `become_root`. `owner` names us to the
-    robot's lock, where we change something."""
+    """`connection` runs scripts as root (see `become_root`); `owner` is our name in the robot's lock."""
 
     connection: Connection
     owner: str = ""
@@ -84,12 +83,12 @@ class SshHost(Host):
         return upload(self.connection, content, path, mode=mode).sent
 
 
-# No greeting says this. What a computer's shell start-up files, sudo's lecture or its resolver say comes before it.
+# Everything before this line is a banner: shell start-up files, sudo's lecture, resolver warnings.
 _OUTPUT_MARKER = "== meshctl begins"
 
 
 class BannerFilter(Connection):
-    """A connection whose scripts' output begins where they do: robots greet whoever logs in (~/.bashrc, sudo)."""
+    """Drops login banners (~/.bashrc, sudo) from the output of scripts."""
 
     def __init__(self, inner: Connection) -> None:
         self._inner = inner
@@ -110,13 +109,13 @@ class BannerFilter(Connection):
 
 
 def _without_banner(said: bytes) -> bytes:
-    """What comes after the line _BEGINS; all of it where the script never began, for then it tells why."""
+    """The output after the marker line; all of it if the script did not start, since that is the error."""
     before, line, after = said.partition(f"{_OUTPUT_MARKER}\n".encode())
     return after if line else before
 
 
 class SudoConnection(Connection):
-    """A connection whose scripts run as root through sudo; `password` None where sudo asks for none."""
+    """Runs scripts as root with sudo; `password` is None for passwordless sudo."""
 
     def __init__(self, inner: Connection, password: Secret | None) -> None:
         self._inner = inner
@@ -127,7 +126,7 @@ class SudoConnection(Connection):
         return self._inner.endpoint
 
     def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
-        # -k: a cached login must not make sudo leave the password unread, for the script would take it as its input
+        # -k: with cached credentials sudo would leave the password unread, as input of the script
         how = ("-n",) if self._password is None else ("-k", "-S", "-p", "")
         command = quoted("sudo", *how, "--", "sh", "-c", script)
         if self._password is not None:
@@ -144,8 +143,7 @@ def _chained(first: bytes, rest: Iterable[bytes]) -> Iterable[bytes]:
     yield from rest
 
 
-# Tells how the login becomes root: `root`, `free` (sudo asks nothing), `password`, `no-sudo`, or `tty` (sudoers has
-# requiretty).
+# Prints how to become root: `root`, `free` (passwordless sudo), `password`, `no-sudo`, or `tty` (requiretty).
 _ROOT_PROBE = """\
 if [ "$(id -u)" = 0 ]; then echo root
 elif ! command -v sudo >/dev/null 2>&1; then echo no-sudo
@@ -155,34 +153,34 @@ else case $why in *tty*) echo tty ;; *) echo password ;; esac; fi
 
 
 def become_root(connection: Connection, password: Callable[[], Secret | None]) -> Connection:
-    """Scripts run by it run as root, through sudo if need be, and say nothing but what they say themselves.
+    """A connection that runs scripts as root, with sudo if necessary, and drops banners from their output.
 
-    `password` is asked for only where sudo wants one; None means there is none to give. Raises CommandFailed where
-    there is no way to become root.
+    `password` is called only if sudo requires one; None means that there is none. Raises CommandFailed if root is not
+    available.
     """
     label, user = connection.endpoint.label, connection.endpoint.user
-    itself = BannerFilter(connection)
+    plain = BannerFilter(connection)
     if user == "root":
-        return itself
-    how = itself.run(_ROOT_PROBE).check(f"{label}: become root").stdout.strip()
+        return plain
+    how = plain.run(_ROOT_PROBE).check(f"{label}: become root").stdout.strip()
     match how:
         case "root":
-            return itself
+            return plain
         case "free":
             return BannerFilter(SudoConnection(connection, None))
         case "password":
             given = password()
             if given is None:
-                hint = "give it with --ask-sudo or MESHCTL_SUDO_PASSWORD, or let sudo ask for none"
-                raise CommandFailed(f"{label}: sudo wants a password for {user}", exit_status=1, hint=hint)
+                hint = "pass --ask-sudo or set MESHCTL_SUDO_PASSWORD, or configure passwordless sudo"
+                raise CommandFailed(f"{label}: sudo requires a password for {user}", exit_status=1, hint=hint)
             elevated = BannerFilter(SudoConnection(connection, given))
             if elevated.run("id -u").stdout.strip() != "0":
-                hint = "check the password, and that the user may use sudo"
+                hint = "check the password and the user's sudo rights"
                 raise CommandFailed(f"{label}: sudo does not let {user} become root", exit_status=1, hint=hint)
             return elevated
         case "tty":
-            hint = f"write `Defaults:{user} !requiretty` into a file in /etc/sudoers.d there"
-            raise CommandFailed(f"{label}: sudo there works on a terminal only", exit_status=1, hint=hint)
+            hint = f"add `Defaults:{user} !requiretty` to a file in /etc/sudoers.d there"
+            raise CommandFailed(f"{label}: sudo requires a terminal (requiretty)", exit_status=1, hint=hint)
         case _:
             hint = "log in as root, or install sudo there"
             raise CommandFailed(f"{label}: {user} is not root and there is no sudo", exit_status=1, hint=hint)

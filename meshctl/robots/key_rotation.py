@@ -1,8 +1,8 @@
-"""A new fleet key without an interruption: the inventory's keys -> the stages still to come.
+"""Rotate the fleet key without an interruption: the inventory's keys -> the remaining stages. Pure.
 
-Pure. A daemon opens with every live key and seals with the first: so the new key is first accepted everywhere, then
-used everywhere, and only then is the old one dropped. Each stage must have reached every robot before the next begins;
-the inventory itself says how far a rotation has come, so one that was interrupted is taken up by the same command.
+A daemon decrypts with every live key and encrypts with the first: the new key is accepted everywhere, then used
+everywhere, then the old one is dropped. Each stage must reach every robot before the next starts. The inventory records
+the progress, so the same command resumes an interrupted rotation.
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from meshctl.model import SecretKind, SecretRef
 
 @dataclass(frozen=True, slots=True)
 class RotationStage:
-    """`keys` are the live keys of this stage, the sealing one first."""
+    """`keys` are the live keys of this stage, the encrypting one first."""
 
     title: str
     keys: tuple[SecretRef, ...]
 
 
 def rotation_stages(keys: tuple[SecretRef, ...], new: SecretRef) -> tuple[RotationStage, ...]:
-    """The stages from what the inventory has to `new` alone; the first is the one that may be half done.
+    """The stages from the inventory's keys to `new` alone; the first one may be partly done.
 
-    Raises InputError for an unkeyed fleet and for one in the middle of another rotation.
+    Raises InputError for a fleet without a key, or during another rotation.
     """
     if not keys:
-        raise InputError("the fleet has no key yet", hint="write udp_mesh.keys and deploy; all robots at once")
+        raise InputError("the fleet has no key", hint="set udp_mesh.keys, then deploy all robots")
     others = tuple(key for key in keys if _same(key) != _same(new))
     if len(others) > 1:
         names = ", ".join(map(str, others))
-        raise InputError(f"two other keys are live: {names}", hint="finish that rotation first, with the second as new")
-    done = RotationStage("the old key is dropped", (new,))
+        raise InputError(f"two other keys are live: {names}", hint="first finish that rotation, to the second one")
+    done = RotationStage("drop the old key", (new,))
     if not others:
         return (done,)
     (old,) = others
-    sealing = RotationStage("the new key seals", (new, old))
+    sealing = RotationStage("use the new key", (new, old))
     if _same(keys[0]) == _same(new):
         return sealing, done
-    return RotationStage("the new key is accepted", (old, new)), sealing, done
+    return RotationStage("accept the new key", (old, new)), sealing, done
 
 
 def _same(ref: SecretRef) -> tuple[SecretKind, str, str]:
@@ -60,7 +60,7 @@ def parse_ref(text: str) -> SecretRef:
 
 
 def inventory_value(ref: SecretRef) -> Value:
-    """The reference as an inventory writes it."""
+    """The reference as an inventory value."""
     value: dict[str, Value] = {ref.kind.value: ref.where}
     if ref.key:
         value["key"] = ref.key

@@ -1,7 +1,4 @@
-"""What a robot's computer is and has: the probe's lines -> `Facts` -> the reasons it cannot take a bundle.
-
-Pure. All reasons are told at once, and before anything on the computer is changed.
-"""
+"""Preconditions of a deploy: the probe's output -> `HostFacts` -> all unmet preconditions, before any change. Pure."""
 
 from __future__ import annotations
 
@@ -15,16 +12,16 @@ from meshctl.robots.wheel_tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
 MIN_PYTHON = (3, 11)
-# A clock this far off has lost its battery.
+# A larger offset means a dead clock battery.
 MAX_CLOCK_SKEW_S = 24 * 3600.0
-# What other programs on the computer need while a release is unpacked.
+# Free space to leave for other programs while a release is unpacked.
 HEADROOM_KIB = 32 << 10
 
 
 @dataclass(frozen=True, slots=True)
 class HostFacts:
-    """`files` are hash by path of the current release as its manifest lists them; `damaged` are paths that are no
-    longer so. `releases` and `trees` are those that are whole. `python` is None where there is none that runs."""
+    """`files` are (path, hash) of the current release's manifest; `damaged` are paths that no longer match; `releases`
+    and `trees` are the intact ones; `python` is None if none runs."""
 
     arch: str = ""
     now_s: float = 0.0
@@ -53,35 +50,35 @@ class HostFacts:
 
     @property
     def units(self) -> tuple[tuple[str, str, str], ...]:
-        """(unit, active, enabled) of the units that the current release has, the daemon's first."""
+        """(unit, active, enabled) of the current release's units, the daemon first."""
         ours = {path for path, _ in self.files}
         return tuple(service for service in self.services if service[0] in ours)
 
     @property
     def target(self) -> Target | None:
-        """None where no Python runs there."""
+        """The wheel target; None if no Python runs."""
         if self.python is None:
             return None
         return Target(self.python[:2], _arch_of_python(self.arch, self.bits), self.libc, self.libc_version)
 
     @property
     def runs(self) -> bool:
-        """Whether all its units do, and will at the next boot."""
+        """Whether all its units are active and enabled."""
         return bool(self.units) and all(tuple(state) == ("active", "enabled") for _, *state in self.units)
 
     @property
     def masked(self) -> tuple[str, ...]:
-        """Units that somebody there has forbidden to start (`systemctl mask`), for good or until the next boot."""
+        """Masked units (`systemctl mask`)."""
         return tuple(unit for unit, _, enabled in self.services if enabled.startswith("masked"))
 
     @property
     def is_sound(self) -> bool:
-        """Whether the current release runs, has proved itself, and is on the disk as it was put there."""
+        """Whether the current release runs, is proven, and is intact on disk."""
         return self.is_proven and not self.damaged and self.runs
 
 
 def parse_facts(text: str) -> HostFacts:
-    """The lines of `scripts/probe.sh`; lines it does not know are passed over."""
+    """Parse the output of `scripts/probe.sh`; unknown lines are ignored."""
     one: dict[str, str] = {}
     many: dict[str, list[str]] = {}
     for line in text.splitlines():
@@ -119,7 +116,7 @@ def parse_facts(text: str) -> HostFacts:
 
 
 def _service(row: str) -> tuple[str, str, str]:
-    """`NAME ACTIVE ENABLED`; systemd says nothing of what it does not know."""
+    """`NAME ACTIVE ENABLED`; the latter are empty for unknown units."""
     name, active, enabled, *_ = (*row.split(), "", "", "")
     return name, active, enabled
 
@@ -134,88 +131,90 @@ def _version(text: str) -> tuple[int, int, int] | None:
 
 
 def _libc(text: str) -> tuple[str, tuple[int, int]]:
-    """`glibc 2.36`; platform.libc_ver knows no musl before Python 3.13 and says nothing there."""
+    """`glibc 2.36`; platform.libc_ver returns nothing for musl before Python 3.13."""
     found = re.fullmatch(r"(glibc|musl) ?(\d+)\.(\d+).*", text)
     return (found[1], (int(found[2]), int(found[3]))) if found else ("musl", (1, 2))
 
 
 def _arch_of_python(machine: str, bits: int) -> str:
-    """The platform's name in wheels: a 32-bit system may run on a 64-bit kernel (Raspberry Pi OS does)."""
+    """The architecture in wheel tags: a 32-bit system may run on a 64-bit kernel (Raspberry Pi OS)."""
     if bits == 32:
         return {"x86_64": "i686", "aarch64": "armv7l"}.get(machine, machine)
     return machine
 
 
 def computer_of(fleet: Fleet, robot: str) -> Computer:
-    """Raises InputError for a robot that has none."""
+    """The robot's computer. Raises InputError if it has none."""
     computer = fleet.robots[robot].computer
     if computer is None:
-        raise InputError(f"robot {robot} has no computer in the inventory", hint=f"write robots.{robot}.computer")
+        raise InputError(f"robot {robot} has no computer in the inventory", hint=f"set robots.{robot}.computer")
     return computer
 
 
 def clock_warning(facts: HostFacts, now_s: float) -> tuple[str, str]:
-    """(what is wrong with its clock, how to mend it), empty where nothing is.
+    """(what is wrong with its clock, how to fix it), or empty strings.
 
-    A wrong clock keeps nothing from working, since no step here and nothing in the daemon believes it; but its logs
-    and recordings lie.
+    A wrong clock does not affect deploys or the daemon, but it makes logs and recordings wrong.
     """
     skew_s = facts.now_s - now_s
     if abs(skew_s) <= MAX_CLOCK_SKEW_S:
         return "", ""
     side = "ahead of" if skew_s > 0 else "behind"
-    return f"its clock is {_days(abs(skew_s))} {side} ours", "its logs lie until it is set: `date -s`, or NTP"
+    return (
+        f"its clock is {_days(abs(skew_s))} {side} ours",
+        "set it with `date -s` or NTP; until then log times are wrong",
+    )
 
 
 def unmet_preconditions(facts: HostFacts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:
-    """Why the computer cannot run udp_mesh as the inventory (`arch`, `python`) has it: (reason, how to mend it)."""
+    """Why the computer cannot run udp_mesh with the inventory's `arch` and `python`: (reason, how to fix it)."""
     if facts.uid != 0:
-        yield "the scripts did not run as root", "log in as root, or as a user who may use sudo"
+        yield "the scripts did not run as root", "log in as root, or as a user with sudo rights"
     if not facts.has_systemd:
-        yield "systemd does not run there", "udp_mesh is deployed as a systemd service"
+        yield "systemd is not running", "udp_mesh is deployed as a systemd service"
     if facts.missing_tools:
-        yield f"it lacks {', '.join(facts.missing_tools)}", "they are in coreutils, util-linux, tar and mawk"
+        yield f"missing tools: {', '.join(facts.missing_tools)}", "install coreutils, util-linux, tar and mawk"
     if facts.missing_ros:
-        hint = f"install ROS there, or take `ros` out of robots.{robot}.computer"
-        yield f"ROS is not there: no {facts.missing_ros}", hint
+        hint = f"install ROS there, or remove `ros` from robots.{robot}.computer"
+        yield f"ROS is not installed: {facts.missing_ros} is missing", hint
     if facts.arch != arch:
-        hint = f"write `arch: {facts.arch}` at robots.{robot}.computer, if it is the right computer"
-        yield f"wrong CPU: the inventory says {arch}, it is {facts.arch}", hint
+        hint = f"if it is the right computer, set `arch: {facts.arch}` in robots.{robot}.computer"
+        yield f"wrong CPU: expected {arch}, found {facts.arch}", hint
     yield from _unmet_python(facts, robot, python)
     if not facts.is_writable:
-        yield "its disk is read-only", "remount it, or look at its log for disk errors"
+        yield "its disk is read-only", "remount it, or check its log for disk errors"
     if not facts.runs_programs:
-        yield "/opt is mounted noexec: nothing there can be started", "remount it with exec, and mend /etc/fstab"
+        yield "/opt is mounted noexec", "remount it with exec, and fix /etc/fstab"
     if facts.masked:
-        hint = f"ask who did, then `systemctl unmask {' '.join(facts.masked)}` there"
-        yield f"somebody has masked {' and '.join(facts.masked)} there", hint
+        hint = f"find out why, then run `systemctl unmask {' '.join(facts.masked)}` there"
+        yield f"masked units: {', '.join(facts.masked)}", hint
 
 
 def _unmet_python(facts: HostFacts, robot: str, python: str) -> Iterator[tuple[str, str]]:
-    least = ".".join(map(str, MIN_PYTHON))
-    name_it = f"install Python {least} or newer beside it and name it as robots.{robot}.computer.python"
+    minimum = ".".join(map(str, MIN_PYTHON))
+    name_it = f"install Python {minimum} or newer and set robots.{robot}.computer.python"
     if facts.python is None:
-        yield f"no {python} runs there", name_it
+        yield f"{python} does not run", name_it
         return
     found = ".".join(map(str, facts.python))
     if facts.python[:2] < MIN_PYTHON:
-        yield f"wrong Python: {python} is {found}, udp_mesh needs {least} or newer", name_it
+        yield f"wrong Python: {python} is {found}, expected {minimum} or newer", name_it
     if facts.implementation != "CPython":
-        yield f"wrong Python: {python} is {facts.implementation}, the wheels are for CPython", name_it
+        yield f"wrong Python: {python} is {facts.implementation}, expected CPython", name_it
     if facts.missing_modules:
         lacking = ", ".join(facts.missing_modules)
         yield (
             f"{python} lacks the standard modules {lacking}",
-            "install the whole of Python (python3, not python3-minimal)",
+            "install the full Python (python3, not python3-minimal)",
         )
 
 
 def unmet_disk_space(facts: HostFacts, needed_bytes: int) -> Iterator[tuple[str, str]]:
-    """Whether a release of that many bytes, unpacked, fits beside what is there."""
+    """The reason if a release of that size does not fit on the disk."""
     needed_kib = needed_bytes // 1024 + HEADROOM_KIB
     if facts.free_kib < needed_kib:
-        found = f"{facts.free_kib >> 10} MiB are free"
-        yield f"full disk: {(needed_kib >> 10) + 1} MiB are needed at /opt, {found}", "make room there"
+        found = f"found {facts.free_kib >> 10} MiB free"
+        yield f"disk full: expected {(needed_kib >> 10) + 1} MiB in /opt, {found}", "free disk space there"
 
 
 def _days(seconds: float) -> str:
@@ -223,9 +222,9 @@ def _days(seconds: float) -> str:
     return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.1f} days"
 
 
-def changed_files(facts: HostFacts, wanted: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Paths whose hash differs between the current release and a wanted manifest, in the wanted order."""
+def changed_files(facts: HostFacts, desired: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """Paths whose hash differs between the current release and a desired manifest, in manifest order."""
     here = dict(facts.files)
-    wanted = tuple(wanted)
-    gone = [path for path in here if path not in dict(wanted)]
-    return (*(path for path, digest in wanted if here.get(path) != digest), *gone)
+    desired = tuple(desired)
+    gone = [path for path in here if path not in dict(desired)]
+    return (*(path for path, digest in desired if here.get(path) != digest), *gone)

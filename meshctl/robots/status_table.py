@@ -1,7 +1,4 @@
-"""What the robots told, for people: `RobotFacts` -> a table; and what a deploy would change (`difference`).
-
-Pure.
-"""
+"""Text for people: `RobotFacts` -> a table; and what a deploy would change (`difference`). Pure."""
 
 from __future__ import annotations
 
@@ -14,19 +11,21 @@ from meshctl.robots.facts import RobotFacts
 from meshctl.robots.preconditions import HostFacts, changed_files
 
 _HEADINGS = ("robot", "service", "release", "version", "up", "peers", "queued", "last message", "load", "keys")
-# On a narrow terminal these go first, in this order: `--json` has them all.
-_GIVE_WAY = ("load", "release", "keys", "version", "last message", "up")
+# Dropped in this order on a narrow terminal; `--json` has all columns.
+_DROP_ORDER = ("load", "release", "keys", "version", "last message", "up")
 _GAP = "  "
 
 
 def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
-    """One line a robot: what runs, for how long, whom it sees, what waits, when it last heard or said something; below
-    them what is wrong. No line of the table is longer than `width` where columns can be left out for it."""
+    """One line per robot: service, uptime, peers, queues, last message; below them what is wrong.
+
+    Columns are dropped to fit `width`.
+    """
     robots = list(rows)
     lines = [_HEADINGS, *(_row(one) for one in robots)]
     widths = {name: max(len(line[at]) for line in lines) for at, name in enumerate(_HEADINGS)}
     shown = list(_HEADINGS)
-    for name in _GIVE_WAY:
+    for name in _DROP_ORDER:
         if width is None or sum(widths[one] + len(_GAP) for one in shown) - len(_GAP) <= width:
             break
         shown.remove(name)
@@ -43,7 +42,7 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
             )
     if len(shown) < len(_HEADINGS):
         left_out = ", ".join(name for name in _HEADINGS if name not in shown)
-        drawn += textwrap.wrap(f"no room for {left_out}: --json has them", width or sys.maxsize)
+        drawn += textwrap.wrap(f"columns not shown: {left_out} (use --json)", width or sys.maxsize)
     return "\n".join(drawn)
 
 
@@ -66,7 +65,7 @@ def _row(one: RobotFacts) -> tuple[str, ...]:
 
 
 def _queued(one: RobotFacts) -> str:
-    """Most urgent first, since that is where waiting is worst: `p0: 3, p9: 120`."""
+    """Queued messages by priority, most urgent first: `p0: 3, p9: 120`."""
     return ", ".join(f"p{queue.priority}: {queue.messages}" for queue in one.queues if queue.messages) or "0"
 
 
@@ -88,23 +87,23 @@ def _duration(seconds: float | None) -> str:
 
 
 def difference(facts: HostFacts, release: Bundle) -> tuple[str, ...]:
-    """One line for each way in which a robot is not as the inventory says; none when a deploy would do nothing.
+    """One line per difference between a robot and the inventory; none if a deploy would do nothing.
 
-    Files are named, not shown: what is on the robot is known by its hash.
+    Files are named without a diff, since only their hashes are known.
     """
     if not facts.current:
-        return (f"nothing is installed; deploy would install {release.id}",)
+        return (f"not installed; deploy would install {release.id}",)
     lines = [f"changed on the robot: {path}" for path in facts.damaged]
     lines += [f"differs from the inventory: {path}" for path in changed_files(facts, release.hashes)]
     if not facts.is_proven:
-        lines.append("a switch was cut short")
+        lines.append("a switch was interrupted")
     for unit, active, enabled in facts.units:
         if active != "active":
-            lines.append(f"{_called(unit)} is {active or 'absent'}")
+            lines.append(f"{_unit_text(unit)} is {active or 'absent'}")
         if enabled != "enabled":
-            lines.append(f"{_called(unit)} is {enabled or 'absent'}: it will not start at boot")
+            lines.append(f"{_unit_text(unit)} is {enabled or 'absent'}: it will not start at boot")
     return tuple(lines)
 
 
-def _called(unit: str) -> str:
+def _unit_text(unit: str) -> str:
     return "the service" if unit == UNIT_NAME else "the ROS bridge"

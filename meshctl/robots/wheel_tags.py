@@ -1,7 +1,7 @@
-"""Wheel file names and the computers that take them (PEP 425, 427, 600, 656).
+"""Wheel tags and compatibility (PEP 425, 427, 600, 656).
 
-A `Target` is one computer's Python as the probe found it; `WheelName` is a file name taken apart; `takes` says whether
-the two fit, and `pip_options` asks pip for what fits.
+A `Target` is one computer's Python; `WheelName` is a parsed file name; `is_compatible` compares the two;
+`pip_options` makes pip download for a target.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-# PEP 600: the old names of manylinux platforms by the glibc they need.
+# PEP 600: legacy manylinux aliases and the glibc they require.
 _LEGACY_GLIBC = {"manylinux1": (2, 5), "manylinux2010": (2, 12), "manylinux2014": (2, 17)}
 _WHEEL = re.compile(
     r"(?P<name>[A-Za-z0-9_.]+)-(?P<version>[A-Za-z0-9_.!+]+)(?:-\d[A-Za-z0-9_.]*)?"
@@ -19,8 +19,8 @@ _WHEEL = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """`python` is (major, minor); `arch` is what `uname -m` says (32-bit Python on a 64-bit kernel: the Python's own);
-    `libc` is `glibc` or `musl` with its version."""
+    """`python` is (major, minor); `arch` is that of `uname -m`, or of a 32-bit Python on a 64-bit kernel; `libc` is
+    `glibc` or `musl`."""
 
     python: tuple[int, int]
     arch: str
@@ -35,7 +35,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class WheelName:
-    """A wheel's file name taken apart; `project` is normalized (PEP 503), the tags are the alternatives it lists."""
+    """A parsed wheel file name; `project` is normalized (PEP 503), tags are its alternatives."""
 
     file: str
     project: str
@@ -46,7 +46,7 @@ class WheelName:
 
 
 def parse_wheel(file: str) -> WheelName | None:
-    """None for a name that is no wheel's."""
+    """Parse a wheel file name; None if it is not one."""
     found = _WHEEL.fullmatch(file)
     if found is None:
         return None
@@ -67,13 +67,13 @@ def _python(target: Target, python: str, abi: str) -> bool:
     found = re.fullmatch(r"(?P<kind>py|cp)(?P<major>\d)(?P<minor>\d*)", python)
     if found is None or int(found["major"]) != major:
         return False
-    least = int(found["minor"] or 0)
+    minimum = int(found["minor"] or 0)
     match abi:
         case "none":
-            # a pure wheel for a Python as old as this one or older
-            return least <= minor if found["kind"] == "py" else least == minor or not found["minor"]
+            # a pure-Python wheel for this Python or an older one
+            return minimum <= minor if found["kind"] == "py" else minimum == minor or not found["minor"]
         case "abi3":
-            return found["kind"] == "cp" and least <= minor
+            return found["kind"] == "cp" and minimum <= minor
         case _:
             return abi == python == f"cp{major}{minor}"
 
@@ -98,7 +98,7 @@ def _platform(target: Target, platform: str) -> bool:
 
 
 def pip_options(target: Target) -> tuple[str, ...]:
-    """What `pip download` needs to know to fetch for another computer than its own, oldest platforms last."""
+    """Options of `pip download` for another computer, newest platforms first."""
     version = f"{target.python[0]}.{target.python[1]}"
     cp = f"cp{target.python[0]}{target.python[1]}"
     major, newest = target.libc_version

@@ -1,7 +1,7 @@
-"""The wheels of one bundle: our own, built from the installed package, and those it needs, from a directory or pip.
+"""The wheels of one bundle: our own, built from the installed package, and its requirements, from a directory or pip.
 
-`own_wheel` -> `fetch` (only without a directory) -> `choose` (one wheel for each requirement, the newest that the
-target takes).
+`own_wheel` -> `download_wheels` (only without a directory) -> `select_wheels` (the newest compatible wheel of each
+requirement).
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from pathlib import Path
 from meshctl.errors import InputError
 from meshctl.robots.wheel_tags import Target, WheelName, is_compatible, parse_wheel, pip_options
 
-# What udp_mesh imports besides the standard library, and what that needs in turn.
+# Dependencies of udp_mesh, direct and transitive.
 REQUIREMENTS = ("cryptography", "cffi", "pycparser")
 _PACKAGE = "udp_mesh"
-# Every entry gets it, so that the same sources make the same bytes; zip knows no earlier time.
+# The earliest zip timestamp, for reproducible wheels.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
-# Compiled files are a little smaller than their sources.
+# Size of .pyc files relative to their sources.
 _COMPILED_SHARE = 0.9
 _PIP_TIMEOUT_S = 600
 
 
 @dataclass(frozen=True, slots=True)
 class Wheel:
-    """A wheel's bytes under its file name; `unpacked_bytes` is what it takes on a disk, compiled."""
+    """A wheel file; `unpacked_bytes` is its size on disk, compiled."""
 
     file: str
     content: bytes = field(repr=False)
@@ -46,34 +46,34 @@ class Wheel:
 
     @property
     def stored(self) -> str:
-        """Its name on a robot: two wheels with one name but other bytes never meet there."""
+        """Its file name on a robot, unique by content."""
         return f"{self.sha256[:16]}-{self.file}"
 
 
 def _wheel(file: str, content: bytes) -> Wheel:
-    """Raises InputError for what is no archive, or would not install by unpacking alone."""
+    """Raises InputError for an invalid archive, and for one that cannot be installed by unpacking."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()
     except zipfile.BadZipFile as error:
-        raise InputError(f"{file}: is no wheel: {error}", hint="fetch it again") from error
+        raise InputError(f"{file} is not a wheel: {error}", hint="download it again") from error
     if any(".data/" in entry.filename for entry in entries):
-        raise InputError(f"{file}: has a .data directory, which only an installer places")
+        raise InputError(f"{file} has a .data directory, which requires an installer")
     sources = sum(entry.file_size for entry in entries if entry.filename.endswith(".py"))
     return Wheel(file, content, sum(entry.file_size for entry in entries) + int(sources * _COMPILED_SHARE))
 
 
 @cache
 def own_wheel() -> Wheel:
-    """udp_mesh alone as a wheel, without meshctl and what that depends on."""
+    """udp_mesh as a wheel, without meshctl and its dependencies."""
     spec = importlib.util.find_spec(_PACKAGE)
     if spec is None or spec.origin is None:
-        raise InputError(f"the package {_PACKAGE} is not installed beside meshctl")
+        raise InputError(f"package {_PACKAGE} is not installed")
     return build_wheel(Path(spec.origin).parent)
 
 
 def build_wheel(package: Path) -> Wheel:
-    """A wheel of the package in this directory, always the same for the same files."""
+    """A reproducible wheel of the package in this directory."""
     files = {
         f"{_PACKAGE}/{path.relative_to(package).as_posix()}": path.read_bytes()
         for path in sorted(package.rglob("*"))
@@ -105,26 +105,26 @@ def _urlsafe(content: bytes) -> str:
 
 
 def download_wheels(target: Target, directory: Path) -> None:
-    """Let pip download the requirements for a target into `directory`, on the operator's machine. Raises InputError."""
+    """Download the requirements for a target into `directory` with pip. Raises InputError."""
     directory.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary", ":all:", "--dest", str(directory), *pip_options(target), *REQUIREMENTS]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise InputError(f"pip could not fetch wheels for {target}: {error}") from error
+        raise InputError(f"pip could not download wheels for {target}: {error}") from error
     if done.returncode != 0:
-        last = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
-        hint = "without internet give the wheels: --wheels DIR"
-        raise InputError(f"pip could not fetch wheels for {target}: {last}", hint=hint)
+        last = (done.stderr.strip() or done.stdout.strip() or "no error message").splitlines()[-1]
+        hint = "without internet access, pass --wheels DIR"
+        raise InputError(f"pip could not download wheels for {target}: {last}", hint=hint)
 
 
 def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
-    """Our own wheel and one for each requirement. Raises InputError naming what is missing and what is there."""
+    """Our own wheel and one per requirement. Raises InputError with the missing and the available ones."""
     try:
         names = [parse_wheel(path.name) for path in sorted(directory.iterdir()) if path.suffix == ".whl"]
     except OSError as error:
-        raise InputError(f"{directory}: cannot be read: {error.strerror}") from error
+        raise InputError(f"cannot read {directory}: {error.strerror}") from error
     wheels = [name for name in names if name is not None]
     picked = [own_wheel()]
     missing = []
@@ -132,7 +132,7 @@ def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
         of_project = [wheel for wheel in wheels if wheel.project == project]
         fitting = [wheel for wheel in of_project if is_compatible(target, wheel)]
         if not fitting:
-            there = ", ".join(wheel.file for wheel in of_project) or "none at all"
+            there = ", ".join(wheel.file for wheel in of_project) or "none"
             missing.append(f"{directory}: expected a wheel of {project} for {target}, found {there}")
             continue
         best = max(fitting, key=_age)
@@ -140,17 +140,17 @@ def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
         try:
             picked.append(_wheel(best.file, path.read_bytes()))
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+            raise InputError(f"cannot read {path}: {error.strerror}") from error
     if missing:
         version = ".".join(map(str, target.python))
         words = f"pip download --only-binary :all: --python-version {version} --platform manylinux2014_{target.arch}"
-        hint = f"fetch them where there is internet: {words} -d DIR {' '.join(REQUIREMENTS)}"
+        hint = f"download them with internet access: {words} -d DIR {' '.join(REQUIREMENTS)}"
         raise InputError("\n".join(missing), hint=hint)
     return tuple(picked)
 
 
 def has_all(target: Target, directory: Path) -> bool:
-    """Whether `select_wheels` would find everything there."""
+    """Whether `select_wheels` would find everything."""
     if not directory.is_dir():
         return False
     there = [wheel for wheel in map(parse_wheel, (path.name for path in directory.iterdir())) if wheel is not None]
@@ -160,30 +160,30 @@ def has_all(target: Target, directory: Path) -> bool:
 
 
 def cache_wheels(wheels: Iterable[Wheel], directory: Path) -> None:
-    """Make these the wheels that a later command finds in `directory` without being told. Raises InputError."""
-    wanted = {wheel.file: wheel for wheel in wheels if parse_wheel(wheel.file) != parse_wheel(own_wheel().file)}
+    """Make these the only wheels in the cache `directory`, for later commands without --wheels. Raises InputError."""
+    keep = {wheel.file: wheel for wheel in wheels if parse_wheel(wheel.file) != parse_wheel(own_wheel().file)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        for name, wheel in wanted.items():
+        for name, wheel in keep.items():
             if not (directory / name).exists():
                 partial = directory / f".{name}.part"
                 partial.write_bytes(wheel.content)
                 partial.replace(directory / name)
         for path in directory.glob("*.whl"):
-            if path.name not in wanted:
+            if path.name not in keep:
                 path.unlink(missing_ok=True)
     except OSError as error:
-        raise InputError(f"{directory}: cannot be written: {error.strerror}") from error
+        raise InputError(f"cannot write {directory}: {error.strerror}") from error
 
 
 def _age(wheel: WheelName) -> tuple[tuple[int, ...], str]:
-    """Versions by their numbers; a tie by the file's name, so that the choice is always the same."""
+    """Sort key: version numbers, then the file name, so that the choice is deterministic."""
     return tuple(int(part) for part in re.findall(r"\d+", wheel.version)), wheel.file
 
 
 @cache
 def stock_units() -> Mapping[str, str]:
-    """The unit files that udp_mesh ships, by name."""
+    """The unit files shipped with udp_mesh, by name."""
     folder = f"{_PACKAGE}/daemon/units/"
     with zipfile.ZipFile(io.BytesIO(own_wheel().content)) as archive:
         return {

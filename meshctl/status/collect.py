@@ -148,8 +148,8 @@ class Collector:
         self.close()
 
     def _observe(self, node: Node) -> Observation:
-        wanted = self._desired_state(node)
-        paths = () if isinstance(wanted, str) else other_paths(wanted)
+        desired = self._desired_state(node)
+        paths = () if isinstance(desired, str) else other_paths(desired)
         with self.access.borrow(node) as connection:
             return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
 
@@ -171,9 +171,9 @@ class Collector:
         plans: dict[str, NodePlan] = {}
         unrendered: dict[str, str] = {}
         for node in nodes:
-            seen, wanted = observations.get(node.name), self._desired_state(node)
-            if isinstance(wanted, str):
-                unrendered[node.name] = wanted
+            seen, desired = observations.get(node.name), self._desired_state(node)
+            if isinstance(desired, str):
+                unrendered[node.name] = desired
             elif seen is not None:
                 exact = self.renderer.desired(node, seen)
                 plans[node.name] = node_plan(exact, seen, fingerprints, owner=self.owner)

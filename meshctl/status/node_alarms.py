@@ -91,9 +91,9 @@ def _drift(seen: NodeAlarmInput) -> Iterator[Alarm]:
 
 
 def _radios(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    wanted = {radio.name for radio in seen.node.radios if radio.mesh is not None}
+    mesh_radios = {radio.name for radio in seen.node.radios if radio.mesh is not None}
     for radio in seen.observation.radios or ():
-        if radio.name in wanted and (not radio.up or radio.setup_failed):
+        if radio.name in mesh_radios and (not radio.up or radio.setup_failed):
             why = "setup failed" if radio.setup_failed else "disabled" if radio.disabled else "down"
             hint = f"meshctl run {seen.node.name} -- logread -e netifd"
             yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}", hint)

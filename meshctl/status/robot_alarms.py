@@ -27,7 +27,7 @@ BUSY_LOAD = 3.0
 # Logs, recordings and stored messages fill a disk; below FULL_DISK_KIB the next deploy fails.
 LOW_DISK_SHARE, LOW_DISK_KIB = 0.10, 2 << 20
 FULL_DISK_KIB = 64 << 10
-DRIFT_LINES_SHOWN = 3
+MAX_DRIFT_LINES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +101,8 @@ def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:
 def _drift(seen: RobotAlarmInput) -> Iterator[Alarm]:
     facts, name = seen.facts, seen.robot.name
     if facts.drift and facts.release:
-        more = len(facts.drift) - DRIFT_LINES_SHOWN
-        text = "; ".join(facts.drift[:DRIFT_LINES_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+        more = len(facts.drift) - MAX_DRIFT_LINES
+        text = "; ".join(facts.drift[:MAX_DRIFT_LINES]) + (f"; and {more} more" if more > 0 else "")
         hint = f"meshctl robots diff {name}; meshctl robots deploy {name} fixes it"
         yield Alarm(Level.WARNING, "drift", text, hint)
     versions = Counter(one.version for one in (*seen.daemons.values(), facts) if one.answers)

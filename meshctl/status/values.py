@@ -121,7 +121,7 @@ class NodeStatus:
 @dataclass(frozen=True, slots=True)
 class TopicStatus:
     """One topic at one robot. `limit_s` is the longest gap that its rate and deadline allow (None: unlimited);
-    `trouble` says what is wrong, `code` in one word (`undeclared`, `silent`, `not-arriving`), both empty when nothing
+    `problem` says what is wrong, `code` in one word (`undeclared`, `silent`, `not-arriving`), both empty when nothing
     is."""
 
     name: str

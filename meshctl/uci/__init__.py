@@ -1,4 +1,4 @@
-"""UCI, OpenWrt's configuration format: text -> tree -> text, and the difference of two trees."""
+"""UCI, OpenWrt's configuration format: text -> tree -> text, and diffs of trees."""
 
 from meshctl.uci.difference import ChangeKind, Diff, OptionChange, SectionChange, apply, diff, is_secret_option
 from meshctl.uci.parser import parse, parse_export

@@ -1,7 +1,7 @@
-"""Two trees of one package -> what changes, section by section; and back: `apply(diff(a, b), a) == b`.
+"""Diff of two trees of one package, section by section; `apply(diff(a, b), a) == b`.
 
-Sections are paired by name and type, anonymous ones by content and then by order within their type. Of the pairs, the
-longest run that keeps its order stands still; what has to jump over it is listed as moved.
+Sections are paired by name and type, anonymous ones by content and then by order within their type. The longest
+increasing subsequence of pairs stays in place; the other pairs are listed as moved.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from meshctl.model import MASK
 from meshctl.uci.text import quote
 from meshctl.uci.tree import Package, Section, Value
 
-# Options that hold keys and passwords in OpenWrt's packages; their values are never shown, whoever wrote them.
-# dropbear's PasswordAuth only says on or off.
+# Options with keys and passwords in OpenWrt's packages, whose values are never shown. dropbear's PasswordAuth is only
+# on or off.
 _SECRET_OPTION = re.compile(
     r"(?!(Root)?PasswordAuth$)(key\d?|.*(passw(or)?d|passphrase|psk|secret|private_key|_pwd).*)", re.IGNORECASE
 )
 
 
 def is_secret_option(name: str) -> bool:
-    """Whether an option of this name holds a key or password."""
+    """Whether an option of this name contains a key or password."""
     return _SECRET_OPTION.fullmatch(name) is not None
 
 
@@ -58,8 +58,8 @@ class OptionChange:
 
 @dataclass(frozen=True, slots=True)
 class SectionChange:
-    """One section. `key` is how `uci` addresses it, in the new package, or in the old one when it is removed; the
-    indexes are its places among the sections before and after. A moved section may have changed, too."""
+    """One section. `key` is its `uci` address in the new package, or in the old one if it is removed; the indexes are
+    its positions before and after. A moved section may also have changed."""
 
     kind: ChangeKind
     key: str
@@ -80,7 +80,7 @@ class SectionChange:
 
 @dataclass(frozen=True, slots=True)
 class Diff:
-    """What turns one package into another; empty (and false) when nothing does."""
+    """The changes from one package to another; false if there are none."""
 
     package: str
     changes: tuple[SectionChange, ...]
@@ -89,7 +89,7 @@ class Diff:
         return bool(self.changes)
 
     def lines(self) -> Iterator[str]:
-        """For people, secrets masked: `~ wireless.radio0.channel: '6' -> '11'`, `+ network.bat0 (interface)`."""
+        """Lines for display, secrets masked: `~ wireless.radio0.channel: '6' -> '11'`, `+ network.bat0 (interface)`."""
         for change in self.changes:
             place = f"{self.package}.{change.key}"
             match change.kind:
@@ -111,7 +111,7 @@ def _type(section: Section | None) -> str:
 
 
 def diff(before: Package, after: Package) -> Diff:
-    """What turns `before` into `after`. Raises ValueError for packages of different names."""
+    """The changes from `before` to `after`. Raises ValueError for packages with different names."""
     if before.name != after.name:
         raise ValueError(f"expected two versions of package {before.name}, found {after.name}")
     pairs = _pairs(before, after)
@@ -137,7 +137,7 @@ def diff(before: Package, after: Package) -> Diff:
 
 
 def _pairs(before: Package, after: Package) -> dict[int, int]:
-    """Index in `before` -> index in `after` of what is the same section."""
+    """Index in `before` -> index in `after` of the same section."""
     new_names = {(s.name, s.type): index for index, s in enumerate(after.sections) if s.name is not None}
     pairs = {}
     for index, section in enumerate(before.sections):
@@ -150,7 +150,7 @@ def _pairs(before: Package, after: Package) -> dict[int, int]:
 
 
 def _anonymous_pairs(before: Package, after: Package, type_name: str) -> Iterator[tuple[int, int]]:
-    """Equal sections first; between them, the first with the first and so on."""
+    """Pair equal sections first, and the sections between them in order."""
     old = [index for index, s in enumerate(before.sections) if s.name is None and s.type == type_name]
     new = [index for index, s in enumerate(after.sections) if s.name is None and s.type == type_name]
     matcher = SequenceMatcher(
@@ -177,14 +177,14 @@ def _longest_increasing(indexes: list[int]) -> frozenset[int]:
 
 
 def apply(change: Diff, package: Package) -> Package:
-    """The package after the change. Raises ValueError when it is not the one that the change was made from."""
+    """Apply a change. Raises ValueError if `package` is not the one that the diff was made from."""
     if package.name != change.package:
         raise ValueError(f"expected package {change.package}, found {package.name}")
     rest: dict[int, Section] = dict(enumerate(package.sections))
     placed: dict[int, Section] = {}
     for item in change.changes:
         if item.before_index is not None and rest.get(item.before_index) != item.before:
-            raise ValueError(f"{change.package}.{item.key} is not what the difference was made from")
+            raise ValueError(f"{change.package}.{item.key} differs from the base of the diff")
         match item.kind:
             case ChangeKind.REMOVED:
                 del rest[_index(item.before_index)]

@@ -1,13 +1,12 @@
-"""Text -> tree, by the rules of libuci's own reader (file.c), with the line and column of what it rejects.
+"""Text -> tree, by the rules of libuci's parser (file.c); errors have line and column.
 
 `parse` reads one file of /etc/config, `parse_export` what `uci export` prints. Both split the text into statements
 (`_Reader.statements`), the statements into arguments (`argument`), and fold the statements into sections (`_Builder`).
 
-The rules, where they surprise: `p`, `c`, `o` and `l` stand for the four keywords; a quoted part may stand in the middle
-of an argument and may span lines; only outside single quotes does a backslash escape; `#` starts a comment anywhere
-outside quotes; `;` separates statements but, directly behind an unquoted argument, silently ends the line; an
-`option x ''` is no option at all; a named section that comes twice is continued; `option` after `list` replaces it and
-`list` after `option` appends to it.
+Surprising rules: `p`, `c`, `o` and `l` abbreviate the four keywords; an argument may contain quoted parts, which may
+span lines; a backslash escapes except in single quotes; `#` starts a comment anywhere outside quotes; `;` separates
+statements but, directly after an unquoted argument, silently ends the line; `option x ''` is ignored; a repeated named
+section continues the first; `option` after `list` replaces it, and `list` after `option` appends to it.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from dataclasses import dataclass, field
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.uci.tree import NAME, TYPE, Package, Section, Value
 
-# isspace() of the C locale; other Unicode spaces are letters to libuci.
+# isspace() of the C locale; other Unicode spaces are ordinary characters to libuci.
 _SPACES = " \t\n\v\f\r"
 _SPACE_RUN = re.compile(r"[ \t\n\v\f\r]*")
-# What needs attention inside each kind of text; everything up to it is taken at once.
+# A run of characters without special meaning.
 _PLAIN_RUN = re.compile(r"[^'\"#;\\ \t\n\v\f\r]+")
-# A `package` line is held to more than the name of a file is.
+# The name in a `package` line is more restricted than a file name.
 _PACKAGE_LINE = re.compile(r"[A-Za-z0-9_-]+")
 _KEYWORD = re.compile(r"[ \t]*([^ \t]*)[ \t]?")
 _KEYWORDS = {word: word[0] for word in ("package", "config", "option", "list")} | {c: c for c in "pcol"}
-# The two shapes that nearly every line has, read without the machinery: they mean the same there.
-_USUAL_OPTION = re.compile(r"[ \t]*(option|list)[ \t]+([A-Za-z0-9_]+)[ \t]+'([^'\n]*)'[ \t]*(?:\n|\Z)")
-_USUAL_CONFIG = re.compile(r"[ \t]*config[ \t]+([A-Za-z0-9_-]+)(?:[ \t]+'([A-Za-z0-9_]+)')?[ \t]*(?:\n|\Z)")
+# Fast path for the two most common forms of lines.
+_COMMON_OPTION = re.compile(r"[ \t]*(option|list)[ \t]+([A-Za-z0-9_]+)[ \t]+'([^'\n]*)'[ \t]*(?:\n|\Z)")
+_COMMON_CONFIG = re.compile(r"[ \t]*config[ \t]+([A-Za-z0-9_-]+)(?:[ \t]+'([A-Za-z0-9_]+)')?[ \t]*(?:\n|\Z)")
 
 
 def parse(text: str, file: str, *, name: str = "") -> Package:
@@ -52,7 +51,7 @@ def parse_export(text: str, file: str) -> tuple[Package, ...]:
 
 
 class _Refused(Exception):
-    """A statement that cannot be; the reader adds the place."""
+    """An invalid statement; the reader adds the position."""
 
     def __init__(self, expected: str, found: str) -> None:
         super().__init__(expected, found)
@@ -64,7 +63,7 @@ class _Refused(Exception):
 class _OpenSection:
     type: str
     name: str | None
-    # lists grow in place, so that long ones cost no more than their length
+    # mutable, so that appending is cheap
     options: dict[str, str | list[str]] = field(default_factory=dict)
 
     def closed(self) -> Section:
@@ -102,7 +101,7 @@ class _Builder:
 
     def open_package(self, name: str) -> None:
         if any(package.name == name for package in self._packages):
-            raise _Refused("every package once", f"{name!r} again")
+            raise _Refused("each package once", f"{name!r} again")
         self._packages.append(_OpenPackage(name))
         self._section = None
 
@@ -144,7 +143,7 @@ class _Builder:
 
 
 class _Reader:
-    """Walks through the text; `_end` is the end of what libuci has read so far: the line, or a quote's last line."""
+    """Reads the text; `_end` is the end of libuci's current input: the line, or the last line of a quoted part."""
 
     def __init__(self, text: str, file: str) -> None:
         self._text = text
@@ -153,28 +152,28 @@ class _Reader:
         self._end = 0
 
     def statements(self, builder: _Builder) -> None:
-        """Hand every statement to `builder`. Raises InvalidInput at the first that libuci would reject."""
+        """Pass every statement to `builder`. Raises InvalidInput at the first one that libuci would reject."""
         nul = self._text.find("\0")
         if nul >= 0:
             raise self._invalid(nul, "text", "a NUL byte")
         while self._end < len(self._text):
-            if self._usual_line(builder):
+            if self._common_line(builder):
                 continue
             self._next_line()
             self._skip_spaces()
             while self._statement(builder):
                 pass
 
-    def _usual_line(self, builder: _Builder) -> bool:
+    def _common_line(self, builder: _Builder) -> bool:
         start = self._end
-        option = _USUAL_OPTION.match(self._text, start)
+        option = _COMMON_OPTION.match(self._text, start)
         if option is not None:
             keyword, name, value = option.groups()
             add = builder.option if keyword == "option" else builder.list_item
             self._apply(lambda: add(name, value), start)
             self._end = option.end()
             return True
-        section = _USUAL_CONFIG.match(self._text, start)
+        section = _COMMON_CONFIG.match(self._text, start)
         if section is not None:
             type_name, section_name = section.groups(default="")
             self._apply(lambda: builder.config(type_name, section_name), start)
@@ -257,7 +256,7 @@ class _Reader:
                     self._at = self._end
                     break
                 case ";":
-                    # libuci writes the terminator of an unquoted argument over the semicolon, and so ends the line
+                    # libuci overwrites the semicolon with the terminator of an unquoted argument, which ends the line
                     if len("".join(parts)) == self._at - start:
                         self._at = self._end
                     break
@@ -268,7 +267,7 @@ class _Reader:
                 case _:
                     self._plain(parts)
             if self._char() in _SPACES:
-                # at the end of the line there is nothing to step over
+                # nothing to skip at the end of the line
                 self._at += 1 if self._char() else 0
                 break
         return "".join(parts)
@@ -305,7 +304,7 @@ class _Reader:
             self._at += 1
 
     def _backslash(self) -> bool:
-        """Step over a backslash; False when it joined the next line to this one."""
+        """Skip a backslash; False if it continues the line."""
         self._at += 1
         if self._text[self._at : self._end] in ("", "\n", "\r\n"):
             self._at = self._end
@@ -315,7 +314,7 @@ class _Reader:
 
     def _plain(self, parts: list[str]) -> None:
         found = _PLAIN_RUN.match(self._text, self._at, self._end)
-        assert found is not None, "the caller has seen a plain character"
+        assert found is not None, "the next character is plain"
         parts.append(found[0])
         self._at = found.end()
 
@@ -327,7 +326,7 @@ class _Reader:
         self._at = found.end() if found is not None else self._at
 
     def _next_line(self) -> bool:
-        """Read one more line behind `_end`; False at the end of the text."""
+        """Read the next line; False at the end of the text."""
         if self._end >= len(self._text):
             return False
         self._at = self._end

@@ -1,6 +1,6 @@
-"""Tree -> text: the canonical form, byte for byte what `uci export` and `uci commit` write.
+"""Tree -> canonical text, byte for byte as `uci export` and `uci commit` write it.
 
-One function quotes every value; nothing else in meshctl writes a UCI value.
+`quote` is the only function in meshctl that quotes UCI values.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ import re
 
 from meshctl.uci.tree import Package, Section
 
-# A section type that libuci's own writer, which does not quote types, would write so that it reads back.
+# A section type that reads back unchanged although libuci does not quote types.
 _PLAIN_TYPE = re.compile(r"[^'\"\\#;]+")
 
 
 def dump(package: Package, *, header: bool = False) -> str:
-    """The package's file; with `header`, a block of `uci export`, which starts with `package NAME`."""
+    """The text of a package file; with `header`, a block of `uci export`, which starts with `package NAME`."""
     parts = [f"package {_plain(package.name)}\n"] if header else []
     for section in package.sections:
         parts.append(_section(section))
@@ -40,8 +40,8 @@ def _plain(word: str) -> str:
 def quote(value: str) -> str:
     """`value` as one UCI argument that reads back unchanged: in single quotes, a quote as `'\\''` (file.c, uci_escape).
 
-    Newlines, other control characters and non-ASCII letters stay as they are. Raises ValueError for a NUL, which no C
-    string holds.
+    Newlines, other control characters and non-ASCII letters stay as they are. Raises ValueError for a NUL, which C
+    strings cannot contain.
     """
     if "\0" in value:
         raise ValueError("expected text, found a NUL byte")

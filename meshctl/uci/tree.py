@@ -1,7 +1,7 @@
 """The tree of a UCI package: package -> sections in order -> options, each a string or a list of strings.
 
-The trees are values: frozen, compared by content. The order of options within a section means nothing to OpenWrt and is
-ignored when comparing; the order of sections means something (firewall rules) and counts.
+Trees are frozen and compared by content. Comparison ignores the order of options, which OpenWrt ignores, but not the
+order of sections, which is significant (firewall rules).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TypeAlias
 # An option's value: text, or the items of a list.
 Value: TypeAlias = str | tuple[str, ...]
 
-# libuci's rules for what may stand where (util.c, uci_validate_str): names of sections and options, types, packages.
+# libuci's rules for names of sections and options, types and packages (util.c, uci_validate_str).
 NAME = re.compile(r"[A-Za-z0-9_]+")
 TYPE = re.compile(r"[!-~]+")
 PACKAGE_NAME = re.compile(r"[!-~]+")
@@ -25,8 +25,8 @@ PACKAGE_NAME = re.compile(r"[!-~]+")
 class Section:
     """`config TYPE 'NAME'` and its options; `name` None is an anonymous section.
 
-    Raises ValueError for what no UCI file can hold: a name with other characters than letters, digits and `_`, an empty
-    option (libuci drops `option x ''` when it reads it), an empty list, a NUL.
+    Raises ValueError for what a UCI file cannot contain: a name with other characters than letters, digits and `_`, an
+    empty option (libuci ignores `option x ''`), an empty list, a NUL.
     """
 
     type: str
@@ -69,7 +69,7 @@ class Package:
         names = [section.name for section in self.sections if section.name is not None]
         if len(names) != len(set(names)):
             twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"package {self.name}: section {twice!r} stands there twice")
+            raise ValueError(f"package {self.name}: duplicate section {twice!r}")
 
     def section(self, name: str) -> Section | None:
         """The section of that name, or None."""
@@ -97,6 +97,6 @@ def _check_option(option: str, value: Value) -> None:
     if not NAME.fullmatch(option):
         raise ValueError(f"option name: expected letters, digits and _, found {option!r}")
     if not value:
-        raise ValueError(f"option {option}: expected a value, found an empty one, which UCI cannot hold")
+        raise ValueError(f"option {option}: expected a value, found an empty one, which UCI cannot represent")
     if "\0" in (value if isinstance(value, str) else "".join(value)):
         raise ValueError(f"option {option}: expected text, found a NUL byte")

@@ -78,12 +78,12 @@ class Apt:
     work: Path
     sources: Mapping[str, str]
 
-    def get(self, archives: Path, *words: str, folder: Path | None = None) -> str:
+    def get(self, archives: Path, *arguments: str, folder: Path | None = None) -> str:
         """Run `apt-get` with its archives in `archives`; returns its output. Raises LabError when it fails."""
-        return _run(("apt-get", *self._options(archives), *words), folder)
+        return _run(("apt-get", *self._options(archives), *arguments), folder)
 
-    def cache(self, *words: str) -> str:
-        return _run(("apt-cache", *self._options(self.work), *words))
+    def cache(self, *arguments: str) -> str:
+        return _run(("apt-cache", *self._options(self.work), *arguments))
 
     def _options(self, archives: Path) -> tuple[str, ...]:
         status = self.work / "status"
@@ -190,18 +190,18 @@ def _unpack_one(archive: Path, root: Path) -> None:
         ) from error
 
 
-def _run(words: Sequence[str], folder: Path | None = None) -> str:
-    if shutil.which(words[0]) is None:
+def _run(command: Sequence[str], folder: Path | None = None) -> str:
+    if shutil.which(command[0]) is None:
         raise LabError(
-            f"building the lab's machine needs {words[0]}, which is not installed", hint="use a Debian or Ubuntu host"
+            f"building the lab's machine needs {command[0]}, which is not installed", hint="use a Debian or Ubuntu host"
         )
     try:
-        done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=_DOWNLOAD_S, check=False)
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=_DOWNLOAD_S, check=False)
     except subprocess.TimeoutExpired as error:
-        raise LabError(f"{words[0]} did not finish within {_DOWNLOAD_S:g} s", hint=_HINT) from error
+        raise LabError(f"{command[0]} did not finish within {_DOWNLOAD_S:g} s", hint=_HINT) from error
     if done.returncode != 0:
         lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
         raise LabError(
-            f"{words[0]} failed for the lab's machine: {lines[-1] if lines else done.returncode}", hint=_HINT
+            f"{command[0]} failed for the lab's machine: {lines[-1] if lines else done.returncode}", hint=_HINT
         )
     return done.stdout

@@ -26,7 +26,7 @@ from typing import Any
 
 from meshlab.control import Control
 from meshlab.errors import LabError
-from meshlab.port_forwarder import claim_port
+from meshlab.port_forwarder import lock_port
 from meshlab.qemu import guest_protocol, initramfs
 from meshlab.qemu.qemu import TCG, Machine, cached_accelerator, find_qemu
 from meshlab.qemu.remote_exec import run_process
@@ -60,7 +60,7 @@ class HostProxy:
         loop = asyncio.get_running_loop()
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
-        port_lock, self.port = claim_port(self._wanted_port)
+        port_lock, self.port = lock_port(self._wanted_port)
         control = Control(self._directory, self.answer)
         control.open()
         watching = asyncio.ensure_future(self._watch())
@@ -103,9 +103,9 @@ class HostProxy:
             answer |= {"pid": os.getpid(), "port": self.port}
         return answer
 
-    async def _connect(self, kind: str, **words: Any) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    async def _connect(self, kind: str, **fields: Any) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         reader, writer = await asyncio.open_connection("127.0.0.1", self._machine.port, limit=guest_protocol.LINE_BYTES)
-        writer.write(guest_protocol.line({"token": self._token, "kind": kind, **words}))
+        writer.write(guest_protocol.line({"token": self._token, "kind": kind, **fields}))
         await writer.drain()
         return reader, writer
 
@@ -192,12 +192,12 @@ def start(directory: Path, spec_text: str, token: str) -> Machine:
     initrd = initramfs.build_initrd(base, spec_text, token, directory)
     spec = load(spec_text)
     radios = sum(len(node.radios) for node in spec.nodes)
-    how = cached_accelerator(base.kernel, cache)
-    log.info("accelerator words=%s", " ".join(how.options))
+    accelerator = cached_accelerator(base.kernel, cache)
+    log.info("accelerator options=%s", " ".join(accelerator.options))
     machine = Machine(directory, base.kernel, initrd, radios=radios, nodes=len(spec.nodes))
     for attempt in range(1, _ATTEMPTS + 1):
         try:
-            machine.start(how, _START_S)
+            machine.start(accelerator, _START_S)
             _check_reachable(machine, token)
             break
         except LabError as error:
@@ -207,7 +207,7 @@ def start(directory: Path, spec_text: str, token: str) -> Machine:
             if attempt == _ATTEMPTS:
                 raise LabError(f"{error} ({_ATTEMPTS} times); consoles are kept: {kept}", hint=error.hint) from error
             # KVM may fail in a long boot though the short probe succeeded
-            how = TCG
+            accelerator = TCG
     initrd.unlink()
     return machine
 

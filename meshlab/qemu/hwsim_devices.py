@@ -89,7 +89,7 @@ def prepare(spec: FleetSpec, country: str = "US") -> None:
     ip(batch)
     for lan in spec.lans:
         address = [f"addr add {lan.computer} dev eth0"] if lan.computer else []
-        ip(["link set lo up", "link set eth0 up", *address], space=computer_namespace(lan))
+        ip(["link set lo up", "link set eth0 up", *address], namespace=computer_namespace(lan))
     # do not answer ARP on one bench cable for the address of another
     Path("/proc/sys/net/ipv4/conf/all/arp_ignore").write_text("1\n", encoding="ascii")
     run(("iw", "reg", "set", country))
@@ -180,13 +180,13 @@ def set_group(phy: str, mask: int) -> None:
     (_GROUPS / phy / "hwsim" / "group").write_text(f"{mask}\n", encoding="ascii")
 
 
-def ip(lines: Sequence[str], *, space: str = "") -> None:
+def ip(lines: Sequence[str], *, namespace: str = "") -> None:
     """Run several `ip` commands in one process. Raises LabError with its error output."""
-    where = ("-n", space) if space else ()
+    where = ("-n", namespace) if namespace else ()
     run(("ip", *where, "-batch", "-"), stdin="".join(f"{line}\n" for line in lines))
 
 
-def run(words: Sequence[str], *, stdin: str = "", node: int = 0, network: int = -1) -> str:
+def run(command: Sequence[str], *, stdin: str = "", node: int = 0, network: int = -1) -> str:
     """Run a program in the network namespace of the node whose process 1 is `node`, in that of the descriptor
     `network`, or (neither) in the machine's own; returns its output.
 
@@ -201,7 +201,7 @@ def run(words: Sequence[str], *, stdin: str = "", node: int = 0, network: int = 
                 raise LabError("the node has ended") from error
             stack.callback(os.close, network)
         enter = (lambda: ns.setns(network, ns.CLONE_NEWNET)) if network >= 0 else None
-        done = subprocess.run(words, input=stdin, capture_output=True, text=True, check=False, preexec_fn=enter)
+        done = subprocess.run(command, input=stdin, capture_output=True, text=True, check=False, preexec_fn=enter)
     if done.returncode != 0:
-        raise LabError(f"{' '.join(words)}: {done.stderr.strip() or done.returncode}")
+        raise LabError(f"{' '.join(command)}: {done.stderr.strip() or done.returncode}")
     return done.stdout

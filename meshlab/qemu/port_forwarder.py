@@ -71,17 +71,17 @@ class QemuPortForwarder(PortForwarder):
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             async with asyncio.timeout(_DIAL_S):
-                await self._connected(made, host, port)
+                await self._wait_connected(made, host, port)
         except BaseException:
             made.close()
             raise
         return made
 
-    async def _connected(self, made: socket.socket, host: str, port: ForwardedPort) -> None:
+    async def _wait_connected(self, made: socket.socket, host: str, port: ForwardedPort) -> None:
         """Wait until the socket is connected. Raises LabError as soon as the port's target changes: a node that gave up
         an address does not reject packets to it."""
         connecting = asyncio.ensure_future(asyncio.get_running_loop().sock_connect(made, (port.address, _SSH_PORT)))
-        moving = asyncio.ensure_future(self._moved(host, port))
+        moving = asyncio.ensure_future(self._wait_moved(host, port))
         try:
             await asyncio.wait((connecting, moving), return_when=asyncio.FIRST_COMPLETED)
             if not connecting.done():
@@ -93,7 +93,7 @@ class QemuPortForwarder(PortForwarder):
             # the socket must not be closed while it is being waited for
             await asyncio.gather(connecting, moving, return_exceptions=True)
 
-    async def _moved(self, host: str, port: ForwardedPort) -> None:
+    async def _wait_moved(self, host: str, port: ForwardedPort) -> None:
         while self._reachable.get(host) == port:
             await self.changed.wait()
 
@@ -118,16 +118,16 @@ class QemuPortForwarder(PortForwarder):
             raise LabError("the fleet has no base: its nodes are reachable on the bench only")
         space = hwsim_devices.computer_namespace(lan)
         if not lan.computer or IPv4Interface(lan.computer).network != address.network:
-            _add_address("eth0", hwsim_devices.operator_address(address, 0), space=space)
+            _add_address("eth0", hwsim_devices.operator_address(address, 0), namespace=space)
         return self._socket_in(space)
 
-    def _socket_in(self, space: str) -> socket.socket:
-        if space not in self._computers:
-            self._computers[space] = os.open(Path("/run/netns") / space, os.O_RDONLY | os.O_CLOEXEC)
+    def _socket_in(self, namespace: str) -> socket.socket:
+        if namespace not in self._computers:
+            self._computers[namespace] = os.open(Path("/run/netns") / namespace, os.O_RDONLY | os.O_CLOEXEC)
         home = os.open("/proc/self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         try:
             # synchronous, so that nothing else runs in the other namespace
-            ns.setns(self._computers[space], ns.CLONE_NEWNET)
+            ns.setns(self._computers[namespace], ns.CLONE_NEWNET)
             try:
                 return socket.socket(socket.AF_INET, socket.SOCK_STREAM)
             finally:
@@ -136,7 +136,7 @@ class QemuPortForwarder(PortForwarder):
             os.close(home)
 
 
-def _add_address(device: str, address: IPv4Interface, *, space: str = "") -> None:
+def _add_address(device: str, address: IPv4Interface, *, namespace: str = "") -> None:
     with contextlib.suppress(LabError):
         # the address may already be set
-        hwsim_devices.ip([f"addr add {address} dev {device}"], space=space)
+        hwsim_devices.ip([f"addr add {address} dev {device}"], namespace=namespace)

@@ -60,15 +60,15 @@ def find_qemu() -> None:
 
 def cached_accelerator(kernel: Path, cache: Path) -> Accelerator:
     """`probe_accelerator`, run once per boot of the host and kept in `cache`."""
-    note = cache / "accelerator"
+    cache_file = cache / "accelerator"
     boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     with contextlib.suppress(OSError, ValueError):
-        known, word = note.read_text(encoding="ascii").split()
+        known, word = cache_file.read_text(encoding="ascii").split()
         if known == boot:
             return KVM if word == "kvm" else TCG
-    how = probe_accelerator(kernel)
-    note.write_text(f"{boot} {'kvm' if how is KVM else 'tcg'}\n", encoding="ascii")
-    return how
+    accelerator = probe_accelerator(kernel)
+    cache_file.write_text(f"{boot} {'kvm' if accelerator is KVM else 'tcg'}\n", encoding="ascii")
+    return accelerator
 
 
 def probe_accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelerator:
@@ -79,12 +79,12 @@ def probe_accelerator(kernel: Path, device: Path = Path("/dev/kvm")) -> Accelera
         return TCG
     with tempfile.TemporaryDirectory(prefix="meshctl-probe-") as folder:
         console = Path(folder) / "console"
-        words = (
+        command = (
             QEMU, "-M", "q35", *KVM.options, "-m", "256", "-nodefaults", "-display", "none", "-no-reboot",
             "-kernel", str(kernel), "-append", "console=ttyS0 panic=-1", "-serial", f"file:{console}",
         )  # fmt: skip
-        silence = subprocess.DEVNULL
-        with subprocess.Popen(words, stdin=silence, stdout=silence, stderr=silence) as probe:
+        null = subprocess.DEVNULL
+        with subprocess.Popen(command, stdin=null, stdout=null, stderr=null) as probe:
             try:
                 deadline = time.monotonic() + _PROBE_S
                 while probe.poll() is None and time.monotonic() < deadline:
@@ -113,7 +113,7 @@ class Machine:
         self._process: subprocess.Popen[bytes] | None = None
         self.port = 0
 
-    def start(self, how: Accelerator, wait_s: float) -> None:
+    def start(self, accelerator: Accelerator, wait_s: float) -> None:
         """Boot it; returns when its supervisor is ready and `port` on 127.0.0.1 is forwarded to it.
 
         Raises LabError with the console's last lines when it ends or is not ready within `wait_s`; it is stopped then.
@@ -121,12 +121,12 @@ class Machine:
         self.console.unlink(missing_ok=True)
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            with (self._directory / "qemu.log").open("wb") as complaints:
+            with (self._directory / "qemu.log").open("wb") as errors:
                 self._process = subprocess.Popen(
-                    self._words(how, theirs.fileno()),
+                    self._command(accelerator, theirs.fileno()),
                     stdin=subprocess.DEVNULL,
-                    stdout=complaints,
-                    stderr=complaints,
+                    stdout=errors,
+                    stderr=errors,
                     pass_fds=(theirs.fileno(),),
                     # safe: this process has one thread
                     preexec_fn=ns.die_with_parent,
@@ -139,14 +139,14 @@ class Machine:
                 self.stop()
                 raise
 
-    def _words(self, how: Accelerator, monitor: int) -> tuple[str, ...]:
+    def _command(self, accelerator: Accelerator, monitor: int) -> tuple[str, ...]:
         line = (
             "console=ttyS0 quiet panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check tsc=reliable "
             f"{_KERNEL_OPTIONS} lab.radios={self._radios}"
         )
         network = f"user,id=host,restrict=on,net={NETWORK},host={GATEWAY},hostfwd=tcp:127.0.0.1:0-{ADDRESS}:{PORT}"
         return (
-            QEMU, "-M", "q35", *how.options, "-smp", str(_PROCESSORS), "-m", str(self._memory_mib),
+            QEMU, "-M", "q35", *accelerator.options, "-smp", str(_PROCESSORS), "-m", str(self._memory_mib),
             "-nodefaults", "-display", "none", "-no-reboot",
             "-kernel", str(self._kernel), "-initrd", str(self._initrd), "-append", line,
             "-netdev", network, "-device", "virtio-net-pci,netdev=host,romfile=", "-device", "virtio-rng-pci",
@@ -193,16 +193,16 @@ class Machine:
 def _forwarded_port(monitor: socket.socket) -> int:
     """The host port that QEMU chose for the forward, from its monitor."""
     monitor.settimeout(_PROBE_S)
-    said = b""
+    output = b""
     try:
         monitor.sendall(b"info usernet\n")
         while True:
-            match = re.search(rb"TCP\[HOST_FORWARD\]\s+\d+\s+127\.0\.0\.1\s+(\d+)", said)
+            match = re.search(rb"TCP\[HOST_FORWARD\]\s+\d+\s+127\.0\.0\.1\s+(\d+)", output)
             if match:
                 return int(match[1])
             more = monitor.recv(4096)
             if not more:
                 raise LabError("QEMU ended immediately", hint="see qemu.log in the fleet's directory")
-            said += more
+            output += more
     except OSError as error:
         raise LabError(f"QEMU's monitor did not answer: {error}") from error

@@ -1,4 +1,4 @@
-"""Which frames carry ARP, what they cost of the air, and the table of it."""
+"""Recognition of ARP frames, their airtime, and the table."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_what_goes_to_one_station_is_acknowledged_and_costs_that_too() -> None:
     assert air_us(one, "unicast") == 20 * airtime_us(0, 84, "probe")
 
 
-def test_a_row_tells_of_a_minute_and_what_was_not_measured_is_said() -> None:
+def test_a_row_is_per_minute_and_missing_results_are_marked() -> None:
     lines = table([result("pings", is_on=False), result("pings", is_on=False, requests=20)]).splitlines()
     assert next(line for line in lines if line.startswith("| pings | off")).startswith(
         "| pings | off | 2 | 30 | 360 | 40 | 35760 | "

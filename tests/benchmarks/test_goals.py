@@ -1,4 +1,4 @@
-"""The comparison's bookkeeping: every goal names a cell that is run, and a missed goal is told as missed."""
+"""Evaluation of goals: every goal names an existing cell, and a missed goal is reported as missed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_cell_run_several_times_is_judged_by_its_median() -> None:
     assert [met for goal, _, met in judged(runs) if goal.figure == "share"] == [True]
 
 
-def test_ours_is_compared_with_the_best_other_that_delivers_and_told_as_behind_where_it_is() -> None:
+def test_our_figures_are_compared_with_the_best_other_transport_and_marked_if_behind() -> None:
     cell = {"set": "loss", "name": "0%"}
     results = [
         {**cell, "peer": OURS, "share": 0.95, "urgent_p99_s": 0.02, "urgent_arrived": 1.0},

@@ -1,4 +1,4 @@
-"""The emulated link keeps its word: what it counts is what it carried, and each setting does what it says."""
+"""The emulated link: its counters are exact, and each setting has its effect."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def send(lab: Laboratory, count: int) -> None:
 
 
 def settled(lab: Laboratory, count: int) -> None:
-    """Wait until the link has dealt with every frame it was given."""
+    """Wait until the link has handled every frame."""
     for _ in range(3000):
         port, other = lab.count().ports
         if port.queue_drops + port.losses + port.down_drops + other.out_frames >= count:
             return
         time.sleep(0.01)
-    raise AssertionError(f"{count} frames were sent, the link tells of {lab.count()}")
+    raise AssertionError(f"{count} frames were sent, the link counted {lab.count()}")
 
 
 def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab: Laboratory) -> None:
@@ -54,7 +54,7 @@ def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab
     send(lab, 200)
     settled(lab, 200)
     count = lab.count()
-    # the receiver's answers to the datagram that taught the emulator may still be under way
+    # the receiver's replies to the learning datagram may still be in flight
     assert 200 <= count.ports[1].out_frames <= 202
     assert count.ports[1].out_bytes == pytest.approx(200 * 1028, rel=0.01)
     assert count.airtime_s == pytest.approx(200 * 1028 * 8 / 1e9, rel=0.02)

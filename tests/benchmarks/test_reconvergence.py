@@ -1,4 +1,4 @@
-"""The airtime of batman-adv's own packets, what is a pause, which case is measured when, and the table."""
+"""Airtime of batman-adv's own packets, detection of pauses, order of the cases, and the table."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def row(results: list[dict[str, Any]], case: Case) -> str:
     return next(line for line in table(results).splitlines() if f"| {case.algorithm} | {case.interval_ms} ms" in line)
 
 
-def test_a_row_tells_how_often_it_was_measured_with_median_and_range() -> None:
+def test_a_row_has_number_of_runs_median_and_range() -> None:
     results = [result(FIRST, pause_s=pause_s, overheard=OVERHEARD) for pause_s in (4.0, 1.0, 2.5)]
     assert row(results, FIRST) == "| BATMAN_IV | 500 ms | 3 | 2.5 s (1.0-4.0) | 10 | 0.19% |"
     assert row(results[:1], FIRST) == "| BATMAN_IV | 500 ms | 1 | 4.0 s | 10 | 0.19% |"
@@ -57,7 +57,7 @@ def test_a_row_says_what_was_not_measured_and_why() -> None:
 
 
 def arrivals(*silences: tuple[float, float], until_s: float) -> list[float]:
-    """Messages every tenth of a second from 0 on, but for those between the given times."""
+    """Messages every tenth of a second from 0 on, except between the given times."""
     every = [number * TELEMETRY_S for number in range(int(until_s / TELEMETRY_S) + 1)]
     return [at_s for at_s in every if not any(begin < at_s < end for begin, end in silences)]
 
@@ -65,7 +65,7 @@ def arrivals(*silences: tuple[float, float], until_s: float) -> list[float]:
 def test_a_pause_counts_once_telemetry_has_flowed_again_for_a_while() -> None:
     assert longest_pause(arrivals((5.0, 8.0), until_s=9.0), 5.0, 9.0) is None
     assert longest_pause(arrivals((5.0, 8.0), until_s=13.0), 5.0, 13.0) == pytest.approx(3.0)
-    # it has stopped once more
+    # it has paused again
     assert longest_pause(arrivals((5.0, 8.0), until_s=13.0), 5.0, 16.0) is None
 
 
@@ -76,7 +76,7 @@ def test_no_pause_is_said_only_after_a_while() -> None:
 
 
 class Machine:
-    """A bench whose cases take their outcomes from a list: a pause, or what goes wrong."""
+    """A bench whose cases take their outcomes from a list: a pause, or an error."""
 
     def __init__(self, outcomes: dict[Case, list[float | Exception]]) -> None:
         self.outcomes = outcomes
@@ -121,7 +121,7 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 
 def measure(results: Path, cases: list[Case], *, runs: int = 2, ends_s: float = float("inf")) -> list[str]:
-    """Measure, and tell what is written down then."""
+    """Measure, and return the recorded results."""
     Measuring(results, runs, ends_s).all(cases)
     return [f"{one['interval_ms']}: {one.get('pause_s', one.get('failed'))}" for one in recorded(results)]
 
@@ -144,8 +144,8 @@ def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path
         SECOND: [NoPauseError("telemetry did not pause when one fell silent"), 3.0, 4.0],
         THIRD: [NoPauseError("never")] * 9,
     }
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
-    assert told == [
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
+    assert lines == [
         "500: 1.0", "500: waited 90 s for telemetry over the other relay", "1000: 3.0", "1000: 4.0", "100: never",
     ]  # fmt: skip
     assert machine.boots == 1
@@ -153,14 +153,14 @@ def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path
 
 def test_a_machine_that_ends_is_started_once_more_for_the_cases_left(tmp_path: Path, machine: Machine) -> None:
     machine.outcomes = {FIRST: [LabError("gone")], SECOND: [3.0, 4.0], THIRD: [LabError("gone again")]}
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
-    assert told == ["500: gone", "1000: 3.0", "1000: 4.0", "100: gone again"]
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
+    assert lines == ["500: gone", "1000: 3.0", "1000: 4.0", "100: gone again"]
     assert machine.boots == 2
 
 
 def test_without_time_each_case_that_was_not_begun_says_so(tmp_path: Path, machine: Machine) -> None:
-    told = measure(tmp_path / "results.jsonl", [FIRST, SECOND], ends_s=0.0)
-    assert told == [f"{case.interval_ms}: not begun: no machine, or no time left" for case in (FIRST, SECOND)]
+    lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND], ends_s=0.0)
+    assert lines == [f"{case.interval_ms}: not begun: no machine, or no time left" for case in (FIRST, SECOND)]
     assert machine.boots == 0
     machine.outcomes = {FIRST: [1.0, 2.0], SECOND: [3.0, 4.0]}
     assert len(measure(tmp_path / "results.jsonl", [FIRST, SECOND])) == 6

@@ -1,4 +1,4 @@
-"""A small fleet that the tests of this folder share, and helpers to talk to its nodes."""
+"""A small fleet shared by the tests of this folder, and helpers to access its nodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.waiting import until
 
-# one kind of host key: making RSA keys would take most of the tests' time
+# one kind of host key: generating RSA keys would take most of the tests' time
 KEYS = ("ed25519",)
 LINE = ("base", "near", "far")
 MESH = """
@@ -49,8 +49,8 @@ reload_config
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualFleet]:
-    """base - near - far in a line, a working mesh of which only the base is wired; on the bench, fresh from the box:
-    `box`, `old` (19.07) and `new` (25.12, with little flash)."""
+    """base - near - far in a line, a working mesh in which only the base is wired; factory-fresh on the bench: `box`,
+    `old` (19.07) and `new` (25.12, with little flash)."""
     nodes = (
         NodeSpec("base", medium=Medium.BASE, host_key_types=KEYS),
         NodeSpec("near", host_key_types=KEYS),
@@ -71,7 +71,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualFleet]:
 
 @pytest.fixture
 def mesh(fleet: VirtualFleet) -> Iterator[VirtualFleet]:
-    """The line of three; what a test did to it is undone afterwards, by a power cut where it changed a node."""
+    """The line of three; changes of a test are undone afterwards, with a power cut where it changed a node."""
     until(lambda: in_mesh(fleet) == {"near", "far"}, "the mesh of three")
     yield fleet
     fleet.repair()
@@ -82,7 +82,7 @@ def mesh(fleet: VirtualFleet) -> Iterator[VirtualFleet]:
 
 @pytest.fixture
 def node(fleet: VirtualFleet) -> Iterator[VirtualNode]:
-    """A node fresh from its box, and fresh again afterwards."""
+    """A factory-fresh node, which is reset afterwards."""
     box = fleet.node("box")
     box.wait_up()
     yield box
@@ -98,7 +98,7 @@ def unplug(fleet: VirtualFleet) -> None:
 
 
 def restore(node: VirtualNode) -> None:
-    """Bring back what is in flash, if the node's files differ from it."""
+    """Restore the flash content, if the node's files differ from it."""
     node.wait_up()
     same = """
     cd /lab/node/flash/current
@@ -138,7 +138,7 @@ def run(transport: paramiko.Transport, command: str) -> str:
 
 
 def answers(endpoint: Endpoint) -> bool:
-    """Whether a login works there."""
+    """Whether a login at the endpoint works."""
     try:
         connect(endpoint).close()
     except (OSError, paramiko.SSHException, EOFError):
@@ -147,6 +147,6 @@ def answers(endpoint: Endpoint) -> bool:
 
 
 def flash_text(node: VirtualNode, path: str) -> str | None:
-    """What a power cut would leave of a file."""
+    """The content of a file that would survive a power cut."""
     file = Path(f"{node.flash_path}{path}")
     return file.read_text(encoding="utf-8") if file.exists() else None

@@ -1,4 +1,4 @@
-"""What a fleet and its nodes say of themselves, for whoever reads why a test failed."""
+"""A report on a fleet and its nodes, for the output of a failed test."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from meshlab.state import Power
 
 _CONSOLE_LINES = 40
 _LOG_LINES = 40
-# of a big fleet, the nodes that are described
+# the maximum number of nodes to describe
 _NODES = 12
 _COMMAND_S = 20.0
-# a node's own shell may be the part that hangs, so it is asked last and not for long
+# a node's shell may hang, so it is used last and with a short timeout
 _LOOK = "uptime; logread | tail -n 20; ps"
-# the supervisor's words; a machine of real radios has its own on its console
+# the supervisor's log; a QEMU machine logs to its console
 _LOGS = ("log", "console", "qemu.log")
 
 
 def fleets_of(values: Iterable[object]) -> list[VirtualFleet]:
-    """The fleets among a test's fixtures: themselves, a node's, or what has one as its `fleet`."""
+    """The fleets among a test's fixtures: a fleet, a node's fleet, or the `fleet` attribute of a fixture."""
     found: dict[int, VirtualFleet] = {}
     for value in values:
         fleet = value._fleet if isinstance(value, VirtualNode) else getattr(value, "fleet", value)
@@ -31,24 +31,24 @@ def fleets_of(values: Iterable[object]) -> list[VirtualFleet]:
 
 
 def report(fleet: VirtualFleet, failure: str) -> str:
-    """All nodes in a line each; console, log and processes of those that are not up or that `failure` names (none: of
-    all); the end of the fleet's own logs."""
-    told = [f"fleet {fleet.spec.name} in {fleet.directory}"]
+    """One line per node; console, log and processes of nodes that are not up or that `failure` names (if none: of all);
+    the end of the fleet's own logs."""
+    parts = [f"fleet {fleet.spec.name} in {fleet.directory}"]
     try:
         nodes = fleet.status()["nodes"]
     except MeshctlError as error:
         nodes = []
-        told.append(f"it does not answer: {error}")
-    told += [json.dumps({key: node[key] for key in ("name", "power", "reason", "boots", "breaks")}) for node in nodes]
+        parts.append(f"it does not answer: {error}")
+    parts += [json.dumps({key: node[key] for key in ("name", "power", "reason", "boots", "breaks")}) for node in nodes]
     odd = [node for node in nodes if node["power"] != Power.UP.value or node["name"] in failure]
     for node in (odd or nodes)[:_NODES]:
-        told.append(_node(fleet.node(node["name"]), is_running=bool(node["pid"])))
+        parts.append(_node(fleet.node(node["name"]), is_running=bool(node["pid"])))
     for name in _LOGS:
         file = fleet.directory / name
         if file.exists():
             lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-            told.append("\n".join([f"--- {name}", *lines[-_LOG_LINES:]]))
-    return "\n".join(told)
+            parts.append("\n".join([f"--- {name}", *lines[-_LOG_LINES:]]))
+    return "\n".join(parts)
 
 
 def _node(node: VirtualNode, *, is_running: bool) -> str:

@@ -1,4 +1,4 @@
-"""Nodes that lose their power or start again, several at once, in every way there is: all of them have to come back."""
+"""Power cycles and reboots of several nodes at once, in every way: all nodes must come back."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from itertools import repeat
 from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.waiting import until
 
-# how a node goes down; it comes back by itself, or is given power again
+# how a node goes down; it comes back by itself, or is powered on again
 _CUT, _KEPT, _TORN, _REBOOT, _REBOOT_AT_ONCE, _OFF_AND_ON = WAYS = (
     "cut", "kept", "torn", "reboot", "reboot at once", "off and on",
 )  # fmt: skip
 
 
 def cycle(fleet: VirtualFleet, names: Sequence[str], count: int, dice: random.Random, *, wait_s: float) -> None:
-    """Take nodes down until it has happened `count` times; fails naming who did not come back within `wait_s`."""
+    """Take nodes down `count` times; fails with the nodes that did not come back within `wait_s`."""
     done = 0
     while done < count:
         down = {name: dice.choice(WAYS) for name in dice.sample(names, dice.randint(1, len(names)))}
@@ -41,7 +41,7 @@ def _all_back(fleet: VirtualFleet, boots: Mapping[str, int]) -> Callable[[], boo
 
 
 def _boots(fleet: VirtualFleet, name: str) -> int:
-    return int(fleet.ask("node", node=name)["boots"])
+    return int(fleet.request("node", node=name)["boots"])
 
 
 def _take_down(node: VirtualNode, how: str, wait_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Requests that nobody foresaw: whoever asks is answered, and the fleet goes on."""
+"""Unexpected requests: each is answered, and the fleet keeps running."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from meshlab.spec import FleetSpec, NodeSpec, dump, load
 
 
 class Faulty(Operations):
-    """What a fleet can be asked for, with a fault in it."""
+    """The operations of a fleet, with a bug in one."""
 
     def __init__(self) -> None:
-        """No fleet behind it."""
+        """Without a fleet."""
 
     def status(self) -> dict[str, Any]:
         return {"power": {"b01": "up"}["b02"]}
@@ -31,7 +31,7 @@ class Faulty(Operations):
 
 
 def asked(directory: Path, *messages: dict[str, Any]) -> list[str]:
-    """What the fleet's socket answers to each message: the error's words."""
+    """The error messages that the fleet's socket returns."""
 
     async def serve() -> list[str]:
         control = Control(directory, Faulty().answer)

@@ -1,4 +1,4 @@
-"""A whole fleet: it comes up, goes down without a trace, and says why when it cannot."""
+"""A whole fleet: it starts, stops without leftovers, and reports why it cannot start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`meshctl lab up` replaces what a lab left, and nothing else."""
+"""`meshctl lab up` replaces the files of an earlier lab, and nothing else."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    """A project of the user's, with an inventory and folders that are called like the lab's."""
+    """A user's project with an inventory and folders that have the names of the lab's."""
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project / "inventory")
     for name in ("rom", "nodes", "mnt", "log"):

@@ -1,4 +1,4 @@
-"""A ground under a running fleet: what its nodes' own tools, and logins through the mesh, show of it."""
+"""The radio environment of a running fleet, as shown by its nodes' own tools and logins over the mesh."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def grounded(mesh: VirtualFleet) -> Iterator[VirtualFleet]:
     (mesh.directory / "ground.json").unlink()
 
 
-def neighbours(fleet: VirtualFleet, name: str) -> dict[str, int]:
-    """Who a node's batman-adv has as a direct neighbour, with its quality (originators whose next hop they are)."""
+def neighbors(fleet: VirtualFleet, name: str) -> dict[str, int]:
+    """The direct neighbors of a node's batman-adv and their quality (originators that are their own next hop)."""
     macs = {mac_of(fleet, one): one for one in ("base", "near", "far")}
     table = json.loads(fleet.node(name).exec("batctl meshif bat0 originators_json").stdout)
     return {macs[row["orig_address"]]: row["tq"] for row in table if row["orig_address"] == row["neigh_address"]}
@@ -68,49 +68,51 @@ def lab(fleet: VirtualFleet, *words: str, status: int = 0) -> str:
 
 def test_a_loss_shows_as_quality_in_both_directions_and_one_way_in_one(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "near", "far", "--loss", "30%")
-    until(lambda: neighbours(grounded, "near").get("far") == tq_of(0.3, 0.3), "the lossy link at near")
-    assert neighbours(grounded, "far")["near"] == tq_of(0.3, 0.3)
+    until(lambda: neighbors(grounded, "near").get("far") == tq_of(0.3, 0.3), "the lossy link at near")
+    assert neighbors(grounded, "far")["near"] == tq_of(0.3, 0.3)
     lab(grounded, "link", "near", "far", "--loss", "0", "--tq", "255")
     lab(grounded, "link", "far", "near", "--loss", "50%", "--one-way")
-    until(lambda: neighbours(grounded, "far").get("near") == tq_of(0.5, 0.0), "far's worse way to near")
-    assert neighbours(grounded, "near")["far"] == tq_of(0.0, 0.5)
+    until(lambda: neighbors(grounded, "far").get("near") == tq_of(0.5, 0.0), "far's worse link to near")
+    assert neighbors(grounded, "near")["far"] == tq_of(0.0, 0.5)
     lab(grounded, "mend", "near-far")
-    until(lambda: neighbours(grounded, "far").get("near") == 200, "the link as it was")
+    until(lambda: neighbors(grounded, "far").get("near") == 200, "the link as it was")
 
 
-def test_a_node_that_nobody_hears_hears_others_and_is_not_reached(grounded: VirtualFleet) -> None:
+def test_a_node_that_no_one_hears_still_hears_others_and_is_unreachable(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "far", "near", "--loss", "100%", "--one-way")
     until(lambda: in_mesh(grounded) == {"near"}, "the mesh without far")
     assert not answers(grounded.endpoint("10.42.0.3"))
     until(lambda: len(signals(grounded, "near")) == 1, "near to hear the base alone")
     assert len(signals(grounded, "far")) == 1
-    assert neighbours(grounded, "far") == {}
+    assert neighbors(grounded, "far") == {}
 
 
 def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounded: VirtualFleet) -> None:
     placement.set_environment(grounded, ROW)
-    until(lambda: set(neighbours(grounded, "base")) == {"near", "far"}, "three that hear each other")
+    until(lambda: set(neighbors(grounded, "base")) == {"near", "far"}, "three that hear each other")
     (link,) = [link for link in links_of(ROW) if link.ends == {"base", "near"}]
-    assert neighbours(grounded, "base")["near"] == link.tq_to("near")
+    assert neighbors(grounded, "base")["near"] == link.tq_to("near")
     assert link.signal_at("base") in signals(grounded, "base")
     lab(grounded, "move", "far", "200", "-5")
-    until(lambda: set(neighbours(grounded, "base")) == {"near"}, "far to be out of the base's earshot")
+    until(lambda: set(neighbors(grounded, "base")) == {"near"}, "far to be out of the base's earshot")
     until(lambda: in_mesh(grounded) == {"near", "far"} and answers(grounded.endpoint("10.42.0.3")), "far over near")
     lab(grounded, "move", "far", "900", "0")
-    until(lambda: in_mesh(grounded) == {"near"}, "far to be out of everybody's earshot")
+    until(lambda: in_mesh(grounded) == {"near"}, "far to lose all its links")
     assert not answers(grounded.endpoint("10.42.0.3"))
     assert placement.current_environment(grounded).positions["far"].at == (900, 0)
 
 
-def test_what_was_set_by_hand_outlives_a_ground_until_it_is_mended(grounded: VirtualFleet) -> None:
+def test_a_link_override_survives_a_new_environment_until_it_is_repaired(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "base", "near", "--down")
     placement.set_environment(grounded, ROW)
-    until(lambda: set(neighbours(grounded, "base")) == {"far"}, "the base without near")
+    until(lambda: set(neighbors(grounded, "base")) == {"far"}, "the base without near")
     lab(grounded, "mend", "base-near")
-    until(lambda: set(neighbours(grounded, "base")) == {"near", "far"}, "the link of the ground")
+    until(lambda: set(neighbors(grounded, "base")) == {"near", "far"}, "the link of the ground")
 
 
-def test_a_ground_is_loaded_shown_and_refused_when_it_is_another_s(grounded: VirtualFleet, tmp_path: Path) -> None:
+def test_an_environment_is_loaded_and_shown_and_rejected_if_it_is_for_another_fleet(
+    grounded: VirtualFleet, tmp_path: Path
+) -> None:
     file = tmp_path / "ground.yaml"
     file.write_text("nodes: {base: [0, 0], near: [60, 0], far: [120, 0], other: [0, 9]}\n", encoding="utf-8")
     shown = lab(grounded, "ground", str(file))
@@ -139,7 +141,7 @@ def test_words_that_say_nothing_are_refused_with_what_was_expected(grounded: Vir
 def test_a_big_ground_comes_in_parts(grounded: VirtualFleet) -> None:
     crowd = {f"other{number}": NodePosition((0, number)) for number in range(40)}
     placement.set_environment(grounded, RadioEnvironment({**ROW.positions, **crowd}, (Wall((90, -9), (90, 9)),)))
-    until(lambda: set(neighbours(grounded, "base")) == {"near"}, "the wall between near and far")
+    until(lambda: set(neighbors(grounded, "base")) == {"near"}, "the wall between near and far")
 
 
 def test_a_mission_drops_a_beacon_and_the_robot_is_reached_over_it(grounded: VirtualFleet, tmp_path: Path) -> None:
@@ -158,7 +160,7 @@ def test_a_mission_drops_a_beacon_and_the_robot_is_reached_over_it(grounded: Vir
     until(lambda: in_mesh(grounded) == {"near", "far"}, "the robot over its beacon")
     assert grounded.node("near").exec("cat /proc/uptime").exit_status == 0
     assert placement.current_environment(grounded).positions["near"].at == (90.0, 0.0)
-    until(lambda: set(neighbours(grounded, "base")) == {"near"}, "the robot out of the base's own earshot")
+    until(lambda: set(neighbors(grounded, "base")) == {"near"}, "the robot out of the base's own earshot")
 
 
 def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFleet, tmp_path: Path) -> None:
@@ -180,6 +182,6 @@ def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFlee
     assert placement.current_environment(grounded).positions["far"].at[0] < 100
 
 
-def test_a_link_of_the_spec_is_a_ground_of_its_own(grounded: VirtualFleet) -> None:
+def test_without_an_environment_the_links_of_the_spec_are_used(grounded: VirtualFleet) -> None:
     assert placement.current_environment(grounded).links == grounded.spec.links
     assert LinkSpec("base", "near", tq=240, signal_dbm=-61) in grounded.spec.links

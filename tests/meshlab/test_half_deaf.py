@@ -1,4 +1,4 @@
-"""Radios of the virtual fleet that are made anew: interface numbers, addresses, station tables, and who hears whom."""
+"""Recreated radios of the virtual fleet: interface indexes, addresses, station tables, and half deafness."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def configured(fleet: VirtualFleet, request: pytest.FixtureRequest) -> Iterator[
 
 
 @pytest.mark.parametrize("configured", ["old", "box", "new"], indirect=True)
-def test_what_makes_an_interface_anew_and_its_address_follow_the_release(configured: VirtualNode) -> None:
+def test_recreation_of_an_interface_and_its_address_follow_the_release(configured: VirtualNode) -> None:
     release = configured.spec.release
     first, own = index(configured), mac(configured)
     change(configured, "radio0.txpower=11")
@@ -78,7 +78,7 @@ def test_a_radio_is_pending_while_it_is_set_up_and_its_interface_gone(mesh: Virt
     until(lambda: "channel 11" in near.exec("iw dev mesh0 info").stdout, "the radio")
 
 
-def test_a_radio_that_starts_anew_is_half_deaf_until_its_neighbours_forget_it(mesh: VirtualFleet) -> None:
+def test_a_restarted_radio_is_half_deaf_until_its_neighbors_delete_its_entry(mesh: VirtualFleet) -> None:
     base, near, far = (mesh.node(name) for name in ("base", "near", "far"))
     macs = mac(base), mac(near), mac(far)
     assert near.exec(f"batctl ping -c 1 {macs[0]}").exit_status == 0
@@ -100,7 +100,7 @@ def test_a_radio_that_starts_anew_is_half_deaf_until_its_neighbours_forget_it(me
         holder.exec(f"iw dev mesh0 station del {macs[1]}").check("forget")
         assert (station(holder, macs[1], "connected time") or 0) <= age_s
     until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way")
-    # what a node hears is written beside what is reachable, not before it
+    # the node's tables are written together with reachability, not before
     until(lambda: near.exec(f"batctl -m bat0 ping -c 1 {macs[0]}").exit_status == 0, "the echo")
 
 

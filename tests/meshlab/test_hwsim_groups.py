@@ -82,8 +82,8 @@ def test_no_step_joins_a_pair_that_is_joined_neither_before_nor_after(
 
 def test_a_changed_link_of_a_small_fleet_touches_its_two_ends_alone() -> None:
     names = [f"n{number}" for number in range(11)]
-    everybody = set(combinations(names, 2))
-    written = transition(assign(names, everybody), assign(names, everybody - {("n3", "n7")}))
+    all_pairs = set(combinations(names, 2))
+    written = transition(assign(names, all_pairs), assign(names, all_pairs - {("n3", "n7")}))
     assert {name for name, _ in written} == {"n3", "n7"}
 
 
@@ -98,6 +98,6 @@ def test_a_graph_that_needs_more_groups_is_refused_with_the_number() -> None:
         assign(names, [("n0", name) for name in names[1:]])
 
 
-def test_an_edge_to_somebody_else_is_a_mistake_of_the_caller() -> None:
+def test_an_edge_to_an_unknown_node_is_a_bug_of_the_caller() -> None:
     with pytest.raises(ValueError, match="edge a-z"):
         assign(["a"], [("a", "z")])

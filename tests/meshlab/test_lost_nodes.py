@@ -1,7 +1,7 @@
-"""How nodes were lost on real OpenWrt 24.10 and 25.12, over again in the virtual fleet.
+"""Failures that lost nodes on real OpenWrt 24.10 and 25.12, reproduced in the virtual fleet.
 
-Changes that were confirmed although they lock everybody out, undone although they succeeded, or that cost a node its
-neighbours' unicast.
+Changes that were confirmed although they lock out all logins, were rolled back although they succeeded, or made the
+neighbors of a node drop its unicast frames.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
 
-# window enough for a reload that takes its time on a busy machine
+# long enough for a reload on a busy machine
 WINDOW_S = 40
 ADDRESS = "10.42.1.1"
-# as long as what a change does may come after it was confirmed: procd's second, the firewall's, and a slow radio
+# the maximum delay of a change's effects after its confirmation: procd's second, the firewall's, and a slow radio
 LATE_S = 10.0
 
 
@@ -30,12 +30,12 @@ LATE_S = 10.0
     scope="module",
     params=[
         pytest.param(Release.V24_10, id="24.10"),
-        # its stand-ins differ from 24.10's in nothing that matters here
+        # its stand-ins do not differ from 24.10's here
         pytest.param(Release.V25_12, id="25.12", marks=pytest.mark.proof),
     ],
 )
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    """A base, and two nodes that only the mesh leads to, which run inventory `a`."""
+    """A base and two nodes that are reached only over the mesh, with inventory `a`."""
     with Rig(tmp_path_factory.mktemp("lost"), 2, window_s=WINDOW_S, release=request.param) as started:
         taken = started.take_in("a")
         assert (taken.code, set(taken.results.values())) == (0, {"done"}), taken.out + taken.err
@@ -47,7 +47,7 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 
 
 def variant(rig: Rig, name: str, more: str) -> str:
-    """Inventory `a` with a line more for n001."""
+    """Inventory `a` with an additional line for n001."""
     text = rig.inventory("a").read_text(encoding="utf-8")
     rig.inventory(name).write_text(f"{text}  n001: {{{more}}}\n", encoding="utf-8")
     return name
@@ -58,7 +58,7 @@ def mac(fleet: VirtualFleet, name: str) -> str:
 
 
 def greets(rig: Rig) -> bool:
-    """Whether an SSH server greets a new connection to n001, which only the mesh leads to."""
+    """Whether an SSH server answers a new connection to n001, which is reached only over the mesh."""
     endpoint = rig.fleet.endpoint(ADDRESS)
     try:
         with socket.create_connection((endpoint.host, endpoint.port), timeout=60) as connection:
@@ -68,13 +68,13 @@ def greets(rig: Rig) -> bool:
 
 
 def stays_reachable(rig: Rig) -> bool:
-    """Whether it still does when all that may come late has come."""
+    """Whether it still does after all delayed effects."""
     rig.fleet.node("base").exec(f"sleep {LATE_S:g}").check("wait")
     return greets(rig)
 
 
 def passes(rig: Rig) -> bool:
-    """Whether frames to n001 alone come back."""
+    """Whether unicast frames to n001 are answered."""
     return rig.fleet.node("base").exec(f"batctl ping -c 3 -t 1 {mac(rig.fleet, 'n001')}").exit_status == 0
 
 
@@ -86,7 +86,7 @@ def passes(rig: Rig) -> bool:
         pytest.param("dropbear.main.Port: '2222'", id="dropbear-port"),
     ],
 )
-def test_a_change_that_locks_everybody_out_is_not_confirmed(rig: Rig, lockout: str) -> None:
+def test_a_change_that_locks_out_all_logins_is_not_confirmed(rig: Rig, lockout: str) -> None:
     closed = variant(rig, "closed", f"extra_uci: {{{lockout}}}")
     ended = rig.meshctl("provision", closed, "n001", "--yes", "--json")
     assert ended.results.get("n001") != "done", ended.out + ended.err

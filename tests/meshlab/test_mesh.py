@@ -1,4 +1,4 @@
-"""A fleet as a mesh: who is reached when, and what links do to connections."""
+"""A fleet as a mesh: reachability, and the effect of links on connections."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from tests.waiting import until
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 
-def test_a_node_behind_the_mesh_is_reached_at_its_address_and_knows_its_neighbours(mesh: VirtualFleet) -> None:
+def test_a_node_in_the_mesh_is_reachable_at_its_address_and_lists_its_neighbors(mesh: VirtualFleet) -> None:
     transport = connect(mesh.endpoint("10.42.0.3"))
-    neighbours = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
+    neighbors = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
     originators = json.loads(run(transport, "batctl meshif bat0 originators_json"))
     stations = run(transport, "iw dev mesh0 station dump")
     info = json.loads(run(transport, 'ubus call iwinfo info \'{"device":"mesh0"}\''))
     transport.close()
-    assert len(neighbours) == 1
-    assert set(neighbours[0]) == {"hard_ifindex", "hard_ifname", "last_seen_msecs", "neigh_address"}
+    assert len(neighbors) == 1
+    assert set(neighbors[0]) == {"hard_ifindex", "hard_ifname", "last_seen_msecs", "neigh_address"}
     assert [path["best"] for path in originators] == [True, True]
-    assert {path["neigh_address"] for path in originators} == {neighbours[0]["neigh_address"]}
+    assert {path["neigh_address"] for path in originators} == {neighbors[0]["neigh_address"]}
     assert sorted(path["tq"] for path in originators) == [165, 200]
-    assert stations.startswith(f"Station {neighbours[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
+    assert stations.startswith(f"Station {neighbors[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
     assert (info["mode"], info["channel"], info["ssid"]) == ("Ad-Hoc", 6, "a team")
 
 
@@ -38,7 +38,7 @@ def test_another_channel_cuts_a_node_and_what_lies_behind_it_off(mesh: VirtualFl
     assert not answers(mesh.endpoint("10.42.0.3"))
     until(lambda: mesh.node("far").exec("batctl meshif bat0 neighbors_json").stdout == "[]\n", "empty tables")
     mesh.node("near").exec("uci set wireless.radio0.channel=6; uci commit; reload_config").check("change back")
-    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
 
 
 def test_a_node_without_batman_has_no_mesh(mesh: VirtualFleet) -> None:
@@ -112,7 +112,7 @@ def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) ->
     mesh.repair("far")
     far.plug(False)
     until(lambda: in_mesh(mesh) == {"near", "far"}, "the link to come back")
-    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the way back")
+    until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
 
 
 def test_a_wrong_key_or_one_encrypted_side_separates(mesh: VirtualFleet) -> None:

@@ -1,4 +1,4 @@
-"""Who hears whom, and over which path: pure laws of the air."""
+"""The mesh model: properties of edges and routes."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_cutting_a_chain_separates_exactly_what_lies_behind(count: int, data: st
     assert set(reached) == {f"n{number}" for number in range(1, cut + 1)}
 
 
-def test_what_a_node_hears_is_one_line_per_station_neighbour_and_originator() -> None:
+def test_what_a_node_hears_is_one_line_per_station_neighbor_and_originator() -> None:
     nodes, links = chain(3)
     graph = mesh_model.edges(nodes, links)
     lines = [

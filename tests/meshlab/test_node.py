@@ -1,4 +1,4 @@
-"""One virtual node: what it is fresh from the box, what survives what, and how it is flashed."""
+"""One virtual node: its factory state, what survives power cuts and reboots, and flashing."""
 
 from __future__ import annotations
 
@@ -262,7 +262,7 @@ def test_flashing_brings_the_new_release_the_given_files_and_new_host_keys(node:
     assert "25.12" in node.exec("cat /etc/openwrt_release").stdout
     assert node.exec("command -v apk").exit_status == 0
     assert host_key(node) != key
-    # back to what the other tests know
+    # restore the state for the other tests
     put_image(node, firmware_image(Release.V23_05, board=node.spec.board))
     boots = node.boot_id
     node.exec("start-stop-daemon -S -b -x /sbin/sysupgrade -- -n /tmp/firmware.bin")

@@ -1,4 +1,4 @@
-"""Nodes that go down and come back: no signal, no word of the bell and no descriptor may keep one from starting."""
+"""Nodes that go down and come back: no signal, bell message or descriptor may keep one from starting."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.meshlab.fleet_report import fleets_of, report
 from tests.meshlab.power_cycles import cycle
 from tests.waiting import until
 
-# the kernel's number of write(2), as /proc/PID/syscall tells it
+# the system call number of write(2), as in /proc/PID/syscall
 _WRITE = {"x86_64": "1", "aarch64": "64"}[os.uname().machine]
 _PIPE_BYTES = 4096
 
@@ -53,7 +53,7 @@ def test_a_signal_that_comes_just_before_process_1_waits_is_not_lost(tmp_path: P
     with subprocess.Popen((busybox, "ash", "-c", text), stderr=lines_end, pass_fds=()) as shell:
         os.close(lines_end)
         try:
-            # the pipe holds what the loop asks first; what comes next is the read
+            # the pipe has the loop's first command; the next one is the read
             until(lambda: _is_writing(shell.pid), "the shell to stand before its read")
             shell.send_signal(signal.SIGTERM)
             os.set_blocking(lines, False)
@@ -70,9 +70,9 @@ def _is_writing(pid: int) -> bool:
 
 def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
     program = (
-        "import os, sys; from meshlab.node_runner import _close_all_but\n"
+        "import os, sys; from meshlab.node_runner import _close_all_except\n"
         "kept, other = os.open('/dev/null', os.O_RDONLY), os.open('/proc/self/ns/net', os.O_RDONLY)\n"
-        "_close_all_but([kept])\n"
+        "_close_all_except([kept])\n"
         "os.fstat(kept)\n"
         "try: os.fstat(other)\n"
         "except OSError: sys.exit(0)\n"
@@ -82,7 +82,7 @@ def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
 
 
 def _has_ended(lines: int) -> bool:
-    """Read what is there; whether the other end is closed."""
+    """Read the available data; returns whether the other end is closed."""
     try:
         while os.read(lines, _PIPE_BYTES):
             pass
@@ -105,7 +105,7 @@ def test_a_word_that_the_fleet_cannot_read_does_not_take_the_next_one_along(pair
 @pytest.mark.lab
 def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     node = pair.node("here")
-    state = {**pair.ask("node", node="here"), "power": "failed", "reason": "no memory"}
+    state = {**pair.request("node", node="here"), "power": "failed", "reason": "no memory"}
     monkeypatch.setattr(VirtualNode, "_state", lambda _: state)
     with pytest.raises(LabError, match="cannot start here: no memory"):
         node.wait_up()
@@ -115,13 +115,13 @@ def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, mon
 def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: VirtualFleet) -> None:
     pair.node("here").power_cut(back=False)
     (fleet,) = fleets_of([1, pair.node("there"), pair])
-    told = report(fleet, "waited 180 s for something")
-    console = told.partition("--- here: console\n")[2].partition("\n--- ")[0]
+    text = report(fleet, "waited 180 s for something")
+    console = text.partition("--- here: console\n")[2].partition("\n--- ")[0]
     assert re.search(r"- boot [0-9a-f-]{36} -\n", console)
     assert re.search(r"^\[[0-9.]+\] S20network$", console, re.M)
-    assert '"name": "here", "power": "off"' in told
-    # it is up, and nothing was said of it
-    assert "--- there" not in told
+    assert '"name": "here", "power": "off"' in text
+    # it is up, so the report does not describe it
+    assert "--- there" not in text
     assert "--- there: log and processes" in report(fleet, "waited 180 s for there to boot")
 
 

@@ -1,4 +1,4 @@
-"""Who hears whom on a ground: laws of the path-loss model, and the file format."""
+"""Radio propagation: properties of the path-loss model, and the file format."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def loss_at(distance_m: float, air: PathLossModel = PathLossModel(), walls_db: f
     return frame_loss(air, received_dbm(air, distance_m, air.tx_power_dbm, walls_db))
 
 
-def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_metre() -> None:
+def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_meter() -> None:
     air = PathLossModel()
     assert frame_loss(air, air.sensitivity_dbm) == 0.1
-    first_metre = received_dbm(replace(air, antenna_gain_dbi=0.0), 1.0, 0.0)
+    first_meter = received_dbm(replace(air, antenna_gain_dbi=0.0), 1.0, 0.0)
     wavelength_m = 299_792_458 / 2.437e9
-    assert first_metre == pytest.approx(20 * math.log10(wavelength_m / (4 * math.pi)))
+    assert first_meter == pytest.approx(20 * math.log10(wavelength_m / (4 * math.pi)))
     assert received_dbm(air, 100.0, 24.0) == pytest.approx(received_dbm(air, 10.0, 24.0) - 35.0)
 
 
@@ -172,7 +172,7 @@ def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
         ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
         ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
         ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),
-        ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: the key 'a' stands twice"),
+        ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: duplicate key 'a'"),
     ],
 )
 def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
@@ -181,7 +181,7 @@ def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: 
     assert said in str(caught.value)
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(InvalidInput) as caught:
         propagation_file.parse("nodes: {a: 1, b: [0, y]}\nair: {exponent: x}\nmore: 1", FILE)
     assert len(caught.value.diagnostics) == 4

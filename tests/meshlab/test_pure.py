@@ -1,4 +1,4 @@
-"""Specs, addresses, breaks, images and the ROM's surgery on busybox: values in, values out."""
+"""Pure functions: specs, addresses, faults, images, and hiding applets of busybox."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loss and batman-adv's quality: what one gives for the other."""
+"""Conversion between loss and batman-adv's TQ."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Missions: where everybody is at which time, what happens when, and the file format."""
+"""Scenarios: positions over time, the timeline, and the file format."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, 
         trajectory(way_points)
 
 
-def test_the_agenda_tells_what_was_planned_and_what_came_of_it() -> None:
+def test_the_timeline_has_planned_events_and_their_effects() -> None:
     assert happenings(AWAY, EventKind.ARRIVES) == [(200.0, "rover", "")]
     assert happenings(AWAY, EventKind.DROPPED) == [(50.0, "beacon", "rover")]
-    # the beacon joins the mesh where it is dropped, and keeps the robot in it for a while
+    # the dropped beacon joins the mesh, and keeps the robot connected for a while
     assert (50.0, "beacon", "") in happenings(AWAY, EventKind.REACHED)
     ((lost_s, *_),) = happenings(AWAY, EventKind.CUT_OFF)
     alone = replace(
@@ -175,7 +175,7 @@ def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: 
     assert said in str(caught.value)
 
 
-def test_the_example_drops_every_beacon_in_reach_and_ends_with_everybody_at_the_base() -> None:
+def test_the_example_drops_every_beacon_in_range_and_ends_with_all_nodes_at_the_base() -> None:
     mission = scenario_file.load(EXAMPLE)
     for name, drop in mission.beacons.items():
         assert (drop.at_s, name, "") in happenings(mission, EventKind.REACHED)

@@ -1,4 +1,4 @@
-"""Playing a mission in virtual time on a stage that keeps what it was told."""
+"""Play a scenario in virtual time on a target that records all calls."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.meshlab.test_scenario import AWAY
 
 
 @dataclass
-class Recorded:
-    """A fleet of these names; a clock that `wait` moves, and that stops everything at `stop_at_s`."""
+class RecordedTarget:
+    """A fleet with these names, and a clock that `wait` advances and that interrupts at `stop_at_s`."""
 
     names: tuple[str, ...] = AWAY.names
     stop_at_s: float = float("inf")
@@ -26,7 +26,7 @@ class Recorded:
     powered: dict[str, bool] = field(default_factory=dict)
     switched: list[tuple[str, bool]] = field(default_factory=list)
     forgotten: list[str] = field(default_factory=list)
-    told: list[Event] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
 
     def set_environment(self, environment: RadioEnvironment) -> None:
         self.environments.append(environment)
@@ -49,44 +49,44 @@ class Recorded:
             raise KeyboardInterrupt
 
 
-def played(stage: Recorded, *, speed: float = 1.0, start_s: float = 0.0) -> float | None:
+def played(stage: RecordedTarget, *, speed: float = 1.0, start_s: float = 0.0) -> float | None:
     return play(
-        AWAY, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed, start_s=start_s
+        AWAY, stage, on_event=stage.events.append, clock=stage.clock, wait=stage.wait, speed=speed, start_s=start_s
     )
 
 
 @given(st.sampled_from([0.5, 1.0, 10.0, 1000.0]))
-def test_every_event_is_told_once_in_order_however_fast(speed: float) -> None:
-    stage = Recorded()
+def test_every_event_is_reported_once_in_order_however_fast(speed: float) -> None:
+    stage = RecordedTarget()
     assert played(stage, speed=speed) is None
-    assert stage.told == list(timeline(AWAY))
+    assert stage.events == list(timeline(AWAY))
     assert stage.powered == {"base": True, "beacon": True, "rover": True, "spare": True}
     assert links_of(stage.environments[-1]) == links_of(snapshot(AWAY, AWAY.duration_s).environment)
 
 
 def test_carried_beacons_are_off_until_they_are_dropped() -> None:
-    stage = Recorded()
+    stage = RecordedTarget()
     played(stage)
     assert [on for name, on in stage.switched if name == "beacon"] == [False, True]
 
 
-def test_the_fleet_is_told_of_new_links_alone() -> None:
-    stage = Recorded()
+def test_the_fleet_gets_only_changed_links() -> None:
+    stage = RecordedTarget()
     played(stage)
-    told = [links_of(ground) for ground in stage.environments]
-    assert all(one != other for one, other in pairwise(told))
-    assert len(told) < AWAY.duration_s
+    link_sets = [links_of(ground) for ground in stage.environments]
+    assert all(one != other for one, other in pairwise(link_sets))
+    assert len(link_sets) < AWAY.duration_s
 
 
 @given(st.integers(1, 199))
 def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int) -> None:
-    first = Recorded(stop_at_s=stop_at_s)
+    first = RecordedTarget(stop_at_s=stop_at_s)
     stopped_s = played(first)
     assert stopped_s is not None
     assert stopped_s <= stop_at_s
-    second = Recorded()
+    second = RecordedTarget()
     assert played(second, start_s=stopped_s) is None
-    assert first.told + second.told == list(timeline(AWAY))
+    assert first.events + second.events == list(timeline(AWAY))
     assert (second.switched[0][0], dict(second.switched[:4])["beacon"]) == ("base", stopped_s >= 50)
 
 
@@ -94,26 +94,26 @@ def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int)
     ("on_s", "is_forgotten"), [(80.0 + STATION_EXPIRY_S - 1, False), (80.0 + STATION_EXPIRY_S, True)]
 )
 @pytest.mark.parametrize("start_s", [0.0, 85.0])
-def test_whoever_was_away_for_long_is_known_to_nobody_when_it_comes_on(
+def test_station_entries_of_a_node_that_was_off_for_long_are_flushed(
     on_s: float, start_s: float, is_forgotten: bool
 ) -> None:
-    stage = Recorded()
+    stage = RecordedTarget()
     mission = replace(AWAY, power_events=(PowerEvent(80.0, "spare", False), PowerEvent(on_s, "spare", True)))
-    play(mission, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, start_s=start_s)
+    play(mission, stage, on_event=stage.events.append, clock=stage.clock, wait=stage.wait, start_s=start_s)
     assert ("spare" in stage.forgotten) == is_forgotten
     assert ("beacon" in stage.forgotten) == (start_s < 50)
 
 
-def test_nodes_that_the_fleet_has_not_are_told_of_and_not_switched() -> None:
-    stage = Recorded(names=("base", "rover"))
+def test_events_of_nodes_outside_the_fleet_are_reported_but_not_applied() -> None:
+    stage = RecordedTarget(names=("base", "rover"))
     played(stage)
     assert set(stage.powered) == {"base", "rover"}
-    assert EventKind.DROPPED in {event.kind for event in stage.told}
+    assert EventKind.DROPPED in {event.kind for event in stage.events}
 
 
 @pytest.mark.parametrize("speed", [1.0, 50.0])
 def test_incidents_switch_radios(speed: float) -> None:
-    stage = Recorded()
+    stage = RecordedTarget()
     mission = replace(AWAY, power_events=(PowerEvent(80.0, "spare", False), PowerEvent(90.0, "spare", True)))
-    play(mission, stage, on_event=stage.told.append, clock=stage.clock, wait=stage.wait, speed=speed)
+    play(mission, stage, on_event=stage.events.append, clock=stage.clock, wait=stage.wait, speed=speed)
     assert [on for name, on in stage.switched if name == "spare"] == [True, False, True]

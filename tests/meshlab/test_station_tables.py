@@ -1,4 +1,4 @@
-"""Laws of station tables: who is half deaf to whom, and what ends it (docs/lab.md, What only real radios showed)."""
+"""Properties of station tables: half deafness and what ends it (docs/lab.md, "What only real radios showed")."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Pair:
         self.nodes[name] = EffectiveState((cell,), self.nodes[name].addresses)
 
     def restart(self, name: str, *, away_s: float = 1.0) -> None:
-        """The interface is made anew; nobody hears it meanwhile."""
+        """Recreate the interface; meanwhile no one hears it."""
         cell = self.nodes[name].interfaces[0]
         self.nodes[name] = EffectiveState((), self.nodes[name].addresses)
         self.hear()
@@ -64,7 +64,7 @@ def test_two_that_just_met_hear_each_other(pair: Pair) -> None:
     assert pair.connected_s("a") == pair.connected_s("b") == [100]
 
 
-def test_a_radio_made_anew_is_not_heard_by_who_knew_it_until_that_one_deletes_its_entry(pair: Pair) -> None:
+def test_a_recreated_radio_is_not_heard_by_a_former_neighbor_until_it_deletes_the_entry(pair: Pair) -> None:
     pair.hear(after_s=100)
     pair.restart("b")
     assert not pair.passes()

@@ -1,4 +1,4 @@
-"""The stand-in for uci against what uci does (docs/facts/openwrt-facts.md sections 1 and 4)."""
+"""uci's stand-in against uci's recorded behavior (docs/facts/openwrt-facts.md sections 1 and 4)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ config interface 'lan'
 
 
 class Uci:
-    """Runs the stand-in on a directory of its own."""
+    """Runs the stand-in in its own directory."""
 
     def __init__(self, directory: Path) -> None:
         self.config = directory / "config"

@@ -23,7 +23,7 @@ TOPIC_SETTINGS = {"priority": 1, "reliable": True, "compression": True, "deadlin
 
 class Hello(NamedTuple):
     """`holds`: by mesh topic and publisher, the number of the last latched message received from the addressee
-    (`types.Mark`). `answer`: whether to reply with a `Hello`."""
+    (`types.LatchMark`). `answer`: whether to reply with a `Hello`."""
 
     holds: dict[str, dict[str, int]]
     answer: bool

@@ -15,7 +15,7 @@ from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
 
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
 from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, decode, encode
-from udp_mesh.bridges.types import Definitions, Mark, MessageKind, TypeKey, kind_text, parse_kind
+from udp_mesh.bridges.types import Definitions, LatchMark, MessageKind, TypeKey, kind_text, parse_kind
 
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
 """Per source, while a definition is requested: a second's worth of messages; beyond it, the oldest is dropped."""
@@ -117,7 +117,7 @@ class Relay:
         if latched:
             self._number += 1
             tag = hashlib.blake2b(publisher.encode(), key=self._nonce, digest_size=4).hexdigest()
-            kind = MessageKind(key, Mark(tag, self._number))
+            kind = MessageKind(key, LatchMark(tag, self._number))
             self._keep_latched(route, publisher, kind, payload)
         effects.append(ToMesh(route.topic, payload, route.peer, kind_text(kind)))
         return effects
@@ -155,7 +155,7 @@ class Relay:
         self._enqueue(source, message)
         return self._request_definition(source, kind.key, now)
 
-    def _is_newer(self, source: str, topic: str, mark: Mark) -> bool:
+    def _is_newer(self, source: str, topic: str, mark: LatchMark) -> bool:
         """Whether neither this message nor a later one of its publisher was received before."""
         held = self._last_numbers.setdefault(source, {}).setdefault(topic, OrderedDict())
         if held.get(mark.publisher, -1) >= mark.number:

@@ -29,7 +29,7 @@ class TypeKey(NamedTuple):
     checksum: str
 
 
-class Mark(NamedTuple):
+class LatchMark(NamedTuple):
     """Identifies a latched message: later ones of a publisher have larger numbers. `publisher` is a hex word, a new
     one after each start of the bridge."""
 
@@ -41,7 +41,7 @@ class MessageKind(NamedTuple):
     """A parsed type field. `mark` is None unless the message is latched: late joiners get each publisher's last one."""
 
     key: TypeKey
-    mark: Mark | None = None
+    mark: LatchMark | None = None
 
 
 def kind_text(kind: MessageKind) -> str:
@@ -63,7 +63,7 @@ def parse_kind(text: str) -> MessageKind | None:
     if len(words) < 3:
         return MessageKind(key)
     found = _LATCHED.fullmatch(words[2])
-    return None if found is None else MessageKind(key, Mark(found[1], int(found[2])))
+    return None if found is None else MessageKind(key, LatchMark(found[1], int(found[2])))
 
 
 class Definitions:

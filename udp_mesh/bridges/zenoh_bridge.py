@@ -85,7 +85,7 @@ def parse_ros2_route(text: str) -> KeyRoute:
     return KeyRoute(topic_keys(name, domain), topic, chosen, publisher_tokens(name, domain))
 
 
-class Bridge:
+class ZenohBridge:
     """The running bridge. Zenoh calls back on its own threads, the daemon client on another; `_lock` guards the shared
     state."""
 
@@ -308,7 +308,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda *_: stop.set())
     with session:
         daemon = DaemonClient(options.socket, ["*"])
-        bridge = Bridge(daemon, session, [*options.route, *options.ros2])
+        bridge = ZenohBridge(daemon, session, [*options.route, *options.ros2])
         bridge.start()
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
         thread.start()

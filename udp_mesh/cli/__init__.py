@@ -1,5 +1,6 @@
-"""The command `udp-mesh`: parse, ask the daemon, show, exit.
+"""The command `udp-mesh`: parses arguments, sends requests to the daemon, prints the replies.
 
-`main` has the parser and the exit codes, `views` turns replies into text, the other modules hold the commands:
-`serve` runs and checks, `inspect` shows, `change` sets, `traffic` sends, receives and measures.
+`main` has the parser and the exit codes, `views` formats replies, `output` writes them. The other modules hold the
+commands: `serve` runs the daemon and checks configurations, `inspect` shows state, `change` modifies it, `traffic`
+sends, receives and measures.
 """

@@ -1,4 +1,4 @@
-"""`set`, `drop`, `reload`: change the running daemon. What commands change lasts until the next reload or restart."""
+"""`set`, `drop`, `reload`: change the running daemon. Changes last until the next reload or restart."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def set_topic(arguments: argparse.Namespace) -> int:
     values = _values(arguments.values)
     if values is None:
         return Exit.USAGE
-    # TOML has no word for what is not there; an outbox can be "none" itself
+    # TOML has no null, so "none" unsets a value; an outbox can itself be "none".
     cleared = {key: None for key, value in values.items() if value == "none" and key != "outbox"}
     return _change(arguments, "set-topic", topic=arguments.topic, values=values | cleared)
 
@@ -63,13 +63,13 @@ def _change(arguments: argparse.Namespace, op: str, **fields: Any) -> int:
     if arguments.json:
         print_json({"changes": changes})
     else:
-        print_text("\n".join(changes) if changes else "nothing to change")
+        print_text("\n".join(changes) if changes else "no changes")
     return Exit.OK
 
 
 def _values(assignments: list[str]) -> dict[str, Any] | None:
-    """`priority=2 outbox=last` as TOML values; a word without quotes is text. None (and a complaint) where one is
-    none."""
+    """`priority=2 outbox=last` as TOML values; a word without quotes is a string. Prints an error and returns None for
+    an invalid assignment."""
     values: dict[str, Any] = {}
     for assignment in assignments:
         key, equals, text = assignment.partition("=")

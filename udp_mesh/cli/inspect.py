@@ -1,4 +1,4 @@
-"""`status`, `peers`, `topics`, `events`, `metrics`: what is."""
+"""`status`, `peers`, `topics`, `events`, `metrics`: show the daemon's state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from udp_mesh.client.mesh_client import MeshClient, MeshError
 from udp_mesh.report.terminal_escapes import clean
 
 HOME, END_OF_LINE, BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
-"""Go to the upper left corner; clear to the end of the line; clear all below (ECMA-48)."""
+"""Move to the upper left corner; clear to the end of the line; clear everything below (ECMA-48)."""
 
 
 def status(arguments: argparse.Namespace) -> int:
@@ -31,7 +31,7 @@ def topics(arguments: argparse.Namespace) -> int:
 
 
 def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> int:
-    """Once, or again and again with `--watch`: one screen, or one JSON line, each time."""
+    """Shows a reply once, or repeatedly with `--watch`, as one screen or one JSON line each time."""
     if arguments.watch is not None:
         _watch(arguments, op, view)
     with MeshClient(arguments.socket) as mesh:
@@ -44,7 +44,7 @@ def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -
 
 
 def _watch(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> NoReturn:
-    """Until Ctrl-C. A daemon that ends once it was seen is waited for: it may be restarted, or updated."""
+    """Runs until Ctrl-C. Once connected, waits for a daemon that goes away: it may be restarting."""
     period_s: float = arguments.watch
     seen = is_away = False
     while True:
@@ -62,7 +62,7 @@ def _watch(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) 
             if error.code != "unreachable" or not seen:
                 raise
             if not is_away and not arguments.json:
-                _redraw(f"{error}; waiting for it")
+                _redraw(f"{error}; waiting for the daemon")
             is_away = True
         time.sleep(period_s)
 
@@ -74,7 +74,7 @@ def _request(mesh: MeshClient, op: str) -> Json:
 
 
 def _redraw(text: str) -> None:
-    """On a terminal in the place of the page before."""
+    """Prints the text, on a terminal in place of the previous one."""
     if sys.stdout.isatty():
         columns, lines = shutil.get_terminal_size()
         write_raw(screen_text(text, columns, lines))
@@ -83,17 +83,17 @@ def _redraw(text: str) -> None:
 
 
 def screen_text(text: str, columns: int, lines: int) -> str:
-    """The text in the place of what stood on a terminal before, without a flicker; what does not fit is cut off, and
-    the last line says so."""
+    """The text that replaces the previous one on a terminal without flicker; excess lines are cut off, and the last
+    line says so."""
     rows = clean(text).split("\n")
     max_rows = max(lines - 1, 1)
     if len(rows) > max_rows:
-        rows = [*rows[: max_rows - 1], f"... {len(rows) - max_rows + 1} more lines (`| less` without --watch has all)"]
+        rows = [*rows[: max_rows - 1], f"... {len(rows) - max_rows + 1} more lines (run without --watch to see all)"]
     return HOME + "".join(f"{row[:columns]}{END_OF_LINE}\n" for row in rows) + BELOW
 
 
 def events(arguments: argparse.Namespace) -> int:
-    """Peers that come and go, conflicts, starvation, as they happen."""
+    """Prints events as they happen: peers that come and go, conflicts, starvation."""
     with MeshClient(arguments.socket) as mesh:
         mesh.request("events")
         while True:
@@ -106,7 +106,7 @@ def events(arguments: argparse.Namespace) -> int:
 
 
 def metrics(arguments: argparse.Namespace) -> int:
-    """The page for Prometheus."""
+    """Prints the metrics in Prometheus text format."""
     with MeshClient(arguments.socket) as mesh:
         _, page = mesh.request_frame("metrics")
         write_text(page.decode())

@@ -19,10 +19,17 @@ from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PI
 Command = Callable[[argparse.Namespace], int]
 
 EPILOG = """\
-exit codes: 0 done, 1 refused or no answer, 2 wrong usage or a file that `report` or `sim` cannot use,
-3 no daemon answers at the socket, 4 problems in the configuration, 5 a message was not delivered, 130 interrupted
+exit codes:
+  0    success
+  1    the daemon refused the request, or a peer did not answer
+  2    invalid arguments, or a file that `report` or `sim` cannot use
+  3    cannot connect to the daemon
+  4    invalid configuration
+  5    a message was not delivered
+  130  interrupted
 
-UDP_MESH_SOCKET in the environment names the daemon's socket where --socket does not.
+environment:
+  UDP_MESH_SOCKET  the daemon's socket, unless --socket is given
 
 examples:
   udp-mesh check udp-mesh.toml && udp-mesh run udp-mesh.toml
@@ -40,23 +47,23 @@ RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
     inspect.events,
     traffic.echo,
 )
-"""To interrupt these is how they end; the others have not done what they were asked for."""
+"""Commands that are normally ended with Ctrl-C, so that an interrupt is a success."""
 
 FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
-"""Commands with arguments of their own: the package's `main(argv)` gets them."""
+"""Commands that parse their own arguments: `main(argv)` of the package is called."""
 
 MAX_COUNT = 1_000_000_000
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Keeps paths and examples whole: argparse breaks lines at hyphens."""
+    """Does not break paths and examples at hyphens."""
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False, break_long_words=False)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the process's exit code."""
+    """Runs one command and returns the process's exit code."""
     prepare_streams()
     command: Command | None = None
     try:
@@ -71,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_error(f"{error} ({hint})" if hint else str(error))
         return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
     except BrokenPipeError:
-        # The reader of our output has gone: nobody is left to be told.
+        # The reader of standard output has gone away; there is nothing left to write to.
         discard_stdout()
         return Exit.FAILED
     except OutputFailed as error:
@@ -83,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _forward(package: str, arguments: list[str]) -> int:
-    """A package's own command; it speaks of its files itself, so what is left is standard output."""
+    """Runs a package's own command, which handles errors of its files itself but not those of standard output."""
     command: Callable[[list[str]], int] = importlib.import_module(package).main
     with checked_stdout():
         code = command(arguments)
@@ -92,27 +99,27 @@ def _forward(package: str, arguments: list[str]) -> int:
 
 
 def _hint(error: MeshError) -> str:
-    """What to do about a refusal, where the command line knows."""
+    """What to do about an error, if known."""
     match error.code, error.__cause__:
         case "unreachable", PermissionError():
-            return "its socket is for root and for the group that `socket_group` in [daemon] names"
+            return "run as root or as a member of the group in `socket_group` of [daemon]"
         case "unreachable", FileNotFoundError() | ConnectionRefusedError():
-            return "`udp-mesh run` starts one, --socket or UDP_MESH_SOCKET names another socket"
+            return "start it with `udp-mesh run`, or set --socket or UDP_MESH_SOCKET"
         case "unknown-peer", _:
-            return "`udp-mesh peers` lists those that were heard"
+            return "run `udp-mesh peers` for the known peers"
         case "cannot-record", _ if "File exists" not in str(error):
-            return "the daemon writes it, and as a service may do so below its state directory, /var/lib/udp-mesh"
+            return "the daemon writes the file; as a service it may do so only below /var/lib/udp-mesh"
         case "unknown-topic", _:
-            return "`udp-mesh topics` lists what is configured"
+            return "run `udp-mesh topics` for the configured topics"
         case _:
             return ""
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Every command with its help."""
+    """The parser of all commands."""
     parser = argparse.ArgumentParser(
         prog="udp-mesh",
-        description="Prioritized messages between robots over lossy, breaking links.",
+        description="Send prioritized messages between robots over lossy, intermittent links.",
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
@@ -123,7 +130,7 @@ def build_parser() -> argparse.ArgumentParser:
     _add_change(commands)
     _add_traffic(commands)
     for name, text in (
-        ("report", "turn a recording into a page of pictures"),
+        ("report", "turn recordings into an HTML page with charts"),
         ("sim", "run a scenario in the simulator"),
     ):
         commands.add_parser(name, help=text, add_help=False)
@@ -161,16 +168,16 @@ def _command(
             help="the daemon's socket (default: UDP_MESH_SOCKET, or %(default)s)",
         )
     if json:
-        parser.add_argument("--json", action="store_true", help="JSON for scripts")
+        parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
 
 def _command_group(
     commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
-    """A command that has commands of its own."""
+    """A command with subcommands."""
     parser = _parser(commands, name, help_text, example)
-    return parser.add_subparsers(title="what", metavar="WHAT", required=True)
+    return parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
 
 def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -182,7 +189,7 @@ def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--log-level",
         choices=("debug", "info", "warning", "error"),
         default="info",
-        help="what is logged, from this level on (default: %(default)s)",
+        help="minimum level of log messages (default: %(default)s)",
     )
     check = _command(
         commands, "check", serve.check, "check a configuration", example="udp-mesh check mesh.toml", daemon=False
@@ -192,19 +199,19 @@ def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         commands,
         "keygen",
         serve.keygen,
-        "make a fleet key",
+        "create a fleet key",
         example="udp-mesh keygen fleet.key",
         daemon=False,
         json=False,
     )
-    keygen.add_argument("file", type=Path, help="a file that does not exist yet")
+    keygen.add_argument("file", type=Path, help="file to create; it must not exist")
 
 
 def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     for name, command, text in (
         ("status", inspect.status, "show links, peers and counters"),
-        ("peers", inspect.peers, "show the peers and what waits for them"),
-        ("topics", inspect.topics, "show the topics and how they travel"),
+        ("peers", inspect.peers, "show peers and their queues"),
+        ("topics", inspect.topics, "show topics and their settings"),
     ):
         parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
         parser.add_argument(
@@ -213,17 +220,17 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
             nargs="?",
             const=1.0,
             metavar="SECONDS",
-            help="again and again (default: every 1 s)",
+            help="repeat until interrupted (default interval: 1 s)",
         )
     _command(
         commands,
         "events",
         inspect.events,
-        "print events of peers and topics as they happen",
+        "print events as they happen",
         example="udp-mesh events --json",
     )
     _command(
-        commands, "metrics", inspect.metrics, "print the page for Prometheus", example="udp-mesh metrics", json=False
+        commands, "metrics", inspect.metrics, "print metrics for Prometheus", example="udp-mesh metrics", json=False
     )
 
 
@@ -238,59 +245,59 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         "add or change a topic",
         example="udp-mesh set topic map priority=7 outbox=all",
     )
-    topic.add_argument("topic", help="its name; one that is not configured yet is added")
+    topic.add_argument("topic", help="name of the topic; added if it is not configured")
     topic.add_argument(
         "values",
         nargs="*",
         metavar="key=value",
-        help="as in [topics], such as priority=9, or deadline_s=none for none; the others stay as they are",
+        help="settings as in [topics], such as priority=9; deadline_s=none unsets one; others are not changed",
     )
     window = _command(
-        setters, "window", change.set_window, "set the packets in flight per peer", example="udp-mesh set window 3"
+        setters, "window", change.set_window, "set the congestion window per peer", example="udp-mesh set window 3"
     )
-    window.add_argument("window", help='"adaptive", or a number such as 3')
+    window.add_argument("window", help='"adaptive", or a fixed number of packets such as 3')
     rates = _command(
         setters,
         "rates",
         change.set_rates,
-        "set times and thresholds of the protocol",
+        "set the protocol's times and thresholds",
         example="udp-mesh set rates offline_s=5 heartbeat_s=0.5",
     )
-    rates.add_argument("values", nargs="+", metavar="key=value", help="as in [rates], such as offline_s=5")
+    rates.add_argument("values", nargs="+", metavar="key=value", help="settings as in [rates], such as offline_s=5")
     neighbour = _command(
         setters,
         "neighbour",
         change.set_neighbour,
-        "add or change a fixed neighbour",
+        "add or change a fixed neighbor",
         example="udp-mesh set neighbour 10.42.0.11 --name husky1 --legacy",
     )
     neighbour.add_argument("address", help="10.0.0.2, 10.0.0.2:8700 or [fd00::2]:8700")
-    neighbour.add_argument("--name", help="its node name (needed for --legacy)")
-    neighbour.add_argument("--link", help="the link it is reached over")
-    neighbour.add_argument("--legacy", action="store_true", help="it speaks the fielded format")
+    neighbour.add_argument("--name", help="node name (required with --legacy)")
+    neighbour.add_argument("--link", help="link over which the neighbor is reached")
+    neighbour.add_argument("--legacy", action="store_true", help="the neighbor uses the legacy format")
     keys = _command(
         setters,
         "keys",
         change.set_keys,
-        "take the keys of a file, the first one seals",
+        "load keys from a file; the first one seals",
         example="udp-mesh set keys /etc/udp-mesh/new.key",
     )
-    keys.add_argument("file", type=Path, help="one or two keys, one per line; the daemon reads it")
+    keys.add_argument("file", type=Path, help="file with one or two keys, one per line; read by the daemon")
     droppers = _command_group(
-        commands, "drop", "remove a topic or neighbour from the running daemon", "udp-mesh drop topic video"
+        commands, "drop", "remove a topic or neighbor from the running daemon", "udp-mesh drop topic video"
     )
-    _command(droppers, "topic", change.drop_topic, "forget a topic", example="udp-mesh drop topic video").add_argument(
-        "topic", help="its name"
+    _command(droppers, "topic", change.drop_topic, "remove a topic", example="udp-mesh drop topic video").add_argument(
+        "topic", help="name of the topic"
     )
     _command(
         droppers,
         "neighbour",
         change.drop_neighbour,
-        "forget a fixed neighbour",
+        "remove a fixed neighbor",
         example="udp-mesh drop neighbour 10.42.0.11",
-    ).add_argument("address", help="as it was set")
+    ).add_argument("address", help="address as it was set")
     _command(
-        commands, "reload", change.reload, "read the daemon's configuration again", example="udp-mesh reload --json"
+        commands, "reload", change.reload, "reload the daemon's configuration file", example="udp-mesh reload --json"
     )
 
 
@@ -302,53 +309,51 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "send a message",
         example="udp-mesh pub map/diff --file map.bin --to base --wait",
     )
-    publish.add_argument("topic", help="its name, as in `udp-mesh topics`")
-    publish.add_argument("text", nargs="?", help="the message (- or nothing: --file, or standard input)")
-    publish.add_argument("--file", type=Path, help="send this file's bytes (- for standard input)")
-    publish.add_argument("--to", metavar="PEER", help="one peer (default: the topic's destinations, or all)")
-    publish.add_argument("--type", default="", help="the message's type name, carried along")
-    publish.add_argument("--count", type=_count, default=1, help="send it so many times")
-    publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="with --count, so many a second")
+    publish.add_argument("topic", help="name of the topic, as in `udp-mesh topics`")
+    publish.add_argument("text", nargs="?", help="the message (default or -: standard input)")
+    publish.add_argument("--file", type=Path, help="send the contents of a file (- for standard input)")
+    publish.add_argument("--to", metavar="PEER", help="send to one peer (default: the topic's destinations, or all)")
+    publish.add_argument("--type", default="", help="type name to send with the message")
+    publish.add_argument("--count", type=_count, default=1, help="number of times to send it (default: %(default)s)")
+    publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="messages per second with --count")
     publish.add_argument(
         "--wait", type=_positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
     )
-    echo = _command(
-        commands, "echo", traffic.echo, "print messages that arrive", example="udp-mesh echo 'map/*' status"
-    )
-    echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"names or patterns; {CONDITIONS_TOPIC} too")
-    echo.add_argument("--count", type=_count, help="stop after so many")
-    echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="stop when nothing comes for so long")
-    echo.add_argument("--raw", action="store_true", help="write the payloads' bytes and nothing else")
+    echo = _command(commands, "echo", traffic.echo, "print received messages", example="udp-mesh echo 'map/*' status")
+    echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"topics or patterns, or {CONDITIONS_TOPIC}")
+    echo.add_argument("--count", type=_count, help="exit after this many messages")
+    echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="exit after this long without a message")
+    echo.add_argument("--raw", action="store_true", help="write only the payloads' bytes")
     ping = _command(
-        commands, "ping", traffic.ping, "measure round trips to a peer", example="udp-mesh ping base --count 5"
+        commands, "ping", traffic.ping, "measure round-trip times to a peer", example="udp-mesh ping base --count 5"
     )
-    ping.add_argument("peer", help="its name, as in `udp-mesh peers`")
-    ping.add_argument("-c", "--count", type=_count, default=4, help="so many (default: %(default)s)")
+    ping.add_argument("peer", help="name of the peer, as in `udp-mesh peers`")
+    ping.add_argument("-c", "--count", type=_count, default=4, help="number of pings (default: %(default)s)")
     ping.add_argument(
-        "--interval", type=_positive, default=1.0, metavar="SECONDS", help="between two (default: %(default)g)"
+        "--interval", type=_positive, default=1.0, metavar="SECONDS", help="time between pings (default: %(default)g)"
     )
     ping.add_argument(
-        "--timeout", type=_ping_s, default=2.0, metavar="SECONDS", help="for each answer (default: %(default)g)"
+        "--timeout", type=_ping_s, default=2.0, metavar="SECONDS", help="timeout per ping (default: %(default)g)"
     )
     bench = _command(
-        commands, "bench", traffic.bench, "fill the link to a peer and measure", example="udp-mesh bench base"
+        commands, "bench", traffic.bench, "measure the throughput to a peer", example="udp-mesh bench base"
     )
-    bench.add_argument("peer", help="its name, as in `udp-mesh peers`")
+    bench.add_argument("peer", help="name of the peer, as in `udp-mesh peers`")
     bench.add_argument(
-        "--size", type=_count, default=200_000, metavar="BYTES", help="per message (default: %(default)s)"
+        "--size", type=_count, default=200_000, metavar="BYTES", help="size per message (default: %(default)s)"
     )
     bench.add_argument(
         "--seconds",
         type=_positive,
         default=5.0,
-        help="how long to send (default: %(default)g); it ends when all of it has arrived",
+        help="how long to send (default: %(default)g); exits when everything has been delivered",
     )
     bench.add_argument(
         "--timeout",
         type=_positive,
         default=60.0,
         metavar="SECONDS",
-        help="give up when none is delivered for so long (default: %(default)g)",
+        help="exit after this long without a delivered message (default: %(default)g)",
     )
     recorders = _command_group(
         commands,
@@ -360,12 +365,12 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         recorders,
         "start",
         traffic.record_start,
-        "begin a recording",
+        "start a recording",
         example="udp-mesh record start /var/lib/udp-mesh/run1.jsonl",
     )
-    start.add_argument("file", type=Path, help="a file that does not exist yet; the daemon writes it, with its rights")
-    start.add_argument("--payloads", action="store_true", help="with the bytes of received messages")
-    _command(recorders, "stop", traffic.record_stop, "end the recording", example="udp-mesh record stop")
+    start.add_argument("file", type=Path, help="file to create, with the daemon's permissions; it must not exist")
+    start.add_argument("--payloads", action="store_true", help="include the payloads of received messages")
+    _command(recorders, "stop", traffic.record_stop, "stop the recording", example="udp-mesh record stop")
 
 
 def _positive(text: str) -> float:
@@ -386,7 +391,7 @@ def _ping_s(text: str) -> float:
 
 
 def _count(text: str) -> int:
-    """A count that does something: at least one."""
+    """A number of repetitions."""
     if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= MAX_COUNT:
         raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found {text!r}")
     return int(text)

@@ -1,4 +1,4 @@
-"""What a command says and how it ends: lines on standard output, refusals on standard error, exit codes."""
+"""Output of the commands: text and JSON on standard output, errors on standard error, exit codes."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ class Exit(IntEnum):
 
     OK = 0
     FAILED = 1
-    """The daemon refused, or a peer did not answer."""
+    """The daemon refused the request, or a peer did not answer."""
     USAGE = 2
     UNREACHABLE = 3
     """No daemon listens at the socket."""
     CONFIGURATION = 4
-    """The configuration has problems; each is on standard error."""
+    """The configuration is invalid; the problems are on standard error."""
     NOT_DELIVERED = 5
-    """A message ended as expired or peer lost."""
+    """A message expired or its peer was lost."""
     INTERRUPTED = 130
-    """Ctrl-C before it was done: 128 and the signal's number, as shells count."""
+    """Ctrl-C: 128 plus the signal number, as in shells."""
 
 
 class OutputFailed(Exception):
-    """Standard output takes no more (a full disk); its reader's going away is a BrokenPipeError."""
+    """Standard output cannot be written (a full disk); a closed pipe raises BrokenPipeError instead."""
 
 
 def prepare_streams() -> None:
-    """Makes standard output and standard error such that whatever is written to them is no error of ours: a closed one
-    swallows it, and characters that a terminal's encoding lacks are shown by their numbers."""
+    """Makes standard output and standard error safe to write to: a closed one is replaced by /dev/null, and characters
+    missing from the terminal's encoding are escaped."""
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if sys.stderr is None:
@@ -46,7 +46,7 @@ def prepare_streams() -> None:
 
 
 def discard_stdout() -> None:
-    """Nothing more is written to standard output, not even what Python holds for it at its end."""
+    """Discards everything written to standard output from now on, including what Python still buffers."""
     with suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, sys.stdout.fileno())
@@ -55,7 +55,7 @@ def discard_stdout() -> None:
 
 @contextmanager
 def checked_stdout() -> Iterator[None]:
-    """Where what fails is standard output: OutputFailed, or BrokenPipeError."""
+    """Turns an OSError of standard output into OutputFailed, or lets BrokenPipeError pass."""
     try:
         yield
     except BrokenPipeError:
@@ -69,12 +69,12 @@ def print_text(text: str) -> None:
 
 
 def write_text(text: str) -> None:
-    """Without the end of a line."""
+    """Prints text without a line end."""
     write_raw(clean(text))
 
 
 def write_raw(text: str) -> None:
-    """With control sequences of our own, around text that was cleaned before."""
+    """Writes text that may contain our own control sequences; foreign text in it must be cleaned before."""
     with checked_stdout():
         sys.stdout.write(text)
         sys.stdout.flush()
@@ -95,7 +95,7 @@ def print_json_line(value: object) -> None:
 
 
 def _is_ascii_safer() -> bool:
-    """Where not every character can be written, JSON's own escapes stand for them."""
+    """Whether JSON escapes are needed because the encoding lacks some characters."""
     return (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
 
 
@@ -104,8 +104,8 @@ def print_error(text: str) -> None:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Columns as wide as they must be; numbers to the right."""
-    # a line end in a name must not begin a row of its own
+    """Columns as wide as their content, numbers aligned to the right."""
+    # A line break in a name must not start a new row.
     cells = [[clean(cell, keep="") for cell in row] for row in (head, *rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
     numeric = [all(_is_number(row[column]) for row in rows) for column in range(len(head))]

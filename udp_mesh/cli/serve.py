@@ -17,8 +17,8 @@ from udp_mesh.daemon.toml_source import ConfigurationError
 
 
 def run_daemon(arguments: argparse.Namespace) -> int:
-    """Runs until it is stopped."""
-    # The transport itself: every other command starts in half the time without it.
+    """Runs the daemon until it is stopped."""
+    # Imported here: the other commands start in half the time without the transport.
     from udp_mesh.daemon.main import run
 
     logging.basicConfig(level=arguments.log_level.upper(), format="%(levelname)s %(message)s")
@@ -35,16 +35,16 @@ def run_daemon(arguments: argparse.Namespace) -> int:
 
 
 def _reason(error: OSError) -> str:
-    """Without the number, and with the way out where files are for somebody else."""
+    """The error without its number, with a hint if a path is not accessible."""
     if error.strerror is None:
         return str(error)
     place = f"{error.filename}: " if error.filename is not None else ""
-    hint = " (`socket` and `state_directory` in [daemon] name other places)"
+    hint = " (run as root, or change `socket` and `state_directory` in [daemon])"
     return f"{place}{error.strerror}{hint if isinstance(error, PermissionError) else ''}"
 
 
 def check(arguments: argparse.Namespace) -> int:
-    """Reads a configuration and says what is wrong with it, or what it means."""
+    """Checks a configuration and prints its problems, or a summary."""
     try:
         configuration = load(arguments.config)
     except ConfigurationError as error:
@@ -76,7 +76,7 @@ def check(arguments: argparse.Namespace) -> int:
     else:
         protection = "UNKEYED" if settings.unkeyed else f"{len(settings.keys)} key(s)"
         print_text(
-            f"{arguments.config}: good: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}"
+            f"{arguments.config}: valid: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}"
         )
     return Exit.OK
 
@@ -88,7 +88,7 @@ def _print_problems(error: ConfigurationError) -> int:
 
 
 def keygen(arguments: argparse.Namespace) -> int:
-    """Makes a fleet key, readable by its owner only; an existing file is never overwritten."""
+    """Creates a fleet key, readable only by its owner; never overwrites a file."""
     key = Key(os.urandom(SECRET_BYTES))
     line = f"{key.secret.hex()}  # {key.key_id.hex()}\n"
     path: Path = arguments.file

@@ -29,14 +29,14 @@ from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
 MAX_BENCH_BACKLOG_BYTES = 16 << 20
 BENCH_BACKLOG_S = 2.0
 MIN_BENCH_BACKLOG = 4
-"""What the benchmark keeps accepted and undelivered: so much time of what arrives, never fewer messages and never more
-bytes. That keeps any link busy, and a slow one is done soon after the time asked for."""
+"""Limits of the benchmark's accepted and undelivered data: this much time at the measured rate, but at least this many
+messages and at most this many bytes. That saturates any link, and a slow one still finishes soon."""
 
 
 def publish(arguments: argparse.Namespace) -> int:
-    """Sends one message, or the same one `--count` times at `--rate` a second."""
+    """Sends one message, or the same one `--count` times at `--rate` per second."""
     if arguments.file is not None and arguments.text not in (None, "-"):
-        print_error(f"expected the message or --file, found both: {arguments.text!r} and --file {arguments.file}")
+        print_error(f"expected either a message or --file, found both: {arguments.text!r} and --file {arguments.file}")
         return Exit.USAGE
     payload = _payload(arguments)
     if payload is None:
@@ -47,7 +47,7 @@ def publish(arguments: argparse.Namespace) -> int:
             topic = _topic(mesh, arguments.topic)
             if topic is not None and not topic["reliable"]:
                 print_error(
-                    f"nobody is told what became of a message of {arguments.topic}, which is best effort (--wait)"
+                    f"topic {arguments.topic} is best effort and reports no outcomes: drop --wait, or make it reliable"
                 )
                 return Exit.USAGE
             destinations = _destinations(mesh, arguments.to, topic)
@@ -69,14 +69,14 @@ def publish(arguments: argparse.Namespace) -> int:
 
 def _payload(arguments: argparse.Namespace) -> bytes | None:
     if arguments.text not in (None, "-"):
-        # The bytes of the command line, whatever they are.
+        # The bytes of the command line, in any encoding.
         return os.fsencode(arguments.text)
     if arguments.text == "-" or arguments.file is None or str(arguments.file) == "-":
         if sys.stdin is None:
             print_error("expected a message or --file: standard input is closed")
             return None
         if sys.stdin.isatty():
-            print_error("the message is what you type now; Ctrl-D ends it")
+            print_error("reading the message from the terminal; press Ctrl-D to end it")
         return _read_bounded(sys.stdin.buffer, "standard input")
     path: Path = arguments.file
     try:
@@ -88,7 +88,7 @@ def _payload(arguments: argparse.Namespace) -> bytes | None:
 
 
 def _read_bounded(file: BinaryIO, name: str) -> bytes | None:
-    """What is in it, where that can be a message."""
+    """Reads a message; prints an error and returns None if it is too large."""
     payload = file.read(MAX_PAYLOAD_BYTES + 1)
     if len(payload) > MAX_PAYLOAD_BYTES:
         print_error(f"{name}: expected at most {MAX_PAYLOAD_BYTES} bytes, found more")
@@ -97,7 +97,7 @@ def _read_bounded(file: BinaryIO, name: str) -> bytes | None:
 
 
 def _topic(mesh: MeshClient, name: str) -> Json | None:
-    """How messages of this topic travel; None where they are refused."""
+    """The settings of a topic; None if it is refused."""
     reply = mesh.request("topics")
     found = [topic for topic in reply["topics"] if topic["configured"] and topic["name"] == name]
     topic: Json | None = found[0] if found else reply["undeclared"]
@@ -105,7 +105,7 @@ def _topic(mesh: MeshClient, name: str) -> Json | None:
 
 
 def _destinations(mesh: MeshClient, to: str | None, topic: Json | None) -> set[str]:
-    """Whose outcomes are awaited: of a message to all, those of the peers that are online."""
+    """Peers whose outcomes are awaited; for a message to all, those that are online."""
     if to is not None:
         return {to}
     conditions = mesh.request("status")["conditions"]
@@ -115,14 +115,14 @@ def _destinations(mesh: MeshClient, to: str | None, topic: Json | None) -> set[s
 
 
 def _await_outcomes(mesh: MeshClient, waiting: set[tuple[int, str]], arguments: argparse.Namespace) -> int:
-    """Waits for the outcome of each message at each destination; one that is not `delivered` decides the exit code."""
+    """Waits for the outcome of each message at each destination; any outcome but `delivered` fails the command."""
     code, deadline = Exit.OK, time.monotonic() + arguments.wait
     while waiting:
         frame = mesh.next_frame(max(0.0, deadline - time.monotonic()))
         if frame is None:
             names = ", ".join(sorted({peer for _, peer in waiting}))
-            hint = "" if arguments.to else " (one to all that fits a datagram has none: name a peer with --to)"
-            print_error(f"{len(waiting)} outcome(s) are missing after {arguments.wait:g} s, of {names}{hint}")
+            hint = "" if arguments.to else " (a single-datagram broadcast has no outcome: name a peer with --to)"
+            print_error(f"timed out after {arguments.wait:g} s: {len(waiting)} outcome(s) missing from {names}{hint}")
             return Exit.NOT_DELIVERED
         fields = frame[0]
         if fields.get("event") != "outcome":
@@ -146,7 +146,7 @@ def echo(arguments: argparse.Namespace) -> int:
         while arguments.count is None or shown < arguments.count:
             frame = mesh.next_frame(arguments.timeout)
             if frame is None:
-                print_error(f"nothing within {arguments.timeout:g} s")
+                print_error(f"no message within {arguments.timeout:g} s")
                 return Exit.FAILED
             header, payload = frame
             if header.get("topic") == CONDITIONS_TOPIC:
@@ -156,7 +156,7 @@ def echo(arguments: argparse.Namespace) -> int:
             message = as_message(frame)
             if message is None:
                 if header.get("event") == "dropped":
-                    print_error(f"too slow: {header['messages']} messages were dropped")
+                    print_error(f"reading too slowly: {header['messages']} messages were dropped")
                 continue
             shown += 1
             if arguments.raw:
@@ -179,7 +179,7 @@ def _preview(payload: bytes) -> str:
 
 
 def ping(arguments: argparse.Namespace) -> int:
-    """Round trips through both daemons, at the most urgent priority; Ctrl-C ends it with what was measured."""
+    """Measures round trips through both daemons at the most urgent priority; Ctrl-C prints the summary."""
     times: list[float] = []
     attempts = 0
     try:
@@ -191,7 +191,7 @@ def ping(arguments: argparse.Namespace) -> int:
                 _ping_once(mesh, arguments, times)
         code = Exit.OK if len(times) == arguments.count else Exit.FAILED
     except KeyboardInterrupt:
-        # the one under way was not waited for to its end
+        # The ping in progress did not get its full timeout.
         attempts = max(attempts - 1, len(times))
         code = Exit.INTERRUPTED
     except MeshError:
@@ -206,8 +206,8 @@ def _print_summary(arguments: argparse.Namespace, times: list[float], attempts: 
     if arguments.json:
         return
     spread = (
-        f", least {milliseconds(min(times))}, mean {milliseconds(sum(times) / len(times))}, "
-        f"most {milliseconds(max(times))}"
+        f", min {milliseconds(min(times))}, mean {milliseconds(sum(times) / len(times))}, "
+        f"max {milliseconds(max(times))}"
         if times
         else ""
     )
@@ -215,7 +215,7 @@ def _print_summary(arguments: argparse.Namespace, times: list[float], attempts: 
 
 
 def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[float]) -> None:
-    """Adds what it took, where it was answered. Raises MeshError where no other will be answered either."""
+    """Adds the round-trip time, if there was an answer. Raises MeshError if further pings are pointless."""
     try:
         reply = mesh.request("ping", peer=arguments.peer, timeout_s=arguments.timeout)
     except MeshError as error:
@@ -236,13 +236,13 @@ def _ping_once(mesh: MeshClient, arguments: argparse.Namespace, times: list[floa
 
 
 def _backlog(size_bytes: int, delivered_per_s: float) -> int:
-    """Messages of the benchmark that may be under way."""
+    """Number of benchmark messages that may be outstanding."""
     return max(MIN_BENCH_BACKLOG, min(MAX_BENCH_BACKLOG_BYTES // size_bytes, int(BENCH_BACKLOG_S * delivered_per_s)))
 
 
 @dataclass(slots=True)
 class _BenchRun:
-    """What a benchmark has sent, and what of it arrived until when."""
+    """What a benchmark sent, and what was delivered until when."""
 
     begun: float
     ended: float
@@ -256,7 +256,7 @@ class _BenchRun:
 
 
 def bench(arguments: argparse.Namespace) -> int:
-    """Fills the link to a peer at the lowest priority for some seconds, says what arrived. Ctrl-C ends it sooner."""
+    """Saturates the link to a peer at the lowest priority and reports the throughput. Ctrl-C ends it early."""
     code = Exit.OK
     with MeshClient(arguments.socket) as mesh:
         begun = time.monotonic()
@@ -288,7 +288,7 @@ def bench(arguments: argparse.Namespace) -> int:
 
 
 def _fill(mesh: MeshClient, arguments: argparse.Namespace, run: _BenchRun) -> bool:
-    """Sends for the time asked for and waits for the rest; False where nothing arrives any more."""
+    """Sends for the given time and waits for the rest; False if nothing is delivered any more."""
     payload = bytes(arguments.size)
     while True:
         if time.monotonic() - run.begun < arguments.seconds:
@@ -316,7 +316,7 @@ def record_start(arguments: argparse.Namespace) -> int:
         mesh.request("record-start", path=str(path), payloads=arguments.payloads)
     print_json({"path": str(path)}) if arguments.json else print_text(f"recording to {path}")
     if _is_missing(path):
-        print_error(f"{path} is not to be seen here: the daemon has a /tmp of its own (PrivateTmp= of its service)")
+        print_error(f"warning: {path} is not visible here: the daemon's service has a private /tmp (PrivateTmp=)")
     return Exit.OK
 
 
@@ -326,7 +326,7 @@ def _is_missing(path: Path) -> bool:
     except FileNotFoundError:
         return True
     except OSError:
-        # a directory of the daemon's that we may not look into
+        # A directory that only the daemon may read.
         return False
     return False
 

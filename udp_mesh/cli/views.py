@@ -1,4 +1,4 @@
-"""The daemon's replies -> text for people. Pure."""
+"""Formats the daemon's replies for people. Pure."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from udp_mesh.cli.output import duration, milliseconds, rate, size, table
 Json = dict[str, Any]
 
 NO_ANSWER_AFTER_S = 3.0
-"""An outage shorter than this is nothing to tell."""
+"""Shorter outages are not shown."""
 
 
 def peers_view(peers: list[Json]) -> str:
-    """One line per peer, then one per level that has something waiting."""
+    """One line per peer, then one per priority with waiting messages."""
     if not peers:
-        return "no peer heard of yet"
+        return "no peers yet"
     rows = [
         [
-            peer["name"] + (" (fielded)" if peer["legacy"] else ""),
+            peer["name"] + (" (legacy)" if peer["legacy"] else ""),
             *_state(peer),
             peer["address"] or "-",
             peer["link"] or "-",
@@ -53,7 +53,7 @@ def peers_view(peers: list[Json]) -> str:
 
 
 def _state(peer: Json) -> tuple[str, str]:
-    """In a word, and for how long."""
+    """State in a word, and its duration."""
     unanswered_for_s = peer["unanswered_for_s"] or 0.0
     if peer["online"] and not peer["one_way"] and unanswered_for_s >= NO_ANSWER_AFTER_S:
         return "NO ANSWER", duration(unanswered_for_s)
@@ -76,7 +76,7 @@ def status_view(status: Json) -> str:
             [
                 link["name"],
                 link["address"],
-                link["broadcast"] or "neighbours only",
+                link["broadcast"] or "neighbors only",
                 str(link["mtu"]),
                 str(link["lost_on_send"]),
             ]
@@ -88,18 +88,18 @@ def status_view(status: Json) -> str:
     lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
     lines += [
         f"link {refusal['link']} CANNOT SEND to {refusal['to']}: {refusal['reason']} "
-        f"({refusal['datagrams']} datagrams, the last {duration(refusal['last_ago_s'])} ago)"
+        f"({refusal['datagrams']} datagrams, last {duration(refusal['last_ago_s'])} ago)"
         for refusal in status["refusals"]
     ]
     lines += ["", peers_view(conditions["peers"])]
     lines += [
-        f"{stranger['name']} at {stranger['address']} on {stranger['link']} is heard and DOES NOT HEAR US, "
+        f"{stranger['name']} at {stranger['address']} on {stranger['link']} is heard but DOES NOT HEAR US, "
         f"for {duration(stranger['heard_for_s'])}"
         for stranger in conditions["strangers"]
     ]
     lines.append("")
     lines.append(
-        f"channel: {rate(conditions['sent_bits_per_s'])} sent here, {rate(conditions['heard_bits_per_s'])} by all heard"
+        f"channel: {rate(conditions['sent_bits_per_s'])} sent here, {rate(conditions['heard_bits_per_s'])} in total"
     )
     lines.append(
         f"messages: {counters['messages_sent']} sent, {counters['messages_delivered']} delivered, "
@@ -108,7 +108,7 @@ def status_view(status: Json) -> str:
     )
     lines.append(
         f"datagrams: {counters['datagrams_sent']} sent, {counters['datagrams_received']} received; fragments: "
-        f"{counters['fragments_retransmitted']} sent again, {counters['duplicates_received']} duplicates"
+        f"{counters['fragments_retransmitted']} retransmitted, {counters['duplicates_received']} duplicates"
     )
     dropped = {name.removeprefix("dropped_"): n for name, n in counters.items() if name.startswith("dropped_") and n}
     if dropped:
@@ -124,7 +124,7 @@ def topics_view(reply: Json) -> str:
         [
             topic["name"],
             str(topic["priority"]) if topic["configured"] else "-",
-            _delivery(topic) if topic["configured"] else "not configured here",
+            _delivery(topic) if topic["configured"] else "not configured",
             f"{topic['sent_messages']}",
             size(topic["sent_bytes"]),
             f"{topic['received_messages']}",
@@ -136,7 +136,7 @@ def topics_view(reply: Json) -> str:
     foot = "other topics are refused" if undeclared is None else f"other topics: priority {undeclared['priority']}"
     if not rows:
         return f"no topic is configured; {foot}"
-    return table(["topic", "priority", "how", "sent", "", "received", ""], rows) + f"\n{foot}"
+    return table(["topic", "priority", "delivery", "sent", "", "received", ""], rows) + f"\n{foot}"
 
 
 def _delivery(topic: Json) -> str:

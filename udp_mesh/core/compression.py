@@ -162,14 +162,14 @@ class CompressionQueue:
         if not compression.step():
             return None
         del self._in_progress[name]
-        return self._take(name), compression.body
+        return self._pop(name), compression.body
 
     def drain(self) -> list[Uncompressed]:
         """Remove and return everything uncompressed, because the node closes."""
         self._in_progress.clear()
-        return [self._take(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
+        return [self._pop(name) for name in list(self._topics) for _ in range(len(self._topics[name]))]
 
-    def _take(self, name: str) -> Uncompressed:
+    def _pop(self, name: str) -> Uncompressed:
         waiting = self._topics[name]
         message = waiting.popleft()
         if not waiting:

@@ -17,6 +17,7 @@ from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.receive import receive_datagram
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.state import State
@@ -217,7 +218,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
         held_messages,
         held_bytes,
         session is not None and session.one_way_since is not None and _recently_heard(session, now),
-        now - sender.last_progress if sender.unresponsive_since is not None and sender.pending else None,
+        now - sender.last_progress if sender.state is SendState.UNRESPONSIVE and sender.pending else None,
     )
 
 

@@ -151,7 +151,7 @@ class Outboxes:
                 queue = level[place]
                 held = queue.front()
                 queue.held.popleft()
-                self._take(queue, held)
+                self._remove(queue, held)
                 released.append(held)
                 if queue.messages:
                     heappush(heads, (queue.front().accepted.message_id, place))
@@ -206,10 +206,10 @@ class Outboxes:
         return sum(queue.messages for queue in queues), sum(queue.bytes for queue in queues)
 
     def _drop(self, queue: _TopicQueue, held: HeldMessage) -> None:
-        self._take(queue, held)
+        self._remove(queue, held)
         self.forget(held.store_key)
 
-    def _take(self, queue: _TopicQueue, held: HeldMessage) -> None:
+    def _remove(self, queue: _TopicQueue, held: HeldMessage) -> None:
         queue.drop(held)
         self.bytes -= held.size
         self._messages -= 1

@@ -21,6 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.path_validation import validate_path
+from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
@@ -28,6 +29,7 @@ from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, SUSPENDED_S, State
@@ -91,19 +93,19 @@ def on_heartbeat(
 
 def on_verified(state: State, session: Session, now: float) -> None:
     """The session has proved that it hears our current boot."""
-    arrival, peer = state.peer_table.verify(session, state.settings)
-    if arrival is VerifyResult.OWN_NAME:
+    result, peer = state.peer_table.verify(session, state.settings)
+    if result is VerifyResult.OWN_NAME:
         _own_name(state, session, now)
         return
     if peer is None:
         state.event_queue.counters.dropped_over_limit += 1
         return
-    if arrival is VerifyResult.RETIRED:
+    if result is VerifyResult.RETIRED:
         # It becomes current again when it is heard and the later boot is gone (`on_activity`).
         return
     session.freshness.confirm(now)
     _replace(state, peer, session, now)
-    if arrival is VerifyResult.RESTARTED and peer.online:
+    if result is VerifyResult.RESTARTED and peer.online:
         state.event_queue.emit(PeerRestarted(peer.name))
         peer.online_since = now
     set_online(state, peer, session, now)
@@ -139,11 +141,9 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
 
 def set_online(state: State, peer: Peer, session: Session, now: float) -> None:
     """The peer is online (again)."""
-    peer.left = False
-    peer.lost = False
     if peer.online:
         return
-    peer.online = True
+    peer.transition(PeerEvent.HEARD)
     peer.online_since = now
     state.event_queue.emit(PeerOnline(peer.name, session.path.address, session.path.link))
     release_outbox(state, peer, now)
@@ -175,7 +175,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
             validate_path(state, session, link, source, now)
             return
         set_online(state, peer, session, now)
-    if peer.has_sender and peer.sender.unresponsive_since is not None:
+    if peer.has_sender and peer.sender.state is SendState.UNRESPONSIVE:
         peer.sender.on_activity(now)
         state.ready[peer] = None
 
@@ -206,7 +206,7 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
         return
     path = session.path
     sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
-    timing_out = sender is not None and (sender.timing_out or sender.unresponsive_since is not None)
+    timing_out = sender is not None and sender.state is not SendState.ACTIVE
     first = not path.link
     quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
     if not first and not quiet and not timing_out:
@@ -307,7 +307,12 @@ def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None
     larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
     if not larger:
         size.narrowed_at = None
-    elif peer.online and path.confirmed and sender.unresponsive_since is None and size.probe.due(now, sender.loss):
+    elif (
+        peer.online
+        and path.confirmed
+        and sender.state is not SendState.UNRESPONSIVE
+        and size.probe.due(now, sender.loss)
+    ):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)
             size.probe.on_probe_sent(token, mtu)
@@ -324,13 +329,11 @@ def on_bye(state: State, session: Session, now: float) -> None:
 
 def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     """The peer is unreachable: messages with an outbox move there; the rest waits for `peer_lost_s`."""
-    peer.online = False
-    peer.left = left
+    peer.transition(PeerEvent.SILENT)
     peer.online_since = None
     state.event_queue.emit(PeerOffline(peer.name, left))
-    if peer.has_sender and peer.sender.unresponsive_since is None and peer.sender.in_flight.outstanding:
-        peer.sender.unresponsive_since = now
-        peer.sender.allow_probe(now)
+    if peer.has_sender and peer.sender.state is not SendState.UNRESPONSIVE and peer.sender.in_flight.outstanding:
+        peer.sender.become_unresponsive(now)
     store_in_outbox(state, peer, now)
 
 
@@ -356,9 +359,9 @@ def maintain(state: State, now: float) -> None:
         if not peer.has_sender:
             _maintain_peer(state, peer, now)
     for name in state.outboxes.peers():
-        holding = state.peer_table.peers.get(name)
-        if holding is not None and holding.online and not holding.settling:
-            release_outbox(state, holding, now)
+        peer_with_outbox = state.peer_table.peers.get(name)
+        if peer_with_outbox is not None and peer_with_outbox.online and not peer_with_outbox.settling:
+            release_outbox(state, peer_with_outbox, now)
     for session in state.peer_table.not_current():
         session.age_windows(now)
         if session.name_conflict and session.peer is not None:
@@ -385,13 +388,13 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         return
     rates = state.settings.rates
     session.age_windows(now)
-    quiet_s = now - session.last_heard
+    silent_s = now - session.last_heard
     one_way_s = now - session.one_way_since if session.one_way_since is not None else 0.0
     offline_after_s = max(rates.offline_s, MISSED_HEARTBEATS * session.interval_s)
-    if peer.online and max(quiet_s, one_way_s) > offline_after_s:
+    if peer.online and max(silent_s, one_way_s) > offline_after_s:
         set_offline(state, peer, now, left=False)
-    if not peer.online and not peer.lost and max(quiet_s, one_way_s) > rates.peer_lost_s:
-        peer.lost = True
+    if peer.state is PeerState.OFFLINE and max(silent_s, one_way_s) > rates.peer_lost_s:
+        peer.transition(PeerEvent.GIVEN_UP)
         if peer.has_sender:
             peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)

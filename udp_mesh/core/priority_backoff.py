@@ -7,6 +7,7 @@ that none starves.
 
 from collections.abc import Iterable
 
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Rates
 from udp_mesh.wire.frames import Waiting
@@ -45,7 +46,7 @@ class PriorityBackoff:
         self._checked_at = now
         oldest: dict[int, float] = {}
         for sender in senders:
-            if sender.unresponsive_since is not None:
+            if sender.state is SendState.UNRESPONSIVE:
                 # Messages to an unresponsive peer do not wait for other nodes' airtime.
                 continue
             max_wait_s = self._rates.yield_after_s + 3 * (sender.rtt.min_rtt or 0.0)

@@ -21,6 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.legacy.sender import can_publish
 from udp_mesh.core.outbox import HeldMessage
+from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
@@ -30,13 +31,11 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
-from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
+from udp_mesh.wire.codec import ANNOUNCE_BYTES
+from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 from udp_mesh.wire.frames import Feature, MessageFlag
 from udp_mesh.wire.legacy import LEGACY_OVERHEAD_BYTES
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
-
-ANNOUNCE_BYTES = 5
-"""Size of a topic announcement without its two names."""
 
 RELEASE_BATCH = 400
 """Outbox messages queued at a time: some milliseconds, in which no urgent message can be sent."""
@@ -191,7 +190,7 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     message.store_key = store_key
     sender = peer.sender
     sender.accept(message, now)
-    if peer.lost:
+    if peer.state is PeerState.LOST:
         sender.finish(message, Outcome.PEER_LOST)
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
@@ -281,8 +280,8 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
         started, session = held.started, peer.session
         if started is not None and held.epoch == peer.sender.epoch:
             # A message sent completely may have arrived completely; under a new number it would arrive twice.
-            whole = started.next_position >= started.fragments
-            if session is not None and (whole or started.fragment_bytes <= session.path.fragment_bytes):
+            fully_sent = started.next_position >= started.fragments
+            if session is not None and (fully_sent or started.fragment_bytes <= session.path.fragment_bytes):
                 started.store_key = held.store_key
                 peer.sender.resume(started, now)
                 state.ready[peer] = None

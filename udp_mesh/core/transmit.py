@@ -7,12 +7,12 @@ copies, and finally level by level broadcasts and the peers in turn. A peer with
 
 from heapq import heappop
 
+from udp_mesh.core.frame_handlers import inflate_step
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import maintain
 from udp_mesh.core.peers.heartbeat import OWN_FEATURES, heartbeat_datagrams
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
-from udp_mesh.core.receive import inflate_step
 from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
 from udp_mesh.core.settings import Address, LinkKind

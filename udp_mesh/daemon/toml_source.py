@@ -41,14 +41,14 @@ class ConfigurationError(Exception):
         super().__init__("\n".join(map(str, self.problems)))
 
 
-Path = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
 
 
-def locate(text: str) -> dict[Path, int]:
+def locate(text: str) -> dict[KeyPath, int]:
     """Line of every table and of every key that starts a line; keys in an inline table have its line."""
-    lines: dict[Path, int] = {}
-    table: Path = ()
-    counts: dict[Path, int] = {}
+    lines: dict[KeyPath, int] = {}
+    table: KeyPath = ()
+    counts: dict[KeyPath, int] = {}
     open_brackets, open_string = 0, ""
     for number, line in enumerate(text.split("\n"), start=1):
         if not open_brackets and not open_string:
@@ -83,9 +83,9 @@ def _split_key(dotted: str) -> Iterator[str]:
         yield part[1:-1] if part[0] in "\"'" else part
 
 
-def _enter(keys: tuple[str, ...], counts: Mapping[Path, int]) -> Path:
+def _enter(keys: tuple[str, ...], counts: Mapping[KeyPath, int]) -> KeyPath:
     """The path of a plain table, inside the latest element if its parent is an array of tables."""
-    path: Path = ()
+    path: KeyPath = ()
     for key in keys:
         path = (*path, key)
         if path != keys and path in counts:
@@ -120,16 +120,16 @@ class Source:
     """One configuration file: its name for messages, the lines of its keys, the problems found so far."""
 
     file: str
-    lines: dict[Path, int]
+    lines: dict[KeyPath, int]
     problems: list[Problem] = field(default_factory=list)
 
-    def line(self, path: Path) -> int:
+    def line(self, path: KeyPath) -> int:
         """The line of this key, or of the nearest enclosing table."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path, 1)
 
-    def report(self, path: Path, expected: str, found: str, hint: str = "") -> None:
+    def report(self, path: KeyPath, expected: str, found: str, hint: str = "") -> None:
         key = ".".join(str(part) for part in path)
         problem = Problem(self.file, self.line(path), key, expected, found, hint)
         if problem not in self.problems:
@@ -171,7 +171,7 @@ def _syntax_problem(text: str, file: str, error: str) -> Problem:
 class Table:
     """One table; each getter checks the value of a key, reports problems and returns the default instead of raising."""
 
-    def __init__(self, values: Mapping[str, object], source: Source, path: Path) -> None:
+    def __init__(self, values: Mapping[str, object], source: Source, path: KeyPath) -> None:
         self._values = values
         self._known: set[str] = set()
         self.source = source

@@ -15,7 +15,7 @@ from udp_mesh.links.udp import UdpLink
 
 
 @dataclass(frozen=True, slots=True)
-class Changes:
+class LinkChanges:
     """The result of a refresh. A reopened link is in `gone` and in `opened`."""
 
     opened: tuple[UdpLink, ...] = ()
@@ -34,7 +34,7 @@ class LinkHub:
         self._port = port
         self._urgent_dscp = urgent_dscp
 
-    def refresh(self) -> Changes:
+    def refresh(self) -> LinkChanges:
         """Opens and closes sockets to match the kernel's interfaces. Raises NetlinkError if they cannot be listed."""
         wanted = {
             attachment.name: attachment for attachment in select_attachments(interfaces(), self.configs, self._port)
@@ -53,7 +53,7 @@ class LinkHub:
                     opened.append(outcome)
                 else:
                     failed[name] = outcome
-        return Changes(tuple(opened), tuple(gone), failed)
+        return LinkChanges(tuple(opened), tuple(gone), failed)
 
     def _open(self, attachment: Attachment) -> UdpLink | str:
         if attachment.mtu < MIN_MTU:

@@ -38,7 +38,7 @@ Deliver: TypeAlias = Callable[[memoryview, Address, float], None]
 """Called with a datagram, its sender, and its kernel timestamp (seconds since 1970; 0.0 if there is none)."""
 
 
-class Outgoing(Protocol):
+class OutgoingDatagram(Protocol):
     """A datagram of the core. `destination` None means the link's broadcast address."""
 
     @property
@@ -144,7 +144,7 @@ class UdpLink:
                 count += 1
         return count
 
-    def send(self, datagrams: Sequence[Outgoing]) -> int:
+    def send(self, datagrams: Sequence[OutgoingDatagram]) -> int:
         """Sends from the front; returns how many are done (sent or lost). Fewer than all means the socket is full."""
         done, total = 0, len(datagrams)
         while done < total:
@@ -161,7 +161,7 @@ class UdpLink:
             done += sent
         return done
 
-    def _run_end(self, datagrams: Sequence[Outgoing], start: int) -> int:
+    def _run_end(self, datagrams: Sequence[OutgoingDatagram], start: int) -> int:
         """The end of the run from `start`: same destination and urgency, same size; the last one may be shorter."""
         first = datagrams[start]
         size, destination, urgent = len(first.data), first.destination, first.urgent
@@ -177,7 +177,7 @@ class UdpLink:
                 break
         return end
 
-    def _send_run(self, run: Sequence[Outgoing], destination: Address) -> int | None:
+    def _send_run(self, run: Sequence[OutgoingDatagram], destination: Address) -> int | None:
         """The number of datagrams of the run that are done; None if the socket is full."""
         ancillary = list(self._urgent) if run[0].urgent else []
         if len(run) > 1:
@@ -201,7 +201,7 @@ class UdpLink:
                 self.send_errors[destination, number] = self.send_errors.get((destination, number), 0) + len(run)
         return len(run)
 
-    def _send_unsegmented(self, run: Sequence[Outgoing], destination: Address, number: int) -> int | None:
+    def _send_unsegmented(self, run: Sequence[OutgoingDatagram], destination: Address, number: int) -> int | None:
         lost_before, done = self.datagrams_lost_on_send, 0
         while done < len(run) and self._send_run([run[done]], destination) is not None:
             done += 1

@@ -1,4 +1,4 @@
-"""From a recording of a run, simulated or real, to one HTML page with its pictures.
+"""Recordings of a run, simulated or real -> one HTML page with charts.
 
 recording lines -> `recording.Recording` -> `figures` (numbers) -> `charts` (SVG) -> `page` (HTML).
 """
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 MAX_SHOWN_PROBLEMS = 5
-"""Of one recording's lines; the page counts them all."""
+"""Maximum number of problems printed per recording; the page counts all of them."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """`udp-mesh report RECORDING... --out PAGE`; 0 written, 2 a recording cannot be read or the page not written."""
+    """`udp-mesh report RECORDING... --out PAGE`; 0 success, 2 a recording is not readable or the page not writable."""
     from udp_mesh.report.figures import summary
     from udp_mesh.report.page import write_page
     from udp_mesh.report.recording import RecordingError, read
@@ -24,15 +24,15 @@ def main(arguments: Sequence[str]) -> int:
 
     parser = argparse.ArgumentParser(
         prog="udp-mesh report",
-        description="Turn recordings of a run into one HTML page with its pictures.",
-        epilog="exit codes: 0 written, 2 a recording cannot be read or the page not be written, 130 interrupted\n\n"
+        description="Turn recordings into one HTML page with charts.",
+        epilog="exit codes: 0 success, 2 invalid recording or page not writable, 130 interrupted\n\n"
         "example: udp-mesh report base.jsonl --out run.html",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("recording", type=Path, nargs="+", help="made by `udp-mesh record` or `udp-mesh sim --out`")
-    parser.add_argument("--out", type=Path, default=Path("report.html"), help="the page (default: report.html)")
-    parser.add_argument("--title", default="udp_mesh run", help="its heading (default: %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the page's numbers as JSON, too")
+    parser.add_argument("recording", type=Path, nargs="+", help="written by `udp-mesh record` or `udp-mesh sim --out`")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), help="output file (default: %(default)s)")
+    parser.add_argument("--title", default="udp_mesh run", help="title of the page (default: %(default)s)")
+    parser.add_argument("--json", action="store_true", help="also print the numbers as JSON")
     options = parser.parse_args(list(arguments))
     try:
         recordings = [read(path) for path in options.recording]
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
             print(f"udp-mesh: warning: {clean(str(problem))}", file=sys.stderr)
         more = len(recording.problems) - MAX_SHOWN_PROBLEMS
         if more > 0:
-            print(f"udp-mesh: warning: ... and {more} more lines that cannot be read", file=sys.stderr)
+            print(f"udp-mesh: warning: ... and {more} more invalid lines", file=sys.stderr)
     if options.json:
         value = {"page": str(options.out), "recordings": [summary(recording) for recording in recordings]}
         print(json.dumps(value, indent=2))

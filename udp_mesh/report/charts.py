@@ -1,6 +1,4 @@
-"""Pictures as SVG text: densities, spans of time, stacked areas, lines over time, paths on a plane.
-
-Every text is escaped."""
+"""SVG charts: densities, time spans, stacked areas, time series, paths in a plane. All text is escaped."""
 
 from __future__ import annotations
 
@@ -12,8 +10,8 @@ from html import escape
 WIDTH, HEIGHT = 760, 260
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 16, 14, 36
 _MAX_ROW_NAME = 9
-"""Characters that fit left of a row; pointing at it shows the rest."""
-# readable on white, told apart by people who do not see red and green (after Okabe and Ito)
+"""Maximum length of a row's label; a tooltip shows longer names."""
+# Readable on white and with color vision deficiency (after Okabe and Ito).
 COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#555555")
 
 
@@ -30,7 +28,7 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 
 
 class _Axes:
-    """Maps values to places in the picture."""
+    """Maps values to coordinates."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], height: int = HEIGHT) -> None:
         self.x0, self.x1 = x
@@ -63,7 +61,7 @@ class _Axes:
 
 
 def ticks(low: float, high: float, about: int = 8) -> list[float]:
-    """Round numbers between two bounds, at most about so many."""
+    """Round numbers between two bounds, at most about `about` of them."""
     span = high - low
     if not span > 0:
         return [low]
@@ -97,7 +95,7 @@ def density(bars: Sequence[float], low: float, high: float, curve: tuple[float, 
 
 
 def spans(rows: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label: str) -> str:
-    """One row per name with bars from-to."""
+    """One row per name with bars from start to end."""
     height = _TOP + _BOTTOM + 24 * max(len(rows), 1)
     axes = _Axes((0.0, end), (0.0, float(len(rows))), height)
     parts = [
@@ -117,7 +115,7 @@ def spans(rows: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label
 
 
 def stacked(layers: Mapping[str, Sequence[float]], end: float, x_label: str, y_label: str) -> str:
-    """Areas on top of each other, the first at the bottom; all of one length."""
+    """Stacked areas, the first at the bottom; all of the same length."""
     length = max((len(values) for values in layers.values()), default=0)
     tops = [sum(values[i] for values in layers.values()) for i in range(length)]
     axes = _Axes((0.0, end), (0.0, max([*tops, 1e-9]) * 1.05))
@@ -134,7 +132,7 @@ def stacked(layers: Mapping[str, Sequence[float]], end: float, x_label: str, y_l
 
 
 def over_time(series: Mapping[str, Sequence[tuple[float, float]]], end: float, x_label: str, y_label: str) -> str:
-    """One line per name through its (seconds, value) points; where points are missing the line has a gap."""
+    """One line per name through its (seconds, value) points, with gaps where points are missing."""
     values = [value for points in series.values() for _, value in points]
     axes = _Axes((0.0, end), (0.0, max([*values, 1e-9]) * 1.05))
     parts = axes.lines(x_label, y_label)
@@ -152,7 +150,7 @@ def over_time(series: Mapping[str, Sequence[tuple[float, float]]], end: float, x
 
 
 def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapping[str, tuple[float, float]]) -> str:
-    """Tracks on a plane (x, y, connected) in metres, drawn where connected in colour, else in grey; marked places."""
+    """Tracks in a plane (x, y, connected) in meters, colored where connected, otherwise gray; and labeled places."""
     points = [(x, y) for track in tracks.values() for x, y, _ in track] + list(marks.values())
     if not points:
         return ""
@@ -161,14 +159,14 @@ def paths(tracks: Mapping[str, Sequence[tuple[float, float, bool]]], marks: Mapp
     high = max(max(ys) - min(ys), wide * 0.1)
     height = min(600, max(160, int((WIDTH - _LEFT - _RIGHT) * high / wide) + _TOP + _BOTTOM))
     axes = _Axes((min(xs), min(xs) + wide), (min(ys), min(ys) + high), height)
-    parts = axes.lines("metres", "metres")
+    parts = axes.lines("meters", "meters")
     for index, track in enumerate(tracks.values()):
-        # one path per stretch, not per step: an hour has thousands of steps
+        # One path per section rather than per step: an hour has thousands of steps.
         for on, steps in itertools.groupby(itertools.pairwise(track), key=lambda step: step[1][2]):
             stretch = list(steps)
             places = [stretch[0][0], *(end for _, end in stretch)]
             points_text = [f"{axes.at_x(x):.1f} {axes.at_y(y):.1f}" for x, y, _ in places]
-            # one that stands is a dot
+            # A robot that does not move is drawn as a dot.
             drawn = "L".join([points_text[0], *(text for text, _ in itertools.groupby(points_text))])
             parts.append(
                 f'<path d="M{drawn}" fill="none" stroke="{color(index) if on else "#bbb"}" '

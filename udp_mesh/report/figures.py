@@ -1,5 +1,5 @@
-"""A recording's numbers: intervals between messages, time online, throughput by topic, outcomes, links; `summary` has
-them for scripts."""
+"""A recording's numbers: intervals between messages, time online, throughput by topic, outcomes, links. `summary`
+returns them for scripts."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 
 from udp_mesh.report.recording import Recording, Sample
 
-# what counts as a periodic topic: enough messages, with a middle interval that most keep to
+# A periodic topic has enough messages, and a median interval that most of them keep to.
 _MIN_MESSAGES = 20
 _PUNCTUAL_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Intervals:
-    """Between consecutive arrivals of one topic from one source. `deviation_s` is the standard deviation of those
-    within half and one and a half of the median: a gap while a robot is out of reach is no jitter; `gaps` counts what
-    lies outside. `punctual` is the share of all within 5 % of the median, the paper's own yardstick."""
+    """Intervals between consecutive arrivals of one topic from one source. `deviation_s` is the standard deviation of
+    those within 0.5 to 1.5 times the median, since a gap while a robot is out of range is not jitter; `gaps` counts the
+    others. `punctual` is the share of all intervals within 5 % of the median, the paper's measure."""
 
     source: str
     topic: str
@@ -53,7 +53,7 @@ class Throughput:
 
 
 def intervals(recording: Recording) -> list[Intervals]:
-    """Of every (source, topic) with enough messages, those with the most messages first."""
+    """Intervals of every (source, topic) with enough messages, most messages first."""
     arrived: dict[tuple[str, str], list[float]] = defaultdict(list)
     for item in recording.arrivals:
         arrived[item.source, item.topic].append(item.t)
@@ -64,7 +64,7 @@ def intervals(recording: Recording) -> list[Intervals]:
         values = [later - earlier for earlier, later in itertools.pairwise(sorted(times))]
         median_s = sorted(values)[len(values) // 2]
         if median_s <= 0.0:
-            # most came at once: nothing periodic
+            # Most arrived at once: not periodic.
             continue
         near = [value for value in values if 0.5 * median_s <= value <= 1.5 * median_s]
         mean_s = sum(near) / len(near) if near else 0.0
@@ -75,7 +75,7 @@ def intervals(recording: Recording) -> list[Intervals]:
 
 
 def connections(recording: Recording) -> list[Connection]:
-    """Of every peer that was ever online, by name."""
+    """Connections of every peer that was ever online, by name."""
     end_s = recording.end_s
     spans: dict[str, list[tuple[float, float]]] = defaultdict(list)
     since: dict[str, float] = {}
@@ -95,7 +95,7 @@ def connections(recording: Recording) -> list[Connection]:
 
 
 def throughput(recording: Recording, bins: int = 120) -> tuple[float, list[Throughput]]:
-    """(width of a bin in seconds, throughput of every topic, the most urgent first)."""
+    """(bin width in seconds, throughput of every topic, most urgent first)."""
     width_s = max(recording.end_s / bins, 1e-9)
     filled: dict[str, list[float]] = defaultdict(lambda: [0.0] * bins)
     totals: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
@@ -112,8 +112,8 @@ def throughput(recording: Recording, bins: int = 120) -> tuple[float, list[Throu
 
 @dataclass(frozen=True, slots=True)
 class SentTopic:
-    """What this node sent of one topic and what became of it; outcomes count destinations, and a broadcast in one
-    datagram has none. `latencies_s` are those of what was delivered, in rising order."""
+    """What this node sent of one topic, and the outcomes. Outcomes count destinations; a single-datagram broadcast has
+    none. `latencies_s` are those of delivered messages, ascending."""
 
     topic: str
     messages: int
@@ -124,14 +124,14 @@ class SentTopic:
     latencies_s: tuple[float, ...]
 
     def latency_s(self, share: float) -> float | None:
-        """So much of what was delivered took no longer; None where nothing was."""
+        """The latency that this share of the delivered messages did not exceed; None if there were none."""
         if not self.latencies_s:
             return None
         return self.latencies_s[min(len(self.latencies_s) - 1, int(share * len(self.latencies_s)))]
 
 
 def sent_topics(recording: Recording) -> list[SentTopic]:
-    """Of every topic that was sent, or had outcomes, the most urgent first."""
+    """Every topic with sent messages or outcomes, most urgent first."""
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
     ends: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
     latencies: dict[str, list[float]] = defaultdict(list)
@@ -161,7 +161,7 @@ def sent_topics(recording: Recording) -> list[SentTopic]:
 def time_series(
     recording: Recording, read: Callable[[Sample], float | None], bins: int = 240
 ) -> dict[str, list[tuple[float, float]]]:
-    """Per peer what its samples say over time: the mean of each of the equal bins that has any, in the bin's middle."""
+    """A value of the samples over time, per peer: the mean of each equal bin that has samples, at the bin's middle."""
     width_s = max(recording.end_s / bins, 1e-9)
     gathered: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for sample in recording.samples:
@@ -175,7 +175,7 @@ def time_series(
 
 
 def summary(recording: Recording) -> dict[str, Any]:
-    """Everything that the page says in numbers, as JSON values."""
+    """All numbers of the page, as JSON values."""
     _, received = throughput(recording)
     return {
         "node": recording.name,
@@ -219,7 +219,7 @@ def summary(recording: Recording) -> dict[str, Any]:
 
 
 def histogram(values: tuple[float, ...], low: float, high: float, bins: int = 60) -> list[float]:
-    """The density of the values between two bounds; what lies outside is left out of the picture, not of the count."""
+    """The density of the values between two bounds; values outside are not drawn but count in the normalization."""
     counts = [0] * bins
     width = (high - low) / bins
     for value in values:

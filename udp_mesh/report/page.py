@@ -17,15 +17,15 @@ table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid #
 td:first-child,th:first-child{text-align:left}.legend span{margin-right:1.2em}
 .legend i{display:inline-block;width:.9em;height:.9em;margin-right:.4em}
 """
-# the paper's own distribution, for comparison (section "Performance")
+# The paper's own distribution, for comparison (section "Performance").
 PAPER_DEVIATION_S = 0.04
 _SHOWN_INTERVALS = 4
 _SHOWN_SPREAD = 0.25
-"""To either side of the median, as a share of it: six of the paper's deviations."""
+"""Range shown on either side of the median, as a share of it: six of the paper's deviations."""
 
 
 def page(recordings: Sequence[Recording], title: str) -> str:
-    """The whole page; one section per recording."""
+    """The whole page, with one section per recording."""
     body = "".join(_section(recording, len(recordings) > 1) for recording in recordings)
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>'
@@ -34,10 +34,10 @@ def page(recordings: Sequence[Recording], title: str) -> str:
 
 
 def write_page(recordings: Sequence[Recording], path: Path, title: str) -> None:
-    """Write the page whole or not at all. Raises OSError."""
+    """Writes the page atomically. Raises OSError."""
     text = page(recordings, title)
     try:
-        # a directory, which is gone afterwards with whatever a full disk left in it
+        # A temporary directory is removed with its contents, even after a write to a full disk failed.
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".report-") as directory:
             unfinished = Path(directory) / "page"
             unfinished.write_text(text, "utf-8")
@@ -49,11 +49,11 @@ def write_page(recordings: Sequence[Recording], path: Path, title: str) -> None:
 def _section(recording: Recording, named: bool) -> str:
     parts = [f"<h2>As seen by {escape(recording.name)}</h2>"] if named else []
     if recording.problems:
-        parts.append(f"<p>{len(recording.problems)} lines could not be read and were left out.</p>")
+        parts.append(f"<p>{len(recording.problems)} lines are invalid and were ignored.</p>")
     if recording.missing_lines:
         parts.append(
-            f"<p>The disk did not keep up when this was recorded: {recording.missing_lines} lines are missing, and "
-            "what they said is not counted.</p>"
+            f"<p>The disk did not keep up with the recording: {recording.missing_lines} lines are missing and not "
+            "counted.</p>"
         )
     parts += [_totals(recording), _sent_topics(recording), _throughput(recording), _connectivity(recording)]
     parts += [_links(recording), _map(recording)]
@@ -88,10 +88,10 @@ def _sent_topics(recording: Recording) -> str:
         for each in sent
     )
     return (
-        "<h3>What became of what was sent here</h3><table><tr><th>topic</th><th>messages</th><th>MB</th>"
+        "<h3>Messages sent by this node</h3><table><tr><th>topic</th><th>messages</th><th>MB</th>"
         "<th>delivered</th><th>expired</th><th>peer lost</th><th>p50 ms</th><th>p99 ms</th></tr>"
-        f"{rows}</table><p>Outcomes count destinations; a broadcast in one datagram has none. Latency is from sending "
-        "to knowing that it was delivered.</p>"
+        f"{rows}</table><p>Outcomes count destinations; a single-datagram broadcast has none. Latency is measured from "
+        "sending to the acknowledgment.</p>"
     )
 
 
@@ -115,15 +115,16 @@ def _connectivity(recording: Recording) -> str:
     rows = {each.peer: each.spans_s for each in peers}
     shares = ", ".join(f"{escape(each.peer)} {each.share:.0%}" for each in peers)
     return (
-        f"<h3>Online</h3>{charts.spans(rows, recording.end_s, 'seconds')}<p>{shares} of the time since first seen.</p>"
+        f"<h3>Online</h3>{charts.spans(rows, recording.end_s, 'seconds')}<p>Share of the time since first seen: "
+        f"{shares}.</p>"
     )
 
 
 def _links(recording: Recording) -> str:
-    """Round trip and loss of each peer over the run."""
+    """Round-trip time and loss of each peer over the run."""
     readings: tuple[tuple[str, str, Callable[[Sample], float | None]], ...] = (
-        ("Round trip", "ms", lambda sample: None if sample.round_trip_s is None else sample.round_trip_s * 1e3),
-        ("Loss on the way there", "%", lambda sample: None if sample.loss is None else sample.loss * 100),
+        ("Round-trip time", "ms", lambda sample: None if sample.round_trip_s is None else sample.round_trip_s * 1e3),
+        ("Loss to the peer", "%", lambda sample: None if sample.loss is None else sample.loss * 100),
     )
     parts = []
     for heading, unit, read in readings:
@@ -135,7 +136,7 @@ def _links(recording: Recording) -> str:
 
 
 def _map(recording: Recording) -> str:
-    """Where each peer was, and whether it was online there."""
+    """Each peer's positions, and whether it was online there."""
     online = {each.peer: each.spans_s for each in figures.connections(recording)}
     tracks: dict[str, list[tuple[float, float, bool]]] = {}
     marks: dict[str, tuple[float, float]] = {}
@@ -155,8 +156,8 @@ def _intervals(each: figures.Intervals) -> str:
     bars = figures.histogram(each.values_s, low, high)
     chart = charts.density(bars, low, high, (each.median_s, PAPER_DEVIATION_S * each.median_s), "seconds")
     return (
-        f"<h3>Time between messages: {escape(each.topic)} from {escape(each.source)}</h3>{chart}"
+        f"<h3>Interval between messages: {escape(each.topic)} from {escape(each.source)}</h3>{chart}"
         f"<p>{len(each.values_s)} intervals, median {each.median_s:.3f} s, {each.punctual:.1%} of them within 5 % of "
-        f"it; standard deviation {each.deviation_s:.4f} s within half to one and a half of it, {each.gaps} gaps "
-        f"outside. The curve is normal, with a deviation of {PAPER_DEVIATION_S:.0%} of the median.</p>"
+        f"it; standard deviation {each.deviation_s:.4f} s within 0.5 to 1.5 times the median, {each.gaps} gaps "
+        f"outside. The curve is a normal distribution with a deviation of {PAPER_DEVIATION_S:.0%} of the median.</p>"
     )

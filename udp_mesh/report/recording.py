@@ -1,17 +1,17 @@
-"""The recording of a run: one JSON object per line, written while it happens, readable after a crash.
+"""The recording of a run: one JSON object per line, written during the run, readable after a crash.
 
 The first line is `{"recording": 1, "node": ..., "started": UNIX_TIME}`; every other line has `t` (seconds since the
-start), `kind`, and `at` (whose view it is) where that is not the node of the first line. Read here are the kinds
+start), `kind`, and `at` (the node whose view it is) unless that is the node of the first line. The kinds read here:
 
-- `received`, `sent`: `topic`, `priority`, `bytes`, and `source` of what is received,
+- `received`, `sent`: `topic`, `priority`, `bytes`, and for `received` also `source`,
 - `message-delivered` (`latency_s`), `message-expired`, `message-peer-lost`: `peer`, `topic`,
 - `peer-online`, `peer-offline`: `peer`,
-- `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`, `hops` (each but the
-  name may be absent),
-- `place`: `x`, `y` in metres (simulated runs),
-- `gap`: `lines`, so many were left out here when the run was recorded;
+- `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`, `hops` (all but the
+  name are optional),
+- `place`: `x`, `y` in meters (simulated runs),
+- `gap`: `lines`, the number of lines dropped here during recording.
 
-others (further events) are passed over.
+Other kinds (further events) are ignored.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from typing import Any, BinaryIO
 
 VERSION = 1
 MAX_LINE_BYTES = 128 << 20
-"""A longer line is no line of ours: the largest usual message (64 MiB), recorded with its payload in base64, fits."""
+"""Maximum line length: the largest usual message (64 MiB) fits, recorded with its payload in base64."""
 MAX_T_S = 1e9
-"""Thirty years: a later time is damage, and would make every picture a point."""
+"""Thirty years: a later time is damage, and would compress every chart to a point."""
 MAX_PLACE_M = 1e7
 MAX_BYTES = 1 << 50
 MAX_SAMPLE = 1e15
@@ -34,11 +34,11 @@ _SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops")
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be read; names file, line, what was expected and what was found."""
+    """An invalid recording; names file, line, what was expected and what was found."""
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
+class ReceivedMessage:
     t: float
     at: str
     source: str
@@ -75,7 +75,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class SentMessage:
     t: float
     topic: str
     priority: int
@@ -83,8 +83,8 @@ class Sent:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a sent message at one destination; `latency_s` where `kind` is `delivered`."""
+class SentOutcome:
+    """The outcome of a sent message at one destination; `latency_s` if `kind` is `delivered`."""
 
     t: float
     peer: str
@@ -95,17 +95,17 @@ class Outcome:
 
 @dataclass(slots=True)
 class Recording:
-    """Everything in one recording, in its order. `problems` are lines that cannot be read, and why; `left_out` counts
-    lines that the recording itself says were never written."""
+    """The contents of one recording, in order. `problems` are the invalid lines and why; `missing_lines` counts lines
+    that were dropped during recording."""
 
     name: str = ""
     started: float = 0.0
-    arrivals: list[Arrival] = field(default_factory=list)
+    arrivals: list[ReceivedMessage] = field(default_factory=list)
     presences: list[Presence] = field(default_factory=list)
     samples: list[Sample] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
-    sent: list[Sent] = field(default_factory=list)
-    outcomes: list[Outcome] = field(default_factory=list)
+    sent: list[SentMessage] = field(default_factory=list)
+    outcomes: list[SentOutcome] = field(default_factory=list)
     missing_lines: int = 0
     end_s: float = 0.0
     """The latest time of a line."""
@@ -116,10 +116,10 @@ def header(name: str, started: float) -> str:
     return json.dumps({"recording": VERSION, "node": name, "started": started})
 
 
-def line(item: Arrival | Presence | Sample | Place) -> str:
-    """One line, without its end."""
+def line(item: ReceivedMessage | Presence | Sample | Place) -> str:
+    """Encodes one line, without the line end."""
     match item:
-        case Arrival(_, _, source, topic, priority, size):
+        case ReceivedMessage(_, _, source, topic, priority, size):
             kind = "received"
             what: dict[str, Any] = {"source": source, "topic": topic, "priority": priority, "bytes": size}
         case Presence(_, _, peer, online):
@@ -136,16 +136,16 @@ def line(item: Arrival | Presence | Sample | Place) -> str:
 
 
 def read(path: Path) -> Recording:
-    """Read a recording. Raises RecordingError when it is none at all; a torn or foreign line becomes a problem."""
+    """Reads a recording. Raises RecordingError if it is not one; a truncated or invalid line becomes a problem."""
     try:
         with path.open("rb") as file:
             return parse(_lines(file), str(path))
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+        raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
 
 
 def _lines(file: BinaryIO) -> Iterator[bytes]:
-    """The lines of a file; of one that is too long its beginning, which is too long as well."""
+    """The lines of a file; of a line that is too long only the beginning, which is still too long."""
     while line := file.readline(MAX_LINE_BYTES + 1):
         yield line
         while len(line) > MAX_LINE_BYTES and not line.endswith(b"\n"):
@@ -155,7 +155,7 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
 
 
 def parse(lines: Iterable[bytes], file: str) -> Recording:
-    """As `read`, from the lines themselves."""
+    """Like `read`, from the lines themselves."""
     numbered = _objects(lines)
     _, first = next(numbered, (1, "nothing"))
     if not isinstance(first, dict) or "recording" not in first:
@@ -183,7 +183,7 @@ class _UnreadableError(ValueError):
 
 
 def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
-    """Each line that is not empty, with its number: an object, or what it is instead, as text."""
+    """Each non-empty line with its number: an object, or a description of what it is instead."""
     for number, raw in enumerate(lines, 1):
         if not raw.strip():
             continue
@@ -193,28 +193,30 @@ def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
         try:
             entry = json.loads(raw)
         except (ValueError, RecursionError):
-            yield number, "no JSON (a line that was cut off?)"
+            yield number, "invalid JSON (a truncated line?)"
             continue
         yield number, entry if isinstance(entry, dict) else "another JSON value"
 
 
 def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -> None:
-    """Adds what the line says. `online` is what is known of each peer so far: a recording may begin, or have a gap,
-    when peers are online that no event of its own announced."""
+    """Adds one line. `online` holds each peer's last known state: a recording may begin, or have a gap, while peers are
+    online that no event announced."""
     t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
     at = _text(entry, "at") if "at" in entry else recording.name
     recording.end_s = max(recording.end_s, t)
     match kind:
         case "received":
             recording.arrivals.append(
-                Arrival(t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry))
+                ReceivedMessage(
+                    t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry)
+                )
             )
         case "sent":
-            recording.sent.append(Sent(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
+            recording.sent.append(SentMessage(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
         case "message-delivered" | "message-expired" | "message-peer-lost":
             latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
             outcome = kind.removeprefix("message-")
-            recording.outcomes.append(Outcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
+            recording.outcomes.append(SentOutcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
         case "peer-online" | "peer-offline":
             peer = _text(entry, "peer")
             online[peer] = kind == "peer-online"
@@ -228,14 +230,14 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
         case "gap":
             recording.missing_lines += _integer(entry, "lines")
         case _:
-            # another kind, which no picture shows
+            # Another kind, which no chart shows.
             return
 
 
 def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], online: dict[str, bool]) -> None:
     name = _text(entry, "name")
     now_online = entry.get("online")
-    # of a peer that is away the values are those of before
+    # An offline peer's values are old ones.
     keys = [key for key in _SAMPLED if entry.get(key) is not None and now_online is not False]
     known: dict[str, Any] = {key: _number(entry, key, 0.0, MAX_SAMPLE) for key in keys}
     recording.samples.append(Sample(t, at, name, **known))
@@ -254,8 +256,8 @@ def _peers(entry: dict[str, Any]) -> list[dict[str, Any]]:
 def _text(entry: dict[str, Any], key: str) -> str:
     value = entry.get(key)
     if not isinstance(value, str):
-        raise _UnreadableError(f"text as {key}", value)
-    # half a surrogate pair, which JSON can name, is nothing that a page can show
+        raise _UnreadableError(f"a string as {key}", value)
+    # JSON can encode a lone surrogate, which cannot be encoded as UTF-8.
     return value.encode(errors="replace").decode()
 
 

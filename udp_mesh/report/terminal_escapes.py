@@ -1,23 +1,22 @@
-"""What peers, daemons and recordings said, made safe for a terminal: every character that could steer it is shown as a
-visible stand-in.
+"""Makes text from peers, daemons and recordings safe for a terminal by replacing every control character.
 
-Names, types and reasons come from other programs and other machines. They may hold escape sequences that clear the
-screen or write to the clipboard, or bidirectional marks that reorder a line. Each stand-in is one character wide.
+Names, types and reasons come from other programs and machines. They may contain escape sequences that clear the screen
+or write to the clipboard, or bidirectional marks that reorder a line. Each replacement is one character wide.
 """
 
 from __future__ import annotations
 
 _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
-# Unicode's pictures of the C0 controls begin here, DEL has its own
+# Unicode's control pictures for C0 start here; DEL has its own.
 _CONTROL_PICTURES = 0x2400
 _DELETE = 0x7F
 _DELETE_PICTURE = "\N{SYMBOL FOR DELETE}"
 
 
 def clean(text: str, *, keep: str = "\n\t") -> str:
-    """The text with control, format and bidirectional characters, lone surrogates and unassigned characters replaced.
+    """Replaces control, format and bidirectional characters, lone surrogates and unassigned characters.
 
-    `keep` are control characters that pass: line ends and tabs for text of several lines.
+    `keep` lists control characters to preserve: line ends and tabs for multi-line text.
     """
     if text.isascii() and text.isprintable():
         return text
@@ -25,14 +24,14 @@ def clean(text: str, *, keep: str = "\n\t") -> str:
 
 
 def json_safe(text: str) -> str:
-    """JSON text with the same characters escaped; it means the same, since JSON has them only within strings."""
+    """Escapes the same characters in JSON text, which does not change its meaning: they only occur in strings."""
     if text.isascii() and "\x7f" not in text:
         return text
     return "".join(one if one == "\n" or _is_harmless(one) else _escaped(one) for one in text)
 
 
 def _is_harmless(one: str) -> bool:
-    # the spaces of other scripts are not "printable" to Python
+    # Python does not consider the spaces of other scripts printable.
     return one.isprintable() or one in "\xa0\u3000\u202f"
 
 

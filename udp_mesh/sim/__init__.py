@@ -1,7 +1,7 @@
-"""Whole teams in virtual time: the transport's own core on a simulated radio channel.
+"""Whole teams in virtual time: the transport's core on a simulated radio channel.
 
 scenario file -> `scenario.load` -> `run.play` (a `team.Team` of cores on a `medium.Medium`, driven by one
-`agenda.Agenda`) -> summary, recording, report. `main` is `udp-mesh sim`.
+`event_queue.EventQueue`) -> summary, recording, report. `main` is `udp-mesh sim`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`udp-mesh sim`: find the scenario, play it with progress, say what came of it, write what was asked for."""
+"""`udp-mesh sim`: loads the scenario, runs it with progress, prints the summary, writes the results."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ SHIPPED = Path(__file__).with_name("scenarios")
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """0 played, 2 the scenario cannot be used, 130 interrupted."""
+    """Exit codes: 0 success, 2 the scenario is invalid or the results cannot be written, 130 interrupted."""
     parser = argparse.ArgumentParser(
         prog="udp-mesh sim",
-        description="Play a whole team in virtual time, on the transport's own core and a simulated radio channel.",
-        epilog="exit codes: 0 played, 2 the scenario cannot be used or the results not be written, 130 interrupted\n\n"
+        description="Simulate a team in virtual time: the transport's core on a simulated radio channel.",
+        epilog="exit codes: 0 success, 2 invalid scenario or results not writable, 130 interrupted\n\n"
         "example: udp-mesh sim final-run --out /tmp/final-run",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("scenario", nargs="?", help="a YAML file, or the name of a shipped scenario")
-    parser.add_argument("--list", action="store_true", help="name the shipped scenarios and exit")
-    parser.add_argument("--seed", type=_seed, help="instead of the scenario's own")
+    parser.add_argument("scenario", nargs="?", help="scenario file (YAML), or name of a shipped scenario")
+    parser.add_argument("--list", action="store_true", help="list the shipped scenarios and exit")
+    parser.add_argument("--seed", type=_seed, help="override the scenario's seed")
     parser.add_argument(
-        "--duration", type=_duration_s, metavar="SECONDS", help="of virtual time, instead of the scenario's own"
+        "--duration", type=_duration_s, metavar="SECONDS", help="override the scenario's duration (virtual time)"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="write recording.jsonl, summary.json and report.html")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -46,7 +46,7 @@ def run_command(arguments: Sequence[str]) -> int:
         if options.duration is not None:
             scenario = replace(scenario, duration_s=options.duration)
         if options.out is not None:
-            # before the run, which may take long
+            # Before the run, which may take long.
             _check_writable(options.out)
         result = play(scenario, _progress(scenario))
         if options.out is not None:
@@ -82,7 +82,7 @@ def _duration_s(text: str) -> float:
 
 
 def _check_writable(directory: Path) -> None:
-    """Raises OSError where nothing could be written there."""
+    """Raises OSError if the directory cannot be written."""
     directory.mkdir(parents=True, exist_ok=True)
     probe = directory / "recording.jsonl"
     with probe.open("ab"):
@@ -96,7 +96,7 @@ def shipped() -> list[str]:
 
 
 def find(name: str) -> Path:
-    """A path that exists, or a shipped scenario by its name; raises ScenarioError."""
+    """An existing path, or the path of a shipped scenario. Raises ScenarioError."""
     path = Path(name)
     if path.exists():
         return path
@@ -114,7 +114,7 @@ def write(result: RunResult, directory: Path) -> None:
 
 
 def _progress(scenario: Scenario) -> Callable[[float], None]:
-    """A line that counts virtual time, on a terminal only."""
+    """Shows the virtual time on a terminal."""
     if not sys.stderr.isatty():
         return lambda now: None
 
@@ -126,12 +126,12 @@ def _progress(scenario: Scenario) -> Callable[[float], None]:
 
 
 def text(summary: dict[str, Any]) -> str:
-    """The summary for people."""
+    """The summary as text."""
     channel = summary["channel"]
     reasons = ", ".join(f"{count} {reason}" for reason, count in summary["rejected_because"].items())
     because = f" ({reasons})" if reasons else ""
     lines = [
-        f"{summary['scenario']}, seed {summary['seed']}, {summary['duration_s']:.0f} virtual seconds",
+        f"{summary['scenario']}, seed {summary['seed']}, {summary['duration_s']:.0f} s of virtual time",
         f"messages: {summary['accepted']} accepted, {summary['rejected']} refused{because}; per destination: "
         f"{summary['delivered']} delivered, {summary['expired']} expired, {summary['peer_lost']} lost with their peer",
         f"channel: busy {channel['airtime_share']:.0%} of the time, {channel['transmissions']} transmissions",

@@ -1,4 +1,4 @@
-"""Virtual time: what is to be done when, in order of time and, at one time, of entry."""
+"""Virtual time: actions in order of time, then in order of insertion."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import heapq
 from collections.abc import Callable
 
 
-class EventQueue:
-    """`now` moves only by `run_until`; everything simulated shares one agenda."""
+class SimEventQueue:
+    """`now` advances only in `run_until`; everything simulated shares one queue."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -15,7 +15,7 @@ class EventQueue:
         self._count = 0
 
     def at(self, time_s: float, action: Callable[[], None]) -> None:
-        """Do `action` at `time_s`, or now if that has passed."""
+        """Schedules `action` at `time_s`, or now if that has passed."""
         self._count += 1
         heapq.heappush(self._entries, (max(time_s, self.now), self._count, action))
 
@@ -23,7 +23,7 @@ class EventQueue:
         self.at(self.now + delay_s, action)
 
     def run_until(self, time_s: float) -> None:
-        """Do everything due up to and at `time_s`; then it is `time_s`."""
+        """Runs everything due up to and at `time_s`, then sets `now` to `time_s`."""
         while self._entries and self._entries[0][0] <= time_s:
             self.now, _, action = heapq.heappop(self._entries)
             action()

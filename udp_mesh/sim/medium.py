@@ -1,17 +1,17 @@
-"""One shared half-duplex radio channel with a layer-2 mesh on it: datagrams in at one station, out at others.
+"""A shared half-duplex radio channel with a layer-2 mesh: datagrams in at one station, out at others.
 
-A datagram joins its station's finite queue; the station waits for silence, backs off a random number of slots, and
-sends the frame to the next hop, again and again up to `attempts` times as 802.11 does; every station in earshot keeps
-quiet meanwhile. The count of slots stands still while others send and goes on after them, so that nobody waits much
-longer than the others (IEEE 802.11-2020, 10.3.4.3). The next hop queues the frame in turn. Routes follow the least
-expected number of transmissions and are looked at anew every `route_s`, which stands for the mesh layer's own reconnect
-time. A broadcast is flooded: each station sends it on once, `broadcast_repeats` times, without acknowledgement.
+A datagram joins its station's finite queue. The station waits for silence, backs off a random number of slots, and
+sends the frame to the next hop with up to `attempts` tries, as in 802.11; all stations in range defer meanwhile. The
+back-off counter pauses while others send and then resumes, so that no station waits much longer than others (IEEE
+802.11-2020, 10.3.4.3). The next hop queues the frame in turn. Routes minimize the expected number of transmissions and
+are recomputed every `route_s`, which models the mesh layer's convergence time. A broadcast is flooded: each station
+forwards it once, with `broadcast_repeats` transmissions and without acknowledgment.
 
-Each station has two queues, as wifi's access categories for video and best effort (IEEE 802.11, EDCA; every 802.11n
-radio has them, and our daemon marks urgent datagrams for the first): urgent frames do not stand behind others and
-draw from fewer slots. `access_categories=False` is a radio without them.
+Each station has two queues, for the access categories video and best effort (IEEE 802.11 EDCA; every 802.11n radio has
+them, and the daemon marks urgent datagrams for the former): urgent frames do not wait behind others and use a smaller
+contention window. `access_categories=False` models a radio without them.
 
-Not modelled: collisions, hidden stations, capture, rate adaptation.
+Not modeled: collisions, hidden stations, capture, rate adaptation.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 
-from udp_mesh.sim.event_queue import EventQueue
+from udp_mesh.sim.event_queue import SimEventQueue
 
-# IP and UDP headers, and what 802.11 and batman-adv add to a frame
+# IP and UDP headers, and the overhead of 802.11 and batman-adv per frame
 IP_UDP_BYTES = 28
 FRAME_BYTES = 68
-# 802.11n at 2.4 GHz: one slot; slots waited before drawing and the smallest contention window, for best effort and for
-# video (IEEE 802.11-2020, table 9-155; the two slots that both wait are part of a transmission's overhead)
+# 802.11n at 2.4 GHz: slot time; AIFS slots before the back-off and the minimum contention window, for best effort and
+# for video (IEEE 802.11-2020, table 9-155; the two slots common to both are part of a transmission's overhead)
 SLOT_S = 9e-6
 BEST_EFFORT_SLOTS = (1, 16)
 VIDEO_SLOTS = (0, 8)
-# of a slot: sums of floats fall this short of whole numbers
+# In slots: sums of floats fall this short of whole numbers.
 _ROUNDING = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
-    """`rate` is in bit/s on the air, `overhead_s` per transmission (preamble, spacing, acknowledgement)."""
+class RadioChannel:
+    """`rate` is the bit rate on the air, `overhead_s` the time per transmission for preamble, spacing and ACK."""
 
     rate: float = 20e6
     overhead_s: float = 100e-6
@@ -52,8 +52,8 @@ class Channel:
 
 
 @dataclass(slots=True)
-class Frame:
-    """A datagram on its way; `to` None means everybody."""
+class RadioFrame:
+    """A datagram in transit; `to` None means broadcast."""
 
     number: int
     source: str
@@ -63,14 +63,14 @@ class Frame:
 
 
 @dataclass(slots=True)
-class Counts:
-    """Of the whole channel since the start."""
+class ChannelCounters:
+    """Counters of the whole channel since the start."""
 
     transmissions: int = 0
     bytes: int = 0
     airtime_s: float = 0.0
     airtime_s_of: dict[str, float] = field(default_factory=dict)
-    """By the station that sent."""
+    """By sending station."""
     queue_drops: int = 0
     losses: int = 0
     unroutable: int = 0
@@ -82,10 +82,10 @@ class _Queue:
 
     station: _Station
     slots: tuple[int, int]
-    frames: deque[Frame] = field(default_factory=deque)
+    frames: deque[RadioFrame] = field(default_factory=deque)
     is_waiting: bool = False
     backoff_slots: int | None = None
-    """Still to be counted down before the frame at the front may leave; None: not drawn yet."""
+    """Slots left before the first frame may be sent; None: not drawn yet."""
     counting_from_s: float = 0.0
 
 
@@ -95,29 +95,29 @@ class _Station:
         self.urgent = _Queue(self, VIDEO_SLOTS)
         self.other = _Queue(self, BEST_EFFORT_SLOTS)
         self.quiet_from_s = self.quiet_until_s = 0.0
-        """The latest time in which others could be heard sending."""
+        """The latest interval in which another station was heard sending."""
         self.is_on = True
         self.flooded: deque[int] = deque(maxlen=512)
 
 
 Loss = Callable[[str, str, float], float]
-"""(station, station, now) -> chance that one frame is lost, 1 where they do not hear each other."""
-Deliver = Callable[[str, Frame], None]
+"""(station, station, now) -> probability that a frame is lost; 1 if they are out of range."""
+DeliverFrame = Callable[[str, RadioFrame], None]
 
 
 class Medium:
-    """The channel of all `stations`; `loss` tells who hears whom, `deliver` takes what arrives for a station."""
+    """The channel of all `stations`; `loss` gives the loss between two, `deliver` gets what arrives at a station."""
 
     def __init__(
         self,
-        event_queue: EventQueue,
-        channel: Channel,
+        event_queue: SimEventQueue,
+        channel: RadioChannel,
         stations: Iterable[str],
         loss: Loss,
-        deliver: Deliver,
+        deliver: DeliverFrame,
         rng: random.Random,
     ) -> None:
-        self.counts = Counts()
+        self.counts = ChannelCounters()
         self._event_queue = event_queue
         self._channel = channel
         self._stations = {name: _Station(name) for name in stations}
@@ -130,7 +130,7 @@ class Medium:
         self._heard: dict[str, dict[str, float]] = {}
 
     def set_on(self, station: str, on: bool) -> None:
-        """Switch a station's radio; what it holds is lost when it goes off."""
+        """Turns a station's radio on or off; turning it off drops its queues."""
         found = self._stations[station]
         found.is_on = on
         if not on:
@@ -139,12 +139,12 @@ class Medium:
         self._routed_at_s = -1.0
 
     def links(self) -> dict[str, dict[str, float]]:
-        """Who hears whom now, and the chance that a frame is lost."""
+        """Current links: for each station those in range, with the frame loss."""
         self._update_routes()
         return self._heard
 
     def hops(self, a: str, b: str) -> int | None:
-        """Transmissions that a datagram takes on today's routes, None where there is no way."""
+        """Number of hops on the current routes; None if there is no route."""
         self._update_routes()
         count = 0
         while a != b:
@@ -155,15 +155,15 @@ class Medium:
         return count
 
     def send(self, source: str, to: str | None, data: bytes, *, urgent: bool = False) -> None:
-        """Hand over one datagram; a full queue drops it without a word, as a radio does."""
+        """Sends one datagram; a full queue drops it silently, as a radio does."""
         self._frames += 1
-        frame = Frame(self._frames, source, to, data, urgent and self._channel.access_categories)
+        frame = RadioFrame(self._frames, source, to, data, urgent and self._channel.access_categories)
         station = self._stations[source]
         if to is None:
             station.flooded.append(frame.number)
         self._enqueue(station, frame)
 
-    def _enqueue(self, station: _Station, frame: Frame) -> None:
+    def _enqueue(self, station: _Station, frame: RadioFrame) -> None:
         if not station.is_on:
             return
         queue = station.urgent if frame.urgent else station.other
@@ -174,7 +174,7 @@ class Medium:
         self._contend(queue)
 
     def _contend(self, queue: _Queue) -> None:
-        """Try at the next silence, after a random number of slots, or what is left of it."""
+        """Contends for the channel after the next silence and a random or the remaining back-off."""
         if queue.is_waiting or not queue.frames:
             return
         queue.is_waiting = True
@@ -205,8 +205,8 @@ class Medium:
             self._forward(station, frame)
         self._contend(queue)
 
-    def _occupy(self, station: _Station, frame: Frame, times: int) -> float:
-        """The air around a station is taken for `times` transmissions; returns their end."""
+    def _occupy(self, station: _Station, frame: RadioFrame, times: int) -> float:
+        """Occupies the channel around a station for `times` transmissions; returns the end of the last."""
         size = len(frame.data) + IP_UDP_BYTES + FRAME_BYTES
         took_s = times * (size * 8 / self._channel.rate + self._channel.overhead_s)
         end_s = self._event_queue.now + took_s
@@ -224,13 +224,13 @@ class Medium:
             station.quiet_from_s = self._event_queue.now
         station.quiet_until_s = max(station.quiet_until_s, end_s)
 
-    def _forward(self, station: _Station, frame: Frame) -> None:
+    def _forward(self, station: _Station, frame: RadioFrame) -> None:
         assert frame.to is not None
         step = self._next_hops.get(frame.to, {}).get(station.name)
         if step is None:
             self.counts.unroutable += 1
             return
-        # the link as it is now, which the route may not know yet
+        # The current loss, which the routes may not reflect yet.
         loss = self._loss(station.name, step, self._event_queue.now) if self._stations[step].is_on else 1.0
         attempts, arrived = 0, False
         while attempts < self._channel.attempts and not arrived:
@@ -242,14 +242,14 @@ class Medium:
         else:
             self.counts.losses += 1
 
-    def _broadcast(self, station: _Station, frame: Frame) -> None:
+    def _broadcast(self, station: _Station, frame: RadioFrame) -> None:
         at_s = self._occupy(station, frame, self._channel.broadcast_repeats)
         for name, loss in self._heard[station.name].items():
             if self._rng.random() >= loss**self._channel.broadcast_repeats:
                 other = self._stations[name]
                 self._event_queue.at(at_s, partial(self._arrive, other, frame))
 
-    def _arrive(self, station: _Station, frame: Frame) -> None:
+    def _arrive(self, station: _Station, frame: RadioFrame) -> None:
         if not station.is_on:
             return
         if frame.to == station.name:
@@ -263,7 +263,7 @@ class Medium:
                 self._enqueue(station, frame)
 
     def _update_routes(self) -> None:
-        """Measure every link and find the routes anew, at most every `route_s`."""
+        """Measures every link and recomputes the routes, at most every `route_s`."""
         now = self._event_queue.now
         if self._routed_at_s >= 0 and now - self._routed_at_s < self._channel.route_s:
             return
@@ -278,7 +278,7 @@ class Medium:
         self._next_hops = {to: self._next_hops_to(to) for to in on}
 
     def _next_hops_to(self, to: str) -> dict[str, str]:
-        """For every station its next hop on the way of fewest expected transmissions (Dijkstra from the end)."""
+        """Each station's next hop on the route with the fewest expected transmissions (Dijkstra from `to`)."""
         cost = {to: 0.0}
         steps: dict[str, str] = {}
         waiting = [(0.0, to)]

@@ -1,4 +1,4 @@
-"""Where robots are and how well they hear each other there: way points in, frame loss between two places out."""
+"""Trajectories of robots, and the frame loss between two points."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """A path through the plane: at `times_s[i]` the thing is at `points[i]`, in between on the straight line."""
+    """A path in the plane: at `points[i]` at `times_s[i]`, with linear interpolation in between."""
 
     times_s: tuple[float, ...]
     points: tuple[Point, ...]
 
     def at(self, now: float) -> Point:
-        """Before the first time it stands at the first point, after the last at the last."""
+        """The position at a time; before the first and after the last time, the first and last point."""
         index = bisect_right(self.times_s, now)
         if index == 0:
             return self.points[0]
@@ -34,7 +34,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Wall:
-    """A straight piece of rock: each one between two radios adds `loss` to a frame's loss."""
+    """A straight wall: each one between two radios adds `loss` to the frame loss."""
 
     a: Point
     b: Point
@@ -43,7 +43,7 @@ class Wall:
 
 @dataclass(frozen=True, slots=True)
 class PathLoss:
-    """How loss grows with distance: `least_loss` up to `good_m`, then in a straight line to 1 at `range_m`."""
+    """Loss by distance: `least_loss` up to `good_m`, then rising linearly to 1 at `range_m`."""
 
     good_m: float = 80.0
     range_m: float = 160.0
@@ -51,7 +51,7 @@ class PathLoss:
     walls: tuple[Wall, ...] = ()
 
     def loss(self, a: Point, b: Point) -> float:
-        """The chance, 0 to 1, that one frame between two places is lost; 1 means that they do not hear each other."""
+        """The probability, 0 to 1, that a frame between two points is lost; 1 means out of range."""
         distance_m = math.dist(a, b)
         if distance_m >= self.range_m:
             return 1.0
@@ -65,18 +65,18 @@ def _side(a: Point, b: Point, c: Point) -> float:
 
 
 def _segments_cross(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Whether the pieces a-b and c-d properly cross."""
+    """Whether the segments a-b and c-d properly intersect."""
     return _side(a, b, c) * _side(a, b, d) < 0 and _side(c, d, a) * _side(c, d, b) < 0
 
 
 def stationary(point: Point) -> Trajectory:
-    """The course of what does not move."""
+    """The trajectory of something that does not move."""
     return Trajectory((0.0,), (point,))
 
 
 def trajectory(way_points: Sequence[tuple[float, Point]]) -> Trajectory:
-    """A course through (seconds, place) pairs; raises ValueError unless the times rise."""
+    """A trajectory through (seconds, point) pairs. Raises ValueError unless the times increase."""
     times = tuple(time_s for time_s, _ in way_points)
     if not times or any(later <= earlier for earlier, later in itertools.pairwise(times)):
-        raise ValueError("way points: expected at least one, with rising times")
+        raise ValueError("waypoints: expected at least one, with increasing times")
     return Trajectory(times, tuple(point for _, point in way_points))

@@ -1,7 +1,7 @@
-"""Play a scenario: robots move, send, fail; what the observer saw becomes a recording, what came of it a summary.
+"""Runs a scenario: robots move, send and fail; the observer's view becomes a recording, the totals a summary.
 
-`play(scenario)` -> `Played`: the recording's lines, the ledger's totals, latencies per topic, the channel's counts.
-Nothing here reads a clock: the same scenario and seed give the same result, to the byte.
+`play(scenario)` -> `RunResult`: the recording's lines, the ledger's totals, latencies per topic, the channel's
+counters. Nothing here reads a clock: the same scenario and seed give the same result, to the byte.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
-from udp_mesh.sim.medium import Counts
+from udp_mesh.sim.medium import ChannelCounters
 from udp_mesh.sim.mobility import Trajectory
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
 
-# when a message was handed over, at the head of its payload
+# The send time, at the start of each payload.
 _SENT = struct.Struct("<d")
 SAMPLE_S = 1.0
 
 
 @dataclass(slots=True)
 class TopicTotal:
-    """What arrived of one topic, at all robots together; `latencies_s` in the order of arrival."""
+    """What all robots together received of one topic; `latencies_s` in order of arrival."""
 
     messages: int = 0
     bytes: int = 0
@@ -45,18 +45,18 @@ class TopicTotal:
 
 @dataclass(slots=True)
 class RunResult:
-    """`lines` is the observer's recording; `offered` counts messages handed over per topic."""
+    """`lines` is the observer's recording; `offered` counts messages sent per topic."""
 
     scenario: Scenario
     lines: list[str]
     topics: dict[str, TopicTotal]
     offered: dict[str, int]
     ledger: Ledger
-    counts: Counts
+    counts: ChannelCounters
     observer_bytes: dict[str, int]
 
     def summary(self) -> dict[str, Any]:
-        """Plain figures for people and scripts."""
+        """The totals as JSON values."""
         return {
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
@@ -143,7 +143,7 @@ class _Run:
         if self.team.is_running(source) and source != flow.destination:
             size = flow.size_bytes
             if flow.spread:
-                # a lognormal with the wanted mean
+                # A lognormal distribution with mean `size_bytes`.
                 size = int(size * self.rng.lognormvariate(-(flow.spread**2) / 2, flow.spread))
             size = max(_SENT.size, min(size, MAX_MESSAGE_BYTES))
             start = self.rng.randrange(MAX_MESSAGE_BYTES - size + 1)
@@ -161,15 +161,17 @@ class _Run:
                 total.latencies_s.append(now - _SENT.unpack_from(payload)[0])
                 if robot == self.scenario.observer:
                     self.observer_bytes[topic] += len(payload)
-                    self._record(recording.Arrival(now, robot, source, topic, priority, len(payload)))
+                    self._record(recording.ReceivedMessage(now, robot, source, topic, priority, len(payload)))
             case PeerOnline(peer) | PeerOffline(peer):
                 if robot == self.scenario.observer:
                     self._record(recording.Presence(now, robot, peer, isinstance(event, PeerOnline)))
             case _:
-                # outcomes are in the ledger
+                # The ledger records outcomes.
                 return
 
-    def _record(self, item: recording.Arrival | recording.Presence | recording.Sample | recording.Place) -> None:
+    def _record(
+        self, item: recording.ReceivedMessage | recording.Presence | recording.Sample | recording.Place
+    ) -> None:
         self.lines.append(recording.line(item))
 
     def _sample(self, progress: Callable[[float], None]) -> None:
@@ -190,7 +192,7 @@ class _Run:
 
 
 def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: None) -> RunResult:
-    """Play to the end; `progress` is told the virtual time about once per virtual second."""
+    """Runs to the end; calls `progress` with the virtual time about once per virtual second."""
     run = _Run(scenario)
     run.run(progress)
     return RunResult(

@@ -1,7 +1,7 @@
-"""A scenario file (YAML) as values: who is there, where they go, what they say, what goes wrong.
+"""A scenario file (YAML) as values: robots and relays, their trajectories, traffic and incidents.
 
-`load(path)` -> YAML nodes with their lines -> checked values -> `Scenario`. Every problem is an error that names file
-and line, what was expected and what was found; unknown keys are problems.
+`load(path)` -> YAML nodes with their lines -> checked values -> `Scenario`. Every problem is reported with file and
+line, what was expected and what was found; unknown keys are problems.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ from typing import Any, Literal
 import yaml
 
 from udp_mesh.core.settings import Outbox, Settings, Topic
-from udp_mesh.sim.medium import Channel
+from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 
-ALL_ROBOTS = "*"
 _MAX_SHOWN_PROBLEMS = 20
 _MAX_BYTES = 1 << 20
 MAX_MESSAGE_BYTES = 1 << 22
-"""Of one simulated message."""
+"""Maximum size of a simulated message."""
 MAX_DURATION_S = 1e7
-"""Four months: what is longer is a mistake."""
+"""Maximum duration: four months. A longer one is a mistake."""
 
-# The least and the most of each number of `Channel` and `Air`, in its unit.
+# Minimum and maximum of each number of `RadioChannel` and `PathLoss`, in its unit.
 _RANGES = {
     "rate": (1e3, 1e11),
     "overhead_s": (0.0, 1.0),
@@ -43,14 +42,14 @@ _RANGES = {
 
 
 class ScenarioError(ValueError):
-    """A scenario that cannot be used; one line per problem."""
+    """An invalid scenario; one line per problem."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """Messages of one topic: each of `sources` sends every `period_s` (with a start of its own within the first
-    period) a message of about `size_bytes`, spread by `spread` (0: always the same; else the sigma of a lognormal
-    with that mean), to `destination` (empty: everybody)."""
+    """Messages of one topic: each of `sources` sends a message of about `size_bytes` to `destination` (empty: all)
+    every `period_s`, with a random offset within the first period. `spread` is the sigma of a lognormal size
+    distribution with that mean (0: constant size)."""
 
     topic: str
     sources: tuple[str, ...]
@@ -64,7 +63,7 @@ class Flow:
 
 @dataclass(frozen=True, slots=True)
 class Incident:
-    """`what` is `off`, `on` (a robot's or relay's radio), `crash`, `restart` (a robot's process), at `at_s`."""
+    """`what` is `off` or `on` (a robot's or relay's radio), `crash` or `restart` (a robot's process), at `at_s`."""
 
     at_s: float
     what: str
@@ -76,7 +75,7 @@ INCIDENTS = ("off", "on", "crash", "restart")
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """`robots` and `relays` map names to their courses; a relay may `appear` later (a beacon that is dropped)."""
+    """`robots` and `relays` map names to trajectories; a relay may `appear` later (a beacon that is dropped)."""
 
     name: str
     seed: int
@@ -84,7 +83,7 @@ class Scenario:
     robots: Mapping[str, Trajectory]
     relays: Mapping[str, Trajectory]
     appear_s: Mapping[str, float]
-    channel: Channel
+    channel: RadioChannel
     air: PathLoss
     topics: tuple[Topic, ...]
     flows: tuple[Flow, ...]
@@ -94,7 +93,7 @@ class Scenario:
 
 
 class _Entry:
-    """One YAML node with the file's name: typed access, problems collected in `problems`."""
+    """One YAML node: typed access, with problems collected in `problems`."""
 
     def __init__(self, node: yaml.Node | None, file: str, what: str, problems: list[str]) -> None:
         self.node, self.file, self.what, self.problems = node, file, what, problems
@@ -115,7 +114,7 @@ class _Entry:
         return "a mapping"
 
     def mapping(self, known: tuple[str, ...] | None) -> dict[str, _Entry]:
-        """The entries of a mapping; keys that are not `known` (None: any key) are problems."""
+        """The entries of a mapping; keys that are not in `known` (None: any key) are problems."""
         if self.node is None:
             return {}
         if not isinstance(self.node, yaml.MappingNode):
@@ -167,7 +166,7 @@ class _Entry:
     def integer(self, default: int, minimum: int = 0, maximum: int = 1_000_000_000) -> int:
         value = self.number(default, minimum, maximum)
         if value != int(value):
-            self.problem("a whole number")
+            self.problem("an integer")
         return int(value)
 
     def flag(self) -> bool:
@@ -175,16 +174,16 @@ class _Entry:
 
 
 def load(path: Path) -> Scenario:
-    """Read a scenario. Raises ScenarioError with every problem found."""
+    """Loads a scenario. Raises ScenarioError with every problem found."""
     try:
         raw = path.read_bytes()
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ScenarioError(f"{path}: cannot read: {error.strerror}") from error
     return parse(raw, str(path))
 
 
 def parse(raw: bytes, file: str) -> Scenario:
-    """As `load`, from the file's bytes."""
+    """Like `load`, from the file's bytes."""
     if len(raw) > _MAX_BYTES:
         raise ScenarioError(f"{file}: expected at most {_MAX_BYTES} bytes, found {len(raw)}")
     try:
@@ -201,7 +200,7 @@ def parse(raw: bytes, file: str) -> Scenario:
         mark = getattr(error, "problem_mark", None)
         line = mark.line + 1 if mark else 1
         found = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ScenarioError(f"{file}:{line}: expected YAML, found otherwise: {found}") from error
+        raise ScenarioError(f"{file}:{line}: expected YAML, found a syntax error: {found}") from error
     problems: list[str] = []
     scenario = _scenario(_Entry(root, file, "", problems), Path(file).stem)
     if problems:
@@ -231,13 +230,13 @@ def _scenario(at: _Entry, name: str) -> Scenario:
         try:
             Settings(key, unkeyed=True)
         except ValueError as error:
-            value.problem("the name of a node", str(error))
+            value.problem("a valid node name", str(error))
     relay_entries = get("relays").mapping(None)
     relays = {key: _trajectory(value, ("appear_s",)) for key, value in relay_entries.items()}
     appear_s = {}
     for key, value in relay_entries.items():
         if key in robots:
-            value.problem("a name that no robot has", key)
+            value.problem("a name that is not a robot's", key)
         if isinstance(value.node, yaml.MappingNode):
             entries = value.mapping(None)
             if "appear_s" in entries:
@@ -267,7 +266,7 @@ def _scenario(at: _Entry, name: str) -> Scenario:
 def _pair(at: _Entry) -> tuple[float, float]:
     values = [item.number(0.0, minimum=-1e6, maximum=1e6) for item in at.items()]
     if len(values) != 2:
-        at.problem("[x, y] in metres")
+        at.problem("[x, y] in meters")
         return (0.0, 0.0)
     return (values[0], values[1])
 
@@ -289,7 +288,7 @@ def _trajectory(at: _Entry, more: tuple[str, ...]) -> Trajectory:
     try:
         return trajectory(points)
     except ValueError:
-        at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with rising times")
+        at.problem("`at: [x, y]` or `path: [[seconds, x, y], ...]` with increasing times")
         return stationary((0.0, 0.0))
 
 
@@ -311,8 +310,8 @@ def _numbers(at: _Entry, made: Any) -> dict[str, Any]:
     return values
 
 
-def _channel(at: _Entry) -> Channel:
-    return Channel(**_numbers(at, Channel()))
+def _channel(at: _Entry) -> RadioChannel:
+    return RadioChannel(**_numbers(at, RadioChannel()))
 
 
 def _path_loss(at: _Entry) -> PathLoss:
@@ -355,7 +354,7 @@ def _topic(name: str, at: _Entry, robots: tuple[str, ...]) -> Topic:
     try:
         return Topic(name, **values)
     except ValueError as error:
-        at.problem("a topic that can be used", str(error))
+        at.problem("a valid topic", str(error))
         return Topic("unusable")
 
 
@@ -369,7 +368,7 @@ def _flow(at: _Entry, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
 
     for key in ("topic", "period_s", "size_bytes"):
         if at.node is not None and key not in entries:
-            at.problem(key, "no such key")
+            at.problem(f"the key {key}", "none")
     sources = tuple(item.text(one_of=robots) for item in get("sources").items()) or robots
     return Flow(
         topic=get("topic").text("", topics),
@@ -387,9 +386,9 @@ def _incident(at: _Entry, robots: tuple[str, ...], relays: tuple[str, ...]) -> I
     entries = at.mapping(("at_s", "what", "who"))
     for key in ("at_s", "what", "who"):
         if key not in entries:
-            at.problem(key, "no such key")
+            at.problem(f"the key {key}", "none")
             return Incident(0.0, "off", "")
     what = entries["what"].text("off", INCIDENTS)
-    # a relay has a radio and no process of ours
+    # A relay has a radio but no process of ours.
     who = entries["who"].text("", robots if what in ("crash", "restart") else (*robots, *relays))
     return Incident(entries["at_s"].number(0.0), what, who)

@@ -1,8 +1,8 @@
-"""A team of real transport cores on a simulated channel: traffic in, everything that happened out.
+"""A team of real transport cores on a simulated channel: traffic in, events out.
 
-`Team` gives each robot a `udp_mesh.core.Node` and joins them by a `Medium`. Whatever touches a node (a datagram, its
-timer, a message of the scenario) is followed by `_settle`: fetch what it wants to send, what it tells, when it wants to
-be woken. What the nodes tell goes to `on_event`; reliable messages are accounted for in `Ledger`.
+`Team` gives each robot a `udp_mesh.core.Node` and connects them with a `Medium`. Every input to a node (a datagram, its
+timer, a message of the scenario) is followed by `_pump`, which fetches its datagrams, its events and its next timer.
+Events go to `on_event`; `Ledger` accounts for reliable messages.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.sim.event_queue import EventQueue
-from udp_mesh.sim.medium import Channel, Frame, Loss, Medium
+from udp_mesh.sim.event_queue import SimEventQueue
+from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
 
 LINK = "mesh0"
 BROADCAST = "10.255.255.255"
-# a node's timer may lie in the past when it just acted; virtual time must still move on
+# A node's timer may lie in the past right after an input; virtual time must still advance.
 _MIN_STEP_S = 1e-6
 
 OnEvent = Callable[[float, str, Event], None]
-"""(now, robot, what its node told)."""
+"""(now, robot, event of its node)."""
 
 
 @dataclass(slots=True)
 class Ledger:
-    """What became of every accepted reliable message: (robot, message, destination) -> its outcomes."""
+    """Outcomes of every accepted reliable message: (robot, message, destination) -> outcomes."""
 
     accepted: int = 0
     rejected: Counter[str] = field(default_factory=Counter)
-    """Refusals by their reason."""
+    """Rejected messages by reason."""
     outcomes: dict[tuple[str, int, MessageId, str], list[str]] = field(default_factory=dict)
 
     def note(self, robot: str, run: int, event: Event) -> None:
@@ -57,7 +57,7 @@ class Ledger:
 
     @property
     def ended_twice(self) -> list[tuple[str, int, MessageId, str]]:
-        """Messages with more than one outcome for one destination: there must be none."""
+        """Messages with more than one outcome for one destination, which must not exist."""
         return [key for key, kinds in self.outcomes.items() if len(kinds) > 1]
 
     def total(self, kind: type[Event]) -> int:
@@ -76,19 +76,19 @@ class _Member:
 
 
 class Team:
-    """`robots` are the settings of each; `relays` forward frames and have no transport of their own."""
+    """`robots` maps names to settings; `relays` forward frames and have no transport."""
 
     def __init__(
         self,
         robots: Mapping[str, Settings],
         *,
         relays: Iterable[str] = (),
-        channel: Channel,
+        channel: RadioChannel,
         loss: Loss,
         seed: int,
         on_event: OnEvent | None = None,
     ) -> None:
-        self.event_queue = EventQueue()
+        self.event_queue = SimEventQueue()
         self.ledger = Ledger()
         self._rng = random.Random(seed)
         self._on_event = on_event or (lambda now, robot, event: None)
@@ -110,13 +110,13 @@ class Team:
         node.link_up(link, self.event_queue.now)
         return _Member(name, address, node, link, run)
 
-    # ---- what a scenario does
+    # Called by the scenario
 
     def send(self, robot: str, topic: str, payload: bytes, destination: str | None = None) -> MessageId | Rejected:
-        """One message now. A robot that is switched off sends nothing: ValueError."""
+        """Sends a message now. Raises ValueError if the robot is not running."""
         member = self._members[robot]
         if not member.is_running:
-            raise ValueError(f"{robot} is switched off")
+            raise ValueError(f"{robot} is not running")
         result = member.node.send(topic, payload, destination=destination, now=self.event_queue.now)
         if isinstance(result, Rejected):
             self.ledger.rejected[result.reason.value] += 1
@@ -129,17 +129,17 @@ class Team:
         return self._members[robot].is_running
 
     def crash(self, robot: str) -> None:
-        """The process dies, with everything it held."""
+        """Ends the process; its state is lost."""
         self._members[robot].is_running = False
 
     def restart(self, robot: str, settings: Settings) -> None:
-        """A new run of the same robot."""
+        """Starts a new run of the same robot."""
         old = self._members[robot]
         self._members[robot] = self._started(robot, old.address, settings, old.run + 1)
         self._pump(self._members[robot])
 
     def change_address(self, robot: str, address: str) -> None:
-        """The same run is found elsewhere from now on."""
+        """Moves a running robot to another address."""
         member = self._members[robot]
         self._addresses.pop(member.address, None)
         self._addresses[address] = robot
@@ -149,7 +149,7 @@ class Team:
         self._pump(member)
 
     def apply(self, robot: str, settings: Settings) -> list[str]:
-        """Change a running robot's settings."""
+        """Changes a running robot's settings."""
         changes = self._members[robot].node.apply(settings, self.event_queue.now)
         self._pump(self._members[robot])
         return changes
@@ -157,9 +157,9 @@ class Team:
     def conditions(self, robot: str) -> Conditions:
         return self._members[robot].node.conditions(self.event_queue.now)
 
-    # ---- what follows from it
+    # Called by the medium and the timers
 
-    def _deliver(self, robot: str, frame: Frame) -> None:
+    def _deliver(self, robot: str, frame: RadioFrame) -> None:
         member = self._members.get(robot)
         source = self._members.get(frame.source)
         if member is None or source is None or not member.is_running:

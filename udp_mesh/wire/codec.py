@@ -1,9 +1,8 @@
 """Frames to bytes and back: `encode` for a datagram's frames, `decode` for an opened datagram.
 
-A frame starts with its type byte. Types with bit 7 set are fragments, whose low bits are flags; the others are listed
-in `Type`. All fields are big-endian. A fragment that ends its datagram has no length field; any other frame has a known
-length. Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames)) ==
-frames`.
+A frame starts with its type byte. Types with bit 7 set are fragments (see `fragment`); the others are listed in `Type`.
+All fields are big-endian. A fragment that ends its datagram has no length field; any other frame has a known length.
+Decoding either returns frames within every cap of `limits` or raises `DecodeError`; `decode(encode(frames)) == frames`.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from typing import assert_never
 from udp_mesh.wire import limits
 from udp_mesh.wire.buffer import Reader, encode_text
 from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.fragment import FRAGMENT, decode_fragment, decode_plain, encode_fragment
 from udp_mesh.wire.frames import (
     Ack,
     Bye,
@@ -24,9 +24,7 @@ from udp_mesh.wire.frames import (
     Fragment,
     Frame,
     Heartbeat,
-    MessageHead,
     Nack,
-    Payload,
     Ping,
     Pong,
     Refused,
@@ -54,36 +52,13 @@ class Type(IntEnum):
     """11 stays free: the tests of the first version use it as an unknown type."""
 
 
-FRAGMENT = 0x80
-FRAGMENT_HAS_HEAD = 0x01
-FRAGMENT_HAS_LENGTH = 0x02
-FRAGMENT_ACK_NOW = 0x04
-FRAGMENT_WIDE = 0x08
-"""The position takes 32 bits instead of 16."""
-FRAGMENT_BROADCAST_ID = 0x10
-FRAGMENT_HAS_LIFE = 0x20
-"""The head ends with the message's remaining lifetime."""
-_FRAGMENT_KNOWN = 0x80 | 0x3F
-
-_NARROW = struct.Struct(">BIH")
-_WIDE = struct.Struct(">BII")
-_LENGTH = struct.Struct(">H")
-_HEAD = struct.Struct(">IIIHBB")
 _ACK = struct.Struct(">B6s3sI")
 _HEARTBEAT = struct.Struct(">BBIHHIQI")
 
-FRAGMENT_BYTES = _NARROW.size
-"""7 B in front of the payload of a fragment that ends its datagram (9 B from position 65,536 on)."""
-FRAGMENT_WIDE_BYTES = _WIDE.size
-LENGTH_BYTES = _LENGTH.size
-"""2 B more for a fragment followed by other frames."""
-HEAD_BYTES = _HEAD.size
-"""16 B more in the fragment at position 0."""
-
-LIFE_BYTES = 4
-"""4 B more in a head with the message's remaining lifetime."""
 SENT_BYTES = 5
 """The frame `Sent`."""
+ANNOUNCE_BYTES = 5
+"""The frame `TopicAnnounce` without its two names."""
 
 _NO_EXTENSION = b"\x00"
 """Length of an empty heartbeat extension; a reader skips extension fields it does not know."""
@@ -107,51 +82,6 @@ def encode(frames: Sequence[Frame]) -> bytes:
         raise ValueError(f"datagram: expected 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, found {len(frames)}")
     final = len(frames) - 1
     return b"".join([_encode_frame(frame, last=place == final) for place, frame in enumerate(frames)])
-
-
-def encode_fragment(fragment: Fragment, *, last: bool = True) -> bytes:
-    """One encoded fragment; `last` if no frame follows it in its datagram."""
-    message_id, position, payload, head, ack_now, broadcast_id = fragment
-    first = FRAGMENT
-    if ack_now:
-        first |= FRAGMENT_ACK_NOW
-    if broadcast_id:
-        first |= FRAGMENT_BROADCAST_ID
-    if (head is None) != (position != 0):
-        raise ValueError("fragment: expected a head exactly at position 0")
-    if last and head is None:
-        if position < 65_536:
-            return _NARROW.pack(first, message_id, position) + payload
-        return _WIDE.pack(first | FRAGMENT_WIDE, message_id, position) + payload
-    parts: list[Payload] = []
-    if not last:
-        first |= FRAGMENT_HAS_LENGTH
-    if head is not None:
-        first |= FRAGMENT_HAS_HEAD if head.life_ms is None else FRAGMENT_HAS_HEAD | FRAGMENT_HAS_LIFE
-    if position < 65_536:
-        parts.append(_NARROW.pack(first, message_id, position))
-    else:
-        parts.append(_WIDE.pack(first | FRAGMENT_WIDE, message_id, position))
-    if head is not None:
-        parts.append(_encode_head(head))
-    if not last:
-        parts.append(_LENGTH.pack(len(payload)))
-    parts.append(payload)
-    return b"".join(parts)
-
-
-def _encode_head(head: MessageHead) -> bytes:
-    if head.size_bytes > limits.MAX_MESSAGE_BYTES or not 1 <= head.fragments <= max(1, head.size_bytes):
-        raise ValueError(f"message head: {head.size_bytes} bytes in {head.fragments} fragments is out of range")
-    if head.fragments > limits.MAX_FRAGMENTS_PER_MESSAGE or not 0 <= head.priority < limits.PRIORITY_LEVELS:
-        raise ValueError(f"message head: {head.fragments} fragments, priority {head.priority} is out of range")
-    age_ms = min(head.age_ms, 0xFFFFFFFF)
-    packed = _HEAD.pack(head.size_bytes, head.fragments, age_ms, head.topic_id, head.priority, head.flags)
-    if head.life_ms is None:
-        return packed
-    if head.life_ms < 1:
-        raise ValueError(f"message head: expected a remaining lifetime of at least 1 ms, found {head.life_ms}")
-    return packed + min(head.life_ms, 0xFFFFFFFF).to_bytes(LIFE_BYTES, "big")
 
 
 def _encode_frame(frame: Frame, *, last: bool) -> bytes:
@@ -254,15 +184,9 @@ def _encode_ids(ids: Iterable[int], broadcast: bool) -> bytes:
 
 def decode(data: bytes | memoryview) -> list[Frame]:
     """The frames of an opened datagram; fragments' payloads are views into `data`. Raises `DecodeError`."""
-    size = len(data)
-    if size >= FRAGMENT_BYTES and data[0] & ~(FRAGMENT_ACK_NOW | FRAGMENT_BROADCAST_ID) == FRAGMENT:
-        # The fast path: one narrow fragment that fills the datagram and is not its message's first.
-        first, message_id, position = _NARROW.unpack_from(data)
-        if position == 0 or size == FRAGMENT_BYTES:
-            raise DecodeError("fragment: expected a head at position 0 and a payload elsewhere")
-        payload = memoryview(data)[FRAGMENT_BYTES:]
-        ack_now, broadcast_id = first & FRAGMENT_ACK_NOW != 0, first & FRAGMENT_BROADCAST_ID != 0
-        return [Fragment(message_id, position, payload, None, ack_now, broadcast_id)]
+    plain = decode_plain(data)
+    if plain is not None:
+        return [plain]
     reader = Reader(data)
     frames: list[Frame] = []
     while reader.remaining():
@@ -270,7 +194,7 @@ def decode(data: bytes | memoryview) -> list[Frame]:
             raise DecodeError(f"datagram: expected at most {limits.MAX_FRAMES_PER_DATAGRAM} frames, found more")
         first = reader.integer(1, "frame type")
         if first & FRAGMENT:
-            frames.append(_decode_fragment(first, reader))
+            frames.append(decode_fragment(first, reader))
             continue
         decoder = _DECODERS.get(first)
         if decoder is None:
@@ -279,50 +203,6 @@ def decode(data: bytes | memoryview) -> list[Frame]:
     if not frames:
         raise DecodeError("datagram: expected a frame, found none")
     return frames
-
-
-def _decode_fragment(first: int, reader: Reader) -> Fragment:
-    if first & ~_FRAGMENT_KNOWN:
-        raise DecodeError(f"fragment: expected flags below {_FRAGMENT_KNOWN:#04x}, found {first:#04x}")
-    message_id = reader.integer(4, "message id")
-    position = reader.integer(4 if first & FRAGMENT_WIDE else 2, "fragment position")
-    if position >= limits.MAX_FRAGMENTS_PER_MESSAGE or (first & FRAGMENT_WIDE and position < 65_536):
-        raise DecodeError(f"fragment position: {position} is out of range")
-    if first & FRAGMENT_HAS_LIFE and not first & FRAGMENT_HAS_HEAD:
-        raise DecodeError("fragment: expected a remaining lifetime only in a head")
-    head = _decode_head(reader, with_life=first & FRAGMENT_HAS_LIFE != 0) if first & FRAGMENT_HAS_HEAD else None
-    if (head is None) != (position != 0):
-        raise DecodeError(f"fragment: expected a head exactly at position 0, found position {position}")
-    count = reader.integer(2, "fragment length") if first & FRAGMENT_HAS_LENGTH else reader.remaining()
-    payload = reader.take(count, "fragment payload")
-    if head is None:
-        if count == 0:
-            raise DecodeError("fragment: expected a payload, found none")
-    elif (
-        (count > head.size_bytes)
-        or (count < head.size_bytes) != (head.fragments > 1)
-        or (count == 0) != (head.size_bytes == 0)
-    ):
-        raise DecodeError(
-            f"fragment: {count} bytes contradict a message of {head.size_bytes} in {head.fragments} fragments"
-        )
-    ack_now, broadcast_id = first & FRAGMENT_ACK_NOW != 0, first & FRAGMENT_BROADCAST_ID != 0
-    return Fragment(message_id, position, payload, head, ack_now, broadcast_id)
-
-
-def _decode_head(reader: Reader, *, with_life: bool) -> MessageHead:
-    size_bytes = reader.at_most(4, limits.MAX_MESSAGE_BYTES, "message size")
-    fragments = reader.at_most(4, limits.MAX_FRAGMENTS_PER_MESSAGE, "number of fragments")
-    if not 1 <= fragments <= max(1, size_bytes):
-        raise DecodeError(f"number of fragments: {fragments} cannot carry {size_bytes} bytes without an empty one")
-    age_ms = reader.integer(4, "message age")
-    topic_id = reader.integer(2, "topic id")
-    priority = reader.at_most(1, limits.PRIORITY_LEVELS - 1, "priority")
-    flags = reader.integer(1, "message flags")
-    life_ms = reader.integer(LIFE_BYTES, "remaining lifetime") if with_life else None
-    if life_ms == 0:
-        raise DecodeError("remaining lifetime: expected at least 1 ms, found 0")
-    return MessageHead(size_bytes, fragments, topic_id, priority, flags, age_ms, life_ms)
 
 
 def _decode_heartbeat(reader: Reader) -> Heartbeat:

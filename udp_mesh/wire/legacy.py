@@ -210,30 +210,30 @@ def decode_mesh_data(raw: bytes) -> PriorityMeshData:
     if len(raw) < 12:
         raise DecodeError(f"legacy message: expected a header of 12 bytes, found {len(raw)}")
     sequence, stamp_s, stamp_ns = struct.unpack_from("<III", raw)
-    place = 12
-    frame_id, place = _take_text(raw, place, MAX_TOPIC_BYTES, "frame id")
-    host, place = _take_text(raw, place, MAX_NAME_BYTES, "host")
-    type_name, place = _take_text(raw, place, MAX_TYPE_BYTES, "type")
-    if place >= len(raw):
+    offset = 12
+    frame_id, offset = _read_text(raw, offset, MAX_TOPIC_BYTES, "frame id")
+    host, offset = _read_text(raw, offset, MAX_NAME_BYTES, "host")
+    type_name, offset = _read_text(raw, offset, MAX_TYPE_BYTES, "type")
+    if offset >= len(raw):
         raise DecodeError("legacy priority: expected 1 byte, found 0")
-    priority = raw[place]
-    topic, place = _take_text(raw, place + 1, MAX_TOPIC_BYTES, "topic")
-    data, place = _take(raw, place, len(raw), "data")
-    if place != len(raw):
-        raise DecodeError(f"legacy message: {len(raw) - place} trailing bytes")
+    priority = raw[offset]
+    topic, offset = _read_text(raw, offset + 1, MAX_TOPIC_BYTES, "topic")
+    data, offset = _read(raw, offset, len(raw), "data")
+    if offset != len(raw):
+        raise DecodeError(f"legacy message: {len(raw) - offset} trailing bytes")
     return PriorityMeshData(host, type_name, priority, topic, data, sequence, stamp_s, stamp_ns, frame_id)
 
 
-def _take(raw: bytes, place: int, limit_bytes: int, what: str) -> tuple[bytes, int]:
-    if place + 4 > len(raw):
-        raise DecodeError(f"legacy {what}: expected a length of 4 bytes, found {len(raw) - place}")
-    length = int.from_bytes(raw[place : place + 4], "little")
-    end = place + 4 + length
+def _read(raw: bytes, offset: int, limit_bytes: int, what: str) -> tuple[bytes, int]:
+    if offset + 4 > len(raw):
+        raise DecodeError(f"legacy {what}: expected a length of 4 bytes, found {len(raw) - offset}")
+    length = int.from_bytes(raw[offset : offset + 4], "little")
+    end = offset + 4 + length
     if length > limit_bytes or end > len(raw):
-        raise DecodeError(f"legacy {what}: {length} bytes are more than {min(limit_bytes, len(raw) - place - 4)}")
-    return raw[place + 4 : end], end
+        raise DecodeError(f"legacy {what}: {length} bytes are more than {min(limit_bytes, len(raw) - offset - 4)}")
+    return raw[offset + 4 : end], end
 
 
-def _take_text(raw: bytes, place: int, limit_bytes: int, what: str) -> tuple[str, int]:
-    value, end = _take(raw, place, limit_bytes, what)
+def _read_text(raw: bytes, offset: int, limit_bytes: int, what: str) -> tuple[str, int]:
+    value, end = _read(raw, offset, limit_bytes, what)
     return decode_text(value, f"legacy {what}"), end

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from meshctl.inventory.fields import Text, wrong
+from meshctl.inventory.fields import Text, expected_error
 
 # Default of an optional key without its own default; `model_fields_set` shows whether it is set.
 NOT_WRITTEN: Any = None
@@ -41,9 +41,9 @@ class SecretDocument(Document):
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if sum(map(bool, (self.env, self.file, self.age))) != 1:
-            raise wrong("exactly one of env, file and age")
+            raise expected_error("exactly one of env, file and age")
         if self.env and (self.key or self.identity):
-            raise wrong("no key and identity with env")
+            raise expected_error("no key and identity with env")
         if self.file and self.identity:
-            raise wrong("no identity with file: only age files have one")
+            raise expected_error("no identity with file: only age files have one")
         return self

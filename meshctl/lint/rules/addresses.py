@@ -273,7 +273,7 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC211",
     Severity.WARNING,
     "The network has no free addresses for a replacement",
-    why="""When all addresses are used, a spare cannot join beside the node it replaces, and a laptop cannot join for
+    why="""When all addresses are used, a spare cannot join next to the node it replaces, and a laptop cannot join for
     diagnosis.""",
     fix="Use a larger network; a shorter prefix costs nothing.",
     failing="""

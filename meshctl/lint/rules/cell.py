@@ -10,7 +10,7 @@ from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.access import RSA_KEY
 from meshctl.model import Band, Fleet, MeshMode, Release
-from meshctl.regdb import occupied
+from meshctl.regdb import occupied_span
 
 # IEEE 802.11: the basic rates of 802.11b, and the OFDM rates of 802.11a and g
 _DSSS_KBPS = (1000, 2000, 5500, 11000)
@@ -123,7 +123,7 @@ def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     spans = []
     for mesh in fleet.meshes.values():
         try:
-            span = occupied(mesh.band, mesh.channel, mesh.htmode)
+            span = occupied_span(mesh.band, mesh.channel, mesh.htmode)
         except ValueError:
             continue
         if span is not None:

@@ -8,7 +8,17 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
-from meshctl.regdb import CHANNELS, Country, Flag, Legality, check_span, legal_channels, occupied, primary, width_mhz
+from meshctl.regdb import (
+    CHANNELS,
+    Country,
+    Flag,
+    Legality,
+    check_span,
+    legal_channels,
+    occupied_span,
+    primary_span,
+    width_mhz,
+)
 
 # flags that prevent a station from starting a cell
 _NO_INITIATE = Flag.DFS | Flag.NO_IR
@@ -17,7 +27,7 @@ _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
 
 
-def _shown(channels: tuple[int, ...]) -> str:
+def _format_channels(channels: tuple[int, ...]) -> str:
     """`one of 1-11`, `one of 36, 40, 44, 48`."""
     if not channels:
         return "another band"
@@ -38,15 +48,15 @@ def _channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Countr
         return
     for mesh in fleet.meshes.values():
         if mesh.channel in CHANNELS[mesh.band]:
-            yield mesh, country, check_span(country, primary(mesh.band, mesh.channel))
+            yield mesh, country, check_span(country, primary_span(mesh.band, mesh.channel))
 
 
-def _wide(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality, int]]:
+def _wide_channels(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, Country, Legality, int]]:
     """Meshes wider than 20 MHz with a legal primary channel, with the legality of the whole width, and the width."""
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
-        span = occupied(mesh.band, mesh.channel, mesh.htmode)
+        span = occupied_span(mesh.band, mesh.channel, mesh.htmode)
         if span is not None and span.width_mhz > 20:
             yield mesh, country, check_span(country, span), span.width_mhz
 
@@ -89,7 +99,9 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
                 legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE) if country else CHANNELS[mesh.band]
             )
             path = ("meshes", mesh.name, "channel")
-            yield Finding(path, f"not a channel of the {mesh.band.value} band", _shown(legal), str(mesh.channel))
+            yield Finding(
+                path, f"not a channel of the {mesh.band.value} band", _format_channels(legal), str(mesh.channel)
+            )
 
 
 @fleet_rule(
@@ -108,7 +120,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, "not allowed in this country", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
@@ -156,7 +168,7 @@ def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -180,7 +192,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _shown(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
             yield Finding(path, "stations may not initiate transmission", expected, f"{mesh.channel} (no-IR)")
@@ -206,9 +218,9 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
-        if occupied(mesh.band, mesh.channel, mesh.htmode) is None:
+        if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
             legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
-            expected = f"a channel {_shown(legal)}" if legal else "a narrower htmode"
+            expected = f"a channel {_format_channels(legal)}" if legal else "a narrower htmode"
             path = ("meshes", mesh.name, "htmode")
             yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
 
@@ -230,13 +242,13 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     """,
 )
 def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for mesh, country, verdict, width in _wide(fleet, context):
+    for mesh, country, verdict, width in _wide_channels(fleet, context):
         silent = verdict.flags & _NO_INITIATE if verdict.covered else Flag(0)
-        own = check_span(country, primary(mesh.band, mesh.channel)).flags & _NO_INITIATE
+        own = check_span(country, primary_span(mesh.band, mesh.channel)).flags & _NO_INITIATE
         if verdict.allows(width) and (not silent or own):
             continue
         legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
-        expected = f"a channel {_shown(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
+        expected = f"a channel {_format_channels(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
 
@@ -347,7 +359,7 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _NO_INITIATE:
             outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE | Flag.NO_OUTDOOR)
-            expected = f"{_shown(outdoor)} (country {country.alpha2})"
+            expected = f"{_format_channels(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "indoor use only", expected, str(mesh.channel))
 
 

@@ -37,7 +37,7 @@ def _profiles(fleet: Fleet) -> Iterator[HardwareProfile]:
     return (profile for profile in fleet.hardware.values() if profile.firmware.image and profile.name in used)
 
 
-def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator[Finding]:
+def _image_findings(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator[Finding]:
     """The image check's findings with `code`, at the profile."""
     for profile in _profiles(fleet):
         for item in context.files.firmware(profile):
@@ -59,7 +59,7 @@ def _found(fleet: Fleet, context: LintContext, code: str, *key: str) -> Iterator
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, UNREADABLE)
+    yield from _image_findings(fleet, context, UNREADABLE)
 
 
 @fleet_rule(
@@ -75,7 +75,7 @@ def image_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_hash(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, WRONG_HASH, "sha256")
+    yield from _image_findings(fleet, context, WRONG_HASH, "sha256")
 
 
 @fleet_rule(
@@ -88,7 +88,7 @@ def image_wrong_hash(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_damaged(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, DAMAGED)
+    yield from _image_findings(fleet, context, DAMAGED)
 
 
 @fleet_rule(
@@ -102,7 +102,7 @@ def image_damaged(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_without_metadata(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, NO_METADATA)
+    yield from _image_findings(fleet, context, NO_METADATA)
 
 
 @fleet_rule(
@@ -115,7 +115,7 @@ def image_without_metadata(fleet: Fleet, context: LintContext) -> Iterator[Findi
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, WRONG_BOARD)
+    yield from _image_findings(fleet, context, WRONG_BOARD)
 
 
 @fleet_rule(
@@ -129,7 +129,7 @@ def image_wrong_board(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, WRONG_RELEASE)
+    yield from _image_findings(fleet, context, WRONG_RELEASE)
 
 
 @fleet_rule(
@@ -143,7 +143,7 @@ def image_wrong_release(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, WRONG_REVISION, "revision")
+    yield from _image_findings(fleet, context, WRONG_REVISION, "revision")
 
 
 @fleet_rule(
@@ -152,7 +152,7 @@ def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding
     "A firmware image's signature is invalid or missing",
     why="""The profile's `usign_key` must have signed the image, but the signature does not match, or the signature or
     the key is missing. OpenWrt does not check it.""",
-    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) beside the image.",
+    fix="Put the release's sha256sums and sha256sums.sig (or the image's own .sig) next to the image.",
     failing=Example(
         _IMAGE.replace("image: rocket.bin", "image: rocket.bin, usign_key: absent.pub"),
         files={"rocket.bin": ROCKET_IMAGE},
@@ -160,7 +160,7 @@ def image_wrong_revision(fleet: Fleet, context: LintContext) -> Iterator[Finding
     passing=Example(_IMAGE, files={"rocket.bin": ROCKET_IMAGE}),
 )
 def image_signature(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    yield from _found(fleet, context, BAD_SIGNATURE, "usign_key")
+    yield from _image_findings(fleet, context, BAD_SIGNATURE, "usign_key")
 
 
 @fleet_rule(

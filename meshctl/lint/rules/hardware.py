@@ -109,7 +109,7 @@ def batctl_tiny(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC824",
     Severity.WARNING,
     "A package is both added and removed",
-    why="The two entries contradict each other, and one of them is not what the node gets.",
+    why="One of the two entries has no effect, so the intended content of the image is unclear.",
     fix="Keep one of the two entries.",
     failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump, -tcpdump]}}",
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, tcpdump]}}",

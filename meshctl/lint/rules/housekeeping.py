@@ -10,7 +10,7 @@ NO_REASON = engine_rule(
     Severity.WARNING,
     "A suppression has no reason",
     name="suppression-without-reason",
-    why="""Without a reason, later readers cannot tell whether the finding was considered or merely silenced. A
+    why="""Without a reason, it is unknown later whether the finding was considered or merely silenced. A
     suppression without a reason has no effect.""",
     fix="Add the reason after two hyphens: `# meshctl: ignore MC424 -- bench only, no radio is connected`.",
     failing="apply: {canary: true}  # meshctl: ignore MC614",

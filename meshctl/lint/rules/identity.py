@@ -250,8 +250,8 @@ def _deployed(fleet: Fleet) -> Iterator[Node]:
     "MC119",
     Severity.NOTE,
     "Host keys of deployed nodes are not pinned",
-    why="""Without a pinned key, any device at the address is accepted, and meshctl refuses to change a node that it
-    cannot authenticate.""",
+    why="""Without a pinned key, another device at the node's address cannot be detected. meshctl refuses to change a
+    node that it cannot authenticate.""",
     fix="Run `meshctl trust NODE` once, over a trusted connection such as a cable on the bench.",
     failing="nodes: {base: {host_keys: <removed>}}",
     passing=Example(

@@ -10,7 +10,7 @@ from meshctl.lint.grouping import group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import AntennaKind, Fleet, Mesh, Node, Radio
-from meshctl.regdb import CHANNELS, check_span, primary
+from meshctl.regdb import CHANNELS, check_span, primary_span
 
 # 47 CFR 15.247(b)(3), (b)(4), and the same in RSS-247 5.4(d): digital modulation at 2400-2483.5 and 5725-5850 MHz
 _CONDUCTED_LIMIT_DBM = 30.0
@@ -54,13 +54,13 @@ def _transmitting(fleet: Fleet) -> Iterator[tuple[Node, Radio, Mesh]]:
 
 
 def _has_conducted_limit(fleet: Fleet, mesh: Mesh) -> bool:
-    span = primary(mesh.band, mesh.channel)
+    span = primary_span(mesh.band, mesh.channel)
     return fleet.country in _CONDUCTED_COUNTRIES and any(
         low <= span.low_mhz and span.high_mhz <= high for low, high in _CONDUCTED_BANDS_MHZ
     )
 
 
-def _at(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
+def _drive_path(fleet: Fleet, node: Node, radio: Radio) -> tuple[str, ...]:
     """The path that sets the drive level: the node's layers, or else the driver's maximum."""
     written = ("nodes", node.name, "radios", radio.name, "tx_power_dbm")
     return first_written(fleet, written, ("hardware", node.hardware.name, "radios", radio.name, "max_drive_dbm"))
@@ -85,7 +85,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     if country is None:
         return
     limits = {
-        mesh.name: check_span(country, primary(mesh.band, mesh.channel))
+        mesh.name: check_span(country, primary_span(mesh.band, mesh.channel))
         for mesh in fleet.meshes.values()
         if mesh.channel in CHANNELS[mesh.band] and not _has_conducted_limit(fleet, mesh)
     }
@@ -98,7 +98,7 @@ def eirp_above_country(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         )
         excess = radio.eirp_dbm - verdict.max_eirp_dbm
         expected = f"at most {_dbm(verdict.max_eirp_dbm)} dBm EIRP (country {country.alpha2}, channel {mesh.channel})"
-        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", expected, total)
+        yield Finding(_drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", expected, total)
 
 
 @fleet_rule(
@@ -130,7 +130,7 @@ def conducted_above_fcc(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         less = f": 30 less {_dbm(excess_gain)} for an antenna of {_dbm(gain)} dBi" if excess_gain else ""
         allowed = f"at most {_dbm(limit)} dBm conducted (country {fleet.country}{less})"
         total = f"{power_sum(radio)} = {_dbm(radio.conducted_dbm)} dBm"
-        yield Finding(_at(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", allowed, total)
+        yield Finding(_drive_path(fleet, node, radio), f"{_dbm(round(excess, 2))} dB above the limit", allowed, total)
 
 
 def _is_limited(fleet: Fleet, mesh: Mesh) -> bool:
@@ -150,7 +150,9 @@ def drive_above_driver(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for node, radio, _ in _transmitting(fleet):
         if radio.tx_power_dbm > radio.hardware.max_drive_dbm:
             expected = f"at most {radio.hardware.max_drive_dbm} (hardware {node.hardware.name})"
-            yield Finding(_at(fleet, node, radio), "above the driver's maximum", expected, str(radio.tx_power_dbm))
+            yield Finding(
+                _drive_path(fleet, node, radio), "above the driver's maximum", expected, str(radio.tx_power_dbm)
+            )
 
 
 @fleet_rule(
@@ -176,7 +178,7 @@ def amplifier_overdriven(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if radio.tx_power_dbm <= hardware.max_drive_dbm and driven > hardware.rated_power_dbm + _ROUNDING_DB:
             found = f"{radio.tx_power_dbm} drive + {_dbm(hardware.amplifier_gain_db)} amplifier = {_dbm(driven)} dBm"
             expected = f"at most {_dbm(hardware.rated_power_dbm)} dBm (hardware {node.hardware.name})"
-            yield Finding(_at(fleet, node, radio), "above the hardware's rating", expected, found)
+            yield Finding(_drive_path(fleet, node, radio), "above the hardware's rating", expected, found)
 
 
 @fleet_rule(
@@ -274,7 +276,7 @@ def powers_far_apart(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                 expected = f"at least {_dbm(strong.conducted_dbm - _ASYMMETRY_DB)} dBm conducted"
                 message = f"{strongest.name} in mesh {name} transmits {_dbm(strong.conducted_dbm)} dBm"
                 found = f"{_dbm(radio.conducted_dbm)} dBm"
-                yield Finding(_at(fleet, node, radio), message, expected, found)
+                yield Finding(_drive_path(fleet, node, radio), message, expected, found)
 
 
 @fleet_rule(

@@ -58,7 +58,7 @@ def _batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
     """,
 )
 def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_ERROR, float("inf"))
+    yield from _airtime_findings(fleet, _AIRTIME_ERROR, float("inf"))
 
 
 @fleet_rule(
@@ -80,10 +80,10 @@ def originators_eat_channel(fleet: Fleet, _context: LintContext) -> Iterator[Fin
     """,
 )
 def originators_take_much(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_WARNING, _AIRTIME_ERROR)
+    yield from _airtime_findings(fleet, _AIRTIME_WARNING, _AIRTIME_ERROR)
 
 
-def _airtime(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
+def _airtime_findings(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
     on_air = (node for node in fleet.managed() if node.state is not NodeState.SPARE)
     members = group_by_key((mesh, node.name) for node in on_air for mesh in node.meshes)
     for mesh in _batman_meshes(fleet):
@@ -401,7 +401,7 @@ def operator_parts_incomplete(fleet: Fleet, _context: LintContext) -> Iterator[F
     """,
 )
 def originators_cost(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    yield from _airtime(fleet, _AIRTIME_NOTE, _AIRTIME_WARNING)
+    yield from _airtime_findings(fleet, _AIRTIME_NOTE, _AIRTIME_WARNING)
 
 
 @fleet_rule(

@@ -155,12 +155,12 @@ def node_of_two_robots(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         for robot in others:
             message = f"{name} is already claimed by {first}"
             yield Finding(("robots", robot, key, name), message, "one robot per node", name)
-    for robot_name, name in _own_freight(fleet):
+    for robot_name, name in _own_nodes_carried(fleet):
         message = f"{name} is mounted on {robot_name} itself"
         yield Finding(("robots", robot_name, "carries", name), message, "either `nodes` or `carries`", name)
 
 
-def _own_freight(fleet: Fleet) -> Iterator[tuple[str, str]]:
+def _own_nodes_carried(fleet: Fleet) -> Iterator[tuple[str, str]]:
     for robot in fleet.robots.values():
         mounted = set(robot.nodes)
         yield from ((robot.name, name) for name in dict.fromkeys(robot.carries) if name in mounted)

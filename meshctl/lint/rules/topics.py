@@ -33,7 +33,7 @@ _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/((msg|srv|action)/)?[A-Za-z][A-Za-z0-
 _TOPIC = re.compile(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
-def _at(topic: Topic, *key: str) -> tuple[str, ...]:
+def _path(topic: Topic, *key: str) -> tuple[str, ...]:
     return ("topics", topic.name, *key)
 
 
@@ -55,7 +55,7 @@ def stop_not_first(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.topic_class is not TopicClass.EMERGENCY_STOP and topic.priority <= level:
             message = f"can delay {stops[0].name}"
-            yield Finding(_at(topic, "priority"), message, f"more than {level}", str(topic.priority))
+            yield Finding(_path(topic, "priority"), message, f"more than {level}", str(topic.priority))
 
 
 @fleet_rule(
@@ -78,7 +78,7 @@ def bulk_above_commands(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         # MC701 covers the level of the stop
         if topic.topic_class in _BULK and topic.priority <= last.priority and topic.priority > max(stops, default=-1):
             message = f"can delay {last.name}"
-            yield Finding(_at(topic, "priority"), message, f"more than {last.priority}", str(topic.priority))
+            yield Finding(_path(topic, "priority"), message, f"more than {last.priority}", str(topic.priority))
 
 
 @fleet_rule(
@@ -97,7 +97,7 @@ def classes_tie(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if len(classes) > 1 and not any(topic.topic_class in _URGENT for topic in topics):
             later = next(topic for topic in topics if topic.topic_class is not topics[0].topic_class)
             found = f"{level} for {join_limited([topic.name for topic in topics])}"
-            yield Finding(_at(later, "priority"), f"shares the level of {topics[0].name}", "a separate level", found)
+            yield Finding(_path(later, "priority"), f"shares the level of {topics[0].name}", "a separate level", found)
 
 
 @fleet_rule(
@@ -123,7 +123,7 @@ def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if latest is not None and topic.topic_class is not latest.topic_class and topic.priority < latest.priority:
             message = f"{topic.topic_class.value} precedes {latest.name} ({latest.topic_class.value})"
             expected = f"more than {latest.priority}"
-            yield Finding(_at(topic, "priority"), message, expected, str(topic.priority))
+            yield Finding(_path(topic, "priority"), message, expected, str(topic.priority))
         if latest is None or topic.priority > latest.priority:
             latest = topic
 
@@ -154,7 +154,7 @@ def no_emergency_stop(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def stop_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.topic_class is TopicClass.EMERGENCY_STOP and not topic.reliable:
-            yield Finding(_at(topic, "reliable"), "may be lost", "true", "false")
+            yield Finding(_path(topic, "reliable"), "may be lost", "true", "false")
 
 
 @fleet_rule(
@@ -173,7 +173,7 @@ def stop_not_for_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         missing = [name for name, robot in fleet.robots.items() if not robot.is_base and name not in topic.destinations]
         if missing:
             yield Finding(
-                _at(topic, "destinations"),
+                _path(topic, "destinations"),
                 f"{join_limited(missing)} would not stop",
                 "all",
                 join_limited(topic.destinations),
@@ -194,10 +194,10 @@ def stop_held_back(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if topic.topic_class is not TopicClass.EMERGENCY_STOP:
             continue
         if topic.deadline_s is not None:
-            yield Finding(_at(topic, "deadline_s"), "a late stop is dropped", "none", f"{topic.deadline_s:g} s")
+            yield Finding(_path(topic, "deadline_s"), "a late stop is dropped", "none", f"{topic.deadline_s:g} s")
         if topic.rate_limit_bytes_per_s is not None:
             found = f"{topic.rate_limit_bytes_per_s} bytes/s"
-            yield Finding(_at(topic, "rate_limit_bytes_per_s"), "a repeated stop is delayed", "none", found)
+            yield Finding(_path(topic, "rate_limit_bytes_per_s"), "a repeated stop is delayed", "none", found)
 
 
 @fleet_rule(
@@ -214,7 +214,7 @@ def destination_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         for index, name in enumerate(topic.destinations):
             if name != _ALL and name not in fleet.robots:
                 expected, hint = suggest((*fleet.robots, _ALL), name)
-                yield Finding(_at(topic, "destinations", str(index)), "no such robot", expected, name, hint)
+                yield Finding(_path(topic, "destinations", str(index)), "no such robot", expected, name, hint)
 
 
 @fleet_rule(
@@ -231,7 +231,7 @@ def source_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for index, name in enumerate(topic.sources):
             if name not in fleet.robots:
                 expected, hint = suggest(fleet.robots, name)
-                yield Finding(_at(topic, "sources", str(index)), "no such robot", expected, name, hint)
+                yield Finding(_path(topic, "sources", str(index)), "no such robot", expected, name, hint)
 
 
 @fleet_rule(
@@ -249,7 +249,7 @@ def topic_to_itself(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             topic.sources and set(topic.destinations) == set(topic.sources) and len(topic.sources) == 1
         ):
             found = join_limited(topic.destinations) or "none"
-            yield Finding(_at(topic, "destinations"), "reaches no other robot", "another robot, or all", found)
+            yield Finding(_path(topic, "destinations"), "reaches no other robot", "another robot, or all", found)
 
 
 @fleet_rule(
@@ -265,7 +265,7 @@ def topic_to_itself(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def video_reliable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.topic_class is TopicClass.VIDEO and topic.reliable:
-            yield Finding(_at(topic, "reliable"), "old frames delay new ones", "false", "true")
+            yield Finding(_path(topic, "reliable"), "old frames delay new ones", "false", "true")
 
 
 @fleet_rule(
@@ -284,7 +284,7 @@ def best_effort_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if not topic.reliable and not topic.repair and fragments > _BEST_EFFORT_FRAGMENTS:
             expected = f"at most {_BEST_EFFORT_FRAGMENTS} fragments"
             found = f"{fragments} fragments; {0.95**fragments:.0%} arrive at 5 % loss"
-            yield Finding(_at(topic, "size_bytes"), "lost if any fragment is lost", expected, found)
+            yield Finding(_path(topic, "size_bytes"), "lost if any fragment is lost", expected, found)
 
 
 @fleet_rule(
@@ -302,7 +302,7 @@ def outbox_expires(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.outbox is not Outbox.NONE and topic.deadline_s is not None and topic.deadline_s <= offline_s:
             expected = f"more than {offline_s:g} s (udp_mesh.offline_after_s)"
-            path = _at(topic, "deadline_s")
+            path = _path(topic, "deadline_s")
             yield Finding(path, "expires before the peer returns", expected, f"{topic.deadline_s:g} s")
 
 
@@ -318,7 +318,7 @@ def outbox_expires(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def outbox_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.outbox is not Outbox.NONE and topic.outbox_bytes < topic.size_bytes:
-            path = _at(topic, "outbox_bytes")
+            path = _path(topic, "outbox_bytes")
             yield Finding(path, "no message fits", f"at least {topic.size_bytes}", str(topic.outbox_bytes))
 
 
@@ -335,7 +335,10 @@ def outbox_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for topic in fleet.topics:
         if topic.outbox is not Outbox.NONE and not topic.reliable:
             yield Finding(
-                _at(topic, "outbox"), "kept, but not delivered reliably", "none, or reliable: true", topic.outbox.value
+                _path(topic, "outbox"),
+                "kept, but not delivered reliably",
+                "none, or reliable: true",
+                topic.outbox.value,
             )
 
 
@@ -352,7 +355,7 @@ def type_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.type_name and _TYPE.fullmatch(topic.type_name) is None:
             expected = "package/Type or package/msg/Type"
-            yield Finding(_at(topic, "type"), "not a ROS type name", expected, topic.type_name)
+            yield Finding(_path(topic, "type"), "not a ROS type name", expected, topic.type_name)
 
 
 @fleet_rule(
@@ -368,4 +371,4 @@ def topic_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for topic in fleet.topics:
         if _TOPIC.fullmatch(topic.name) is None:
             expected = "letters, digits and underscores, parts joined by /"
-            yield Finding(_at(topic), "not a valid ROS name", expected, topic.name)
+            yield Finding(_path(topic), "not a valid ROS name", expected, topic.name)

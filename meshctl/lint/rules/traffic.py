@@ -93,7 +93,7 @@ def _best_mbps(fleet: Fleet, mesh: Mesh) -> float:
     return _MCS7_MBPS[width] * max(chains, default=1) * _EFFICIENCY
 
 
-def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, OfferedLoad, float, float]]:
+def _channel_shares(fleet: Fleet) -> Iterator[tuple[Mesh, OfferedLoad, float, float]]:
     """Every loaded mesh with its share of airtime: best case, and usual."""
     for name, load in offered_load(fleet).items():
         mesh = fleet.meshes.get(name)
@@ -106,7 +106,7 @@ def _shares(fleet: Fleet) -> Iterator[tuple[Mesh, OfferedLoad, float, float]]:
         yield mesh, load, best, usual
 
 
-def _sum(load: OfferedLoad) -> str:
+def _format_load(load: OfferedLoad) -> str:
     kbps = (load.unicast_bytes_per_s * 8 / 1000, load.broadcast_bytes_per_s * 8 / 1000)
     return f"{kbps[0]:.0f} kbit/s unicast and {kbps[1]:.0f} kbit/s broadcast, mostly {load.largest.name}"
 
@@ -122,10 +122,10 @@ def _sum(load: OfferedLoad) -> str:
     passing="topics: {video: {rate_hz: 1, size_bytes: 5000}}",
 )
 def load_above_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh, load, best, _ in _shares(fleet):
+    for mesh, load, best, _ in _channel_shares(fleet):
         if best > 1.0:
             path = ("topics", load.largest.name, "rate_hz")
-            message = f"mesh {mesh.name} cannot carry {_sum(load)}"
+            message = f"mesh {mesh.name} cannot carry {_format_load(load)}"
             yield Finding(path, message, "at most 100% of the channel in the best case", f"{best:.0%}")
 
 
@@ -141,10 +141,10 @@ def load_above_channel(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     passing="topics: {map: {rate_hz: 0.1, size_bytes: 20000, destinations: [base-station]}}",
 )
 def load_high(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh, load, best, usual in _shares(fleet):
+    for mesh, load, best, usual in _channel_shares(fleet):
         if best <= 1.0 and usual > _USUAL_LIMIT:
             path = ("topics", load.largest.name, "rate_hz")
-            message = f"mesh {mesh.name} must carry {_sum(load)}"
+            message = f"mesh {mesh.name} must carry {_format_load(load)}"
             expected = f"at most {_USUAL_LIMIT:.0%} of the channel in the usual case"
             yield Finding(path, message, expected, f"{usual:.0%}")
 
@@ -311,7 +311,7 @@ def offline_too_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC741",
     Severity.WARNING,
     "The transport's port is in the ephemeral range",
-    why="""Linux assigns ports from 32768 on to any program that asks for one: occasionally this port is taken before
+    why="""Linux assigns ports from 32768 on to any program that requests one: occasionally this port is taken before
     udp_mesh starts.""",
     fix="Use a port from 1024 to 32767, such as 8700.",
     failing="udp_mesh: {port: 40000}",

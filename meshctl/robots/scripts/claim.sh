@@ -1,5 +1,5 @@
-# claim CURRENT DEAD: holds the robot for $owner from here to `release`, if it still runs the release CURRENT (`-`: any).
-# DEAD is a claim's owner known to have ended. Prints `claimed`, or `held OWNER SECONDS`.
+# claim CURRENT DEAD: locks the robot for $owner until `release`, if it still runs the release CURRENT (`-`: any).
+# DEAD is the owner of a claim whose process has died. Prints `claimed`, or `held OWNER SECONDS`.
 current=$1 dead=$2
 mkdir -p "$root" || die no-space "cannot make $root"
 exec 9>"$root/.lock"

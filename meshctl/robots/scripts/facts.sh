@@ -1,5 +1,5 @@
-# facts: how the computer, its services and the daemon fare, in sections that a line `== NAME` begins. Changes nothing,
-# and looks at the disk no more than needed: status asks everyone, often.
+# facts: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes nothing, and
+# reads little from the disk, since status calls it often.
 echo "== services"
 for service in $unit $bridge_unit; do
 	# of a service that was never installed systemd knows ActiveState=inactive, UnitFileState= and LoadState=not-found

@@ -1,11 +1,11 @@
-"""Asks the daemon on a robot how it fares; runs there, in the release's own Python, with the standard library alone.
+"""Query the daemon on a robot; runs there, in the release's Python, with the standard library only.
 
-    facts                     prints the daemon's status and topics, as sections that a line `== NAME` begins
+    facts                     prints the daemon's status and topics, in sections that start with `== NAME`
     online                    prints the peers that are online
     before                    prints, as one line of JSON, what must hold again after a switch: `Baseline`
-    prove WAIT_S BEFORE UNIT... prints nothing as soon as all is well, or after WAIT_S what is not
+    prove WAIT_S BEFORE UNIT... prints nothing once all is healthy, or after WAIT_S what is not
 
-The scripts beside this file call it; `look` and `ask` are all its I/O, `flowing` and `ill` decide.
+Called by the scripts beside this file. `take_snapshot` and `query` do all I/O; `flowing` and `problems` decide.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ SOCKET = "/run/udp-mesh/udp-mesh.sock"
 CURRENT = Path("/opt/udp-mesh/current")
 QUERY_TIMEOUT_S = 10.0
 POLL_INTERVAL_S = 0.25
-# A daemon that dies at start is back within RestartSec=1 for another try: a process must have lived for longer.
+# A daemon that dies at start is restarted within RestartSec=1: a healthy process must be older.
 STEADY_S = 2.0
-# The bridge reads all of ROS before it can fail; a topic that it asks the daemon for shows sooner that it got through.
+# The bridge loads all of ROS before it can fail; its own topic at the daemon shows earlier that it succeeded.
 BRIDGE_STEADY_S = 8.0
 BRIDGE_TOPIC = "bridge/ros1"
-# Topics are called flowing when so many messages came within so long, so that a single message is no promise of more.
+# A topic flows with this many messages within this time; a single message does not promise more.
 FLOW_WATCH_S = 1.0
 MIN_FLOW_MESSAGES = 2
 
@@ -36,8 +36,8 @@ Json = dict[str, Any]
 
 
 class Baseline(NamedTuple):
-    """What was so while the release before ran: peers that were online, messages received by topic that flowed, and
-    which process it was (a reload keeps it, and its counts go on)."""
+    """The state under the previous release: online peers, received messages of flowing topics, and the boot ID of its
+    process (a reload keeps the process and its counts)."""
 
     online: list[str]
     flowing: dict[str, int]
@@ -45,7 +45,7 @@ class Baseline(NamedTuple):
 
 
 class ServiceState(NamedTuple):
-    """A service as `systemctl show` tells it; `started_s` is on the monotonic clock."""
+    """A service in `systemctl show`; `started_s` is on the monotonic clock."""
 
     name: str
     active: str = ""
@@ -55,13 +55,13 @@ class ServiceState(NamedTuple):
     started_s: float = 0.0
 
     def __str__(self) -> str:
-        again = f", started again {self.restarts} times" if self.restarts not in ("", "0") else ""
+        again = f", restarted {self.restarts} times" if self.restarts not in ("", "0") else ""
         result = f", {self.result}" if self.result not in ("", "success") else ""
-        return f"{self.active or 'not there'} ({self.sub}{result}{again})"
+        return f"{self.active or 'absent'} ({self.sub}{result}{again})"
 
 
 class HealthSnapshot(NamedTuple):
-    """One look: the units, and what the daemon answered, or why it did not."""
+    """The units, and the daemon's answers or why there are none."""
 
     units: list[ServiceState]
     status: Json
@@ -75,23 +75,23 @@ class HealthSnapshot(NamedTuple):
 
 
 def flowing(first: list[Json], then: list[Json]) -> dict[str, int]:
-    """Topics that received at least FLOW_MESSAGES between two looks, with their counts at the second."""
+    """Topics that received at least FLOW_MESSAGES between two snapshots, with their counts at the second."""
     counts = {topic["name"]: int(topic["received_messages"]) for topic in first}
     later = {topic["name"]: int(topic["received_messages"]) for topic in then}
     return {name: count for name, count in later.items() if count - counts.get(name, 0) >= MIN_FLOW_MESSAGES}
 
 
-def problems(snapshot: HealthSnapshot, wanted: list[str], baseline: Baseline, now_s: float) -> str:
-    """Why the robot is not well yet, in one line; empty when it is. `wanted` are the topics it shall have."""
+def problems(snapshot: HealthSnapshot, expected: list[str], baseline: Baseline, now_s: float) -> str:
+    """Why the robot is not healthy yet, in one line; empty if it is. `expected` are the topics of the release."""
     for unit in snapshot.units:
         if unit.active != "active":
             return f"{_called(unit)} does not run: systemd says {unit}"
     if snapshot.no_answer_reason:
         return f"the daemon does not answer: {snapshot.no_answer_reason}"
     here = {topic["name"]: topic for topic in snapshot.topics}
-    lacking = [name for name in wanted if not here.get(name, {}).get("configured")]
+    lacking = [name for name in expected if not here.get(name, {}).get("configured")]
     if lacking:
-        return f"topics are not there: {', '.join(lacking)}"
+        return f"topics are missing: {', '.join(lacking)}"
     away = [peer for peer in baseline.online if peer not in snapshot.online]
     if away:
         return f"peers were online before and are not seen: {', '.join(away)}"
@@ -108,7 +108,7 @@ def problems(snapshot: HealthSnapshot, wanted: list[str], baseline: Baseline, no
         for unit in snapshot.units
         if now_s - unit.started_s < (BRIDGE_STEADY_S if _is_bridge(unit) and BRIDGE_TOPIC not in here else STEADY_S)
     ]
-    return f"{_called(young[0])} has only just started" if young else ""
+    return f"{_called(young[0])} has just started" if young else ""
 
 
 def _is_bridge(unit: ServiceState) -> bool:
@@ -120,7 +120,7 @@ def _called(unit: ServiceState) -> str:
 
 
 def query(*operations: str) -> list[Json]:
-    """The daemon's replies. Raises OSError, and ValueError for what is no reply (docs/local-api.md)."""
+    """The daemon's replies. Raises OSError, and ValueError for an invalid reply (docs/local-api.md)."""
     with socket.socket(socket.AF_UNIX) as server:
         server.settimeout(QUERY_TIMEOUT_S)
         server.connect(SOCKET)
@@ -154,14 +154,14 @@ def take_snapshot(units: list[str]) -> HealthSnapshot:
 def _unit(name: str) -> ServiceState:
     asked = "ActiveState,SubState,Result,NRestarts,ExecMainStartTimestampMonotonic"
     shown = subprocess.run(["systemctl", "show", "-p", asked, name], capture_output=True, text=True, check=False)
-    told = dict(line.partition("=")[::2] for line in shown.stdout.splitlines())
-    active, sub, result, restarts, started_us = (told.get(key, "") for key in asked.split(","))
+    values = dict(line.partition("=")[::2] for line in shown.stdout.splitlines())
+    active, sub, result, restarts, started_us = (values.get(key, "") for key in asked.split(","))
     started_s = int(started_us) / 1e6 if started_us.isdecimal() else 0.0
     return ServiceState(name, active, sub, result, restarts, started_s)
 
 
 def baseline() -> Baseline:
-    """Waits for FLOW_WATCH_S, but only where something may be flowing."""
+    """Measures flowing topics for FLOW_WATCH_S, but only if a topic was received recently."""
     first = take_snapshot([])
     recent = [
         topic for topic in first.topics if (age := topic.get("received_ago_s")) is not None and age < FLOW_WATCH_S
@@ -174,7 +174,7 @@ def baseline() -> Baseline:
 
 
 def wait_healthy(wait_s: float, was: Baseline, units: list[str]) -> str:
-    """Looks until all is well; after `wait_s` tells what is not."""
+    """Poll until all is healthy; after `wait_s` return what is not."""
     wanted = (CURRENT / "topics").read_text(encoding="utf-8").splitlines()
     deadline = time.monotonic() + wait_s
     while True:

@@ -1,5 +1,5 @@
-# install ID TREE: puts a release beside the others and proves it, without touching what runs. Its own files come as a
-# tar on stdin; the wheels they name are in wheels/ already. Cut anywhere, it leaves nothing but dot files behind.
+# install ID TREE: installs a release beside the others and checks it, without touching the running one. Its files come
+# as a tar on stdin; its wheels are in wheels/ already. An interruption leaves only dot files behind.
 id=$1 tree=$2
 alone
 new=$root/releases/.$id.new

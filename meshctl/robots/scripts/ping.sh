@@ -1,5 +1,5 @@
-# ping PEER...: a message to each peer through both daemons and back, at the most urgent priority; prints a line of JSON
-# for each, with `round_trip_s` or `error`. Some at a time, because each is a program. Changes nothing.
+# ping PEER...: a message to each peer through both daemons and back, at the highest priority; prints one line of JSON
+# per peer, with `round_trip_s` or `error`. In batches, since each is a process. Changes nothing.
 begun=0
 for peer in "$@"; do
 	mesh ping "$peer" --json --count 1 --timeout 5 2>/dev/null &

@@ -1,4 +1,4 @@
-# probe PYTHON ROS: everything that decides whether and how this computer is changed, as NAME=VALUE lines. Changes nothing.
+# probe PYTHON ROS: all facts that a deploy depends on, as NAME=VALUE lines. Changes nothing.
 python=$1 ros=$2
 
 echo "arch=$(uname -m)"
@@ -40,7 +40,7 @@ awk -v there="$(readlink -f "$there")/" '
 	END { if (options ~ /,noexec,/) print "noexec=yes" }
 ' /proc/self/mountinfo 2>/dev/null
 
-# a release is whole when it and its packages are as they were put there; one that is not is brought anew
+# a release is intact if it and its packages match their manifests; a damaged one is installed again
 is_whole() { (cd "$1" 2>/dev/null && sha256sum -c --quiet "$2") >/dev/null 2>&1; }
 has_whole_tree() { case $whole in *" $(basename "$(readlink "$1/lib")") "*) ;; *) return 1 ;; esac }
 current=$(release_of current) whole=' '

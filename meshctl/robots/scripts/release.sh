@@ -1,4 +1,4 @@
-# release: gives the robot back, if $owner still holds it.
+# release: removes the claim, if $owner still has it.
 exec 9>"$root/.lock" || exit 0
 flock -n 9 || exit 0
 claimed_by

@@ -1,5 +1,5 @@
-# remove PURGE: stops the daemon and takes it off this computer. With `purge` also what it kept for absent partners, and
-# its user; otherwise that waits in /var/lib/udp-mesh for the next install.
+# remove PURGE: stops and removes the daemon. With `purge` also its stored messages and its user; otherwise the messages
+# stay in /var/lib/udp-mesh for the next install.
 purge=$1
 alone
 for service in $(ours); do

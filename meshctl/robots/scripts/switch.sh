@@ -1,16 +1,16 @@
-# switch ID HOW WAIT: makes a release the current one, and goes back to the one before unless it proves itself healthy
-# within WAIT seconds. HOW is `restart`, or `reload` where only the configuration differs: then nothing that the daemon
-# holds is lost. Runs to its end even if the operator's link breaks. Prints `result=...`, then why, then the last log.
+# switch ID HOW WAIT: makes a release the current one, and rolls back unless it is healthy within WAIT seconds. HOW is
+# `restart`, or `reload` if only the configuration differs, which keeps all messages of the daemon. Completes even if
+# the operator's connection breaks. Prints `result=...`, then why, then the last log.
 id=$1 how=$2 wait_s=$3
 trap '' HUP INT PIPE
 alone
 none_masked
 [ -d "$root/releases/$id" ] || die no-release "release $id is not installed here"
 was=$(release_of current)
-# a switch that was cut short has proved nothing: what ran before it is still what to go back to
+# an interrupted switch is not proven: roll back to the release before it
 [ ! -e "$root/unproven" ] || read -r was <"$root/unproven" || was=
 
-# bring HOW: lets the units of the current release run, and no other ones of ours.
+# bring HOW: run the units of the current release, and remove our other units.
 bring() {
 	for service in $bridge_unit $unit; do
 		if [ -e "$root/current/$service" ]; then
@@ -29,7 +29,7 @@ bring() {
 	done
 }
 
-# takes_over UNIT: lets a running service take the new files without an interruption, where it can.
+# takes_over UNIT: reload a running service without an interruption, if possible.
 takes_over() {
 	# the bridge reads none of them
 	[ "$1" = "$unit" ] || return 0
@@ -37,20 +37,20 @@ takes_over() {
 	case $changes in *"takes effect with the next start"*) return 1 ;; esac
 }
 
-# well HOW: brings the current release and waits for it to prove itself; `reason` tells why it does not.
+# well HOW: bring up the current release and wait until it is healthy; `reason` is why it is not.
 well() {
 	reason=
 	if bring "$1"; then
 		reason=$(health prove "$wait_s" "$before" $(ours) 2>&1) && [ -z "$reason" ]
 	else
-		# one look is enough to say why, and a robot should not be without its daemon for longer
+		# one check is enough for the reason: do not leave the robot without its daemon for longer
 		reason=$(health prove 0 "$before" $(ours) 2>&1)
 		[ -n "$reason" ] || reason="systemd could not start it"
 		return 1
 	fi
 }
 
-# what is gone with the last release that used it
+# remove releases, trees and wheels that are no longer used
 tidy() {
 	keep=" $(release_of current) $(release_of previous) "
 	for release in "$root"/releases/*; do

@@ -1,4 +1,4 @@
-"""What a script is told of a run by its exit code."""
+"""The exit code of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`meshctl deployed`: a beacon that was dropped is expected to answer from then on."""
+"""`meshctl deployed`: a dropped beacon is required to answer from then on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Earlier runs: a heading over the columns, and no node of one fleet among those of another."""
+"""Past runs: column headings, and runs of different fleets kept apart."""
 
 from __future__ import annotations
 

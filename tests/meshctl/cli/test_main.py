@@ -126,7 +126,7 @@ def test_a_reader_that_has_seen_enough_is_no_failure() -> None:
         assert (process.stderr.read(), process.wait()) == ("", 0)
 
 
-def test_ctrl_c_before_the_command_has_begun_is_told_as_any_other(
+def test_ctrl_c_before_the_command_has_begun_is_reported_as_any_other(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(meant: str) -> None:

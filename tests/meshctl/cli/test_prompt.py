@@ -1,4 +1,4 @@
-"""What the commands say at the prompt: without colours where those are unwanted, with the remedy that fits."""
+"""Prompts and hints: no colors with NO_COLOR, and the hint that fits."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def run_of(command: str) -> RunRecord:
 
 
 @pytest.mark.parametrize("words", [["--help"], ["plan", "--help"], ["robots", "deploy", "--help"], ["plan", "--nope"]])
-def test_no_color_leaves_out_colours_and_bold_everywhere(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+def test_no_color_leaves_out_colors_and_bold_everywhere(monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
     def shown() -> str:
         out, err = Terminal(), Terminal()
         monkeypatch.setattr(sys, "stdout", out)

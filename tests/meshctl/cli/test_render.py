@@ -118,12 +118,12 @@ def test_render_reports_in_json_without_the_key(run: Run, tmp_path: Path) -> Non
     assert build["calls"]["b01"] in (tmp_path / "ib/rocket-23.05/build.sh").read_text()
 
 
-def test_an_image_whose_ports_may_be_dead_is_told_of(run: Run, inventory: Path, tmp_path: Path) -> None:
+def test_an_image_whose_ports_may_be_dead_gets_a_warning(run: Run, inventory: Path, tmp_path: Path) -> None:
     text = INVENTORY.replace("[eth0]", "[eth0.1]")
     (inventory / "fleet.yaml").write_text(text)
-    told = run("render", "b01", "--imagebuilder", tmp_path / "ib")
-    assert (told.code, told.err.count("\n")) == (0, 1)
-    assert told.err.startswith("warning: b01: eth0.1 may have no port in this image")
+    ran = run("render", "b01", "--imagebuilder", tmp_path / "ib")
+    assert (ran.code, ran.err.count("\n")) == (0, 1)
+    assert ran.err.startswith("warning: b01: eth0.1 may have no port in this image")
     assert run("render", "b01", "--out", tmp_path / "out").err == ""
     (inventory / "fleet.yaml").write_text(text.replace("[eth0.1]", "[eth0.1]\n    switch_vlans: {1: 3 0t}"))
     assert run("render", "b01", "--imagebuilder", tmp_path / "ib").err == ""
@@ -131,13 +131,13 @@ def test_an_image_whose_ports_may_be_dead_is_told_of(run: Run, inventory: Path, 
     assert "option ports '3 0t'" in written
 
 
-@pytest.mark.parametrize(("vlans", "told"), [("{0: 3 0t}", "1 to 4094"), ("{1: eth0}", "such as 3 0t")])
-def test_a_layout_that_no_switch_can_have_is_told(run: Run, inventory: Path, vlans: str, told: str) -> None:
+@pytest.mark.parametrize(("vlans", "message"), [("{0: 3 0t}", "1 to 4094"), ("{1: eth0}", "such as 3 0t")])
+def test_a_layout_that_no_switch_can_have_is_refused(run: Run, inventory: Path, vlans: str, message: str) -> None:
     (inventory / "fleet.yaml").write_text(INVENTORY.replace("[eth0]", f"[eth0]\n    switch_vlans: {vlans}"))
     ran = run("render", "b01")
     assert ran.code == 2
     assert "switch_vlans" in ran.err
-    assert told in ran.err
+    assert message in ran.err
 
 
 @pytest.mark.usefixtures("inventory")
@@ -147,7 +147,7 @@ def test_a_node_that_is_not_there_is_told(run: Run) -> None:
     assert ran.err.startswith("error: no node matches 'b9*'")
 
 
-def test_a_missing_key_is_told_with_its_place(run: Run, inventory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_key_is_reported_with_its_place(run: Run, inventory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MESH_KEY")
     ran = run("render", "--inventory", inventory)
     assert ran.code == 2
@@ -162,7 +162,7 @@ def test_nothing_is_written_when_one_node_cannot_be(run: Run, inventory: Path, t
     ran = run("render", "--out", tmp_path / "out")
     assert ran.code == 2
     place = f"fleet.yaml:{INVENTORY.count(chr(10), 0, INVENTORY.index('b[01-03]')) + 1}:"
-    # three nodes share the mistake; it is told once
+    # three nodes share the mistake; it is reported once
     assert ran.err.count(place) == 1
     assert not (tmp_path / "out").exists()
 

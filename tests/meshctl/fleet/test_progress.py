@@ -101,8 +101,8 @@ def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() 
         progress(Event(EventKind.STEP, "b02", 2.0, "confirm"))
     shown = screen.getvalue()
     assert STOPPING in shown, "and stays when the live lines are gone"
-    assert "STOPPING: finishing b01, b02; no other node is begun" in shown
-    assert "STOPPING: finishing b02; no other node is begun" in shown
+    assert "STOPPING: finishing b01, b02; no other node will be started" in shown
+    assert "STOPPING: finishing b02; no other node will be started" in shown
 
 
 def test_the_second_request_replaces_the_first_ones_state() -> None:
@@ -122,10 +122,10 @@ def test_more_nodes_than_lines_leave_room_for_the_totals_and_the_state_of_stoppi
         for number in range(40):
             progress(Event(EventKind.STARTED, f"b{number:02}", 1.0))
         progress.stopping(STOPPING)
-    assert "... and 34 more in work" in screen.getvalue()
-    last = screen.getvalue().rpartition("... and 34 more in work")[2]
+    assert "... and 34 more in progress" in screen.getvalue()
+    last = screen.getvalue().rpartition("... and 34 more in progress")[2]
     assert "0/40 nodes" in last
-    assert "STOPPING: finishing b00, b01, b02, b03 ...; no other node is begun" in last
+    assert "STOPPING: finishing b00, b01, b02, b03 ...; no other node will be started" in last
 
 
 def test_logs_and_scripts_are_told_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:

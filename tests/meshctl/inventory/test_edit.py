@@ -22,7 +22,7 @@ from meshctl.inventory.edit import Editor, add_topic, remove_topic, save, set_no
 from meshctl.inventory.source import Source
 from meshctl.inventory.text_edit import insert_entry, remove_entry, replace_value
 from meshctl.inventory.tree import MappingNode, Plain, descend, plain_data
-from meshctl.inventory.yaml_text import Value, data
+from meshctl.inventory.yaml_text import Value, parsed_data
 from meshctl.model import NodeState
 from tests.meshctl.inventory.inventories import HEAD, SHIPPED
 
@@ -99,7 +99,7 @@ def test_topics_are_added_changed_and_removed_in_the_file_that_holds_them(final:
     assert (topics["chat"].priority, topics["chat"].reliable, topics["chat"].deadline_s) == (5, False, 1.5)
     assert (topics["telemetry"].rate_hz, topics["telemetry"].repair) == (5, True)
     text = (final / "topics.yaml").read_text()
-    assert _comments(text) == [line for line in comments if "pieces of the map" not in line]
+    assert _comments(text) == [line for line in comments if "map updates" not in line]
     assert "\n\n\n" not in text
     assert "\n\n  chat:\n    priority: 5\n" in text
     assert (final / "fleet.yaml").read_text() == main
@@ -281,7 +281,7 @@ def test_a_replaced_value_reads_back_as_meant_beside_unchanged_neighbours(path: 
     after = _root(text)
     found = descend(after, path)
     assert found is not None
-    assert _texts(plain_data(found)) == _texts(data(value))
+    assert _texts(plain_data(found)) == _texts(parsed_data(value))
     assert _comments(text)[:1] == ["# head"]
     for other in ("one", "two"):
         if other != path[0]:
@@ -303,7 +303,7 @@ def test_an_inserted_entry_reads_back_and_its_removal_restores_the_text(
     text = insert_entry(_BASE, mapping, key, value)
     after = descend(_root(text), section)
     assert isinstance(after, MappingNode)
-    assert _texts(plain_data(after.values[key])) == _texts(data(value))
+    assert _texts(plain_data(after.values[key])) == _texts(parsed_data(value))
     assert list(after.keys) == [*mapping.keys, key]
     assert remove_entry(text, after, key) == _BASE
 

@@ -30,7 +30,7 @@ def another_host_name() -> Plan:
 
 def test_it_begins_with_the_totals_and_gives_every_stage_its_reason() -> None:
     text = read(another_host_name())
-    assert text.startswith("fleet team: 2 to change, 1 as wanted\nreached through base\n")
+    assert text.startswith("fleet team: 2 to change, 1 up to date\nreached through base\n")
     assert "  1  rolling b02\n             b02 is 2 hops away" in text
     assert "alone, because it is a cut vertex: while it is down b02 cannot be reached" in text
 

@@ -46,7 +46,7 @@ def test_longer_rules_than_known_are_read_by_their_known_part() -> None:
         (_DATA[:4] + b"\0\0\0\x15" + _DATA[8:], "version 20, found 21"),
         (_DATA[:300], "ends at byte 300, expected 3 bytes at byte 4764"),
         (_DATA[:8] + b"a!" + _DATA[10:], "expected a country code of two letters at byte 8"),
-        (_DATA[:12] + _DATA[8:12] + _DATA[16:], "country 00 at byte 12 is there twice"),
+        (_DATA[:12] + _DATA[8:12] + _DATA[16:], "duplicate country 00 at byte 12"),
         (b"RGDB" * 80_000, "at most"),
         (_minimal(struct.pack(">BBHIII", 8, 0, 0, 1, 2, 3)), "a rule of at least 16 bytes at byte 28, found 8"),
         (_minimal(struct.pack(">BBHIII", 16, 0, 0, 9, 2, 3)), "a rising frequency range at byte 28, found 9-2"),

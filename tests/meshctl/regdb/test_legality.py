@@ -13,7 +13,7 @@ from meshctl.regdb import (
     check_span,
     legal_channels,
     load,
-    occupied,
+    occupied_span,
     width_mhz,
 )
 
@@ -53,7 +53,7 @@ def test_frequencies_between_channels_belong_to_none() -> None:
     ],
 )
 def test_a_wide_channel_occupies_its_group(band: Band, channel: int, htmode: str, low: int, high: int) -> None:
-    assert occupied(band, channel, htmode) == Span(low, high)
+    assert occupied_span(band, channel, htmode) == Span(low, high)
 
 
 @pytest.mark.parametrize(
@@ -69,11 +69,11 @@ def test_a_wide_channel_occupies_its_group(band: Band, channel: int, htmode: str
     ],
 )
 def test_a_width_without_its_other_half_does_not_exist(band: Band, channel: int, htmode: str) -> None:
-    assert occupied(band, channel, htmode) is None
+    assert occupied_span(band, channel, htmode) is None
 
 
 def test_an_unknown_htmode_is_an_error_of_the_caller() -> None:
-    with pytest.raises(ValueError, match="no such htmode"):
+    with pytest.raises(ValueError, match="unknown htmode"):
         width_mhz("HT30")
 
 

@@ -152,7 +152,7 @@ def test_unknown_robots_and_those_without_a_computer_are_refused() -> None:
     with pytest.raises(InvalidInput, match="expected a robot of the fleet, found 'nobody'"):
         daemon_config(source, "nobody")
     bare = replace(source, robots={"spot": Robot("spot", ())})
-    with pytest.raises(InvalidInput, match="expected the robot's computer, found none"):
+    with pytest.raises(InvalidInput, match="expected a robot with a computer, found none"):
         daemon_config(bare, "spot")
 
 

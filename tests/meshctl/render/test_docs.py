@@ -1,4 +1,4 @@
-"""docs/render.md tells every code that these packages use, and no other."""
+"""docs/render.md describes every code that these packages use, and no other."""
 
 from __future__ import annotations
 

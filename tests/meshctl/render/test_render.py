@@ -74,7 +74,7 @@ def test_awkward_names_reach_the_radio_unchanged(ssid: str) -> None:
 def test_no_text_for_people_shows_the_key(key: str) -> None:
     fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     other = render(fleet)
-    # a key that is a part of what everybody may read, such as a package's name, cannot be told from it
+    # a key that is part of public text, such as a package's name, cannot be distinguished from it
     assume(key not in other.masked_text + repr(other))
     rendered = render(fleet, key)
     wireless = rendered.file("etc/config/wireless")
@@ -133,7 +133,7 @@ def test_a_fleet_renders_its_managed_nodes_in_order() -> None:
 
 def test_unknown_and_lost_nodes_are_refused() -> None:
     fleet = fleets.fleet(fleets.node(state=NodeState.LOST))
-    with pytest.raises(UnknownNode, match="is lost: it has no configuration"):
+    with pytest.raises(UnknownNode, match="is lost and has no configuration"):
         render(fleet)
     with pytest.raises(UnknownNode, match="expected a node of the fleet, found 'b99'"):
         render_node(fleet, "b99", fleets.secrets)
@@ -242,7 +242,7 @@ class TestTemplates:
             ("config system\n\toption x {{ [] | uci }}\n", 2, "found list"),
             ("config system\n\toption x {{ ''.__class__ | uci }}\n", 2, "is unsafe"),
             ("config system\n{% include 'gone.j2' %}\n", 0, "found none named gone.j2"),
-            ("option x 'y'\n", 0, "the rendered text is no UCI: etc/config/system:1:1"),
+            ("option x 'y'\n", 0, "template output is not UCI: etc/config/system:1:1"),
         ],
     )
     def test_fail_with_their_file_and_line(self, tmp_path: Path, text: str, line: int, words: str) -> None:

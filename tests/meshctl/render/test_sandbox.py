@@ -21,7 +21,7 @@ from tests.meshctl.render import fleets
 
 NAME = "husky1-front"
 # which of both comes first depends on the machine
-MEMORY = "MemoryError|more than 1 s of processor time"
+MEMORY = "MemoryError|exceeds 1 s of CPU time"
 GOOD = "config system\n\toption hostname {{ intent.hostname | uci }}\n"
 
 
@@ -52,10 +52,13 @@ def quick(folder: Path) -> Templates:
         (
             "{% for a in range(99999) %}{% for b in range(99999) %}{% for c in range(99999) %}"
             "{% endfor %}{% endfor %}{% endfor %}",
-            "it does not end: it takes more than 1 s of processor time",
+            "the template exceeds 1 s of CPU time",
         ),
-        ("config x {{ (9**(9**9)) | uci }}\n", "it does not end: it takes more than 1 s of processor time"),
-        ("{% for i in range(99999) %}{{ ('A' * 99) | uci }}{% endfor %}", "it renders"),
+        ("config x {{ (9**(9**9)) | uci }}\n", "the template exceeds 1 s of CPU time"),
+        (
+            "{% for i in range(99999) %}{{ ('A' * 99) | uci }}{% endfor %}",
+            "the template's output of .* characters exceeds",
+        ),
     ],
 )
 def test_a_template_that_does_not_end_is_refused_with_its_name(tmp_path: Path, text: str, words: str) -> None:
@@ -81,7 +84,7 @@ def test_shipped_templates_start_no_process(tmp_path: Path, monkeypatch: pytest.
 def test_a_rendering_process_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path, GOOD)
     monkeypatch.setattr("sys.executable", "/bin/false")
-    with pytest.raises(InvalidInput, match="the process that renders it ended with status 1"):
+    with pytest.raises(InvalidInput, match="the rendering process ended with status 1"):
         render(tmp_path)
 
 
@@ -98,12 +101,12 @@ def test_links_out_of_the_tree_pipes_and_folders_elsewhere_are_refused(
         render(fleet)
     assert "HUNTER2" not in str(caught.value)
     monkeypatch.setenv(VARIABLE, str(tmp_path))
-    with pytest.raises(InvalidInput, match="no UCI"):
+    with pytest.raises(InvalidInput, match="output is not UCI"):
         render(fleet)
     monkeypatch.delenv(VARIABLE)
     place.unlink()
     os.mkfifo(place)
-    with pytest.raises(InvalidInput, match="a pipe, a socket or a device"):
+    with pytest.raises(InvalidInput, match="a pipe, socket or device"):
         render(fleet)
     place.unlink()
     write(fleet, "{% include 'common/etc/config/_part.j2' %}")

@@ -1,4 +1,4 @@
-"""Nothing that a device says can steer the operator's terminal, in whatever output it stands."""
+"""No output of a device can control the operator's terminal."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_json_stays_the_same_value_and_steers_nothing(words: str) -> None:
     assert steering(written) == []
 
 
-def test_colours_of_ours_pass_and_nothing_else() -> None:
+def test_our_colors_pass_and_nothing_else() -> None:
     shown = clean_styled(f"{paint('ok', 'ok')} \x1b[2J\x1b]0;t\x07")
     assert shown.startswith("\x1b[32mok\x1b[0m")
     assert steering(shown.replace("\x1b[32m", "").replace("\x1b[0m", "")) == []
@@ -137,12 +137,12 @@ def test_history_of_a_hostile_device_steers_nothing(
     assert steering(shown) == []
 
 
-def test_colours_of_status_and_preflight_are_colours(
+def test_colors_of_status_and_preflight_are_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     checks = (Check("base", True, "answers"), Check("links", False, HOSTILE), Check("robots", True, "", False))
     monkeypatch.setattr("meshctl.cli.status.paint_of", lambda: paint)
-    # as on a terminal, where colours are not taken out
+    # as on a terminal, where colors are not stripped
     monkeypatch.setattr("typer.echo", lambda text, **_: sys.stdout.write(text))
     show_preflight(checks, as_json=False)
     shown = capsys.readouterr().out

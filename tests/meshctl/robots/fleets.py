@@ -138,7 +138,7 @@ class RobotFleet:
         return self.meshctl("deploy", *words, exit_code=exit_code, wheels=True)
 
     def status(self) -> dict[str, dict[str, Any]]:
-        """What `meshctl robots status --json` tells, by robot, whatever its exit code."""
+        """The output of `meshctl robots status --json`, by robot, whatever its exit code."""
         done = CliRunner().invoke(
             build("robots"), ["robots", "status", "--json", "-i", str(self.file)], catch_exceptions=False
         )

@@ -89,7 +89,7 @@ class Machine:
         self.write(path, there.read_text() + text, there.stat().st_mode & 0o7777)
 
     def start(self) -> None:
-        """Power on, and wait until it lets somebody log in."""
+        """Power on, and wait until a login works."""
         self._cgroup.mkdir()
         enter = 'echo $$ >"$1/cgroup.procs" && shift && exec "$@"'
         namespaces = ["--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup"]
@@ -127,11 +127,11 @@ class Machine:
         return self._process is None or self._process.poll() is not None
 
     def reboot(self, pins: Path) -> None:
-        """As `systemctl reboot` does it: services stop in order, and everything starts anew."""
+        """As `systemctl reboot` does it: services stop in order, and everything starts again."""
         self.shell("systemctl reboot", pins)
         eventually(self._ended)
         assert self._process is not None
-        # what the kernel tells of a namespace whose first process asked for a restart: reboot(2)
+        # what the kernel reports of a namespace whose first process asked for a restart: reboot(2)
         assert self._process.returncode == -signal.SIGHUP
         self.stop()
         self.start()

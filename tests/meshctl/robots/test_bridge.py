@@ -45,7 +45,7 @@ def _pid(fleet: RobotFleet) -> str:
 def test_the_bridge_is_deployed_watched_and_taken_away_with_the_daemon(fleet: RobotFleet) -> None:
     _robot_with_ros(fleet)
     fleet.shell("husky1", "mv /opt/ros /opt/sor")
-    assert "ROS is not there: no /opt/ros/noetic/setup.bash" in fleet.deploy(exit_code=1)
+    assert "ROS is not installed: /opt/ros/noetic/setup.bash is missing" in fleet.deploy(exit_code=1)
     fleet.shell("husky1", "mv /opt/sor /opt/ros && systemctl start rosmaster")
     assert "husky1: done: runs " in fleet.deploy()
     eventually(lambda: _is_registered(fleet))
@@ -86,9 +86,9 @@ def test_a_bridge_that_fails_brings_the_release_before_back_and_one_that_is_no_m
     broken = own_wheel_with(fleet.directory, "bridges/ros1/bridge.py", "import rosgraph\n", "import rosgraf\n")
     with monkeypatch.context() as patch:
         patch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-        told = fleet.deploy("--wait", "12", exit_code=1)
-    assert "husky1: rolled back: the ROS bridge does not run: systemd says" in told
-    assert "No module named 'rosgraf'" in told
+        output = fleet.deploy("--wait", "12", exit_code=1)
+    assert "husky1: rolled back: the ROS bridge does not run: systemd says" in output
+    assert "No module named 'rosgraf'" in output
     found = fleet.status()["husky1"]
     assert (found["release"], found["well"]) == (first, True)
 

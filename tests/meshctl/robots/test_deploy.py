@@ -22,7 +22,7 @@ _EVERYTHING = (
 def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
     fleet.add("husky1", fresh=True)
     fleet.write()
-    assert "nothing is installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
+    assert "not installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
     assert "husky1: done: runs " in fleet.deploy()
     before = fleet.shell("husky1", _EVERYTHING)
     assert "husky1: unchanged: already runs " in fleet.deploy()
@@ -57,11 +57,11 @@ def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
         '    raise OSError("no such radio")\n    service = Service(',
     )
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-    told = fleet.deploy("--wait", "5", exit_code=1)
-    assert "husky1: rolled back: systemd could not start the daemon; the release before runs again" in told or (
-        "husky1: rolled back: the daemon does not run" in told
+    output = fleet.deploy("--wait", "5", exit_code=1)
+    assert "husky1: rolled back: systemd could not start the daemon; the previous release runs again" in output or (
+        "husky1: rolled back: the daemon does not run" in output
     )
-    assert "no such radio" in told, "the operator sees the daemon's last words"
+    assert "no such radio" in output, "the operator sees the daemon's last words"
     third = fleet.status()["husky1"]
     assert third["well"]
     assert third["release"] == second["release"]
@@ -78,22 +78,22 @@ def test_a_first_release_that_does_not_run_is_removed_again(
     fleet.write()
     broken = own_wheel_with(tmp_path, "daemon/main.py", "    service = Service(", "    raise OSError\n    Service(")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: broken)
-    assert "so it was removed" in fleet.deploy("--wait", "3", exit_code=1)
+    assert "removed, since there is no previous release" in fleet.deploy("--wait", "3", exit_code=1)
     assert fleet.shell("husky1", "ls /opt/udp-mesh/releases /etc/systemd/system/udp*.service 2>/dev/null || :") == (
         "/opt/udp-mesh/releases:\n"
     )
 
 
-def test_what_was_changed_by_hand_or_cut_short_is_seen_and_mended(fleet: RobotFleet) -> None:
+def test_changes_by_hand_and_interruptions_are_seen_and_fixed(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()
     release = fleet.status()["husky1"]["release"]
     fleet.shell("husky1", "echo '# tuned' >>/opt/udp-mesh/current/etc/udp-mesh.toml")
     fleet.shell("husky1", "echo broken >/opt/udp-mesh/current/lib/udp_mesh/daemon/api.py")
-    told = fleet.meshctl("diff", exit_code=1)
-    assert "changed on the robot: etc/udp-mesh.toml" in told
-    assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in told
+    output = fleet.meshctl("diff", exit_code=1)
+    assert "changed on the robot: etc/udp-mesh.toml" in output
+    assert "changed on the robot: lib/./udp_mesh/daemon/api.py" in output
     assert f"husky1: done: runs {release}" in fleet.deploy()
     assert "no changes" in fleet.meshctl("diff")
 
@@ -145,7 +145,7 @@ def test_a_release_that_peers_see_and_whose_topics_no_longer_flow_goes_back(
     first = fleet.status()["husky1"]["release"]
     deaf = own_wheel_with(tmp_path, "daemon/service.py", "count.received_messages += 1", "count.received_messages += 0")
     monkeypatch.setattr("meshctl.robots.wheels.own_wheel", lambda: deaf)
-    told = fleet.deploy("husky1", "--wait", "15", exit_code=1)
-    assert "husky1: rolled back: topics flowed before and receive nothing: status" in told
+    output = fleet.deploy("husky1", "--wait", "15", exit_code=1)
+    assert "husky1: rolled back: topics flowed before and receive nothing: status" in output
     assert fleet.status()["husky1"]["release"] == first
     eventually(lambda: heard() > 0)

@@ -1,4 +1,4 @@
-"""What a robot told becomes facts: recorded outputs beside what they mean, and a table for people."""
+"""Facts of robots: recorded outputs, what they mean, and the table."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def _facts(text: str = ANSWER, wanted: ExpectedRelease = WANTED) -> RobotFacts:
     return parse_robot_facts("husky1", text, wanted, now_s=NOW_S)
 
 
-def test_one_answer_tells_service_release_daemon_and_computer() -> None:
+def test_one_answer_has_service_release_daemon_and_computer() -> None:
     facts = _facts()
     assert facts.is_healthy
     assert (facts.service.active, facts.service.enabled, facts.service.restarts) == ("active", "enabled", 2)
     assert facts.bridge is None, "none is wanted and none is installed"
     assert (facts.release, facts.previous, facts.version, facts.drift) == ("aaaa", "bbbb", "0.1.0", ())
     assert facts.online == ("base",)
-    assert facts.remark == "away: husky2"
+    assert facts.remark == "offline peers: husky2"
     (queue,) = facts.queues
     assert (queue.priority, queue.messages, queue.bytes, queue.oldest_s) == (9, 3, 150, 9.0)
     assert {topic.name: topic.last_ago_s for topic in facts.topics} == {"estop": None, "status": 0.25}
@@ -107,7 +107,7 @@ def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_han
     assert facts.drift == (
         "changed on the robot: etc/udp-mesh.toml",
         "differs from the inventory: udp-mesh.service",
-        "another version of udp-mesh than ours",
+        "another version of udp-mesh than in this meshctl",
         "udp-mesh.service will not start at boot",
     )
     assert facts.is_healthy, "what runs is well, only not as the inventory says"
@@ -124,7 +124,7 @@ def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
     up = ANSWER[:bridge] + ANSWER[bridge:].replace("not-found", "loaded", 1).replace("inactive", "active", 1)
     up = up.replace("UnitFileState=\n", "UnitFileState=enabled\n")
     assert _facts(up, wanted).is_healthy
-    assert _facts(up).bridge is not None, "one that is there is told even where the inventory wants none"
+    assert _facts(up).bridge is not None, "an installed one is reported even if the inventory has none"
 
 
 def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
@@ -134,17 +134,17 @@ def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
     assert "the daemon does not answer" in table([silent, _facts()])
     nothing = _facts("")
     assert not nothing.is_healthy
-    assert nothing.drift == ("nothing is installed",)
+    assert nothing.drift == ("not installed",)
     assert "not installed" in nothing.remark
     away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer")
     assert "no answer" in table([away])
 
 
-def test_the_table_tells_queues_by_priority_and_the_youngest_message() -> None:
-    told = table([_facts()])
-    assert "p9: 3" in told
-    assert "status 0 s ago" in told
-    assert "1/2" in told
+def test_the_table_shows_queues_by_priority_and_the_latest_message() -> None:
+    output = table([_facts()])
+    assert "p9: 3" in output
+    assert "status 0 s ago" in output
+    assert "1/2" in output
 
 
 def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble() -> None:
@@ -154,4 +154,4 @@ def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble(
         assert [line for line in lines if len(line) > width] == []
         assert "husky9: husky9 (10.42.0.19): no answer" in " ".join(lines)
         assert lines[0].split()[:2] == ["robot", "service"]
-        assert ("no room for" in " ".join(lines)) == (width < 100)
+        assert ("columns not shown" in " ".join(lines)) == (width < 100)

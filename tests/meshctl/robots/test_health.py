@@ -1,4 +1,4 @@
-"""What a robot must show after a switch before it is called well, and what it says otherwise."""
+"""What makes a robot healthy after a switch, and the reasons otherwise."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
         (
             _look(DAEMON._replace(active="activating", sub="auto-restart", result="exit-code", restarts="3")),
             NOTHING,
-            "the daemon does not run: systemd says activating (auto-restart, exit-code, started again 3 times)",
+            "the daemon does not run: systemd says activating (auto-restart, exit-code, restarted 3 times)",
         ),
         (_look(DAEMON, BRIDGE._replace(active="failed", sub="failed")), NOTHING, "the ROS bridge does not run"),
         (HealthSnapshot([DAEMON], {}, [], "timed out"), NOTHING, "the daemon does not answer: timed out"),
         (_look(online=("base",)), Baseline(["base", "husky2"], {}, "b"), "are not seen: husky2"),
         (_look(), Baseline([], {"video": 5}, "a"), "topics flowed before and receive nothing: video"),
-        (_look(DAEMON._replace(started_s=NOW_S - STEADY_S / 2)), NOTHING, "the daemon has only just started"),
-        (_look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S)), NOTHING, "the ROS bridge has only just started"),
+        (_look(DAEMON._replace(started_s=NOW_S - STEADY_S / 2)), NOTHING, "the daemon has just started"),
+        (_look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S)), NOTHING, "the ROS bridge has just started"),
     ],
 )
 def test_what_is_not_well_is_said_in_one_line(look: HealthSnapshot, before: Baseline, reason: str) -> None:
@@ -70,9 +70,9 @@ def test_a_bridge_that_came_through_to_the_daemon_needs_no_longer_than_that() ->
 
 
 def test_a_topic_that_is_lacking_or_only_arrives_is_not_there() -> None:
-    assert _ill(_look(), wanted=("estop", "lidar")) == "topics are not there: lidar"
+    assert _ill(_look(), wanted=("estop", "lidar")) == "topics are missing: lidar"
     seen = _look()._replace(topics=[_topic("estop"), _topic("video", configured=False)])
-    assert _ill(seen) == "topics are not there: video"
+    assert _ill(seen) == "topics are missing: video"
 
 
 def test_after_a_reload_the_same_process_must_count_on() -> None:

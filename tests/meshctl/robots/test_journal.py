@@ -1,4 +1,4 @@
-"""Runs that are cut short, and taken up again: Ctrl-C, `history`, `resume`; two operators at one robot."""
+"""Interrupted and resumed runs: Ctrl-C, `history`, `resume`; two operators on one robot."""
 
 from __future__ import annotations
 
@@ -56,25 +56,25 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
     fleet.add("husky2")
     fleet.write(parallel=1)
     with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/wheels", times=1):
-        told = fleet.deploy(exit_code=130)
-    assert "husky1: done" in told
-    assert "husky2: pending: interrupted before it started" in told
-    told = fleet.root_command("history")
-    assert "robots deploy" in told
-    assert "1 done, 1 pending" in told
+        output = fleet.deploy(exit_code=130)
+    assert "husky1: done" in output
+    assert "husky2: pending: interrupted before its turn" in output
+    output = fleet.root_command("history")
+    assert "robots deploy" in output
+    assert "1 done, 1 pending" in output
     (run,) = json.loads(fleet.root_command("history", "--json"))
-    told = fleet.root_command("history", str(run["run"]))
+    output = fleet.root_command("history", str(run["run"]))
     for step in ("look", "send", "install", "switch"):
-        assert step in told
-    # another release meanwhile, and the same wheels without being told
-    told = fleet.root_command("resume")
-    assert "resuming run 1 (robots deploy): husky2" in told
-    assert "husky2: done: runs " in told
+        assert step in output
+    # another release meanwhile, and the same wheels without --wheels
+    output = fleet.root_command("resume")
+    assert "resuming run 1 (robots deploy): husky2" in output
+    assert "husky2: done: runs " in output
     assert "run 2 is finished: nothing to resume" in fleet.root_command("resume")
 
 
 @pytest.mark.proof
-def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_are_taken_up(
+def test_a_second_ctrl_c_leaves_the_robot_intact_and_robots_that_were_off_are_resumed(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("husky1", "husky2"):
@@ -82,31 +82,31 @@ def test_whoever_leaves_at_once_finds_the_robot_whole_and_robots_that_were_off_a
     fleet.write()
     fleet.machines["husky2"].stop()
     with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/unproven", times=2):
-        told = fleet.deploy(exit_code=130)
-    assert "husky1: uncertain" in told
-    assert "husky2: unreachable" in told
+        output = fleet.deploy(exit_code=130)
+    assert "husky1: uncertain" in output
+    assert "husky2: unreachable" in output
     fleet.machines["husky2"].start()
     # the robot comes to the end of its switch by itself
     eventually(lambda: bool(fleet.status()["husky1"]["well"]))
-    told = fleet.root_command("resume")
-    assert "husky1: unchanged" in told
-    assert "husky2: done: runs " in told
+    output = fleet.root_command("resume")
+    assert "husky1: unchanged" in output
+    assert "husky2: done: runs " in output
 
 
-def test_two_operators_at_one_robot_exclude_each_other_and_the_dead_hold_nobody(fleet: RobotFleet) -> None:
+def test_two_operators_on_one_robot_exclude_each_other_and_a_dead_claim_does_not_block(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'
     fleet.shell("husky1", "mkdir -p /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
-    told = fleet.deploy(exit_code=1)
-    assert "husky1 (10.42.0.10): ann@laptop:17:4711 changes this robot" in told
-    assert "wait until it is done" in told
+    output = fleet.deploy(exit_code=1)
+    assert "husky1 (10.42.0.10): locked by ann@laptop:17:4711" in output
+    assert "wait until it is done" in output
 
     with subprocess.Popen(["sleep", "600"]) as other:
         start = Path(f"/proc/{other.pid}/stat").read_text().rpartition(")")[2].split()[19]
         dead = f"{lock_owner().rsplit(':', 2)[0]}:{other.pid}:{start}"
         fleet.shell("husky1", claim.format(owner=dead))
-        assert f"{dead} changes this robot" in fleet.deploy(exit_code=1)
+        assert f"locked by {dead}" in fleet.deploy(exit_code=1)
         other.kill()
         other.wait(PATIENCE_S)
     assert "husky1: done: runs " in fleet.deploy()

@@ -15,7 +15,7 @@ from tests.meshctl.robots.fleets import RobotFleet
 pytestmark = pytest.mark.timeout(600)
 
 
-def told(fleet: RobotFleet, *words: str) -> dict[str, Any]:
+def document(fleet: RobotFleet, *words: str) -> dict[str, Any]:
     """What a command prints as JSON, whatever its exit code."""
     arguments = [*words, "--json", "--timeout", "60", "-i", str(fleet.file)]
     done = CliRunner().invoke(build(words[0]), arguments, catch_exceptions=False)
@@ -29,17 +29,17 @@ def serious(robot: dict[str, Any]) -> list[str]:
 
 
 def checks(fleet: RobotFleet) -> dict[str, dict[str, Any]]:
-    return {check["check"]: check for check in told(fleet, "preflight")["checks"]}
+    return {check["check"]: check for check in document(fleet, "preflight")["checks"]}
 
 
-def test_a_deployed_crew_is_well_talks_and_a_daemon_that_stops_is_told_with_its_reason(fleet: RobotFleet) -> None:
+def test_a_deployed_crew_is_well_talks_and_a_daemon_that_stops_is_reported_with_its_reason(fleet: RobotFleet) -> None:
     for name in ("alpha", "bravo"):
         fleet.add(name)
     fleet.write()
-    before = told(fleet, "status", "--role", "computer")
+    before = document(fleet, "status", "--role", "computer")
     assert [serious(robot) for robot in before["robots"]] == [["not-installed"]] * 2
     fleet.deploy()
-    crew = told(fleet, "status", "--role", "computer")
+    crew = document(fleet, "status", "--role", "computer")
     assert crew["exit"] == 0, crew
     alpha = crew["robots"][0]
     assert alpha["daemon"]["drift"] == []
@@ -51,7 +51,7 @@ def test_a_deployed_crew_is_well_talks_and_a_daemon_that_stops_is_told_with_its_
     assert {name: found[name]["go"] for name in names} == dict.fromkeys(names, True), found
     assert "all 2 pairs" in found["delivery"]["reason"]
     fleet.meshctl("stop", "bravo")
-    after = told(fleet, "status", "--robot", "bravo", "--role", "computer")
+    after = document(fleet, "status", "--robot", "bravo", "--role", "computer")
     assert (after["exit"], serious(after["robots"][0])) == (1, ["daemon"])
     found = checks(fleet)
     assert not found["delivery"]["go"]

@@ -46,14 +46,12 @@ def test_a_half_deleted_installation_is_seen_and_made_whole_by_one_deploy(fleet:
     fleet.add_topic("video: {priority: 9}")
     fleet.deploy()
     fleet.shell("husky1", "rm /opt/udp-mesh/previous/topics")
-    told = fleet.meshctl("rollback", exit_code=1)
-    assert f"the release before, {release}, is damaged there, or gone" in told
+    output = fleet.meshctl("rollback", exit_code=1)
+    assert f"the previous release {release} is damaged or missing" in output
     assert fleet.status()["husky1"]["well"]
 
 
-def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
-    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_login_banners_do_not_affect_a_deploy(fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     key = fleet.key.with_suffix(".pub").read_text()
     for name, rule in (("husky1", "NOPASSWD: ALL"), ("husky2", "ALL")):
         machine = fleet.add(name, start=False)
@@ -68,9 +66,9 @@ def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
         fleet.shell(name, "mount --bind /home /home && mount -o remount,bind,noexec /home")
         fleet.shell(name, "mount -t tmpfs -o size=4k tmpfs /tmp && ! head -c 1M /dev/zero >/tmp/full")
     fleet.write(user="robot")
-    told = fleet.deploy(exit_code=1)
-    assert "husky1: done: runs " in told
-    assert "husky2 (10.42.0.11): sudo wants a password for robot" in told
+    output = fleet.deploy(exit_code=1)
+    assert "husky1: done: runs " in output
+    assert "husky2 (10.42.0.11): sudo requires a password for robot" in output
     monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", "wrong")
     assert "sudo does not let robot become root" in fleet.deploy("husky2", exit_code=1)
     monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", USER_PASSWORD)
@@ -82,7 +80,7 @@ def test_what_a_computer_says_to_whoever_logs_in_confuses_nothing(
     assert "husky1: done: removed" in fleet.meshctl("uninstall", "husky1")
 
 
-def test_what_somebody_there_has_forbidden_is_refused_and_left_as_it_was(fleet: RobotFleet) -> None:
+def test_masked_units_are_refused_and_stay_masked(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()
@@ -90,10 +88,10 @@ def test_what_somebody_there_has_forbidden_is_refused_and_left_as_it_was(fleet: 
     before = fleet.status()["husky1"]["release"]
     fleet.shell("husky1", "systemctl stop udp-mesh && ln -sf /dev/null /etc/systemd/system/udp-mesh.service")
     fleet.shell("husky1", "systemctl daemon-reload")
-    told = fleet.deploy(exit_code=1)
-    assert "husky1: refused: somebody has masked udp-mesh.service there" in told
-    assert "systemctl unmask udp-mesh.service" in told
-    assert "somebody has masked udp-mesh.service there" in fleet.meshctl("restart", exit_code=1)
+    output = fleet.deploy(exit_code=1)
+    assert "husky1: refused: masked units: udp-mesh.service" in output
+    assert "systemctl unmask udp-mesh.service" in output
+    assert "masked unit: udp-mesh.service" in fleet.meshctl("restart", exit_code=1)
     assert fleet.shell("husky1", "systemctl is-enabled udp-mesh || :") == "masked\n"
     fleet.shell("husky1", "systemctl unmask udp-mesh")
     fleet.shell("husky1", "mount --bind /opt /opt && mount -o remount,bind,noexec /opt")
@@ -104,22 +102,22 @@ def test_what_somebody_there_has_forbidden_is_refused_and_left_as_it_was(fleet: 
     assert fleet.status()["husky1"]["previous"] == before
 
 
-def test_a_computer_whose_name_does_not_resolve_or_which_has_no_user_for_us_is_told_as_that(fleet: RobotFleet) -> None:
+def test_a_computer_that_does_not_resolve_or_has_no_user_for_us_is_reported_as_that(
+    fleet: RobotFleet,
+) -> None:
     fleet.add("husky1")
     fleet.write()
     named = fleet.file.read_text()
     fleet.file.write_text(named.replace("ssh: {user: root,", "ssh: {host: husky1.invalid, user: root,"))
-    told = fleet.deploy(exit_code=3)
-    assert "no address is known here for husky1.invalid: write one into robots.husky1.computer.ssh.host" in told
+    output = fleet.deploy(exit_code=3)
+    assert "husky1.invalid cannot be resolved: set an address in robots.husky1.computer.ssh.host" in output
     fleet.file.write_text(named.replace("ssh: {user: root,", "ssh: {"))
     assert fleet.file.read_text() != named
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOGNAME", "alice")
-        told = fleet.deploy(exit_code=1)
-        assert "let alice in with none of" in told
-        assert (
-            "the inventory names no user, so alice was tried, your own: write robots.husky1.computer.ssh.user" in told
-        )
+        output = fleet.deploy(exit_code=1)
+        assert "let alice in with none of" in output
+        assert "the inventory has no user, so your own, alice, was tried: set robots.husky1.computer.ssh.user" in output
         patch.setenv("LOGNAME", "root")
         assert getpass.getuser() == "root"
         assert "husky1: done: runs " in fleet.deploy()

@@ -19,16 +19,16 @@ def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing
         give_user(machine, key if name != "husky4" else "", rule)
         machine.start()
     fleet.write(user="robot")
-    told = fleet.deploy(exit_code=1)
-    assert "husky1: done: runs " in told
-    assert "husky2 (10.42.0.11): sudo wants a password for robot" in told
-    assert "husky4: failed" in told
-    assert "put your public key into ~robot/.ssh/authorized_keys there" in told
-    assert "dropbear" not in told
+    output = fleet.deploy(exit_code=1)
+    assert "husky1: done: runs " in output
+    assert "husky2 (10.42.0.11): sudo requires a password for robot" in output
+    assert "husky4: failed" in output
+    assert "add your public key to ~robot/.ssh/authorized_keys there" in output
+    assert "dropbear" not in output
     monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", "wrong")
-    told = fleet.deploy("husky2", "husky3", exit_code=1)
-    assert "husky2 (10.42.0.11): sudo does not let robot become root" in told
-    assert "husky3 (10.42.0.12): sudo does not let robot become root" in told
+    output = fleet.deploy("husky2", "husky3", exit_code=1)
+    assert "husky2 (10.42.0.11): sudo does not let robot become root" in output
+    assert "husky3 (10.42.0.12): sudo does not let robot become root" in output
     assert fleet.shell("husky2", "ls -A /opt/udp-mesh") == "trees\nwheels\n", "as it was before"
     monkeypatch.setenv("MESHCTL_SUDO_PASSWORD", USER_PASSWORD)
     assert "husky2: done: runs " in fleet.deploy("husky2")

@@ -19,8 +19,8 @@ MAX_EXPOSURE = 20
 
 
 def _show(fleet: RobotFleet, *properties: str, unit: str = "udp-mesh.service") -> dict[str, str]:
-    told = fleet.shell("husky1", f"systemctl show -p {','.join(properties)} {unit}")
-    return dict(line.partition("=")[::2] for line in told.splitlines())
+    output = fleet.shell("husky1", f"systemctl show -p {','.join(properties)} {unit}")
+    return dict(line.partition("=")[::2] for line in output.splitlines())
 
 
 def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it_hangs_and_after_a_boot(
@@ -29,10 +29,10 @@ def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it
     machine = fleet.add("husky1")
     fleet.write()
     fleet.deploy()
-    told = _show(fleet, "MainPID", "Type", "StatusText", "WatchdogUSec", "NRestarts")
-    assert told["Type"] == "notify"
-    assert told["StatusText"] == "husky1: 0 of 0 peers online", "it tells systemd how it fares"
-    pid = told["MainPID"]
+    output = _show(fleet, "MainPID", "Type", "StatusText", "WatchdogUSec", "NRestarts")
+    assert output["Type"] == "notify"
+    assert output["StatusText"] == "husky1: 0 of 0 peers online", "it reports its status to systemd"
+    pid = output["MainPID"]
 
     process = dict(
         line.split(":\t", 1) for line in fleet.shell("husky1", f"cat /proc/{pid}/status").splitlines() if ":\t" in line
@@ -63,7 +63,7 @@ def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it
     assert "husky1: unchanged" in fleet.deploy()
 
 
-def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_it(fleet: RobotFleet) -> None:
+def test_power_lost_in_the_middle_of_a_switch_is_seen_and_fixed_by_the_next_deploy(fleet: RobotFleet) -> None:
     machine = fleet.add("husky1")
     fleet.write()
     fleet.deploy()
@@ -78,16 +78,16 @@ def test_power_lost_in_the_middle_of_a_switch_is_seen_and_the_next_deploy_mends_
 
     cutting = threading.Thread(target=cut)
     cutting.start()
-    told = fleet.deploy(exit_code=1)
+    output = fleet.deploy(exit_code=1)
     cutting.join()
-    assert "husky1: uncertain" in told
-    assert "finishes or undoes the switch by itself" in told
+    assert "husky1: uncertain" in output
+    assert "completes or rolls back the switch by itself" in output
     machine.start()
     eventually(lambda: fleet.status()["husky1"]["answers"])
     found = fleet.status()["husky1"]
     assert not found["is_proven"]
-    assert "a switch was cut short" in found["remark"]
-    assert "a switch was cut short" in fleet.meshctl("diff", exit_code=1)
+    assert "a switch was interrupted" in found["remark"]
+    assert "a switch was interrupted" in fleet.meshctl("diff", exit_code=1)
     assert "husky1: done: runs " in fleet.root_command("resume")
     found = fleet.status()["husky1"]
     assert found["well"]
@@ -106,8 +106,8 @@ def test_a_clock_that_is_years_off_misleads_nothing(fleet: RobotFleet) -> None:
     fleet.add("husky2")
     fleet.write()
     assert int(fleet.shell("husky1", "date +%s")) < time.time() - 19 * 365 * 86_400
-    told = fleet.deploy()
-    assert "its clock is 20.0 years behind ours" in told
+    output = fleet.deploy()
+    assert "its clock is 20.0 years behind ours" in output
     pid = fleet.shell("husky1", "systemctl show -p MainPID --value udp-mesh.service").strip()
     assert str(library) in fleet.shell("husky1", f"cat /proc/{pid}/maps"), "the daemon, too, lives in that year"
     eventually(lambda: all(one["online"] for one in fleet.status().values()))

@@ -34,12 +34,12 @@ def test_a_robot_behind_its_radio_gets_packages_that_pip_fetched_once(
 
         monkeypatch.setenv("PIP_NO_INDEX", "1")
         monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.directory / "nothing"))
-        told = fleet.meshctl("deploy", "--key", str(fleet.key), exit_code=1)
-        assert "pip could not fetch wheels for CPython" in told
-        assert "without internet give the wheels: --wheels DIR" in told
+        output = fleet.meshctl("deploy", "--key", str(fleet.key), exit_code=1)
+        assert "pip could not download wheels for CPython" in output
+        assert "without internet access, pass --wheels DIR" in output
         monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.wheels))
-        told = fleet.meshctl("deploy", "--key", str(fleet.key))
-        assert "husky1: done: runs " in told
+        output = fleet.meshctl("deploy", "--key", str(fleet.key))
+        assert "husky1: done: runs " in output
         # in the field there is neither pip nor its index
         monkeypatch.setenv("PIP_FIND_LINKS", str(fleet.directory / "nothing"))
         assert "husky1: unchanged" in fleet.meshctl("deploy", "--key", str(fleet.key))

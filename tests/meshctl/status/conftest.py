@@ -1,4 +1,4 @@
-"""The fleet that the status tests look at."""
+"""The fleet of the status tests."""
 
 from __future__ import annotations
 

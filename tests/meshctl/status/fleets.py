@@ -1,4 +1,4 @@
-"""A small fleet, radios that answer, robots that answer, and what a look at them gives."""
+"""A small fleet, radios that answer, robots that answer, and their snapshot."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def peer(name: str, **other: Any) -> PeerFacts:
     return replace(PeerFacts(name, True, heard_ago_s=0.5, round_trip_s=0.012), **other)
 
 
-def told(robot: str, *peers: PeerFacts, **other: Any) -> RobotFacts:
+def robot_facts(robot: str, *peers: PeerFacts, **other: Any) -> RobotFacts:
     """A robot on which all is well, and whose daemon has run for long."""
     sends = robot == "station"
     made = RobotFacts(
@@ -144,7 +144,7 @@ def told(robot: str, *peers: PeerFacts, **other: Any) -> RobotFacts:
     return replace(made, **other)
 
 
-CREW = {"station": told("station", peer("rover")), "rover": told("rover", peer("station"))}
+CREW = {"station": robot_facts("station", peer("rover")), "rover": robot_facts("rover", peer("station"))}
 
 
 def queue(priority: int, messages: int, oldest_s: float, size: int = 1000) -> QueueFacts:
@@ -184,7 +184,7 @@ def status_of(
     robots: Mapping[str, RobotFacts] = CREW,
     **other: Any,
 ) -> FleetStatus:
-    """The status of everybody in the fleet."""
+    """The status of the whole fleet."""
     return assess(look_of(fleet, observations, robots, **other), fleet.managed(), NOW, fleet.robots)
 
 

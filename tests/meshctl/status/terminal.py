@@ -35,8 +35,8 @@ if sys.argv[2] == "shell":
     os.setpgid(0, 0)
 os.execv(sys.argv[3], sys.argv[3:])
 """
-# Of what it showed, so much is told where it did not show what it should.
-_TOLD_BYTES = 4000
+# Tail of the output that a failed expectation reports.
+_TAIL_BYTES = 4000
 
 
 class Terminal:
@@ -92,7 +92,7 @@ class Terminal:
         try:
             return until(shown, what, wait_s=PATIENCE_S)
         except AssertionError as error:
-            raise AssertionError(f"{error}; state {self._state()}; shown: {self._shown[-_TOLD_BYTES:]!r}") from None
+            raise AssertionError(f"{error}; state {self._state()}; shown: {self._shown[-_TAIL_BYTES:]!r}") from None
 
     def has_state(self, letter: str) -> None:
         """Waits until the process is in this state of proc(5): T when stopped."""

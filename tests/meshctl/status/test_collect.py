@@ -1,4 +1,4 @@
-"""Everybody is asked at once, and what one does changes nothing for the others."""
+"""All devices are queried in parallel, and none affects the others."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ def refuse() -> object:
 
 
 def vanish() -> object:
-    raise Unreachable("nobody there")
+    raise Unreachable("no answer")
 
 
 def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     jobs = {"a": lambda: 1, "b": refuse, "c": vanish, "d": lambda: None}
-    found = run_parallel(jobs, 2, lambda done, count: told.append((done, count)))
+    found = run_parallel(jobs, 2, lambda done, count: progress.append((done, count)))
     assert list(found) == ["a", "b", "c", "d"]
     assert (found["a"], found["d"]) == (1, None)
     assert isinstance(found["b"], NodeError)
     assert isinstance(found["c"], Unreachable)
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert progress == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_a_bug_is_raised_to_the_caller() -> None:
@@ -35,7 +35,7 @@ def test_a_bug_is_raised_to_the_caller() -> None:
         run_parallel({"a": lambda: 1 // 0}, 1)
 
 
-def test_nobody_to_ask_is_no_wait() -> None:
+def test_without_devices_there_is_no_wait() -> None:
     assert run_parallel({}, 8) == {}
 
 

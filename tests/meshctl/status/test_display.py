@@ -1,4 +1,4 @@
-"""The table fits where it is shown, says what it left out, and JSON holds everything that documentation promises."""
+"""The table fits the terminal and lists dropped columns; the JSON has every documented key."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
 
 
 def test_a_preflight_ends_with_its_verdict_and_what_stands_against_it(fleet: Fleet) -> None:
-    told = preflight_text(preflight(fleet, broken(fleet)))
-    assert told.splitlines()[-1].startswith("NO-GO: robot radios, beacons, configuration, ")
+    output = preflight_text(preflight(fleet, broken(fleet)))
+    assert output.splitlines()[-1].startswith("NO-GO: robot radios, beacons, configuration, ")
     assert preflight_text([Check("base", True, "answers")]).splitlines()[-1] == "GO"
 
 
 def test_what_has_no_room_is_named(fleet: Fleet) -> None:
-    told = " ".join(text(broken(fleet), 80).split())
-    left_out = re.search(r"columns not shown: (.*?) \(use --wide", told)
+    output = " ".join(text(broken(fleet), 80).split())
+    left_out = re.search(r"columns not shown: (.*?) \(use --wide", output)
     assert left_out is not None
     headings = text(broken(fleet), 80)
     for heading in left_out[1].split(", "):
@@ -100,7 +100,7 @@ def test_columns_give_way_by_rank_and_those_without_rank_stay(cells: list[tuple[
         assert widest <= width
 
 
-def test_a_column_nobody_has_anything_in_is_left_out_silently(fleet: Fleet) -> None:
+def test_an_empty_column_is_left_out_silently(fleet: Fleet) -> None:
     status = assess(look_of(fleet), fleet.managed(), NOW)
     assert "waits" not in text(status)
     assert "no room" not in text(status)
@@ -122,13 +122,13 @@ def test_one_alarm_at_many_is_one_line(fleet: Fleet) -> None:
 
 
 def test_brief_leaves_out_notes_and_advice(fleet: Fleet) -> None:
-    told = text(broken(fleet), brief=True)
-    assert "->" not in told
-    assert "NOTE" not in told
-    assert "ERROR" in told
+    output = text(broken(fleet), brief=True)
+    assert "->" not in output
+    assert "NOTE" not in output
+    assert "ERROR" in output
 
 
-def test_topics_are_told_per_robot_the_most_urgent_first(fleet: Fleet) -> None:
+def test_topics_are_shown_per_robot_the_most_urgent_first(fleet: Fleet) -> None:
     lines = topic_lines(status_of(fleet))
     assert [line.split()[0] for line in lines] == ["topic", *["estop"] * 2, *["commands"] * 2, *["telemetry"] * 2]
 
@@ -159,11 +159,11 @@ def documented(value: Any) -> set[str]:
 
 
 def test_every_field_of_the_json_is_documented(fleet: Fleet) -> None:
-    told = as_json(broken(fleet))
-    assert json.loads(json.dumps(told)) == told
-    kept_as_told = {key for one in (*told["nodes"], *told["robots"]) for key in one["last_known"] or {}}
-    fields = documented(told) | documented(preflight_json([Check("a", True, "b")]))
-    missing = {field for field in fields - kept_as_told if f"`{field}`" not in PAGE}
+    output = as_json(broken(fleet))
+    assert json.loads(json.dumps(output)) == output
+    kept = {key for one in (*output["nodes"], *output["robots"]) for key in one["last_known"] or {}}
+    fields = documented(output) | documented(preflight_json([Check("a", True, "b")]))
+    missing = {field for field in fields - kept if f"`{field}`" not in PAGE}
     assert missing == set()
 
 
@@ -177,7 +177,7 @@ def test_the_json_is_as_its_schema_says(fleet: Fleet) -> None:
         is_valid(as_json(status))
         is_valid(preflight_json(preflight(fleet, status)))
     with pytest.raises(jsonschema.ValidationError):
-        is_valid({**as_json(statuses[0]), "a field nobody wrote down": 1})
+        is_valid({**as_json(statuses[0]), "an undocumented field": 1})
 
 
 def test_a_fact_that_is_not_known_is_null_and_never_zero(fleet: Fleet) -> None:

@@ -1,4 +1,4 @@
-"""The live page on a real terminal: it follows the window, is left by Ctrl-C, and gives back the screen it took."""
+"""The live screen on a real terminal: it follows the window size, ends on Ctrl-C, and restores the screen."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ENTERED, LEFT = r"\x1b\[\?1049h", r"\x1b\[\?1049l"
 # How a look goes, by the word the program gets; `look` counts the looks.
 PROGRAM = """\
 import sys, threading
-from meshctl.cli.live_screen import live
+from meshctl.cli.live_screen import live_screen
 looks = 0
 def look():
     global looks
@@ -28,7 +28,7 @@ def look():
 def draw(seen, size):
     return [f"look {seen} in {size.columns} x {size.lines}", *(f"line {n}" for n in range(10))]
 print("before")
-print("last", live(look, draw, 0.05, sys.stdout))
+print("last", live_screen(look, draw, 0.05, sys.stdout))
 """
 
 
@@ -46,8 +46,8 @@ def test_a_page_follows_the_window_and_ctrl_c_gives_back_the_screen_whether_or_n
         for lines, columns in ((40, 90), (5, 33), (24, 72)):
             terminal.forget()
             terminal.resize(lines, columns)
-            told = terminal.shows(rf"look \d+ in {columns} x {lines}.*(line 9|more lines)", "a page of the new size")
-            assert ("more lines" in told) == (lines < 11)
+            output = terminal.shows(rf"look \d+ in {columns} x {lines}.*(line 9|more lines)", "a page of the new size")
+            assert ("more lines" in output) == (lines < 11)
         terminal.forget()
         terminal.press(b"\x03")
         terminal.shows(rf"{LEFT}.*last \d+", "the screen from before")
@@ -66,7 +66,7 @@ def test_a_burst_of_window_changes_ends_in_a_page_of_the_last_size() -> None:
 
 @pytest.mark.parametrize("has_shell", [True, False])
 def test_ctrl_z_gives_back_the_screen_until_the_page_goes_on(has_shell: bool) -> None:
-    # without a shell in its session nobody could let it go on, so the kernel does not stop it
+    # without a shell in its session it is in an orphaned process group, which the kernel does not stop
     with page("goes on", has_shell=has_shell) as terminal:
         terminal.shows("line 9", "a page")
         terminal.forget()
@@ -93,7 +93,7 @@ def test_a_page_that_is_terminated_leaves_the_screen() -> None:
         assert terminal.exit_code() == 128 + signal.SIGTERM
 
 
-def test_what_goes_wrong_in_a_look_is_told_on_the_screen_from_before() -> None:
+def test_what_goes_wrong_in_a_look_is_reported_on_the_screen_from_before() -> None:
     with page("fails") as terminal:
         terminal.shows(f"{LEFT}.*no such radio", "the mistake")
         assert terminal.exit_code() == 1

@@ -15,7 +15,7 @@ from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
 from meshctl.status.values import Alarm, Level
-from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, seen, status_of, told
+from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, robot_facts, seen, status_of
 
 KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
 DELIVERED = Pings({("station", "rover"): 0.01, ("rover", "station"): 0.02})
@@ -40,13 +40,13 @@ def test_a_healthy_team_is_a_go(fleet: Fleet) -> None:
     assert preflight_json(found.values())["go"]
 
 
-def test_who_stays_on_the_shelf_is_named_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_robot_that_stays_on_the_shelf_is_named_and_does_not_block(fleet: Fleet) -> None:
     found = checks(fleet)
     assert "not taking part: shelf (carried)" in found["robot radios"].reason
     assert "not taking part: shelf" in found["daemons"].reason
 
 
-def test_a_robot_that_has_not_moved_over_is_named_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_robot_with_the_legacy_program_is_named_and_does_not_block(fleet: Fleet) -> None:
     husky = Robot("husky", (), fielded=IPv4Address("10.42.0.20"))
     robots = {**fleet.robots, "husky": husky, "cart": Robot("cart", ())}
     # only robots with a computer are asked
@@ -90,7 +90,7 @@ def test_a_radio_without_a_path_or_with_one_that_carries_nothing_is_a_no_go(flee
 
 
 def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
-    found = checks(fleet, {**CREW, "station": told("station")})
+    found = checks(fleet, {**CREW, "station": robot_facts("station")})
     assert found["peers"].reason == "station does not hear rover"
 
 
@@ -111,26 +111,26 @@ def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) ->
     assert "env:KEY is not set" in found["configuration"].reason
 
 
-def test_what_nobody_could_tell_is_no_go(fleet: Fleet) -> None:
+def test_a_check_without_any_answer_is_a_no_go(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, Pings())}
     assert not any(check.is_go for check in found.values() if check.name != "beacons")
     assert found["radios"].reason == "cannot check: no device answers"
 
 
-def test_how_many_could_tell_is_said_where_some_could_not(fleet: Fleet) -> None:
+def test_a_check_with_some_answers_says_how_many(fleet: Fleet) -> None:
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
     assert found["identity"].reason == "every radio is the expected device (2 of 3 answer)"
 
 
-def test_a_busy_computer_is_a_note_and_stops_nobody(fleet: Fleet) -> None:
+def test_a_busy_computer_is_a_note_and_does_not_block(fleet: Fleet) -> None:
     rover = CREW["rover"]
     busy = replace(rover, computer=replace(rover.computer, load=(40.0, 9.0, 3.0)))
     assert stopped(checks(fleet, {**CREW, "rover": busy})) == []
 
 
-def test_robots_that_were_not_asked_are_told_and_not_judged(fleet: Fleet) -> None:
+def test_robots_that_were_not_asked_are_shown_and_not_judged(fleet: Fleet) -> None:
     status = replace(
         status_of(fleet, robots={}, known=KNOWN), robots=(), alarms=(Alarm(Level.NOTE, "robots-unasked", "not asked"),)
     )
@@ -156,8 +156,8 @@ def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
 
 def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:
     text = '{"peer": "a", "round_trip_s": 0.5}\nnoise\n{"peer": "b", "error": "no-answer"}\n[1]\n{"peer": "c"}\n'
-    told = parse_pings(text, ("a", "b", "c", "d"))
-    assert told == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
-    pings = pings_of({"x": told})
+    answers = parse_pings(text, ("a", "b", "c", "d"))
+    assert answers == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
+    pings = pings_of({"x": answers})
     assert pings.round_trips_s == {("x", "a"): 0.5}
     assert pings.failed["x", "b"] == "no-answer"

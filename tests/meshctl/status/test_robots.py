@@ -1,4 +1,4 @@
-"""What the status says of the robots follows from what their computers told: health, alarms, topics, who hears whom."""
+"""The status of robots: health, alarms, topics and peers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from meshctl.status.last_known import facts_to_record, merge_by_device
 from meshctl.status.text import text
 from meshctl.status.topics import limit_s
 from meshctl.status.values import NoAnswer
-from tests.meshctl.status.fleets import CREW, NOW, alarms, peer, queue, robot_health, status_of, told
+from tests.meshctl.status.fleets import CREW, NOW, alarms, peer, queue, robot_facts, robot_health, status_of
 
 DOWN = NoAnswer("no answer to connect within 5 s")
 COMPUTER = CREW["rover"].computer
@@ -32,7 +32,7 @@ def test_a_healthy_crew_has_no_alarm_and_the_one_on_the_shelf_is_off(fleet: Flee
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_silent_robot_whose_daemon_others_hear_is_told_so(fleet: Fleet) -> None:
+def test_a_silent_robot_whose_daemon_others_hear_is_reported_so(fleet: Fleet) -> None:
     status = status_of(fleet, robots={"station": CREW["station"]}, silent_robots={"rover": DOWN})
     assert robot_health(status)["rover"] is Health.UNREACHABLE
     assert (
@@ -41,9 +41,9 @@ def test_a_silent_robot_whose_daemon_others_hear_is_told_so(fleet: Fleet) -> Non
     assert status.exit_code is ExitCode.UNREACHABLE
 
 
-def test_an_unpinned_computer_is_told_with_the_command_that_pins_it(fleet: Fleet) -> None:
+def test_an_unpinned_computer_is_reported_with_the_command_that_pins_it(fleet: Fleet) -> None:
     silent = {"rover": NoAnswer("no key is pinned", "untrusted")}
-    status = status_of(fleet, robots={"station": told("station")}, silent_robots=silent)
+    status = status_of(fleet, robots={"station": robot_facts("station")}, silent_robots=silent)
     assert "meshctl robots trust rover" in alarms(status, "rover", robot=True)["untrusted"].hint
 
 
@@ -86,19 +86,21 @@ def test_what_is_wrong_with_a_robot_has_a_code_and_a_level(
         {"computer": replace(COMPUTER, clock_ahead_s=2.0)},
     ],
 )
-def test_what_is_as_it_should_be_or_was_not_told_is_no_alarm(fleet: Fleet, change: dict[str, Any]) -> None:
+def test_what_is_as_it_should_be_or_was_not_reported_is_no_alarm(fleet: Fleet, change: dict[str, Any]) -> None:
     assert alarms(status_of(fleet, robots=with_rover(**change)), "rover", robot=True) == {}
 
 
 def test_the_version_that_most_run_is_the_right_one(fleet: Fleet) -> None:
-    crew = {name: told(name, version=version) for name, version in (("station", "2"), ("rover", "2"), ("shelf", "1"))}
+    crew = {
+        name: robot_facts(name, version=version) for name, version in (("station", "2"), ("rover", "2"), ("shelf", "1"))
+    }
     status = status_of(fleet, robots=crew)
     assert "version" not in alarms(status, "rover", robot=True)
     assert "most others 2" in alarms(status, "shelf", robot=True)["version"].text
 
 
 def test_a_robot_that_is_off_is_not_missed_by_its_peers(fleet: Fleet) -> None:
-    status = status_of(fleet, robots={"station": told("station")}, silent_robots={"rover": DOWN})
+    status = status_of(fleet, robots={"station": robot_facts("station")}, silent_robots={"rover": DOWN})
     assert "peers" not in alarms(status, "station", robot=True)
 
 

@@ -1,4 +1,4 @@
-"""What the status says of the radios follows from what was seen: health, alarms, what is kept and remembered."""
+"""The status of radios: health, alarms, last known facts."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_carried_beacon_that_others_hear_and_that_does_not_answer_is_worth_a_l
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(fleet: Fleet) -> None:
+def test_a_deployed_node_that_is_silent_is_missed_and_shown_by_whom_it_is_heard(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"version": "23.05.5"})}
     status = status_of(fleet, WITHOUT_ROVER, known=known)
     assert health(status)["rover"] is Health.UNREACHABLE
@@ -56,7 +56,7 @@ def test_a_deployed_node_that_is_silent_is_missed_and_told_by_whom_it_is_heard(f
     assert status.exit_code is ExitCode.UNREACHABLE
 
 
-def test_who_is_gone_for_good_is_told_with_the_place_it_was_at(fleet: Fleet) -> None:
+def test_who_is_gone_for_good_is_reported_with_the_place_it_was_at(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
     status = status_of(fleet, {"base": seen("base", {})}, known=known)
     assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops away, behind b01")
@@ -81,7 +81,7 @@ def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: No
     assert found.code == code
 
 
-def test_a_carried_node_that_keeps_us_out_is_told_though_it_may_be_off(fleet: Fleet) -> None:
+def test_a_carried_node_that_keeps_us_out_is_reported_though_it_may_be_off(fleet: Fleet) -> None:
     status = status_of(fleet, silent={"b02": NoAnswer("the host key changed", "host-key")})
     assert "meshctl trust b02 --replace" in alarms(status, "b02")["host-key"].hint
     assert health(status)["b02"] is Health.DEGRADED
@@ -93,13 +93,13 @@ def test_hops_and_quality_follow_the_path_to_the_base(fleet: Fleet) -> None:
     assert rover.quality == pytest.approx(250 / 255 * 200 / 255)
 
 
-def test_a_look_at_some_tells_no_paths(fleet: Fleet) -> None:
+def test_a_partial_snapshot_has_no_paths(fleet: Fleet) -> None:
     rover = next(node for node in status_of(fleet, is_partial=True).nodes if node.name == "rover")
     assert (rover.hops, rover.is_path_known, rover.is_cut_vertex) == (None, False, False)
     assert alarms(status_of(fleet, is_partial=True), "b01") == {}
 
 
-def test_a_node_without_a_path_to_a_base_that_answers_is_told(fleet: Fleet) -> None:
+def test_a_node_without_a_path_to_a_base_that_answers_is_reported(fleet: Fleet) -> None:
     apart = {"base": seen("base", {}), "b01": seen("b01", {"rover": 200}), "rover": HEALTHY["rover"]}
     status = status_of(fleet, apart)
     assert "no-path" in alarms(status, "rover")
@@ -150,11 +150,11 @@ def test_a_factory_device_has_no_change_under_way(fleet: Fleet) -> None:
     assert alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover") == {}
 
 
-def test_drift_names_the_files_and_the_commands_that_mend_it(fleet: Fleet) -> None:
+def test_drift_names_the_files_and_the_commands_that_fix_it(fleet: Fleet) -> None:
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
-    told = text(status_of(fleet, plans={"rover": plan}))
-    assert "rover: configuration differs: wireless" in told
-    assert "meshctl provision rover fixes them" in told
+    output = text(status_of(fleet, plans={"rover": plan}))
+    assert "rover: configuration differs: wireless" in output
+    assert "meshctl provision rover fixes them" in output
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
@@ -165,7 +165,7 @@ def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_what_could_not_be_compared_is_told_once_for_all(fleet: Fleet) -> None:
+def test_what_could_not_be_compared_is_reported_once_for_all(fleet: Fleet) -> None:
     status = status_of(fleet, unrendered={"base": "env:KEY is not set", "b01": "env:KEY is not set"})
     (alarm,) = status.alarms
     assert alarm.text == "base, b01 not compared with the inventory: env:KEY is not set"
@@ -207,7 +207,7 @@ def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet: Fleet) -> None:
+def test_a_dropped_beacon_that_dies_is_an_alarm_although_it_was_not_marked(fleet: Fleet) -> None:
     kept = facts_to_record(status_of(fleet, _DROPPED))
     known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
     status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
@@ -217,7 +217,7 @@ def test_a_dropped_beacon_that_dies_is_an_alarm_although_nobody_marked_it(fleet:
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_a_carried_beacon_that_nobody_needed_may_be_switched_off(fleet: Fleet) -> None:
+def test_a_carried_beacon_without_relays_may_be_switched_off(fleet: Fleet) -> None:
     on = {**HEALTHY, "b02": seen("b02", {"b01": 220})}
     kept = facts_to_record(status_of(fleet, on))
     known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})

@@ -1,4 +1,4 @@
-"""Every picture of the mesh shows every node and marks what holds others."""
+"""Every format of the topology shows every node and marks cut vertices."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def test_the_order_of_options_is_no_difference() -> None:
 
 def test_a_difference_is_refused_by_any_other_package() -> None:
     change = diff(parse(OLD, "x"), parse(NEW, "x"))
-    with pytest.raises(ValueError, match="not what the difference was made from"):
+    with pytest.raises(ValueError, match="differs from the base of the diff"):
         apply(change, parse(NEW, "x"))
     with pytest.raises(ValueError, match="expected package x"):
         apply(change, parse(OLD, "y"))

@@ -1,8 +1,8 @@
-"""One machine of real radios for the tests of this folder, taken from factory state to a working mesh once; those of
-`crew` have one of their own, which is gone before this one starts.
+"""One QEMU machine for the tests of this folder, provisioned from factory state to a working mesh once; the tests of
+`crew` have their own, which is stopped before this one starts.
 
-Tests that change the fleet leave it as the inventory says, whatever that is by then. QEMU is installed by
-scripts/setup-lab when it is missing: nothing here is skipped.
+Tests that change the fleet leave it in the state of its inventory. scripts/setup-lab installs QEMU when it is missing:
+no test is skipped.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from tests.meshlab.fleet_report import report
 
 INVENTORY = Path(__file__).with_name("inventory")
 SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
-# packages are fetched, then a machine under emulation boots, on a host with much else to do; at worst twice
+# packages are downloaded, then an emulated machine boots on a busy host; at worst twice
 START_S = 900.0
-# a run of meshctl over several hops, each login of which is emulated, that ends with a window of ten minutes
+# a run of meshctl over several hops with emulated logins, up to the end of a confirm window of ten minutes
 COMMAND_S = 900.0
 _TRIES = 3
-# six emulated nodes that started at once took up to 200 s on two processors with twenty other programs at work
+# six emulated nodes that boot together took up to 200 s on two cores beside twenty other programs
 WAIT_S = 600.0
 NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
 
@@ -71,11 +71,11 @@ class Lab:
     state: Path
 
     def meshctl(
-        self, *words: str, expect: int | None = 0, when_told: tuple[str, Callable[[], None]] | None = None
+        self, *words: str, expect: int | None = 0, on_line: tuple[str, Callable[[], None]] | None = None
     ) -> Done:
-        """Run meshctl as an operator does, in a process of its own; `expect` None: any exit code.
+        """Run meshctl in a separate process, as an operator does; `expect` None: any exit code.
 
-        `when_told`: a text, and what is done as soon as meshctl has said it.
+        `on_line`: a text, and the function to call as soon as meshctl prints it.
         """
         environment = {
             **os.environ,
@@ -98,9 +98,9 @@ class Lab:
                 assert process.stdout is not None
                 for line in process.stdout:
                     lines.append(line)
-                    if when_told is not None and when_told[0] in line:
-                        when_told[1]()
-                        when_told = None
+                    if on_line is not None and on_line[0] in line:
+                        on_line[1]()
+                        on_line = None
                 status = process.wait()
             finally:
                 patience.cancel()
@@ -110,8 +110,8 @@ class Lab:
         assert expect is None or status == expect, f"meshctl {' '.join(words)}: {done.text}{done.errors}"
         return done
 
-    def take_in(self) -> None:
-        """Take the mesh's nodes in on the bench and carry them into the field, where only the mesh leads to them.
+    def bootstrap(self) -> None:
+        """Bootstrap the mesh's nodes on the bench and unplug them, so that they are reached only over the mesh.
 
         On a starved host a node may not answer in time, or not begin; then an operator does it again.
         """
@@ -129,7 +129,7 @@ class Lab:
         self.settle()
 
     def provision(self, *nodes: str) -> list[list[dict[str, Any]]]:
-        """Provision until all is as the inventory says; the events of each run.
+        """Provision until all nodes match the inventory; returns the events of each run.
 
         On a starved host a connection may be given up, and the change is undone: then an operator does it again.
         """
@@ -143,7 +143,7 @@ class Lab:
         raise AssertionError(f"meshctl provision did not succeed {_TRIES} times: {runs[-1]}")
 
     def edit(self, old: str, new: str) -> None:
-        """Replace a text that the inventory holds once."""
+        """Replace a text that occurs once in the inventory."""
         file = self.inventory / "fleet.yaml"
         text = file.read_text(encoding="utf-8")
         assert text.count(old) == 1, f"{old!r} stands {text.count(old)} times in {file}"
@@ -153,11 +153,11 @@ class Lab:
         return self.fleet.node(name)
 
     def on(self, node: str, command: str) -> str:
-        """What a command on a node's console prints."""
+        """The output of a command on a node's console."""
         return self.node(node).exec(command).check(f"{node}: {command}").stdout
 
     def computer(self, robot: str, command: str) -> str:
-        """What a command on a robot's computer prints."""
+        """The output of a command on a robot's computer."""
         done = control.run(self.fleet.directory, f"ip netns exec pc.{robot} {command}", timeout_s=120.0)
         return done.check(f"{robot}'s computer: {command}").stdout
 
@@ -167,19 +167,19 @@ class Lab:
         return control.run(self.fleet.directory, words).exit_status == 0
 
     def originators(self, node: str) -> dict[str, str]:
-        """The node's own batman-adv: each node it has a route to -> the next hop towards it."""
+        """The routes of the node's batman-adv: each destination -> its next hop."""
         names = self.names()
         known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
         return {names[one["orig_address"]]: names[one["neigh_address"]] for one in known if one.get("best")}
 
-    def neighbours(self, node: str) -> set[str]:
-        """Whom the node's own batman-adv has heard within the last seconds."""
+    def neighbors(self, node: str) -> set[str]:
+        """The neighbors that the node's batman-adv has heard within the last seconds."""
         names = self.names()
         known = json.loads(self.on(node, "batctl meshif bat0 neighbors_json"))
         return {names[one["neigh_address"]] for one in known if one["last_seen_msecs"] < 5000}
 
     def hops(self) -> dict[str, int]:
-        """How many hops each node is from the base, along the next hops that the kernels would take now."""
+        """The number of hops from the base to each node, along the kernels' current routes."""
         others = self.NODES[1:]
         towards = {name: self.originators(name).get("base", "") for name in others}
         found = {"base": 0}
@@ -205,16 +205,16 @@ class Lab:
             raise AssertionError(f"{error}\n{self.tables()}") from error
 
     def tables(self) -> str:
-        """What the kernel of each node knows of the others: for whoever has to find out why a mesh carries nothing."""
+        """The kernel tables of each node, for the report of a mesh that does not forward."""
         names = self.names()
-        told = []
+        parts = []
         for name in self.NODES:
             text = self.node(name).exec(_TABLES).stdout
             for mac, owner in names.items():
                 text = text.replace(mac, owner)
-            told.append(f"--- {name}\n{text}")
-        told.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
-        return "\n".join(told)
+            parts.append(f"--- {name}\n{text}")
+        parts.append("--- switches and computers\n" + control.run(self.fleet.directory, _LANS).stdout)
+        return "\n".join(parts)
 
 
 L = TypeVar("L", bound=Lab)
@@ -245,14 +245,15 @@ done
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
-    """`waiting.until`, as long and as seldom as befits machines that QEMU emulates."""
+    """`waiting.until` with a timeout and interval for emulated machines."""
     waiting.until(condition, what, wait_s=WAIT_S, look_s=0.2)
 
 
 @contextmanager
-def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
-    """Nodes fresh from their boxes, taken into the fleet on the bench and carried into the field: only the mesh leads
-    there. A mesh that does not come about is made once more in a new machine, and the reason told at the end.
+def field_lab(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L], None] | None = None) -> Iterator[L]:
+    """Factory-fresh nodes, bootstrapped on the bench and unplugged, so that they are reached only over the mesh.
+
+    A mesh that does not form is set up once more in a new machine, and the reason reported at the end.
     """
     set_up_host()
     for turn in ("lab", "again"):
@@ -264,9 +265,9 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
             if before is not None:
                 before(made)
             try:
-                made.take_in()
+                made.bootstrap()
             except AssertionError as error:
-                # here, because the fleet is down when the fixture has failed
+                # here, because the fleet has stopped when the fixture fails
                 error.add_note(report(fleet, str(error)))
                 if turn == "again":
                     raise
@@ -279,11 +280,11 @@ def fielded(kind: type[L], inventory: Path, place: Path, *, before: Callable[[L]
 
 
 def _quick(spec: FleetSpec) -> FleetSpec:
-    """With one kind of host key: to make an RSA key takes an emulated node three to five seconds of a processor."""
+    """With one kind of host key: an RSA key takes an emulated node three to five seconds of CPU time."""
     return replace(spec, nodes=tuple(replace(node, host_key_types=("ed25519",)) for node in spec.nodes))
 
 
-# why a machine was made once more, until a test's report can carry it
+# why a machine was set up once more, until a test's report can include it
 _tried_again: list[str] = []
 
 
@@ -296,10 +297,10 @@ def why_once_more(record_property: Callable[[str, object], None]) -> None:
 @pytest.fixture(scope="package")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     """Five nodes of one mesh, three hops long."""
-    with fielded(Lab, INVENTORY, tmp_path_factory.mktemp("real")) as made:
+    with field_lab(Lab, INVENTORY, tmp_path_factory.mktemp("real")) as made:
         yield made
 
 
 def set_up_host() -> None:
-    """QEMU and what apt needs; there already, as a rule."""
+    """Install QEMU and the requirements of apt, unless they are installed."""
     subprocess.run((SETUP,), check=True, timeout=START_S)

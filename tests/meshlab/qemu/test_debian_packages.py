@@ -1,4 +1,4 @@
-"""Where the machine's packages come from, on hosts of other distributions."""
+"""The sources of the machine's packages, on Debian and other distributions."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
     listed = Path(options["Dir::Etc::sourcelist"]).read_text()
     assert listed == f"deb [arch=amd64 signed-by={apt.KEYRING}] {apt.MIRROR} bookworm main\n"
     assert options["Dir::Etc::sourceparts"] == "-"
-    # apt itself reads the options as they are meant
+    # check the options with apt itself
     (tmp_path / "work").mkdir()
     shown = apt.Apt(tmp_path / "work", options).get(tmp_path, "-qq", "indextargets", "--format", "$(METAKEY)")
     assert {line.split("/")[0] for line in shown.splitlines()} <= {"main"}
 
 
-def test_another_mirror_is_taken_where_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_configured_mirror_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apt, "KEYRING", release(tmp_path, NOBLE))
     options = apt.sources(
         tmp_path / "cache",
@@ -49,9 +49,7 @@ def test_another_mirror_is_taken_where_it_is_named(tmp_path: Path, monkeypatch: 
     assert "http://mirror.example/debian bookworm main" in Path(options["Dir::Etc::sourcelist"]).read_text()
 
 
-def test_what_apt_cannot_verify_is_refused_with_the_way_to_mend_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unverifiable_packages_are_rejected_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apt, "KEYRING", tmp_path / "nothing")
     with pytest.raises(LabError, match=r"Ubuntu 24\.04\.1 LTS has no .*nothing") as caught:
         apt.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))

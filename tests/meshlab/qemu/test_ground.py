@@ -1,4 +1,4 @@
-"""A ground under real radios: losses, distances and a mission, and what the kernel's own batman-adv makes of them."""
+"""Radio environments of the kernel's radios: losses, positions and a mission, as seen by the kernel's batman-adv."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DRIVE = (
 
 @pytest.fixture
 def field(lab: Lab, tmp_path: Path) -> Iterator[Path]:
-    """A directory for files; afterwards the fleet has its own links again."""
+    """A directory for files; afterwards the fleet's links are restored."""
     yield tmp_path
     lab.meshctl("lab", "mend")
     lab.meshctl("lab", "ground", str(lab.inventory / "links.yaml"))
@@ -33,7 +33,7 @@ def field(lab: Lab, tmp_path: Path) -> Iterator[Path]:
 
 
 def quality(lab: Lab, node: str, other: str) -> int:
-    """What a node's batman-adv thinks of its direct link to another one, 0 while it knows none."""
+    """The quality of a node's direct link to another one in its batman-adv, 0 if there is none."""
     names = lab.names()
     known = json.loads(lab.on(node, "batctl meshif bat0 originators_json"))
     return max(
@@ -61,18 +61,18 @@ def test_a_robot_that_moves_changes_the_kernel_s_routes(lab: Lab, field: Path) -
     until(lambda: lab.originators("base").get("husky-front") == "b01", "the way over b01")
     lab.meshctl("lab", "move", "husky-front", "40", "-30")
     until(lambda: lab.originators("base").get("husky-front") == "husky-front", "the robot in the base's earshot")
-    assert "husky-front" in lab.neighbours("base")
+    assert "husky-front" in lab.neighbors("base")
     lab.meshctl("lab", "move", "husky-front", "230", "0")
-    until(lambda: "husky-front" not in lab.neighbours("base"), "the robot out of the base's earshot")
+    until(lambda: "husky-front" not in lab.neighbors("base"), "the robot out of the base's earshot")
     until(lambda: lab.originators("base").get("husky-front") == "b01", "the way over b01 again")
 
 
 def test_a_mission_drops_a_beacon_and_the_mesh_heals_over_it(lab: Lab, field: Path) -> None:
-    told = lab.meshctl("lab", "mission", written(field, DRIVE), "--speed", "2", "--json").events
+    events = lab.meshctl("lab", "mission", written(field, DRIVE), "--speed", "2", "--json").events
     assert {"at_s": 14.0, "event": "dropped", "node": "b02", "other": "husky-front"}.items() <= next(
-        event for event in told if event["event"] == "dropped"
+        event for event in events if event["event"] == "dropped"
     ).items()
-    assert told[-1]["event"] == "end"
+    assert events[-1]["event"] == "end"
     until(lambda: lab.node("b02").is_up(), "the beacon to boot")
     until(lambda: lab.originators("base").get("husky-front") == "b01", "the robot behind two beacons")
     until(lambda: lab.originators("b01").get("husky-front") == "b02", "the dropped beacon in between")

@@ -1,4 +1,4 @@
-"""Output of a process in the machine, over a host that reads it late."""
+"""Output of a process in the machine, with a host that reads it late."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from meshlab.qemu import guest_protocol
 from meshlab.qemu.guest_agent import GuestAgent
 from meshlab.qemu.port_forwarder import QemuPortForwarder
 
-# far longer than output takes that nothing holds up
+# far longer than unblocked output takes
 LATE_S = 0.3
 EXEC: dict[str, Any] = {"kind": "exec", "request": {}, "terminal": None}
 
 
 class SlowHost:
-    """An `asyncio.StreamWriter` that takes the first frame and lets the sender wait before the next one."""
+    """An `asyncio.StreamWriter` that accepts the first frame and blocks the sender before the next one."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[int, bytes]] = []

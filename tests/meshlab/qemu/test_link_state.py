@@ -1,4 +1,4 @@
-"""The air of real radios, where it meets a node that is not ready for what is done to it."""
+"""Link state of a QEMU fleet, with a node that is not ready for a change."""
 
 from __future__ import annotations
 

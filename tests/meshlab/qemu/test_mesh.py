@@ -1,4 +1,4 @@
-"""From factory state to a working mesh of the kernel's own radios, and changes carried over that mesh itself."""
+"""From factory state to a working mesh of the kernel's radios, and changes over that mesh itself."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from meshlab.qemu import control
 from tests.meshlab.qemu.conftest import NODES, Lab, until
 
-# the machine's start, its image's packages and the whole fleet's provisioning fall into the first test
+# the first test includes the machine's start, the download of packages and the provisioning of the fleet
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 # numbers sent as broadcasts from the base's computer, and those that arrive at the Husky's, in the order of arrival
@@ -46,7 +46,7 @@ def test_what_was_provisioned_is_a_mesh_of_three_hops_with_lans_behind_it(lab: L
     # the kernel's own routes: each hop only hears the next
     assert lab.originators("base") == {"b01": "b01", "b02": "b01", "husky-front": "b01", "husky-rear": "b01"}
     assert lab.originators("b01")["husky-front"] == "b02"
-    assert lab.neighbours("b02") == {"b01", "husky-front", "husky-rear"}
+    assert lab.neighbors("b02") == {"b01", "husky-front", "husky-rear"}
     # node to node over three hops, and computer to computer behind them
     until(lambda: "2 packets received" in lab.on("base", "ping -c 2 -W 5 10.42.0.11 || true"), "three hops")
     assert lab.answers("husky", "10.42.0.2")
@@ -76,7 +76,7 @@ def test_two_radios_on_one_switch_pass_a_broadcast_once_and_make_no_storm(lab: L
     frames = "cat /sys/class/net/eth0/statistics/rx_packets"
     before = int(lab.computer("husky", frames))
     lab.computer("husky", "sleep 5")
-    # what passes the switch while nobody speaks: the loop avoidance's claims, a few neighbour solicitations
+    # idle traffic on the switch: the loop avoidance's claims, a few neighbor solicitations
     assert int(lab.computer("husky", frames)) - before < 200
 
 
@@ -86,7 +86,7 @@ def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
     for link in drawn["links"]:
         linked[link["a"]].add(link["b"])
         linked[link["b"]].add(link["a"])
-    assert linked == {name: lab.neighbours(name) for name in NODES}
+    assert linked == {name: lab.neighbors(name) for name in NODES}
     cuts_off = {node["name"]: set(node["cuts_off"]) for node in drawn["nodes"]}
     assert cuts_off["b01"] == {"b02", "husky-front", "husky-rear"}
     assert cuts_off["b02"] == {"husky-front", "husky-rear"}
@@ -94,7 +94,7 @@ def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
 
 
 def _topology_of_one_moment(lab: Lab) -> Any:
-    """What meshctl draws; each node's hops are those of the kernels' routes just before or just after."""
+    """The topology of meshctl; each node's hops match the kernels' routes just before or just after."""
     drawn: Any = None
 
     def agrees() -> bool:
@@ -113,20 +113,20 @@ def test_status_says_what_the_radios_hear(lab: Lab) -> None:
     names = lab.names()
 
     def agrees() -> bool:
-        told = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
-        nodes = {node["name"]: node for node in told if node["answers"]}
+        reported = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
+        nodes = {node["name"]: node for node in reported if node["answers"]}
         return nodes.keys() == set(NODES) and all(
-            {neighbour["name"] for neighbour in node["neighbours"]} == heard(name) for name, node in nodes.items()
+            {neighbor["name"] for neighbor in node["neighbours"]} == heard(name) for name, node in nodes.items()
         )
 
     def heard(name: str) -> set[str]:
         stations = lab.on(name, "iw dev mesh0 station dump")
         return {names[line.split()[1]] for line in stations.splitlines() if line.startswith("Station")}
 
-    until(agrees, "the told neighbours to be the stations that the kernels know")
+    until(agrees, "the reported neighbors to be the stations of the kernels")
 
 
-def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> None:
+def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
     def quality() -> int:
         known = json.loads(lab.on("b01", "batctl meshif bat0 originators_json"))
         names = lab.names()
@@ -136,7 +136,7 @@ def test_a_link_loses_what_it_is_told_to_lose_and_is_cut_at_once(lab: Lab) -> No
     lab.meshctl("lab", "link", "base", "b01", "--loss", "0.4")
     until(lambda: quality() < 190, "losses to show in batman-adv's quality")
     lab.meshctl("lab", "link", "base", "b01", "--down")
-    until(lambda: "base" not in lab.neighbours("b01"), "the link to be gone")
+    until(lambda: "base" not in lab.neighbors("b01"), "the link to be gone")
     lab.meshctl("lab", "mend", "base-b01")
     lab.settle()
     until(lambda: quality() > 230, "the link's full quality again")

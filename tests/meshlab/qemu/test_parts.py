@@ -1,4 +1,4 @@
-"""The machine's parts as functions of values: archives, modules, traffic control, and what the kernel is to have."""
+"""Pure parts of the machine: archives, modules, traffic control, and the kernel's target state."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_kernel_without_virtual_radios_is_refused(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 2), st.binary(max_size=200))
-def test_a_frames_header_tells_its_stream_and_length(stream: int, content: bytes) -> None:
+def test_a_frame_header_has_stream_and_length(stream: int, content: bytes) -> None:
     sent = guest_protocol.frame(stream, content)
     assert guest_protocol.header(sent[: guest_protocol.HEADER_BYTES]) == (stream, len(content))
     assert sent[guest_protocol.HEADER_BYTES :] == content
@@ -177,7 +177,7 @@ config wifi-iface 'mesh0'
 
 
 def planned(run: Path, config: str) -> list[list[str]]:
-    """What the stand-in for netifd wants of the kernel, as lines of fields; of one directory, one after the other."""
+    """The kernel's target state from netifd's stand-in, as lines of fields; state is kept in one directory."""
     run.mkdir(exist_ok=True)
     awk = rootfs.STAND_INS / "lab" / "netifd.awk"
     variables = {
@@ -208,13 +208,13 @@ def test_the_files_become_the_kernels_devices_in_the_order_of_making(tmp_path: P
     assert plan[7][2] == "10.42.0.11/24"
 
 
-def test_another_channel_makes_the_radio_and_what_hangs_on_it_anew_and_nothing_else(tmp_path: Path) -> None:
+def test_another_channel_recreates_the_radio_and_its_dependents_and_nothing_else(tmp_path: Path) -> None:
     before = planned(tmp_path / "run", CONFIG.format(channel=6))
     assert planned(tmp_path / "run", CONFIG.format(channel=6)) == before
     after = planned(tmp_path / "run", CONFIG.format(channel=11))
     changed = [line for line in after if line not in before]
     assert [line[:2] for line in changed] == [["radio", "mesh0"], ["tune", "mesh0"], ["hard", "mesh0"]]
-    # another number of making, and the other address, because the old interface still stands when it is chosen
+    # another creation number, and the other address, because the old interface still exists when it is chosen
     assert [(line[9], line[10]) for line in (before[1], changed[0])] == [
         ("21", "02:4d:00:00:00:10"), ("22", "42:4d:00:00:00:10"),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Nodes of real radios that lose their power: radios and cables are theirs again, whatever else is left of them."""
+"""Power cuts of nodes in the machine: they get radios and cables back, whatever else remains of them."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.
 
 
 def test_a_node_comes_back_while_something_keeps_its_old_network(lab: Lab) -> None:
-    """A connection that waits for its next farewell keeps the network of a dead node for up to two minutes."""
+    """A connection that retransmits its FIN keeps a dead node's network namespace for up to two minutes."""
     (pid,) = (node["pid"] for node in lab.fleet.status()["nodes"] if node["name"] == "b02")
     keep = f"sleep 1000 </proc/{pid}/ns/net >/dev/null 2>&1 & echo $!"
     keeper = control.run(lab.fleet.directory, keep).check("keep the network").stdout.strip()
     try:
-        # it is given up only when it has not booted in time
+        # it fails only if it has not booted in time
         lab.node("b02").power_cut(wait_s=WAIT_S)
         assert lab.node("b02").is_up()
         kept = control.run(lab.fleet.directory, f"readlink /proc/{keeper}/fd/0").check("it is still kept").stdout

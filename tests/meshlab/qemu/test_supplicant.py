@@ -1,4 +1,4 @@
-"""What the lab's wpa_supplicant is told: the cell that is configured, and nothing that it might choose by itself."""
+"""The configuration of the lab's wpa_supplicant: the configured cell, with nothing left for it to choose."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCRIPT = Path(initramfs.__file__).with_name("node_root") / "lab" / "supplicant"
 KEY = "a word that all of them know"
 
 
-def told(mode: str, width: str = "HT20", key: str = KEY) -> tuple[list[str], dict[str, str]]:
+def config_of(mode: str, width: str = "HT20", key: str = KEY) -> tuple[list[str], dict[str, str]]:
     """The configuration's global lines, and its network's options."""
     bssid = "-" if mode == "mesh" else "02:ca:fe:00:00:21"
     radio = (
@@ -29,7 +29,7 @@ def told(mode: str, width: str = "HT20", key: str = KEY) -> tuple[list[str], dic
 
 
 def test_an_ad_hoc_cell_is_joined_where_it_is_configured_and_not_where_one_is_found() -> None:
-    head, options = told("adhoc")
+    head, options = config_of("adhoc")
     assert "ap_scan=2" in head
     assert options["bssid"] == "02:ca:fe:00:00:21"
     assert (options["frequency"], options["fixed_freq"], options["mode"]) == ("2437", "1", "1")
@@ -40,7 +40,7 @@ def test_an_ad_hoc_cell_is_joined_where_it_is_configured_and_not_where_one_is_fo
 
 
 def test_a_mesh_authenticates_by_the_password_and_leaves_forwarding_to_batman() -> None:
-    head, options = told("mesh")
+    head, options = config_of("mesh")
     assert "ap_scan=2" not in head
     assert (options["mode"], options["key_mgmt"], options["ieee80211w"]) == ("5", "SAE", "2")
     assert (options["sae_password"], options["mesh_fwding"]) == (f'"{KEY}"', "0")
@@ -48,12 +48,12 @@ def test_a_mesh_authenticates_by_the_password_and_leaves_forwarding_to_batman() 
 
 
 def test_a_key_of_64_digits_is_not_a_word() -> None:
-    assert told("adhoc", key="0f" * 32)[1]["psk"] == "0f" * 32
+    assert config_of("adhoc", key="0f" * 32)[1]["psk"] == "0f" * 32
 
 
 @pytest.mark.parametrize(
     ("width", "off"), [("NOHT", {"disable_ht"}), ("HT20", {"disable_ht40"}), ("HT40+", set()), ("HT40", set())]
 )
 def test_a_cell_is_as_wide_as_it_is_configured(width: str, off: set[str]) -> None:
-    options = told("adhoc", width)[1]
+    options = config_of("adhoc", width)[1]
     assert {name for name in ("disable_ht", "disable_ht40") if name in options} == off

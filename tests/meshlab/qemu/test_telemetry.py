@@ -55,7 +55,7 @@ def on_machine(lab: Lab, command: str) -> str:
 
 
 def put_programs(lab: Lab) -> None:
-    """udp_mesh, the cryptography it stands on, and the client that the benchmark uses, into the machine."""
+    """Copy udp_mesh, its cryptography package and the benchmark's client into the machine."""
     archive = io.BytesIO()
     with tarfile.open(fileobj=archive, mode="w") as tar:
         for name in ("udp_mesh", "cryptography"):
@@ -69,14 +69,14 @@ def put_programs(lab: Lab) -> None:
         source.seek(0)
         command = "mkdir -p /opt/telemetry && tar -x -C /opt/telemetry"
         descriptors = (source.fileno(), said.fileno(), said.fileno())
-        answer = lab.fleet.ask_with(descriptors, _UPLOAD_S, "machine", command=command)
+        answer = lab.fleet.request_with_fds(descriptors, _UPLOAD_S, "machine", command=command)
         said.seek(0)
         assert answer["status"] == 0, said.read().decode(errors="replace")
 
 
 @contextmanager
 def telemetry(lab: Lab) -> Iterator[None]:
-    """The Husky's computer tells the base station's something ten times a second."""
+    """The Husky's computer sends the base station's ten messages a second."""
     for robot in ("base-station", "husky"):
         on_machine(lab, _START.format(robot=robot, python=_PYTHON, key="be" * 32))
     try:
@@ -96,24 +96,24 @@ def is_there(lab: Lab, path: str) -> bool:
 
 
 def arrived(lab: Lab) -> int:
-    """How many messages have arrived."""
+    """The number of received messages."""
     return int(on_machine(lab, "cat /run/arrivals 2>/dev/null | wc -l"))
 
 
 def have_forgotten(lab: Lab, node: str, other: str) -> None:
-    """Have a node's radio forget that of another one, which is off."""
+    """Delete the station entry of another node, which is off, on a node."""
     mac = next(mac for mac, name in lab.names().items() if name == other)
     lab.on(node, f"iw dev mesh0 station del {mac} || true")
 
 
 def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
     put_programs(lab)
-    # a second way for the relay's neighbours, and not as good
+    # a second route for the relay's neighbors, and a worse one
     lab.meshctl("lab", "link", "base", "b02", "--loss", "0.3")
     try:
         with telemetry(lab):
-            until(lambda: "base" in lab.neighbours("b02"), "the other way to be there")
-            until(lambda: lab.originators("b02").get("base") == "b01", "the way over the relay to be the better one")
+            until(lambda: "base" in lab.neighbors("b02"), "the other route to exist")
+            until(lambda: lab.originators("b02").get("base") == "b01", "the route over the relay to be the better one")
             until(lambda: arrived(lab) > PLENTY, "telemetry over the relay")
             lab.fleet.inject_fault("b01", "off")
             until(lambda: lab.originators("b02").get("base") == "base", "the route without the relay")
@@ -121,10 +121,10 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
             until(lambda: arrived(lab) > before + PLENTY, "telemetry without the relay")
             assert not lab.node("b01").is_up()
     finally:
-        # else they would be half deaf to it: it is back within the minute in which Linux forgets
+        # else they would be half deaf to it: it is back within the minute before Linux drops its entry
         for name in ("base", "b02"):
             have_forgotten(lab, name, "b01")
         lab.fleet.repair("b01")
         lab.meshctl("lab", "mend", "base-b02")
-    until(lambda: "base" not in lab.neighbours("b02"), "the links to be as they were")
+    until(lambda: "base" not in lab.neighbors("b02"), "the links to be as they were")
     lab.settle()

@@ -16,7 +16,7 @@ def older_interpreters(*minors: int) -> list[str]:
     found = [path for path in map(shutil.which, named) if path]
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     found += [str(path) for name in named for path in sorted(pyenv.glob(f"{name[6:]}.*/bin/python"))]
-    # A pyenv shim may stand for a version that is not chosen: then it does not start.
+    # A pyenv shim of a version that is not selected does not start.
     return [
         path for path in found if subprocess.run([path, "-c", ""], capture_output=True, check=False).returncode == 0
     ]
@@ -37,5 +37,5 @@ def has_ros() -> bool:
 
 
 def expects_ros() -> bool:
-    """Whether tests of a real ROS 1 are to be run: where there is one, and where somebody says that there is."""
+    """Whether to run tests with a real ROS 1: if it is installed or required."""
     return has_ros() or bool(os.environ.get(NEEDS_ROS))

@@ -140,11 +140,11 @@ class Robot:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.startswith("{"):
-                told = json.loads(line)
+                entry = json.loads(line)
                 with self._changing:
-                    self._lines.append(told)
+                    self._lines.append(entry)
 
-    def _tell(self, **command: object) -> None:
+    def _command(self, **command: object) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(command) + "\n")
         self.process.stdin.flush()
@@ -173,26 +173,26 @@ class Robot:
 
     def subscribe(self, name: str, type_name: str = "std_msgs/String", **more: object) -> None:
         """Waits until the subscriber is registered."""
-        self._tell(subscribe=name, type=type_name, **more)
+        self._command(subscribe=name, type=type_name, **more)
         self.expect("subscribed", name)
 
     def stream(self, name: str, type_name: str, rate_hz: float, payload_bytes: int = 0) -> None:
         """Publishes at this rate until `stop_streams`: images of so many bytes, or texts with number and time."""
-        self._tell(stream=name, type=type_name, rate_hz=rate_hz, bytes=payload_bytes)
+        self._command(stream=name, type=type_name, rate_hz=rate_hz, bytes=payload_bytes)
 
     def stop_streams(self) -> dict[str, int]:
         """How many messages each stream has published."""
-        self._tell(stop_streams=True)
+        self._command(stop_streams=True)
         return dict(self.expect("streamed")["streamed"])
 
     def call(self, service: str) -> dict[str, Any]:
         """Calls a service without a request, as a program that was built with its package does."""
-        self._tell(call=service)
+        self._command(call=service)
         return dict(self.expect("answer")["answer"])
 
     def publish(self, name: str, data: object, type_name: str = "std_msgs/String", **more: object) -> int:
         """Publishes; returns how many subscribers were connected."""
-        self._tell(publish=name, type=type_name, data=data, **more)
+        self._command(publish=name, type=type_name, data=data, **more)
         return int(self.expect("connections")["connections"])
 
     def publish_until_heard(self, name: str, data: str, hearer: Robot, **more: Any) -> dict[str, Any]:
@@ -230,15 +230,15 @@ class BridgeProcess:
     def start(self, *, launch: str = "", arguments: Sequence[str] = ()) -> None:
         """`launch` is a launch file's path; else the module is run."""
         if launch:
-            # The fielded package, as a robot's workspace has it on its paths.
-            fielded = self._master.folder / "workspace" / "udp_mesh"
-            (fielded / "msg").mkdir(parents=True, exist_ok=True)
-            (fielded / "__init__.py").touch()
-            (fielded / "package.xml").write_text("<package><name>udp_mesh</name></package>")
+            # The legacy package, as a robot's workspace has it on its paths.
+            legacy = self._master.folder / "workspace" / "udp_mesh"
+            (legacy / "msg").mkdir(parents=True, exist_ok=True)
+            (legacy / "__init__.py").touch()
+            (legacy / "package.xml").write_text("<package><name>udp_mesh</name></package>")
             environment = {
                 **self._master.environment,
-                "ROS_PACKAGE_PATH": f"{fielded}:/usr/share",
-                "PYTHONPATH": f"{fielded.parent}:{DEBIAN_PACKAGES}",
+                "ROS_PACKAGE_PATH": f"{legacy}:/usr/share",
+                "PYTHONPATH": f"{legacy.parent}:{DEBIAN_PACKAGES}",
             }
             command = ["/usr/bin/roslaunch", launch]
         else:

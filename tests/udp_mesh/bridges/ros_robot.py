@@ -5,7 +5,7 @@
 "rate_hz": HZ, "bytes": SIZE}; {"stop_streams": true}; {"call": SERVICE}.
 
 What arrives is {"name", "type", "md5sum", "definition", "latching"} and one of "data" (typed), "number" (of an image),
-"text" (of a fielded message) or "hex" (of "*"). TYPE may be one that is installed
+"text" (of a legacy message) or "hex" (of "*"). TYPE may be one that is installed
 nowhere: then "md5sum" and "definition" stand in the command, and the data is hex.
 """
 
@@ -120,7 +120,7 @@ with open("/dev/urandom", "rb") as source:
 
 
 class GetHosts:
-    """The fielded service as its package defines it."""
+    """The legacy service as its package defines it."""
 
     _type = "udp_mesh/GetHosts"
     _md5sum = "240aa9a842ed6592e7a3e693aebc36a4"

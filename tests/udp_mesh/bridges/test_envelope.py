@@ -80,7 +80,7 @@ def test_a_token_of_anything_but_a_publisher_keeps_nothing() -> None:
     assert kept_samples(TOKEN.replace("/MP/", "/MS/").replace("1:2:", ":1:"))[1] == 0
 
 
-def test_what_is_told_again_is_new_once() -> None:
+def test_a_repeated_sample_is_new_once() -> None:
     kept = SampleDeduplicator()
     assert [kept.is_new("k", b"a", b"p") for _ in range(2)] == [True, False]
     assert kept.is_new("k", b"", b"ap")

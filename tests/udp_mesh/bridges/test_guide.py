@@ -37,7 +37,7 @@ def connect(port: int) -> socket.socket:
         except ConnectionRefusedError:
             return None
 
-    return poll(connected, f"somebody at port {port}")
+    return poll(connected, f"a listener at port {port}")
 
 
 def test_the_example_is_short_and_carries_lines(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_the_example_is_short_and_carries_lines(tmp_path: Path) -> None:
 
 
 def speak_until_heard(speaker: socket.socket, reader: socket.socket, lines: BinaryIO) -> None:
-    """Says it again until a reader has it: who listens is known only after a while."""
+    """Repeats it until a reader receives it, since discovery takes a while."""
 
     def heard() -> bytes | None:
         speaker.sendall(b"hello\r\n")

@@ -1,4 +1,4 @@
-"""A bridge without its middleware says what is missing, and what to do."""
+"""A bridge without its middleware reports what is missing and what to do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
         ("zenoh_bridge", "zenoh", "pip install eclipse-zenoh"),
     ],
 )
-def test_a_missing_middleware_is_told_in_one_line(tmp_path: Path, module: str, needs: str, remedy: str) -> None:
+def test_a_missing_middleware_is_reported_in_one_line(tmp_path: Path, module: str, needs: str, remedy: str) -> None:
     (tmp_path / f"{needs}.py").write_text(f"raise ModuleNotFoundError(\"No module named '{needs}'\")\n")
     done = subprocess.run(
         [sys.executable, "-m", f"udp_mesh.bridges.{module}"],

@@ -1,4 +1,4 @@
-"""Names of the fielded system."""
+"""Names of the legacy system."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = st.text(st.characters(exclude_characters="/", exclude_categories=("Z", "
 TOPICS = st.lists(NAMES, min_size=1, max_size=3).map("/".join)
 
 
-def test_names_are_those_of_the_fielded_system() -> None:
+def test_names_are_those_of_the_legacy_system() -> None:
     assert outbound_name("ugv1", Route("map", "base")) == "/ugv1/mesh_comm/base/map"
     assert outbound_name("ugv1", Route("map", None)) == "/ugv1/mesh_comm/map"
     assert inbound_name("ugv1", "base", "map") == "/base/mesh_comm/ugv1/map"
@@ -59,7 +59,7 @@ def test_an_undeclared_name_goes_to_the_peer_it_names_or_to_all() -> None:
     assert undeclared_route("a", "/a/mesh_comm/", ["bob"]) is None
 
 
-def test_the_fielded_topic_list_is_read_and_every_mistake_in_it_named() -> None:
+def test_the_legacy_topic_list_is_read_and_every_mistake_in_it_named() -> None:
     listed, problems = parse_topic_list(["1|std_msgs/String|high", "99|a/B|/low/", "x|a/B|c", "no bars", 7])
     assert [tuple(topic) for topic in listed] == [("high", 1), ("low", 15)]
     assert [problem.partition(":")[0] for problem in problems] == ["topic_list[2]", "topic_list[3]", "topic_list[4]"]

@@ -59,7 +59,7 @@ def test_bridges_and_client_are_python_3_8(path: Path) -> None:
 
 
 def newer(tree: ast.Module) -> Iterator[str]:
-    """What 3.8 reads and cannot run."""
+    """Constructs that Python 3.8 parses but cannot run."""
     unevaluated = {id(node) for annotation in unevaluated_annotations(tree) for node in ast.walk(annotation)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr in NEWER_NAMES:

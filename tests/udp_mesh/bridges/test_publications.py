@@ -1,4 +1,4 @@
-"""Publishing into a ROS graph whose master answers late or never: what waits, what goes on, in which order."""
+"""Publishing into a ROS graph whose master answers late or never: queueing and order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from udp_mesh.bridges.ros1.publications import (
     MAX_WAITING_BYTES,
     MAX_WAITING_MESSAGES,
     Advertised,
-    Outgoing,
+    OutgoingMessage,
     Publications,
 )
 from udp_mesh.bridges.types import TypeKey
@@ -23,7 +23,7 @@ INT = TypeKey("std_msgs/Int32", "bb")
 
 
 class Graph:
-    """A ROS graph in memory: a master that answers when it is told to, and what subscribers got."""
+    """A ROS graph in memory: a master that answers on request, and what subscribers got."""
 
     def __init__(self) -> None:
         self.answers = threading.Event()
@@ -35,7 +35,7 @@ class Graph:
         self.withdrawn: list[str] = []
         self.publications = Publications(self._advertise, lambda name: self.subscribers, lambda: self.now)
 
-    def _advertise(self, message: Outgoing) -> Advertised:
+    def _advertise(self, message: OutgoingMessage) -> Advertised:
         assert self.answers.wait(WAIT_S)
         return Topic(self, message)
 
@@ -52,14 +52,14 @@ class Graph:
             thread.join(WAIT_S)
 
     def publish(self, name: str, payload: bytes, key: TypeKey = STRING, *, latched: bool = False) -> None:
-        self.publications.publish(Outgoing(name, key, "", latched, payload))
+        self.publications.publish(OutgoingMessage(name, key, "", latched, payload))
 
     def got(self, name: str) -> list[bytes]:
         return [payload for topic, _, payload in self.log if topic == name]
 
 
 class Topic:
-    def __init__(self, graph: Graph, message: Outgoing) -> None:
+    def __init__(self, graph: Graph, message: OutgoingMessage) -> None:
         self._graph, self._name, self._type = graph, message.name, message.key.name
 
     def connections(self) -> int:

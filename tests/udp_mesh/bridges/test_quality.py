@@ -21,7 +21,7 @@ def test_a_quality_of_service_is_read_as_it_was_written(quality: Quality) -> Non
     assert parse_quality(quality_text(quality)) == quality
 
 
-def test_a_quality_nobody_wrote_is_none() -> None:
+def test_an_invalid_quality_is_none() -> None:
     good = quality_text(Quality())
     assert parse_quality(good) is not None
     for text in (

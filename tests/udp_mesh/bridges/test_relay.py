@@ -1,4 +1,4 @@
-"""What the relay decides: two relays joined in memory, no ROS, no daemon."""
+"""The relay's decisions: two relays connected in memory, without ROS and daemon."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from udp_mesh.bridges.ros2.quality import Quality, quality_text
 from udp_mesh.bridges.types import (
     MAX_DEFINITION_BYTES,
     Definitions,
-    Mark,
+    LatchMark,
     MessageKind,
     TypeKey,
     kind_text,
@@ -39,7 +39,7 @@ def relay(own: str) -> Relay:
 
 
 def carry(effects: list[Effect], source: str, target: Relay, now: float = 0.0) -> list[Effect]:
-    """What the target makes of what the source put on the mesh."""
+    """The target's effects for what the source sent over the mesh."""
     found: list[Effect] = []
     for effect in effects:
         if isinstance(effect, ToMesh) and effect.peer in (None, target.own):
@@ -111,7 +111,7 @@ def test_the_last_latched_message_stays_whatever_the_order_they_arrive_in() -> N
     stop, go = to_bob(alice, b"stop", latched=True), to_bob(alice, b"go", latched=True)
     assert len(carry(go, "alice", bob)) == 1
     assert carry(stop, "alice", bob) == []
-    # Another publisher's is no earlier one, nor what the same publishes after its bridge has started anew.
+    # Another publisher's message is not an earlier one, nor is one of the same publisher after its bridge restarted.
     assert len(carry(to_bob(alice, b"x", latched=True, publisher="/other"), "alice", bob)) == 1
     again = Relay("alice", EXCHANGE, ros_version=1, nonce=b"another start")
     assert len(carry(to_bob(again, b"stop", latched=True)[-1:], "alice", bob)) == 1
@@ -125,9 +125,9 @@ def test_programs_that_latched_and_went_do_not_outlive_who_came_after() -> None:
     repeated = carry(bob.on_peer_online("alice"), "bob", alice)
     assert [effect for effect in repeated if isinstance(effect, ToMesh) and effect.topic == "status"] == []
     late = carry(relay("bob").on_peer_online("alice"), "bob", alice)
-    told = [effect.payload for effect in late if isinstance(effect, ToMesh) and effect.topic == "status"]
-    assert len(told) == MAX_LATCHED_PER_ROUTE
-    assert told[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
+    sent = [effect.payload for effect in late if isinstance(effect, ToMesh) and effect.topic == "status"]
+    assert len(sent) == MAX_LATCHED_PER_ROUTE
+    assert sent[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
 
 
 def test_a_definition_that_never_comes_blocks_its_topic_for_a_while_only() -> None:
@@ -151,8 +151,8 @@ def test_a_publisher_without_a_definition_does_not_blot_out_one_that_has_it() ->
     alice = relay("alice")
     to_bob(alice, b"1")
     alice.from_ros(Route("status", "bob"), "/rosserial", STRING, "", False, b"2")
-    told = alice.from_mesh("bob", EXCHANGE, "bridge", encode(Want([STRING])), 0.0)
-    assert [decode(effect.payload) for effect in told if isinstance(effect, ToMesh)] == [
+    sent = alice.from_mesh("bob", EXCHANGE, "bridge", encode(Want([STRING])), 0.0)
+    assert [decode(effect.payload) for effect in sent if isinstance(effect, ToMesh)] == [
         Definition(STRING, "string data")
     ]
 
@@ -168,7 +168,7 @@ def test_latched_messages_go_to_whom_they_were_for() -> None:
     assert payloads == {"bob": [b"for bob"], "base": [b"for base"], "carol": []}
 
 
-def test_a_fielded_robot_names_the_type_alone() -> None:
+def test_a_legacy_robot_sends_only_the_type_name() -> None:
     found = relay("bob").from_mesh("old", "status", "std_msgs/String", b"x", 0.0)
     assert found == [ToRos("/old/mesh_comm/bob/status", TypeKey("std_msgs/String", ""), None, False, b"x")]
 
@@ -210,8 +210,12 @@ def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -
         assert [type(effect) for effect in relay("bob").from_mesh("a", EXCHANGE, "", data, 0.0)] == [Note]
 
 
-@given(WORDS, WORDS, st.none() | st.builds(Mark, st.from_regex("[0-9a-f]{8}", fullmatch=True), st.integers(0, 1 << 50)))
-def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, mark: Mark | None) -> None:
+@given(
+    WORDS,
+    WORDS,
+    st.none() | st.builds(LatchMark, st.from_regex("[0-9a-f]{8}", fullmatch=True), st.integers(0, 1 << 50)),
+)
+def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, mark: LatchMark | None) -> None:
     kind = MessageKind(TypeKey("pkg/" + name, checksum), mark)
     assert parse_kind(kind_text(kind)) == kind
 

@@ -29,7 +29,7 @@ FIELDED = {
     ),
     "hosts": ("udp_mesh/HostEntry", "Header header\nstring host\nstring mac\n" + HEADER),
 }
-"""The fielded package's messages, as its users' programs know them."""
+"""The legacy package's messages, as its users' programs know them."""
 
 LAUNCH = """
 <launch>
@@ -46,7 +46,7 @@ LAUNCH = """
   </include>
 </launch>
 """
-"""A fielded robot's own launch file, every argument given. Its include is the line that changes; the socket's place is
+"""A legacy robot's own launch file, every argument given. Its include is the line that changes; the socket's place is
 the test's."""
 
 pytestmark = [pytest.mark.proof, pytest.mark.xdist_group("ros1")]
@@ -93,7 +93,7 @@ def team() -> Iterator[tuple[Side, Side]]:
         yield sides[0], sides[1]
 
 
-def test_a_message_to_one_robot_comes_out_typed_under_the_fielded_name(team: tuple[Side, Side]) -> None:
+def test_a_message_to_one_robot_comes_out_typed_under_the_legacy_name(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.robot.subscribe("/alice/mesh_comm/bob/status")
     heard = alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "ready", bob.robot)
@@ -174,7 +174,7 @@ def test_a_topic_added_while_everything_runs_is_carried(team: tuple[Side, Side])
     alice.robot.publish_until_heard("/alice/mesh_comm/bob/new/topic", "late news", bob.robot)
 
 
-def test_the_fielded_status_messages_and_service_need_no_package(team: tuple[Side, Side]) -> None:
+def test_the_legacy_status_messages_and_service_need_no_package(team: tuple[Side, Side]) -> None:
     alice, _ = team
     for name, (type_name, definition) in FIELDED.items():
         alice.robot.subscribe(f"/alice/{name}", type_name, definition=definition)
@@ -197,7 +197,7 @@ def test_the_networks_conditions_are_a_topic(team: tuple[Side, Side]) -> None:
     assert "counters" in conditions
 
 
-def test_the_fielded_settings_message_sets_the_window(team: tuple[Side, Side]) -> None:
+def test_the_legacy_settings_message_sets_the_window(team: tuple[Side, Side]) -> None:
     alice, _ = team
     settings = {"type_name": "udp_mesh/MeshSettings", "md5sum": "00" * 16, "definition": "uint8 windowSize\n"}
 

@@ -57,8 +57,8 @@ def test_urgent_messages_pass_thirty_images_a_second_on_a_link_for_less_than_one
 
         def urgent() -> dict[int, float]:
             lines = [line for line in bob.node.received() if str(line.get("data")).startswith("{")]
-            told = [(json.loads(line["data"]), line["at"]) for line in lines]
-            return {message["number"]: arrived - message["at"] for message, arrived in told}
+            received = [(json.loads(line["data"]), line["at"]) for line in lines]
+            return {message["number"]: arrived - message["at"] for message, arrived in received}
 
         poll(lambda: len(urgent()) >= published[STATUS], "every urgent message")
         latencies = sorted(urgent().values())
@@ -71,7 +71,7 @@ def test_urgent_messages_pass_thirty_images_a_second_on_a_link_for_less_than_one
         assert max(most) < MEMORY_BYTES
 
 
-def test_a_subscriber_that_does_not_keep_up_costs_a_bounded_memory_and_delays_nobody(
+def test_a_subscriber_that_does_not_keep_up_costs_bounded_memory_and_delays_no_other(
     pair: tuple[Member, Member],
 ) -> None:
     alice, bob = pair
@@ -131,21 +131,21 @@ def test_a_message_that_is_too_long_is_refused_and_takes_no_other_with_it(pair: 
     }
     poll(lambda: alice.node.publish(ANY, "", **giant) > 0, "the bridge as a subscriber")
 
-    def told() -> str:
+    def log_text() -> str:
         return alice.bridge.log.read_text()[len(before) :]
 
     def refused() -> bool:
         alice.node.publish(ANY, "", **giant)
-        return "messages-refused" in told()
+        return "messages-refused" in log_text()
 
     poll(refused, "the refusal in the log")
-    assert "too-large: expected a payload of at most 1000000 bytes, found 2000000" in told()
+    assert "too-large: expected a payload of at most 1000000 bytes, found 2000000" in log_text()
     for _ in range(50):
         alice.node.publish(ANY, "", **giant)
     flows(alice, bob, "after the giant")
-    # Nothing else is lost by it, the connection to the daemon least of all; and it is told once, not fifty times.
-    assert told().count("daemon-connected") == 0
-    assert told().count("messages-refused") < 20
+    # Nothing else is lost, in particular not the connection to the daemon, and it is not logged fifty times.
+    assert log_text().count("daemon-connected") == 0
+    assert log_text().count("messages-refused") < 20
 
 
 def test_ten_thousand_messages_at_once_are_delivered_or_refused_aloud(pair: tuple[Member, Member]) -> None:
@@ -159,11 +159,11 @@ def test_ten_thousand_messages_at_once_are_delivered_or_refused_aloud(pair: tupl
     def flood() -> list[str]:
         return [line["data"] for line in bob.node.received() if str(line.get("data")).startswith("flood ")]
 
-    told = alice.bridge.log.read_text()[before:]
-    if "messages-refused" not in told:
+    log_text = alice.bridge.log.read_text()[before:]
+    if "messages-refused" not in log_text:
         poll(lambda: len(flood()) == 10_000, "all of it")
     assert len(set(flood())) == len(flood())
-    assert told.count("\n") < 20
+    assert log_text.count("\n") < 20
 
 
 def test_without_a_master_what_flows_goes_on_and_what_is_new_waits(pair: tuple[Member, Member]) -> None:

@@ -42,9 +42,9 @@ def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and
         message = poll(sent, "the message at bob's daemon")
         assert message.type == kind_text(MessageKind(STRING))
         assert message.payload == b"\5\0\0\0ready"
-        told = [decode(each.payload) for each in heard if each.topic == PROTOCOL_TOPIC]
+        received = [decode(each.payload) for each in heard if each.topic == PROTOCOL_TOPIC]
         assert Definition(STRING, "string data\n") in [
-            each._replace(text=each.text.rstrip() + "\n") for each in told if isinstance(each, Definition)
+            each._replace(text=each.text.rstrip() + "\n") for each in received if isinstance(each, Definition)
         ]
         node.subscribe("/bob/mesh_comm/alice/status")
         client.publish("status", message.payload, to="alice", type=message.type)

@@ -1,4 +1,4 @@
-"""Two robots with a Zenoh session, a bridge and a daemon each: what holds between the sessions."""
+"""Two robots with a Zenoh session, a bridge and a daemon each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CDR_HELLO = bytes.fromhex("00010000") + struct.pack("<I", 6) + b"hello\0"
 
 
 def settings(listen: int | None = None, connect: int | None = None) -> dict[str, str]:
-    """A peer on the loopback that looks for nobody."""
+    """A peer on the loopback without scouting."""
     return {
         "mode": '"peer"',
         "scouting/multicast/enabled": "false",
@@ -70,7 +70,7 @@ class Side:
         return [sample for sample in self.samples if bytes(sample.payload) == payload]
 
     def put_until_seen(self, other: Side, key: str, payload: bytes, **more: Any) -> Any:
-        """Puts it until the other side has it: who subscribes is known only after a while."""
+        """Puts it repeatedly until the other side receives it, since discovery takes a while."""
 
         def seen() -> Any:
             self.session.put(key, payload, **more)
@@ -158,7 +158,7 @@ def test_what_came_from_the_mesh_is_not_sent_back(team: tuple[Side, Side]) -> No
 
 def test_a_second_bridge_beside_the_first_sends_nothing_back(team: tuple[Side, Side]) -> None:
     alice, bob = team
-    # The twin hears bob's network and serves alice's daemon: whatever it sends comes out at bob's once more.
+    # The twin is on bob's network and uses alice's daemon: whatever it sends would reach bob again.
     twin = Side(alice.daemon, bob.port, None)
     twin.start_bridge(mode="client")
     try:
@@ -174,7 +174,7 @@ def test_a_second_bridge_beside_the_first_sends_nothing_back(team: tuple[Side, S
         alice.session.put("demo/twin", b"single")
         poll(lambda: bool(bob.saw(b"single")), "single at bob")
         bob.session.put("demo/twin", b"after")
-        # Its own, what the twin sent, and what the twin got of bob's bridge.
+        # Its own sample, the twin's, and the one the twin got from bob's bridge.
         poll(lambda: len(bob.saw(b"after")) == 3, "what bob said, by way of the twin")
         assert len(bob.saw(b"single")) == 1
         assert len(alice.saw(b"single")) == 1
@@ -203,7 +203,7 @@ def test_a_ros_2_publisher_is_in_the_other_graph_with_its_qos_for_as_long_as_it_
 
 
 def attachment(number: int, publisher: bytes) -> bytes:
-    """What rmw_zenoh attaches: sequence number, time, publisher."""
+    """An attachment of rmw_zenoh: sequence number, time, publisher."""
     return struct.pack("<qqB16s", number, 1_700_000_000_000_000_000 + number, 16, publisher)
 
 
@@ -234,14 +234,14 @@ def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_ke
             publisher.put(b"%d %d" % (place, number), attachment=attachment(number, bytes([place] * 16)))
     present: list[bytes] = []
     kept = [late_subscriber(bob, present)]
-    # A robot that comes late: told what is kept, of each publisher the last two.
+    # A robot that joins late gets the cached samples, the last two of each publisher.
     bob.start_bridge()
     poll(lambda: sorted(present) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what was kept: {present}")
-    # A subscriber that comes late, on the robot that had it from the mesh.
+    # A late subscriber on the robot that received it from the mesh.
     late: list[bytes] = []
     kept.append(late_subscriber(bob, late))
     poll(lambda: sorted(late) == [b"0 2", b"0 3", b"1 2", b"1 3"], f"what the bridge keeps: {late}")
-    # What comes now comes once, also when the robots meet again and it is told again.
+    # A later sample is put once, even if it is sent again when the robots meet again.
     publishers[0].put(b"0 4", attachment=attachment(4, bytes(16)))
     poll(lambda: b"0 4" in present and b"0 4" in late, "what is new")
     bob.daemon.kill()
@@ -249,9 +249,9 @@ def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_ke
     bob.daemon.start()
     publishers[0].put(b"0 5", attachment=attachment(5, bytes(16)))
     poll(lambda: b"0 5" in present, "what came after they met again")
-    alice.put_until_seen(bob, "demo/after", b"whatever was told again has come before")
+    alice.put_until_seen(bob, "demo/after", b"all cached samples came before")
     assert len(present) == len(set(present)) == 6
-    # With the publisher goes what was kept of it.
+    # The cache is dropped with its publisher.
     token.undeclare()
     poll(lambda: bob.tokens.get(KEPT_TOKEN) is False, "the publisher gone")
 

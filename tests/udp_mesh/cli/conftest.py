@@ -19,7 +19,7 @@ def pair() -> Iterator[Pair]:
 
 @pytest.fixture
 def run(pair: Pair, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs a command on alice; returns its exit code, output and complaints."""
+    """Runs a command on alice; returns its exit code, output and errors."""
 
     def run_command(*words: str) -> tuple[int, str, str]:
         code = main([*words, "--socket", str(pair[0].socket)])

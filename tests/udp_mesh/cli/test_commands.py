@@ -1,4 +1,4 @@
-"""The command line against real daemons: what scripts rely on is exit codes and JSON."""
+"""The command line with real daemons: exit codes, JSON and messages."""
 
 import argparse
 import errno
@@ -52,7 +52,7 @@ def test_a_watch_repeats_until_it_is_interrupted(pair: Pair) -> None:
     assert uptimes[1] > uptimes[0]
 
 
-def test_a_watch_waits_for_a_daemon_that_starts_anew() -> None:
+def test_a_watch_waits_for_a_daemon_that_restarts() -> None:
     with (
         tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder,
         RunningDaemon(Path(folder), "alone", configuration(Path(folder), "alone", 1, [2], free_port())) as daemon,
@@ -66,7 +66,7 @@ def test_a_watch_waits_for_a_daemon_that_starts_anew() -> None:
             lines = iter(program.stdout.readline, "")
             assert next(lines).startswith("alone  udp-mesh")
             daemon.stop()
-            assert any(line.endswith("; waiting for it\n") for line in lines)
+            assert any(line.endswith("; waiting for the daemon\n") for line in lines)
             daemon.start()
             assert any(line.startswith("alone  udp-mesh") for line in lines)
             program.send_signal(signal.SIGINT)
@@ -167,7 +167,7 @@ def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
     assert run("set", "neighbour", "127.0.3.9", "--name", "base")[0] == Exit.OK
     assert run("drop", "neighbour", "127.0.3.9")[0] == Exit.OK
     assert run("reload")[0] == Exit.OK
-    assert run("reload")[1] == "nothing to change\n"
+    assert run("reload")[1] == "no changes\n"
 
 
 def test_a_bound_that_was_set_can_be_taken_away(run: Run) -> None:
@@ -184,9 +184,13 @@ def test_a_bound_that_was_set_can_be_taken_away(run: Run) -> None:
         (["set", "topic", "map", "priority"], Exit.USAGE, "expected key=value, found 'priority'"),
         (["set", "topic", "map", "prioriti=3"], Exit.FAILED, "did you mean 'priority'?"),
         (["set", "window", "many"], Exit.FAILED, 'expected "adaptive" or 1 to 4096'),
-        (["pub", "unknown", "x"], Exit.FAILED, "unknown topic: topic unknown is not declared (`udp-mesh topics` lists"),
-        (["pub", "map", "x", "--to", "nobody"], Exit.FAILED, "nobody was never heard of (`udp-mesh peers` lists"),
-        (["pub", "map", "x", "--file", "map.bin"], Exit.USAGE, "expected the message or --file, found both"),
+        (
+            ["pub", "unknown", "x"],
+            Exit.FAILED,
+            "unknown topic: topic unknown is not declared (run `udp-mesh topics` for",
+        ),
+        (["pub", "map", "x", "--to", "nobody"], Exit.FAILED, "nobody was never heard of (run `udp-mesh peers` for"),
+        (["pub", "map", "x", "--file", "map.bin"], Exit.USAGE, "expected either a message or --file, found both"),
     ],
 )
 def test_a_mistake_is_explained_in_one_line(run: Run, words: list[str], code: int, complaint: str) -> None:
@@ -232,20 +236,20 @@ def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
     complaint = capsys.readouterr().err
     assert "cannot connect to the daemon at" in complaint
-    assert "`udp-mesh run` starts one" in complaint
+    assert "start it with `udp-mesh run`" in complaint
 
 
 def test_a_socket_for_others_is_not_called_a_missing_daemon(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Root may use every socket, so the refusal is the kernel's word in a stand-in's mouth."""
+    """Root may use every socket, so the kernel's error is simulated."""
 
     def refused(_: socket.socket, _path: str) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(socket.socket, "connect", refused)
     assert main(["status", "--socket", "s"]) == Exit.UNREACHABLE
-    assert "Permission denied (its socket is for root and for the group" in capsys.readouterr().err
+    assert "Permission denied (run as root or as a member of the group" in capsys.readouterr().err
 
 
 def test_a_key_is_made_once_for_its_owner_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -266,7 +270,7 @@ def test_a_configuration_is_checked_for_people_and_for_scripts(
     path.write_text('name = "ugv1"\nkey_file = "fleet.key"\n[topics]\nvideo = { priority = 9 }\n')
     capsys.readouterr()
     assert main(["check", str(path)]) == Exit.OK
-    assert f"{path}: good: ugv1, port 8700, 1 topics, 1 key(s)" in capsys.readouterr().out
+    assert f"{path}: valid: ugv1, port 8700, 1 topics, 1 key(s)" in capsys.readouterr().out
     assert main(["check", str(path), "--json"]) == Exit.OK
     assert json.loads(capsys.readouterr().out)["topics"][0]["name"] == "video"
     path.write_text('key_file = "fleet.key"\nport = 0\nwindo = 3\n')
@@ -338,12 +342,12 @@ def test_a_directory_that_is_not_ours_is_named_with_the_way_out(
     assert main(["run", str(path)]) == Exit.FAILED
     assert f"cannot start: {tmp_path}/file" in capsys.readouterr().err
     assert serve._reason(PermissionError(errno.EACCES, "Permission denied", "/run/udp-mesh")) == (
-        "/run/udp-mesh: Permission denied (`socket` and `state_directory` in [daemon] name other places)"
+        "/run/udp-mesh: Permission denied (run as root, or change `socket` and `state_directory` in [daemon])"
     )
 
 
 def test_events_are_printed_until_the_daemon_ends(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """A stand-in for a daemon that ends right after one event: the command says so and exits."""
+    """A fake daemon that exits after one event: the command reports it and exits."""
     path = tmp_path / "s"
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))

@@ -1,4 +1,4 @@
-"""`pub`, `echo`, `ping`, `bench`, `record` against real daemons: what they say, and their exit codes."""
+"""`pub`, `echo`, `ping`, `bench`, `record` with real daemons: output and exit codes."""
 
 import io
 import json
@@ -36,7 +36,7 @@ def test_a_measurement_that_is_interrupted_says_what_it_has(pair: Pair, words: l
         program.send_signal(signal.SIGINT)
         last = program.stdout.read().splitlines()[-1]
         assert program.wait(WAIT_S) == Exit.INTERRUPTED
-    assert re.match("[1-9][0-9]* of [1-9][0-9]* (answered, least|messages of 1 B delivered)", last)
+    assert re.match("[1-9][0-9]* of [1-9][0-9]* (answered, min|messages of 1 B delivered)", last)
 
 
 def messages_received(daemon: RunningDaemon) -> int:
@@ -66,8 +66,8 @@ def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair:
 def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
     assert run("set", "topic", "orders", 'destinations=["bob", "carol"]', "deadline_s=0.2", "outbox=all")[0] == Exit.OK
     code, text, _ = run("pub", "orders", "go", "--wait", str(WAIT_S), "--json")
-    told = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
-    assert (code, told) == (Exit.NOT_DELIVERED, {"bob": "delivered", "carol": "expired"})
+    outcomes = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
+    assert (code, outcomes) == (Exit.NOT_DELIVERED, {"bob": "delivered", "carol": "expired"})
     code, text, _ = run("pub", "map", "x" * 20_000, "--wait", str(WAIT_S), "--json")
     assert (code, json.loads(text)["peer"]) == (Exit.OK, "bob")
 
@@ -75,11 +75,12 @@ def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
 def test_what_has_no_outcome_says_so(run: Run) -> None:
     code, text, complaint = run("pub", "video", "x", "--to", "bob", "--wait")
     assert (code, text) == (Exit.USAGE, "")
-    assert "video, which is best effort" in complaint
+    assert "video is best effort" in complaint
     assert run("set", "topic", "later", 'destinations=["carol"]', "outbox=all")[0] == Exit.OK
     code, text, complaint = run("pub", "later", "x", "--wait", "0.1")
     assert (code, text) == (Exit.NOT_DELIVERED, "")
-    assert "1 outcome(s) are missing after 0.1 s, of carol (one to all that fits a datagram has none" in complaint
+    expected = "timed out after 0.1 s: 1 outcome(s) missing from carol (a single-datagram broadcast has no outcome"
+    assert expected in complaint
 
 
 def test_a_message_is_the_bytes_of_the_command_line(run: Run, pair: Pair) -> None:
@@ -110,7 +111,7 @@ def test_a_file_without_end_is_no_message(run: Run, monkeypatch: pytest.MonkeyPa
     assert (code, complaint) == (Exit.FAILED, f"udp-mesh: {name}: expected at most 1000 bytes, found more\n")
 
 
-def test_a_script_is_told_that_its_message_was_accepted(run: Run) -> None:
+def test_a_script_learns_that_its_message_was_accepted(run: Run) -> None:
     code, text, _ = run("pub", "map", "x", "--to", "bob", "--count", "2", "--rate", "100", "--json")
     assert (code, json.loads(text)) == (Exit.OK, {"topic": "map", "accepted": 2})
 
@@ -128,7 +129,7 @@ def test_arriving_messages_are_printed(pair: Pair, capsysbinary: pytest.CaptureF
 
     def send() -> None:
         with bob.client() as client:
-            # The subscription may come a moment later than the first of these.
+            # The subscription may be later than the first of these.
             while not done.wait(0.1):
                 client.publish("status", b"ready", to="alice")
 
@@ -172,7 +173,7 @@ def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
     assert "2 of 2 answered" in run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50")[1]
     code, text, complaint = run("ping", "nobody", "-c", "1000")
     assert (code, text) == (Exit.FAILED, "")
-    assert "nobody was never heard of (`udp-mesh peers` lists" in complaint
+    assert "nobody was never heard of (run `udp-mesh peers` for" in complaint
     code, text, _ = run("ping", "nobody", "--json")
     assert (code, json.loads(text)) == (Exit.FAILED, {"peer": "nobody", "error": "unknown-peer"})
 
@@ -189,7 +190,7 @@ def test_a_ping_whose_daemon_ends_says_what_it_has(run: Run, monkeypatch: pytest
     monkeypatch.setattr(MeshClient, "request", request)
     code, text, complaint = run("ping", "bob", "-c", "9", "--interval", "0.001")
     assert (code, complaint) == (Exit.UNREACHABLE, "udp-mesh: the daemon closed the connection\n")
-    assert text.splitlines()[-1] == "2 of 3 answered, least 2 ms, mean 3 ms, most 4 ms"
+    assert text.splitlines()[-1] == "2 of 3 answered, min 2 ms, mean 3 ms, max 4 ms"
 
 
 def test_a_benchmark_says_what_arrived(run: Run) -> None:
@@ -209,17 +210,17 @@ def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
     assert run("record", "start", str(path))[::2] == (Exit.FAILED, f"udp-mesh: {path}: File exists\n")
 
 
-def test_a_recording_where_the_daemon_may_not_write_or_we_cannot_look_is_told(
+def test_a_recording_that_cannot_be_written_or_seen_is_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code, _, complaint = run("record", "start", str(tmp_path / "none" / "run.jsonl"))
     assert code == Exit.FAILED
-    assert "No such file or directory (the daemon writes it, and as a service may do so below" in complaint
-    # a /tmp of the daemon's own: what it made there is not here
+    assert "No such file or directory (the daemon writes the file; as a service it may do so only below" in complaint
+    # A private /tmp of the daemon: its files are not visible here.
     monkeypatch.setattr(MeshClient, "request", lambda *_, **__: {})
     code, _, complaint = run("record", "start", str(tmp_path / "run.jsonl"))
     assert code == Exit.OK
-    assert "run.jsonl is not to be seen here: the daemon has a /tmp of its own" in complaint
+    assert "run.jsonl is not visible here: the daemon's service has a private /tmp" in complaint
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The daemon's replies as people read them."""
+"""The daemon's replies as text."""
 
 import json
 from dataclasses import replace

@@ -101,7 +101,7 @@ def play(
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_fielded_sender_loses_what_the_link_loses_and_no_more(seed: int) -> None:
+def test_a_legacy_sender_loses_what_the_link_loses_and_no_more(seed: int) -> None:
     urgent, bulk, program = play(0.01, 20.0, seed=seed)
     assert urgent >= 192
     assert bulk >= 370
@@ -117,7 +117,7 @@ def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
     assert program.in_flight == {}
 
 
-def test_a_restart_of_ours_stalls_a_fielded_sender_for_no_ten_seconds() -> None:
+def test_a_restart_of_ours_stalls_a_legacy_sender_for_no_ten_seconds() -> None:
     urgent, _, program = play(0.02, 15.0, restart_at=7.0)
     assert urgent >= 135
     assert program.flushed == 0
@@ -138,7 +138,7 @@ def legacy(*topics: Topic) -> OldRobot:
     return OldRobot(topics=(Topic("map", priority=9), *topics))
 
 
-def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
+def test_what_an_outbox_keeps_waits_until_a_legacy_robot_has_started() -> None:
     """It acknowledges before its reader has subscribed: what arrives before that is lost."""
     old = legacy(Topic("kept", priority=8, outbox=Outbox.ALL))
     old.now += 20.0
@@ -161,7 +161,7 @@ def test_what_an_outbox_keeps_waits_until_a_fielded_robot_has_started() -> None:
     assert left == 40
 
 
-def test_a_bridges_own_messages_are_not_sent_to_fielded_robots() -> None:
+def test_a_bridges_own_messages_are_not_sent_to_legacy_robots() -> None:
     old = OldRobot()
     for type_name in ("bridge", "zenoh", "std_msgs/msg/String RIHS01_ab"):
         old.node.send("map", b"{}", destination="old", now=old.now, type_name=type_name)
@@ -174,14 +174,14 @@ def test_a_bridges_own_messages_are_not_sent_to_fielded_robots() -> None:
 @pytest.mark.parametrize(
     ("topic", "kind"), [("~mesh/ping", "a/B"), ("a b", "a/B"), ("chat", "B"), ("1", "a/B"), ("a//b", "a/B")]
 )
-def test_only_names_of_ros_are_taken_from_fielded_robots(topic: str, kind: str) -> None:
+def test_only_names_of_ros_are_taken_from_legacy_robots(topic: str, kind: str) -> None:
     old = OldRobot()
     body = encode_mesh_data(PriorityMeshData("old", kind, 1, topic, b"x"))
     old.say(LegacyPayload(1, 0, 1, body, wants_ack=True))
     assert old.received() == []
 
 
-def test_a_fielded_robot_names_so_many_topics_and_no_more() -> None:
+def test_a_legacy_robot_names_so_many_topics_and_no_more() -> None:
     old = OldRobot()
     for number in range(MAX_TOPICS + 50):
         body = encode_mesh_data(PriorityMeshData("old", "a/B", 1, f"t{number}", b"x"))
@@ -191,7 +191,7 @@ def test_a_fielded_robot_names_so_many_topics_and_no_more() -> None:
     assert old.node.conditions(old.now).counters.dropped_over_limit == 51
 
 
-def test_another_port_of_a_fielded_robot_is_not_believed() -> None:
+def test_another_port_of_a_legacy_robot_is_not_believed() -> None:
     old = OldRobot()
     old.node.receive(encode_legacy(fragments(1, b"forged")[0]), "mesh", (OLD[0], 4444), old.now)
     assert old.received() == []
@@ -199,7 +199,7 @@ def test_another_port_of_a_fielded_robot_is_not_believed() -> None:
     assert len(old.hear_payloads()) == 1
 
 
-def test_the_status_of_a_fielded_robot_and_our_own_rate_say_what_goes_to_it() -> None:
+def test_the_status_of_a_legacy_robot_and_our_own_rate_say_what_goes_to_it() -> None:
     world = World(seed=1)
     config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
     world.add(config, address="10.0.0.1")

@@ -177,7 +177,7 @@ def test_whatever_an_insider_says_nothing_crashes_and_little_is_owed(datagrams: 
     both.roundtrip(times=10)
 
 
-def test_a_message_larger_than_the_limit_is_refused_and_its_sender_told() -> None:
+def test_a_message_larger_than_the_limit_is_refused_and_its_sender_notified() -> None:
     world = World()
     world.add(settings("a"))
     world.add(settings("b", limits=Limits(message_bytes=10_000)))
@@ -213,7 +213,7 @@ def test_a_flood_of_garbage_delays_no_urgent_message(flood_per_s: int) -> None:
     assert max(latencies) < 0.012
 
 
-def test_waiting_levels_claimed_without_end_hold_nobody_back_for_good() -> None:
+def test_waiting_levels_claimed_without_end_hold_no_node_back_for_good() -> None:
     world = World()
     for name in ("a", "b"):
         world.add(settings(name, Topic("bulk", priority=9)))

@@ -84,7 +84,7 @@ def fragments(sequence: int, data: bytes, *, wants_ack: bool = True) -> list[Leg
     return [LegacyPayload(sequence, place, len(chunks), chunk, wants_ack) for place, chunk in enumerate(chunks)]
 
 
-def test_messages_go_to_a_fielded_peer_in_its_own_format_with_their_priority() -> None:
+def test_messages_go_to_a_legacy_peer_in_its_own_format_with_their_priority() -> None:
     old = OldRobot()
     sent_type = "std_msgs/Empty d41d8cd98f00b204e9800998ecf8427e"
     old.node.send("stop", b"halt", destination="old", now=old.now, type_name=sent_type)
@@ -101,7 +101,7 @@ def test_messages_go_to_a_fielded_peer_in_its_own_format_with_their_priority() -
     assert [type(event) for event in old.events()] == [MessageDelivered]
 
 
-def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
+def test_messages_of_a_legacy_peer_arrive_and_are_acknowledged() -> None:
     old = OldRobot()
     for fragment in reversed(fragments(5, b"x" * 4000)):
         old.say(fragment)
@@ -111,13 +111,13 @@ def test_messages_of_a_fielded_peer_arrive_and_are_acknowledged() -> None:
     assert (event.source, event.topic, event.payload, event.priority) == ("old", "chat", b"x" * 4000, 4)
 
 
-def test_where_a_fielded_peer_was_heard_is_told() -> None:
+def test_where_a_legacy_peer_was_heard_is_reported() -> None:
     old = OldRobot()
     (peer,) = old.node.conditions(old.now + 2).peers
     assert (peer.name, peer.online, peer.address, peer.link, peer.last_heard) == ("old", True, OLD, "mesh", old.now)
 
 
-def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> None:
+def test_a_neighbor_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> None:
     old = OldRobot()
     named = old.node._state.settings
     others = tuple(
@@ -131,14 +131,14 @@ def test_a_neighbour_no_longer_named_is_forgotten_unless_it_was_heard_or_somethi
     old.hear()
 
 
-def test_a_broadcast_of_a_fielded_peer_arrives_without_an_acknowledgement() -> None:
+def test_a_broadcast_of_a_legacy_peer_arrives_without_an_acknowledgement() -> None:
     old = OldRobot()
     old.say(fragments(0x8001, b"all", wants_ack=False)[0])
     assert not [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
     assert [event.broadcast for event in old.received()] == [True]
 
 
-def test_three_fragments_are_in_flight_to_a_fielded_peer_and_urgent_ones_go_first() -> None:
+def test_three_fragments_are_in_flight_to_a_legacy_peer_and_urgent_ones_go_first() -> None:
     old = OldRobot()
     old.node.send("map", bytes(20_000), destination="old", now=old.now)
     first = old.hear_payloads()
@@ -148,7 +148,7 @@ def test_three_fragments_are_in_flight_to_a_fielded_peer_and_urgent_ones_go_firs
     assert decode_mesh_data(urgent.data).topic == "stop"
 
 
-def test_a_message_to_all_reaches_fielded_peers_too() -> None:
+def test_a_message_to_all_reaches_legacy_peers_too() -> None:
     old = OldRobot()
     old.node.send("stop", b"all", now=old.now)
     assert [decode_mesh_data(fragment.data).data for fragment in old.hear_payloads()] == [b"all"]
@@ -202,7 +202,7 @@ def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
-def test_defect_4_nothing_that_is_sent_to_all_ends_a_fielded_program() -> None:
+def test_defect_4_nothing_that_is_sent_to_all_ends_a_legacy_program() -> None:
     world = World(seed=9)
     legacy = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
     topic = Topic("cast", repair=True)
@@ -347,7 +347,7 @@ def test_defect_11_an_exact_multiple_of_the_fragment_size_sends_no_empty_fragmen
     assert [event.payload for event in both.events(both.b) if isinstance(event, MessageReceived)] == [bytes(size)]
 
 
-def test_defect_11_the_fielded_receiver_still_gets_the_empty_fragment_it_counts_on() -> None:
+def test_defect_11_the_legacy_receiver_still_gets_the_empty_fragment_it_counts_on() -> None:
     overhead = len(encode_mesh_data(PriorityMeshData("new", "", 9, "map", b"")))
     old = OldRobot()
     old.node.send("map", bytes(1300 - overhead), destination="old", now=old.now)
@@ -362,7 +362,7 @@ def test_a_repeated_fragment_of_a_finished_message_is_acknowledged_and_opens_no_
     assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) == 4
 
 
-def test_a_silent_fielded_peer_is_probed_gently_and_loses_nothing() -> None:
+def test_a_silent_legacy_peer_is_probed_gently_and_loses_nothing() -> None:
     old = OldRobot()
     old.node.send("map", bytes(20_000), destination="old", now=old.now)
     sent = 0
@@ -380,20 +380,20 @@ def test_a_silent_fielded_peer_is_probed_gently_and_loses_nothing() -> None:
     assert delivered
 
 
-def test_without_fielded_neighbours_their_format_is_dropped() -> None:
+def test_without_legacy_neighbors_their_format_is_dropped() -> None:
     both = pair()
     both.b.receive(encode_legacy(Host("x", "10.0.0.9")), "mesh", OLD, both.now)
     assert both.events(both.b) == []
 
 
-def test_settings_of_a_fielded_neighbour_need_its_name() -> None:
+def test_settings_of_a_legacy_neighbor_need_its_name() -> None:
     with pytest.raises(ValueError, match="requires a name"):
         Neighbour(OLD, legacy=True)
     assert isinstance(settings("x"), Settings)
     assert PeerOnline is not None
 
 
-def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_start_anew() -> None:
+def test_a_legacy_program_that_restarts_is_understood_although_its_numbers_restart() -> None:
     old = OldRobot()
     for sequence in (1, 2):
         for fragment in fragments(sequence, b"x" * 2000):
@@ -410,7 +410,7 @@ def test_a_fielded_program_that_starts_anew_is_understood_although_its_numbers_s
     assert [event.payload[:1] for event in old.received()] == [b"y", b"z", b"z"]
 
 
-def test_a_message_above_the_limit_stalls_no_fielded_sender() -> None:
+def test_a_message_above_the_limit_stalls_no_legacy_sender() -> None:
     old = OldRobot(limits=Limits(message_bytes=5000))
     for fragment in [*fragments(1, bytes(20_000)), *fragments(2, b"small")]:
         old.say(fragment)
@@ -431,7 +431,7 @@ def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:
     assert all(1 <= number <= LAST_SEQUENCE for number in numbers)
 
 
-def test_a_link_without_ipv4_is_not_announced_in_the_fielded_format() -> None:
+def test_a_link_without_ipv4_is_not_announced_in_the_legacy_format() -> None:
     old = OldRobot()
     old.node.link_up(
         LinkInfo("six", LinkKind.BROADCAST, ("fe80::1234:5678:9abc:def0", 8700), ("ff02::1", 8700)), 1000.0

@@ -45,14 +45,14 @@ def play(seed: int, duration_s: float) -> tuple[list[float], int]:
     return sorted(took.values()), len(bulk)
 
 
-def test_urgent_messages_and_bulk_to_a_fielded_peer_stand_a_fifth_of_loss() -> None:
+def test_urgent_messages_and_bulk_to_a_legacy_peer_stand_a_fifth_of_loss() -> None:
     took, bulk = play(5, 40.0)
     assert len(took) >= 395
     assert took[len(took) * 99 // 100] <= 0.35
     assert bulk >= 1500
 
 
-def test_a_fielded_peer_that_answered_and_fell_silent_is_probed_gently() -> None:
+def test_a_legacy_peer_that_answered_and_fell_silent_is_probed_gently() -> None:
     old = OldRobot()
     old.node.send("map", bytes(50_000), destination="old", now=old.now)
     for turn in range(12):

@@ -106,7 +106,7 @@ def test_bulk_fills_a_lossy_link(loss: float, share: float) -> None:
     assert figures.goodput_bits_per_s >= share * 10e6 * (1 - loss)
 
 
-@pytest.mark.parametrize(("loss", "least_p99_s"), [(0.0, 0.020), (0.05, 0.028), (0.2, 0.050)])
+@pytest.mark.parametrize(("loss", "min_p99_s"), [(0.0, 0.020), (0.05, 0.028), (0.2, 0.050)])
 def test_an_urgent_message_overtakes_the_bulk_that_fills_the_link(loss: float, min_p99_s: float) -> None:
     figures = settled(15.0, loss=loss)
     assert figures.latency(0.5) <= 0.022

@@ -57,7 +57,7 @@ class Move:
         ]
 
 
-def test_messages_go_on_after_a_fielded_robot_has_moved_over_although_nobody_was_told() -> None:
+def test_messages_continue_after_a_legacy_robot_was_upgraded_without_reconfiguration() -> None:
     move = Move()
     world = move.world
     world.send("a", "map", MAP, "b")

@@ -88,7 +88,7 @@ def test_a_message_costs_the_same_however_many_are_held(topic: Topic) -> None:
     assert many.count < 1.2 * few.count
 
 
-def test_to_take_back_what_was_under_way_costs_the_same_per_message() -> None:
+def test_returning_messages_in_flight_to_an_outbox_costs_the_same_per_message() -> None:
     counts = []
     for messages in (500, 2000):
         world = met(LOG)

@@ -74,7 +74,7 @@ def test_reassembly_never_holds_more_than_its_cap_whatever_fragments_claim(claim
         assert len(reassembly.finished) <= limits.finished_ranges_per_peer
 
 
-def test_a_refused_piece_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
+def test_a_refused_fragment_leaves_nothing_behind_and_is_taken_when_there_is_room() -> None:
     reassembly = Reassembly(Limits(partial_bytes_per_peer=FRAGMENT_OVERHEAD_BYTES + 50))
     first, second = fragments_of(bytes(60), 30)
     assert reassembly.add(first, 0.0) is FragmentStatus.KEPT

@@ -17,7 +17,7 @@ def test_levels_less_urgent_than_the_one_waiting_elsewhere_hold_back_for_a_while
     assert priority_backoff.allowed_levels(1.2) == ALL_LEVELS
 
 
-def test_bulk_waiting_elsewhere_holds_nobody_back() -> None:
+def test_bulk_waiting_elsewhere_holds_no_node_back() -> None:
     priority_backoff = PriorityBackoff(Rates(), 0.0)
     priority_backoff.on_waiting((Waiting(9, 60_000),), 1.0)
     assert priority_backoff.allowed_levels(1.0) == ALL_LEVELS

@@ -76,7 +76,7 @@ def test_one_that_had_left_whole_arrives_once_although_the_link_became_narrower(
     assert len(world.events_of("b", MessageReceived)) == 1
 
 
-def test_a_peer_that_restarted_gets_the_message_anew() -> None:
+def test_a_peer_that_restarted_gets_the_message_again() -> None:
     world = met(ART)
     world.send("a", "art", bytes(500_000), "b")
     world.run(0.2)
@@ -90,7 +90,7 @@ def test_a_peer_that_restarted_gets_the_message_anew() -> None:
     assert len(world.events_of("b", MessageReceived)) == 1
 
 
-def test_a_peer_that_forgot_its_pieces_meanwhile_gets_the_message_anew() -> None:
+def test_a_peer_that_lost_its_fragments_meanwhile_gets_the_message_again() -> None:
     world = met(ART)
     world.send("a", "art", bytes(500_000), "b")
     world.run(0.2)

@@ -49,7 +49,7 @@ def exchange(world: World, name: str) -> None:
         assert len(world.events_of(who, MessageDelivered)) == ended[who] + 1
 
 
-def test_each_of_them_is_told_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
+def test_each_of_them_is_reported_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
     world = conflict()
     for number in range(20):
         again = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)

@@ -49,7 +49,7 @@ def stop(world: World, name: str, stopped_s: float) -> None:
 
 
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0, 200.0])
-def test_a_stopped_sender_takes_nobody_for_lost(stopped_s: float) -> None:
+def test_a_suspended_sender_declares_no_peer_lost(stopped_s: float) -> None:
     """What the others sent meanwhile did not fit the socket's buffer: to the sender they were silent."""
     world = met(3)
     world.send("a", "map", bytes(MAP_BYTES), "b")

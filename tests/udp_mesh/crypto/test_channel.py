@@ -82,7 +82,7 @@ def test_broadcasts_and_unicasts_have_kinds_of_their_own() -> None:
     assert kinds == [Kind.INTRODUCTION, Kind.DATA]
 
 
-def test_a_replayed_datagram_is_told_from_a_forged_one() -> None:
+def test_a_replayed_datagram_is_distinguished_from_a_forged_one() -> None:
     sender, receiver = SendChannel(KEY, ALICE, BOB), ReceiveChannel(KEY, ALICE, BOB)
     _, data = sender.seal(b"frames")
     open_datagram(receiver, data)

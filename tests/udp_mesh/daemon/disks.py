@@ -1,4 +1,4 @@
-"""Disks that do not do as they should, for outboxes."""
+"""Faulty disks, for outboxes."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -8,7 +8,7 @@ from pathlib import Path
 
 @contextmanager
 def standing_disk(directory: Path, key: int) -> Iterator[Callable[[], None]]:
-    """A disk that stands still at the file of `key` until the function is called: a pipe with nobody at its end."""
+    """A disk that hangs at the file of `key` until the returned function is called: a pipe without a reader."""
     directory.mkdir(parents=True, exist_ok=True)
     pipe = directory / f"{key:020d}.new"
     os.mkfifo(pipe)

@@ -1,7 +1,7 @@
-"""Two real daemons, each in a network namespace of its own, joined by veth pairs that come, go and change.
+"""Two real daemons, each in a network namespace of its own, joined by veth pairs that are added, removed and changed.
 
 `python -m tests.udp_mesh.daemon.namespaces SCENARIO` plays one of the functions below; it must run as root of a network
-namespace nobody else uses (`unshare --net`). Anything that is not as it should be raises.
+namespace of its own (`unshare --net`). Anything that is not as it should be raises.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, 
 from udp_mesh.cli.views import status_view
 
 MAP_BYTES = 3_000_000
-"""At the topic's rate limit it takes some seconds: time to change the network in the middle."""
+"""Takes some seconds at the topic's rate limit: time to change the network during the transfer."""
 
 
 class Pair:
-    """Alice and bob; `join` lays a cable between them."""
+    """Alice and bob; `join` connects them."""
 
     def __init__(self, alice: RunningDaemon, bob: RunningDaemon) -> None:
         self.alice, self.bob = alice, bob
@@ -41,7 +41,7 @@ class Pair:
             self.ip(daemon, f"link set {interface} up")
 
     def addresses(self) -> dict[str, str]:
-        """Peer -> the address its messages go to, as each daemon tells."""
+        """Peer -> the address its messages go to, as each daemon reports it."""
         found: dict[str, str] = {}
         for daemon in (self.alice, self.bob):
             with daemon.client() as client:
@@ -62,7 +62,7 @@ class Pair:
 
 @contextmanager
 def pair(*more: str) -> Iterator[Pair]:
-    """Both daemons up, not yet joined; `more` is what stands in the configuration of each besides."""
+    """Both daemons up, not yet joined; `more` is appended to the configuration of each."""
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder = Path(path)
         (folder / "key").write_text(KEY + "\n")
@@ -81,7 +81,7 @@ socket = "{folder / name}.sock"
 state_directory = "{folder / name}"
 """
             daemon = RunningDaemon(folder, name, configuration)
-            # IPv6 addresses need no check for duplicates on a cable with two ends
+            # No duplicate address detection needed on a veth pair
             no_check = "echo 0 > /proc/sys/net/ipv6/conf/default/accept_dad"
             daemon.prefix = ["unshare", "--net", "sh", "-c", f'{no_check}; exec "$@"', "sh"]
             daemons.append(daemon)
@@ -98,7 +98,7 @@ def met(both: Pair) -> None:
 
 
 def ipv6_only() -> None:
-    """Without any IPv4 address they find each other at all nodes of the link, lose each other, and meet again."""
+    """Without any IPv4 address they discover each other over the all-nodes group, lose contact, and reconnect."""
     with pair() as both:
         both.join("mesh0")
         met(both)
@@ -112,7 +112,7 @@ def ipv6_only() -> None:
 
 
 def ipv6_neighbours() -> None:
-    """Fixed neighbours with routable addresses, which appear after the link-local ones."""
+    """Fixed neighbors with routable addresses, which appear after the link-local ones."""
     link = '[[links]]\ninterface = "mesh0"\nkind = "neighbours"\n[[neighbours]]\naddress = '
     with pair(f'{link}"fd00::2"\n', f'{link}"[fd00::1]:8700"\n') as both:
         both.join("mesh0")
@@ -124,7 +124,7 @@ def ipv6_neighbours() -> None:
 
 
 def two_ipv6_links() -> None:
-    """Link-local addresses mean nothing without their interface: each link keeps to its own."""
+    """Link-local addresses are valid on one interface only: each link uses its own."""
     with pair() as both:
         both.join("mesh0")
         met(both)
@@ -162,7 +162,7 @@ def addresses_without_broadcast() -> None:
 
 
 def address_changes_in_the_middle() -> None:
-    """A map under way follows bob to another address, and another subnet, and arrives once."""
+    """A map in transfer follows bob to another address and another subnet, and arrives once."""
     with pair() as both:
         both.join("mesh0")
         for number, daemon in enumerate((both.alice, both.bob), 1):
@@ -188,7 +188,7 @@ def address_changes_in_the_middle() -> None:
 
 
 def interface_goes_in_the_middle() -> None:
-    """The interface is unplugged under a map and another one appears: the map goes on there."""
+    """The interface is removed during a transfer and another one appears: the transfer continues there."""
     with pair() as both:
         both.join("mesh0")
         met(both)
@@ -204,8 +204,8 @@ def interface_goes_in_the_middle() -> None:
             assert link_of(both.alice, "bob") == "mesh1"
 
 
-def interface_made_anew() -> None:
-    """Deleted and there again at once, with the same name and address, as a driver's reload or a script does it."""
+def interface_created_again() -> None:
+    """Deleted and created again at once with the same name and address, as by a driver reload or a script."""
     with pair() as both:
         both.join("mesh0")
         for number, daemon in enumerate((both.alice, both.bob), 1):
@@ -227,7 +227,7 @@ def interface_made_anew() -> None:
 
 
 def interface_too_narrow() -> None:
-    """An interface that no datagram fits is told of; the others go on."""
+    """An interface too narrow for any datagram is reported; the others keep working."""
     with pair() as both:
         both.join("mesh0")
         both.join("narrow0")
@@ -242,8 +242,8 @@ def interface_too_narrow() -> None:
 
 
 def sending_is_forbidden() -> None:
-    """A rule forbids what goes to one peer, then everything: it is told, why and to whom; when it is gone, all goes on
-    and arrives once."""
+    """A firewall rule drops traffic to one peer, then to all: it is logged with reason and peers; without it, traffic
+    resumes and arrives once."""
     with pair() as both:
         both.join("mesh0")
         for number, daemon in enumerate((both.alice, both.bob), 1):
@@ -289,7 +289,7 @@ def interface_queue_overflows() -> None:
 
 
 def logged(daemon: RunningDaemon, text: str) -> None:
-    """Waits until the daemon's log says so."""
+    """Waits for a text in the daemon's log."""
     poll(lambda: text in daemon.log.read_text(), f"{daemon.name} logs {text!r}")
 
 
@@ -299,7 +299,7 @@ def link_of(daemon: RunningDaemon, peer: str) -> str | None:
 
 
 def under_way(daemon: RunningDaemon, fragments: int) -> None:
-    """Waits until so many fragments have left."""
+    """Waits until this many fragments were sent."""
 
     def sent() -> bool:
         with daemon.client() as client:
@@ -318,7 +318,7 @@ SCENARIOS: dict[str, Callable[[], None]] = {
         addresses_without_broadcast,
         address_changes_in_the_middle,
         interface_goes_in_the_middle,
-        interface_made_anew,
+        interface_created_again,
         interface_too_narrow,
         sending_is_forbidden,
         interface_queue_overflows,

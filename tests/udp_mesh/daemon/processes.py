@@ -29,14 +29,14 @@ offline_s = 3.0
 """Faster than in the field, so that tests that wait for discovery are short."""
 
 PATIENT_RATES = RATES.replace("offline_s = 3.0", "offline_s = 15.0")
-"""For crowds of processes on a busy machine: one that had no turn for some seconds is not taken for gone."""
+"""For many processes on a busy machine: one that was not scheduled for some seconds does not go offline."""
 
 
 T = TypeVar("T")
 
 
 def poll(condition: Callable[[], T | None], what: str) -> T:
-    """`until`, with the bound of every wait for a real part."""
+    """`until`, with the timeout for real processes."""
     return until(condition, what, wait_s=WAIT_S)
 
 
@@ -51,7 +51,7 @@ class RunningDaemon:
         self.log = folder / f"{name}.log"
         self.environment: dict[str, str] = {}
         self.prefix: list[str] = []
-        """What starts the daemon, such as `unshare --net`."""
+        """Command prefix for the daemon, such as `unshare --net`."""
         self.process: subprocess.Popen[bytes] | None = None
         self.write(configuration)
 
@@ -125,7 +125,7 @@ def configuration(
     more: str = "",
     rates: str = RATES,
 ) -> str:
-    """A node at 127.0.3.<own> with fixed neighbours at 127.0.3.<others>."""
+    """A node at 127.0.3.<own> with fixed neighbors at 127.0.3.<others>."""
     key_file = folder / f"{name}.key"
     key_file.write_text("\n".join(keys) + "\n")
     neighbours = "".join(f'[[neighbours]]\naddress = "127.0.3.{other}"\n' for other in others)
@@ -152,7 +152,7 @@ state_directory = "{folder / name}"
 
 @contextmanager
 def two_daemons(topics: str = "", alice_more: str = "") -> Iterator[tuple[RunningDaemon, RunningDaemon]]:
-    """Alice and bob, who know each other, both answering and online."""
+    """Alice and bob, running and online to each other."""
     # A Unix socket's path has at most 107 bytes: pytest's folders are too long.
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder, port = Path(path), free_port()
@@ -167,7 +167,7 @@ def two_daemons(topics: str = "", alice_more: str = "") -> Iterator[tuple[Runnin
 
 
 def wait_online(daemon: RunningDaemon, peer: str, online: bool = True) -> None:
-    """Waits until the daemon holds the peer for online (or offline)."""
+    """Waits until the daemon considers the peer online (or offline)."""
     with daemon.client() as client:
         poll(
             lambda: {found["name"]: found["online"] for found in client.request("peers")["peers"]}.get(peer) == online,

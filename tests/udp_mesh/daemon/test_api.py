@@ -1,4 +1,4 @@
-"""The local socket under a crowd: programs that do not read, that are too many, that want the largest messages."""
+"""The local socket under load: clients that do not read, too many clients, the largest messages."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Answers:
 
 
 def serve(work: Callable[[LocalServer, Path], Awaitable[None]]) -> None:
-    """Does `work` beside a listening server."""
+    """Runs `work` with a listening server."""
 
     async def run() -> None:
         with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
@@ -45,7 +45,7 @@ def serve(work: Callable[[LocalServer, Path], Awaitable[None]]) -> None:
 
 
 async def connected(server: LocalServer, path: Path, count: int) -> list[socket.socket]:
-    """Programs that are connected and read nothing."""
+    """Connected clients that read nothing."""
     loop = asyncio.get_running_loop()
     before = len(server.clients)
     programs = []
@@ -67,7 +67,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def read(program: socket.socket, wanted: Callable[[list[Header]], bool]) -> list[Header]:
-    """Headers of what arrives, until `wanted`."""
+    """Headers of received frames, until `wanted`."""
     reader, found = FrameReader(), list[Header]()
     async with asyncio.timeout(WAIT_S):
         while not wanted(found):
@@ -108,10 +108,10 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
                 client.send_encoded(frame)
             await until(lambda: not reader.backlog_bytes())
         assert len(await reading) == rounds
-        # all that waits, and at most one frame each beyond its part
+        # The whole backlog, and at most one frame each beyond its share
         assert sum(client.backlog_bytes() for client in idle) < 10_000_000 + 9 * 1_000_000
-        told = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
-        assert len(told) + told[-1]["messages"] - 1 == rounds
+        received = await read(lazy[0], lambda found: "dropped" in [header["event"] for header in found])
+        assert len(received) + received[-1]["messages"] - 1 == rounds
         for one in (*lazy, program):
             one.close()
 
@@ -140,13 +140,13 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
             await loop.sock_sendall(program, request[:-1])
         await loop.sock_sendall(programs[8], encode_frame({"op": "publish", "id": 2}, b"whole"))
         assert [answer["ok"] for answer in await read(programs[8], bool)] == [True]
-        told = []
+        replies = []
         for program in programs[:8]:
             await loop.sock_sendall(program, request[-1:])
-            told += await read(program, bool)
-        assert {answer["id"] for answer in told} == {1}
-        assert {answer.get("code") for answer in told} == {None, "busy"}
-        # and what asyncio reads at a time
+            replies += await read(program, bool)
+        assert {answer["id"] for answer in replies} == {1}
+        assert {answer.get("code") for answer in replies} == {None, "busy"}
+        # Plus one read of asyncio
         assert most <= 4_000_000 + 256 * 1024
         looking.cancel()
         for program in programs:
@@ -155,7 +155,7 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
     serve(work)
 
 
-def test_one_program_too_many_is_told_why() -> None:
+def test_one_program_too_many_gets_the_reason() -> None:
     async def work(server: LocalServer, path: Path) -> None:
         programs = await connected(server, path, api.MAX_CLIENTS)
 

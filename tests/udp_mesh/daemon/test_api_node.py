@@ -77,7 +77,7 @@ def test_a_refused_message_raises_with_the_reason() -> None:
     run(body)
 
 
-def test_leaving_is_told_at_once_and_a_message_to_who_left_expires() -> None:
+def test_leaving_is_reported_at_once_and_a_message_to_a_peer_that_left_expires() -> None:
     async def body(alice: Node, bob: Node) -> None:
         await bob.__aexit__(None, None, None)
         async for event in alice.events():

@@ -1,4 +1,4 @@
-"""No local request holds the daemon up: files that are none, connections that say nothing, requests half sent."""
+"""No local request blocks the daemon: special files, idle connections, incomplete requests."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_keys_that_protect_nothing_are_refused(tmp_path: Path, text: str, found:
         read_keys(path)
 
 
-def test_a_key_file_that_everybody_can_read_is_told_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_world_readable_key_file_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "fleet.key"
     path.write_text(KEY)
     path.chmod(0o644)
@@ -105,14 +105,14 @@ def test_a_long_number_is_an_id_like_any_other() -> None:
     assert not isinstance(found, BadFrame)
 
 
-def test_status_is_answered_whoever_holds_all_connections(alice: RunningDaemon) -> None:
+def test_status_is_answered_even_if_all_connections_are_in_use(alice: RunningDaemon) -> None:
     idle = []
     try:
         for _ in range(api.MAX_CLIENTS + 3 * api.MAX_SPARE_CLIENTS):
             one = socket.socket(socket.AF_UNIX)
             one.connect(str(alice.socket))
             idle.append(one)
-        # The newest of those there is no room for may ask, unless too many come at the very same moment.
+        # The newest client beyond the limit may send a request, unless too many connect at the same time.
         asked = time.monotonic()
         while True:
             try:
@@ -138,7 +138,7 @@ def test_status_is_answered_whoever_holds_all_connections(alice: RunningDaemon) 
             assert time.monotonic() < deadline
 
 
-def test_the_metrics_are_served_whoever_holds_connections_without_asking(alice: RunningDaemon) -> None:
+def test_metrics_are_served_despite_idle_connections(alice: RunningDaemon) -> None:
     idle = [socket.create_connection(("127.0.0.1", METRICS_PORT)) for _ in range(3 * metrics_server.MAX_CONNECTIONS)]
     try:
         for one in idle:

@@ -1,4 +1,4 @@
-"""The configuration: what it means, and that every mistake is named by its line."""
+"""The configuration: its values, and that every mistake is reported with its line."""
 
 import dataclasses
 from pathlib import Path
@@ -399,7 +399,7 @@ KEYS = {
 
 @settings(max_examples=60)
 @given(data=st.data())
-def test_whatever_stands_in_the_file_is_taken_or_told(
+def test_any_value_in_the_file_is_accepted_or_reported(
     data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     lines = ['key_file = "fleet.key"']

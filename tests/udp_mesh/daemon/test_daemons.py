@@ -33,7 +33,7 @@ def pair() -> Iterator[Pair]:
         yield daemons
 
 
-def test_messages_arrive_as_they_were_sent_and_their_end_is_told(pair: Pair) -> None:
+def test_messages_arrive_as_they_were_sent_and_their_outcome_is_reported(pair: Pair) -> None:
     alice, bob = pair
     big = bytes(range(256)) * 12_000
     with alice.client() as sender, bob.client() as receiver:
@@ -113,7 +113,7 @@ def test_a_request_that_cannot_be_met_is_refused_with_a_word_and_a_reason(
 @pytest.mark.parametrize(
     "raw", [b"\xff" * 100, encode_frame({})[:-1] + b"x", b"GET / HTTP/1.1\r\n\r\n", encode_frame({"op": "publish"}) * 3]
 )
-def test_a_program_that_sends_anything_disturbs_nobody(pair: Pair, raw: bytes) -> None:
+def test_a_program_that_sends_anything_disturbs_no_other(pair: Pair, raw: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as hostile:
         hostile.connect(str(pair[0].socket))
         hostile.sendall(raw)
@@ -142,7 +142,7 @@ def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: P
 
 
 def test_a_program_that_asks_without_reading_stops_being_answered_until_it_reads(pair: Pair) -> None:
-    # an id comes back in the answer: a long one makes the answers long
+    # Replies contain the id: a long id makes long replies.
     request, taken = encode_frame({"op": "neighbours", "id": "x" * 60_000}), 0
     with socket.socket(socket.AF_UNIX) as hostile:
         hostile.connect(str(pair[0].socket))
@@ -168,11 +168,11 @@ def resident_bytes(daemon: RunningDaemon) -> int:
 
 
 def poll_writable(program: socket.socket) -> bool:
-    """Whether the daemon takes more of this program within a second of its doing nothing else."""
+    """Whether the daemon reads more from this client within a second."""
     return bool(select.select([], [program], [], 1.0)[1])
 
 
-def test_a_subscriber_that_does_not_read_loses_messages_and_is_told_how_many(pair: Pair) -> None:
+def test_a_subscriber_that_does_not_read_loses_messages_and_gets_their_number(pair: Pair) -> None:
     alice, bob = pair
     payload = bytes(1_000_000)
     with alice.client() as sender, bob.client() as lazy:
@@ -224,7 +224,7 @@ def test_the_conditions_are_a_topic_for_local_programs(pair: Pair) -> None:
         assert [peer["name"] for peer in frame[0]["conditions"]["peers"]] == ["bob"]
 
 
-def test_status_tells_links_keys_and_peers_and_never_a_secret(pair: Pair) -> None:
+def test_status_shows_links_keys_and_peers_and_never_a_secret(pair: Pair) -> None:
     with pair[0].client() as client:
         status = client.request("status")
     assert status["links"][0]["address"].startswith("127.0.3.1:")
@@ -289,7 +289,7 @@ def test_any_bytes_on_the_udp_port_neither_stop_the_daemon_nor_its_urgent_messag
         host, port = receiver.request("status")["links"][0]["address"].split(":")
         before = receiver.request("status")["conditions"]["counters"]
         for turn in range(3000):
-            # Noise, and headers that look like ours or like the fielded format's in front of noise.
+            # Noise, and headers in the current and the legacy format in front of noise.
             first = bytes((source.choice((0x90, 0x91, 0x92, 0x93, 0xA0, 1, 2, 4, 5, source.randrange(256))),))
             attacker.sendto(first + source.randbytes(source.randrange(200)), (host, int(port)))
             if turn % 300 == 0:

@@ -1,4 +1,4 @@
-"""The driver at its edges: full sockets, stepped clocks, vanished links, endings."""
+"""Edge cases of the driver: full sockets, clock steps, removed links, shutdown."""
 
 import asyncio
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.daemon.driver import MAX_BLOCKED_DATAGRAMS
 from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError
-from udp_mesh.links.udp import Deliver, Outgoing, UdpLink
+from udp_mesh.links.udp import Deliver, OutgoingDatagram, UdpLink
 
 PAYLOAD = bytes(range(256)) * 2000
 
@@ -23,7 +23,7 @@ def test_a_socket_that_is_full_for_a_while_costs_nothing_but_time(monkeypatch: p
     async def body(alice: Node, bob: Node) -> None:
         real, full_for = UdpLink.send, 200
 
-        def send(self: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+        def send(self: UdpLink, datagrams: Sequence[OutgoingDatagram]) -> int:
             nonlocal full_for
             if self.attachment.address[0].endswith(".1") and full_for:
                 full_for -= 1
@@ -62,7 +62,7 @@ def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_
         sent: list[bytes] = []
         room = 0
 
-        def send(_: UdpLink, datagrams: Sequence[Outgoing]) -> int:
+        def send(_: UdpLink, datagrams: Sequence[OutgoingDatagram]) -> int:
             sent.extend(datagram.data for datagram in datagrams[:room])
             return min(room, len(datagrams))
 
@@ -102,7 +102,7 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     run(body)
 
 
-def test_links_that_are_no_longer_wished_for_close_and_return() -> None:
+def test_links_that_are_no_longer_configured_close_and_return() -> None:
     async def body(alice: Node, bob: Node) -> None:
         wishes = alice.driver.hub.configs
         alice.driver.apply_links(())
@@ -128,7 +128,7 @@ def test_an_interfaces_address_that_another_process_uses_is_reported_and_tried_a
     asyncio.run(main())
 
 
-def test_an_exception_nobody_expected_is_reported_and_the_transport_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_exception_is_reported_and_the_transport_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, bob: Node) -> None:
         reported: list[str] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(str(context["exception"])))
@@ -149,7 +149,7 @@ def test_an_exception_nobody_expected_is_reported_and_the_transport_goes_on(monk
     run(body)
 
 
-def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again_and_that_is_said_once(
+def test_a_failed_interface_dump_is_retried_and_logged_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def body(alice: Node, bob: Node) -> None:
@@ -165,7 +165,7 @@ def test_a_kernel_that_will_not_list_its_interfaces_is_asked_again_and_that_is_s
     run(body)
 
 
-def test_a_bug_in_the_look_at_interfaces_leaves_the_open_links_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_in_the_refresh_of_interfaces_leaves_the_links_open(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, bob: Node) -> None:
         def fail() -> None:
             raise ZeroDivisionError("a bug")
@@ -178,7 +178,7 @@ def test_a_bug_in_the_look_at_interfaces_leaves_the_open_links_heard(monkeypatch
     run(body)
 
 
-def test_notices_without_end_do_not_put_off_the_look_at_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_continuous_notices_do_not_postpone_the_refresh_of_interfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, _: Node) -> None:
         driver = alice.driver
         assert driver._monitor is not None
@@ -189,7 +189,7 @@ def test_notices_without_end_do_not_put_off_the_look_at_interfaces(monkeypatch: 
         await asyncio.sleep(0.001)
         driver._interfaces_changed()
         assert driver._refresh_timer is first
-        # but one that waits for another attempt later comes at once
+        # A refresh scheduled for a later retry is moved forward.
         first.cancel()
         later = driver._refresh_timer = asyncio.get_running_loop().call_later(3600.0, driver._refresh_and_pump)
         driver._interfaces_changed()

@@ -1,4 +1,4 @@
-"""What the README and the guide show works when it is pasted."""
+"""The examples of the README and the guide work as printed."""
 
 import asyncio
 import contextlib
@@ -63,7 +63,7 @@ def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted:
             task = asyncio.create_task(shown())
             async with Node(base, links=(LinkConfig(address="127.0.6.2", broadcast=False),)) as node:
                 arrived = asyncio.ensure_future(anext(node.messages()))
-                # whichever ends first: an example that fails must not be waited for
+                # Stop at the first to finish, so that a failing example does not block.
                 await asyncio.wait((arrived, task), return_when=asyncio.FIRST_COMPLETED)
                 if not arrived.done():
                     await task
@@ -77,7 +77,7 @@ def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted:
 
 def test_two_robots_on_one_machine_find_each_other_as_the_guide_says(tmp_path: Path) -> None:
     shown = example("docs/udp-mesh.md", "udp-mesh run robot2.toml")
-    # on a port of this test's own, on addresses of its own
+    # With a port and addresses of this test's own
     shown = shown.replace("127.0.0.", "127.0.7.").replace('key_file = "', f'port = {free_port()}\nkey_file = "')
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     with subprocess.Popen(

@@ -1,4 +1,4 @@
-"""A node of another make, written from docs/wire-format.md alone, and a real daemon understand each other."""
+"""An independent implementation, written from docs/wire-format.md alone, interoperates with a real daemon."""
 
 import json
 import os
@@ -72,7 +72,7 @@ def test_it_takes_messages_of_any_size_and_the_daemon_knows(daemon: RunningDaemo
         assert set(outcomes(client, len(payloads)).values()) == {"delivered"}
     assert {one.topic: one.payload for one in foreign.arrived} == payloads
     assert {one.type_name for one in foreign.arrived} == {"a/Type"}
-    # compression is used only towards who announces it
+    # Compression is used only with peers that announce it.
     packed = next(one for one in foreign.arrived if one.topic == "packed")
     assert bool(packed.flags & COMPRESSED) == bool(foreign.features & ZLIB)
 
@@ -91,7 +91,7 @@ def test_what_it_sends_arrives_once_and_is_acknowledged(daemon: RunningDaemon, f
         assert {(message.source, message.topic, message.type) for message in found} == {
             (foreign.name, "from-abroad", "foreign/Type")
         }
-        # whole messages sent again are acknowledged again, and delivered no second time
+        # Complete messages sent again are acknowledged again but not delivered twice.
         for number in numbers:
             alice.ends.pop(number)
         alice.next_id = 0

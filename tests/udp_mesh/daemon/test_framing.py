@@ -1,4 +1,4 @@
-"""Requests of local programs: any cutting gives the same, and a frame that cannot be taken costs that frame only."""
+"""Requests of local clients: any split gives the same result, and an invalid frame costs only itself."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Daemons killed, restarted, reloaded in the middle of transfers: what was accepted is delivered or its end is told."""
+"""Daemons killed, restarted and reloaded during transfers: every accepted message is delivered or has an outcome."""
 
 import signal
 import socket
@@ -60,7 +60,7 @@ def test_what_waited_on_disk_when_the_sender_was_killed_is_delivered_after_its_r
     assert entries == {b"entry %d" % number for number in range(10)}
 
 
-def test_a_disk_that_stands_still_holds_up_nobody_but_the_publisher_who_waits_for_it() -> None:
+def test_a_hung_disk_delays_only_the_publisher_that_waits_for_it() -> None:
     topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
     with (
         two_daemons(topics) as (alice, bob),
@@ -110,7 +110,7 @@ def test_a_reload_of_a_broken_file_changes_nothing_and_names_the_line() -> None:
         poll(lambda: "reload-refused" in alice.log.read_text(), "the refusal is logged")
         assert operator.request("topics")["topics"] == before
         alice.write(text.replace('name = "alice"', 'name = "carol"'))
-        assert operator.request("reload")["changes"] == ["name: takes effect with the next start"]
+        assert operator.request("reload")["changes"] == ["name: takes effect after a restart"]
 
 
 def test_keys_are_rotated_through_two_live_keys_without_losing_a_message() -> None:
@@ -182,7 +182,7 @@ def test_a_second_daemon_does_not_take_the_firsts_socket_or_port() -> None:
                 timeout=WAIT_S,
             )
             assert second.returncode == 1
-            assert f"cannot start: another daemon answers at {first.socket}" in second.stderr
+            assert f"cannot start: {first.socket}: another daemon is already listening" in second.stderr
             assert "Traceback" not in second.stderr
             with first.client() as client:
                 client.request("peers")

@@ -21,7 +21,7 @@ from udp_mesh.daemon.listener import Listener
 
 
 def listening(work: Callable[[Listener, Path, list[socket.socket]], Awaitable[None]]) -> None:
-    """Does `work` beside an open listener and the list of what it accepted."""
+    """Runs `work` with an open listener and the list of accepted connections."""
 
     async def run() -> None:
         with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
@@ -52,7 +52,7 @@ def test_what_is_no_socket_is_left_alone_and_named(tmp_path: Path, what: str) ->
 
 
 def connect(path: Path) -> None:
-    """A program comes and goes as soon as there is a socket."""
+    """A client connects and disconnects as soon as the socket exists."""
 
     def attempt() -> bool:
         with socket.socket(socket.AF_UNIX) as program:

@@ -1,4 +1,4 @@
-"""Daemons follow the kernel's interfaces and addresses, IPv4 or IPv6, in the middle of what they carry."""
+"""Daemons follow changes of interfaces and addresses, IPv4 or IPv6, during transfers."""
 
 import os
 import subprocess

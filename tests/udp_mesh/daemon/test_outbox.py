@@ -1,4 +1,4 @@
-"""Messages on disk: what was put is loaded, whatever ended the process."""
+"""Messages on disk: stored messages are loaded again, however the process ended."""
 
 import asyncio
 import signal
@@ -86,7 +86,7 @@ def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [f"{2:020d}.message"]
 
 
-def test_nobody_but_who_asks_waits_for_a_disk_that_stands_still(tmp_path: Path) -> None:
+def test_only_the_publisher_that_asks_waits_for_a_hung_disk(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     with standing_disk(tmp_path, 1) as go_on:
         for key in (1, 2, 3):
@@ -103,7 +103,7 @@ def test_nobody_but_who_asks_waits_for_a_disk_that_stands_still(tmp_path: Path) 
     store.close()
 
 
-def test_nobody_is_told_of_a_flush_that_others_still_wait_for(tmp_path: Path) -> None:
+def test_a_flush_is_not_reported_to_callers_before_it_is_complete(tmp_path: Path) -> None:
     async def run() -> None:
         store = DirectoryStore(tmp_path, 1 << 20)
         flusher = Flusher(store)
@@ -210,7 +210,7 @@ assert [store.holds(key) for key in range(3)] == [True, False, True]
     assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 30).load()] == [0, 2]
 
 
-def test_a_directory_that_cannot_be_used_is_told_before_anything_is_to_be_kept(
+def test_an_unusable_directory_is_reported_before_the_first_message(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "state").write_text("a file")
@@ -223,7 +223,7 @@ def test_a_directory_that_cannot_be_used_is_told_before_anything_is_to_be_kept(
     assert not list((tmp_path / "usable").iterdir())
 
 
-def test_a_directory_that_vanished_is_told_and_made_again(tmp_path: Path) -> None:
+def test_a_deleted_directory_is_reported_and_created_again(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "outbox", 1 << 20)
     store.put(message(1))
     path = tmp_path / "outbox" / f"{1:020d}.message"

@@ -1,4 +1,4 @@
-"""From root to an ordinary user: for good, with the directories it owns; anybody else is told."""
+"""From root to an ordinary user: irrevocably, with the directories it owns; without root it is an error."""
 
 import os
 import pwd
@@ -35,7 +35,7 @@ def test_being_that_user_already_needs_nothing(tmp_path: Path) -> None:
 
 
 def test_root_becomes_the_user_for_good_and_others_may_not() -> None:
-    """Both halves of the law: as root the process ends as nobody; as anyone else it is refused."""
+    """Both cases: as root the process ends as nobody; as anyone else it is refused."""
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)
         folder.chmod(0o755)

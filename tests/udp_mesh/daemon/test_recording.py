@@ -1,4 +1,4 @@
-"""A recording is written by a thread: whole when it is closed, with its gaps told, and nobody waits for it."""
+"""A recording is written by a thread: complete when closed, with its gaps recorded, without making a caller wait."""
 
 import json
 import threading
@@ -62,7 +62,7 @@ def test_a_recording_ends_at_its_limit(tmp_path: Path) -> None:
     assert 1900 < made.path.stat().st_size <= 2000
 
 
-def test_what_a_disk_that_stands_still_does_not_take_is_left_out_and_the_gap_told(
+def test_lines_for_a_hung_disk_are_dropped_and_the_gap_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording, "MAX_BACKLOG_BYTES", 3 * recording.BATCH_BYTES)

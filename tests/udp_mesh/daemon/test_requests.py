@@ -1,4 +1,4 @@
-"""What a local program may ask: what no robot could take is refused by name, and long answers arrive whole."""
+"""Requests of local clients: invalid names are refused with the reason, and long replies arrive complete."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -31,7 +31,7 @@ def pair() -> Iterator[Pair]:
             {"topic": "status", "to": "a b"},
             "to: expected a name of 1 to 63 bytes without spaces or slashes, found 'a b'",
         ),
-        ({"topic": "status", "type": "x" * MAX_HEADER_BYTES}, "the daemon takes 65536 at most"),
+        ({"topic": "status", "type": "x" * MAX_HEADER_BYTES}, "expected at most 65536 bytes"),
     ],
 )
 def test_a_name_that_no_robot_takes_is_refused_and_what_follows_is_delivered(

@@ -1,4 +1,4 @@
-"""systemd hears what the daemon says, and a missing systemd disturbs nothing."""
+"""systemd receives the daemon's notifications, and a missing systemd is harmless."""
 
 import os
 import socket

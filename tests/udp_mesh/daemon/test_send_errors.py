@@ -1,4 +1,4 @@
-"""What the kernel refuses to send is logged soon, then seldom, and when it is resolved."""
+"""Send errors are logged soon after the first, then rarely, and when they stop."""
 
 import errno
 
@@ -7,7 +7,7 @@ from udp_mesh.daemon.send_errors import LOG_AGAIN_S, LOG_NEW_DESTINATIONS_S, RES
 BOB, CAROL = ("10.7.20.2", 8700), ("fe80::3", 8700)
 
 
-def test_a_refusal_is_told_with_its_reason_and_to_whom() -> None:
+def test_a_send_error_is_logged_with_its_reason_and_destinations() -> None:
     errors = SendErrors()
     assert not errors
     errors.add("mesh0", {(BOB, errno.EPERM): 3}, 10.0)
@@ -20,7 +20,7 @@ def test_a_refusal_is_told_with_its_reason_and_to_whom() -> None:
     assert errors.active() == (logged,)
 
 
-def test_one_that_goes_on_is_told_once_a_minute() -> None:
+def test_an_ongoing_error_is_logged_once_a_minute() -> None:
     errors = SendErrors()
     logged_at = []
     for second in range(300):
@@ -31,7 +31,7 @@ def test_one_that_goes_on_is_told_once_a_minute() -> None:
     assert logged_at == list(range(0, 300, int(LOG_AGAIN_S)))
 
 
-def test_one_that_comes_to_concern_more_peers_is_told_again_soon() -> None:
+def test_an_error_that_affects_more_peers_is_logged_again_soon() -> None:
     errors = SendErrors()
     errors.add("mesh0", {(BOB, errno.EPERM): 1}, 0.0)
     errors.review(REVIEW_S)
@@ -43,7 +43,7 @@ def test_one_that_comes_to_concern_more_peers_is_told_again_soon() -> None:
     assert errors.review(2 * (REVIEW_S + LOG_NEW_DESTINATIONS_S)) == ([], [])
 
 
-def test_each_link_and_reason_is_told_apart_and_ends_for_itself() -> None:
+def test_each_link_and_reason_is_separate_and_is_resolved_separately() -> None:
     errors = SendErrors()
     errors.add("mesh0", {(BOB, errno.EPERM): 1, (BOB, errno.EMSGSIZE): 1}, 0.0)
     errors.add("mesh1", {(BOB, errno.EPERM): 1}, 0.0)
@@ -59,7 +59,7 @@ def test_each_link_and_reason_is_told_apart_and_ends_for_itself() -> None:
     assert [one.link for one in errors.active()] == ["mesh1"]
 
 
-def test_what_a_link_refused_in_the_moment_it_went_down_is_not_told() -> None:
+def test_errors_of_a_link_that_goes_down_are_not_logged() -> None:
     errors = SendErrors()
     errors.add("mesh0", {(BOB, errno.ENETDOWN): 9}, 0.0)
     errors.link_closed("mesh0")

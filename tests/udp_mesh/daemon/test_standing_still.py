@@ -1,4 +1,4 @@
-"""A daemon that stands still (stopped, swapped out, asleep) until the others hold it for gone, and goes on."""
+"""A daemon that is suspended until the others consider it offline, and then continues."""
 
 import signal
 

@@ -22,7 +22,7 @@ class Out:
 
 
 def free_port() -> int:
-    """A UDP port nobody uses at the moment."""
+    """A UDP port that is free at the moment."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

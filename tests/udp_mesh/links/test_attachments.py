@@ -37,7 +37,7 @@ def test_by_default_every_running_interface_that_can_broadcast_is_used() -> None
     )
 
 
-def test_an_interface_made_anew_under_the_same_name_and_address_is_another() -> None:
+def test_an_interface_created_again_under_the_same_name_and_address_is_another() -> None:
     (before,) = select_attachments((WLAN0,), EVERY_INTERFACE, 8700)
     (after,) = select_attachments((replace(WLAN0, index=9),), EVERY_INTERFACE, 8700)
     assert before != after
@@ -121,7 +121,7 @@ def test_an_address_that_was_given_no_broadcast_address_has_its_networks_last(
         )
 
     assert parse(answers(local))[0].addresses == (InterfaceAddress(address, prefix_length, broadcast),)
-    # a point-to-point address has somebody at the far end, not a network
+    # a point-to-point address has a remote end, not a network
     assert parse(answers(socket.inet_aton("10.9.9.9")))[0].addresses[0].broadcast is None
 
 

@@ -17,7 +17,7 @@ monitor = InterfaceMonitor()
 hub = LinkHub(EVERY_INTERFACE, 8700)
 
 def settle(*expected):
-    # Refreshes whenever the kernel tells of a change, until exactly these links are open.
+    # Refreshes whenever the kernel reports a change, until exactly these links are open.
     opened, gone, deadline = [], [], time.monotonic() + 60
     while True:
         changes = hub.refresh()
@@ -27,7 +27,7 @@ def settle(*expected):
         if now == set(expected):
             return opened, gone
         ready, _, _ = select.select([monitor], [], [], max(0, deadline - time.monotonic()))
-        assert ready, f"the kernel told of nothing more: {now}"
+        assert ready, f"the kernel reported no further change: {now}"
         assert monitor.drain()
 
 settle()
@@ -62,7 +62,7 @@ settle()
 ip("link set far0 up")
 settle(("mesh0", "10.7.20.6"))
 
-# A port that someone else has is told, and tried again.
+# A port in use is reported, and retried.
 hub.close()
 taken = LinkHub(EVERY_INTERFACE, 8700)
 assert taken.refresh().opened
@@ -71,14 +71,14 @@ assert "Address already in use (UDP port 8700" in failed["mesh0"], failed
 taken.close()
 assert hub.refresh().opened
 
-# Too narrow for a datagram of ours: told, not opened, and nothing else suffers.
+# Too narrow for a datagram: reported, not opened, without effect on other links.
 ip("link set mesh0 mtu 150")
 failed = hub.refresh().failed
 assert "expected an MTU of at least 200 bytes, found 150 on mesh0" in failed["mesh0"], failed
 ip("link set mesh0 mtu 1500")
 settle(("mesh0", "10.7.20.6"))
 
-# Deleted and made anew between two looks, with the same name and address: the old socket would hear nothing.
+# Deleted and created again between two refreshes, with the same name and address: the old socket would hear nothing.
 first = hub.links["mesh0"]
 ip("link del mesh0")
 ip("link add mesh0 type veth peer name far0")

@@ -1,4 +1,4 @@
-"""Real sockets: what is sent arrives, in runs or one by one, and a refusing kernel costs a datagram, not the node."""
+"""Real sockets: datagrams arrive in runs or one by one, and a send error costs only its datagram."""
 
 import errno
 import socket

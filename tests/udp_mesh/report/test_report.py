@@ -1,4 +1,4 @@
-"""A recording survives being written and read, torn and foreign lines included; the page shows what it holds."""
+"""A recording survives a round trip, with truncated and foreign lines; the page shows its contents."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from udp_mesh.report.charts import density, over_time, paths, spans, stacked, ti
 from udp_mesh.report.figures import connections, histogram, intervals, sent_topics, summary, throughput, time_series
 from udp_mesh.report.page import page
 from udp_mesh.report.recording import (
-    Arrival,
     Place,
     Presence,
+    ReceivedMessage,
     Recording,
     RecordingError,
     Sample,
@@ -32,14 +32,14 @@ from udp_mesh.report.recording import (
 
 ITEMS = (
     Presence(1.0, "base", "spot1", True),
-    Arrival(1.5, "base", "spot1", "telemetry", 3, 1000),
+    ReceivedMessage(1.5, "base", "spot1", "telemetry", 3, 1000),
     Sample(2.0, "base", "spot1", 0.02, 0.05, 8000.0, 2),
     Place(2.0, "spot1", 10.0, 20.5),
     Presence(3.0, "base", "spot1", False),
 )
 
 
-def lines(*items: Arrival | Presence | Sample | Place) -> list[bytes]:
+def lines(*items: ReceivedMessage | Presence | Sample | Place) -> list[bytes]:
     return [text.encode() for text in (header("base", 0.0), *map(line, items))]
 
 
@@ -52,7 +52,7 @@ def test_what_is_written_is_read() -> None:
     assert read_back.end_s == 3.0
 
 
-def test_a_torn_line_is_left_out_and_told() -> None:
+def test_a_truncated_line_is_ignored_and_reported() -> None:
     recording = parse([*lines(*ITEMS), b'{"t": 4, "kind": "recei'], "r.jsonl")
     assert len(recording.arrivals) == 1
     assert recording.problems[0].startswith("r.jsonl:7:")
@@ -61,14 +61,14 @@ def test_a_torn_line_is_left_out_and_told() -> None:
 @pytest.mark.parametrize(
     ("raw", "problem"),
     [
-        ('{"t": 4, "kind": "recei', "expected one JSON object, found no JSON (a line that was cut off?)"),
+        ('{"t": 4, "kind": "recei', "expected one JSON object, found invalid JSON (a truncated line?)"),
         ("[1]", "expected one JSON object, found another JSON value"),
         ('{"kind": "place"}', "expected a number from 0 to 1e+09 as t, found None"),
         ('{"t": NaN, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found nan"),
         ('{"t": 1e308, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found 1e+308"),
         ('{"t": -3, "kind": "place"}', "expected a number from 0 to 1e+09 as t, found -3"),
         ('{"t": 1, "kind": "place", "x": 1e308, "y": 1}', "expected a number from -1e+07 to 1e+07 as x, found 1e+308"),
-        ('{"t": 1, "kind": "peer-online", "peer": 5}', "expected text as peer, found 5"),
+        ('{"t": 1, "kind": "peer-online", "peer": 5}', "expected a string as peer, found 5"),
         (
             '{"t": 1, "kind": "received", "source": "a", "topic": "t", "priority": 1, "bytes": 1e400}',
             "expected a number from 0 to 1.1259e+15 as bytes, found inf",
@@ -80,10 +80,10 @@ def test_a_torn_line_is_left_out_and_told() -> None:
         ('{"t": 1, "kind": "conditions", "peers": 5}', "expected a list of objects as peers, found 5"),
     ],
 )
-def test_a_damaged_line_is_left_out_and_told_by_what_is_wrong_with_it(raw: str, problem: str) -> None:
+def test_a_damaged_line_is_ignored_and_reported_with_the_reason(raw: str, problem: str) -> None:
     recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
     assert recording.problems == [f"r:2: {problem}"]
-    assert "1 lines could not be read" in page([recording], "any")
+    assert "1 lines are invalid" in page([recording], "any")
 
 
 def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
@@ -91,13 +91,14 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
         peer = {"name": "spot1", "online": online, "loss": 0.5}
         return json.dumps({"t": t, "kind": "conditions", "peers": [peer]}).encode()
 
-    told = line(Presence(4.0, "base", "spot1", False)).encode()
+    offline = line(Presence(4.0, "base", "spot1", False)).encode()
     recording = parse(
-        [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), told, conditions(5.0, False)], "r"
+        [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), offline, conditions(5.0, False)],
+        "r",
     )
     (spot,) = connections(recording)
     assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
-    # what is said of a peer that is away is of before
+    # Values of an offline peer are old.
     assert [t for t, _ in time_series(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
 
 
@@ -117,7 +118,7 @@ def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
     assert "<td>estop</td><td>1</td><td>0.00</td><td>2</td><td>0</td><td>0</td><td>40.0</td>" in page([recording], "")
 
 
-def test_lines_that_were_never_written_are_told() -> None:
+def test_lines_that_were_never_written_are_reported() -> None:
     recording = parse([header("a", 0.0).encode(), b'{"t": 1, "kind": "gap", "lines": 40}'], "r")
     assert "40 lines are missing" in page([recording], "any")
     assert summary(recording)["lines_left_out"] == 40
@@ -147,7 +148,7 @@ def test_the_pages_numbers_are_there_for_scripts(tmp_path: Path, capsys: pytest.
     assert value["page"] == str(tmp_path / "page.html")
     assert value["recordings"][0]["received"] == [{"topic": "telemetry", "priority": 3, "messages": 1, "bytes": 1000}]
     assert value["recordings"][0]["online"] == [{"peer": "spot1", "share": 1.0, "spans_s": [[1.0, 3.0]]}]
-    assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more lines that cannot be read"
+    assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more invalid lines"
 
 
 def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
@@ -164,9 +165,11 @@ def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
     assert sorted(tmp_path.iterdir()) == [path, taken]
 
 
-def test_the_topic_with_the_most_messages_is_shown_first_and_its_punctuality_told() -> None:
-    often = [Arrival(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
-    seldom = [Arrival(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
+def test_the_topic_with_the_most_messages_is_shown_first_with_its_punctuality() -> None:
+    often = [
+        ReceivedMessage(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)
+    ]
+    seldom = [ReceivedMessage(i * 4.0, "base", "spot2", "artifact", 2, 100) for i in range(25)]
     first, second = intervals(parse(lines(*often, *seldom), "r"))
     assert (first.topic, second.topic) == ("telemetry", "artifact")
     # each late one makes its own interval longer and the next one shorter
@@ -179,14 +182,14 @@ def test_a_track_is_one_path_for_each_stretch_online_or_not() -> None:
     assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
 
 
-def test_a_long_name_fits_beside_its_row_and_is_told_in_full() -> None:
+def test_a_long_name_is_shortened_and_shown_in_full_in_a_tooltip() -> None:
     picture = spans({"operator-base-station": [(0.0, 1.0)]}, 2.0, "s")
     assert ">operator…</text>" in picture
     assert "<title>operator-base-station</title>" in picture
 
 
 def test_messages_that_all_come_at_once_are_not_periodic() -> None:
-    burst = [Arrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
+    burst = [ReceivedMessage(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
     assert intervals(parse(lines(*burst), "r")) == []
 
 
@@ -220,16 +223,16 @@ def test_any_json_in_a_known_kind_is_an_item_or_a_problem(value: object) -> None
 
 
 def periodic(jitter: float) -> Recording:
-    items = [Arrival(i + (jitter if i % 2 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
+    items = [ReceivedMessage(i + (jitter if i % 2 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)]
     return parse(lines(*items), "r")
 
 
-def test_intervals_tell_median_deviation_and_gaps() -> None:
+def test_intervals_have_median_deviation_and_gaps() -> None:
     (steady,) = intervals(periodic(0.0))
     assert (steady.median_s, steady.deviation_s, steady.gaps) == (1.0, 0.0, 0)
     (jittered,) = intervals(periodic(0.1))
     assert jittered.deviation_s == pytest.approx(0.1, abs=0.01)
-    lonely = parse(lines(*[Arrival(t, "base", "s", "t", 1, 1) for t in [*range(30), *range(100, 130)]]), "r")
+    lonely = parse(lines(*[ReceivedMessage(t, "base", "s", "t", 1, 1) for t in [*range(30), *range(100, 130)]]), "r")
     assert intervals(lonely)[0].gaps == 1
 
 
@@ -280,7 +283,7 @@ def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
         "spot1",
         "Throughput by topic",
         "Online",
-        "Round trip",
+        "Round-trip time",
         "Loss",
         "Where the robots were online",
     ):

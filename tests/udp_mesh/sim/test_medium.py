@@ -1,12 +1,12 @@
-"""The simulated channel keeps to what its docstring says."""
+"""The simulated channel behaves as its docstring says."""
 
 from __future__ import annotations
 
 import itertools
 import random
 
-from udp_mesh.sim.event_queue import EventQueue
-from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Channel, Frame, Medium
+from udp_mesh.sim.event_queue import SimEventQueue
+from udp_mesh.sim.medium import FRAME_BYTES, IP_UDP_BYTES, Medium, RadioChannel, RadioFrame
 from udp_mesh.sim.mobility import PathLoss, Wall, trajectory
 
 
@@ -14,8 +14,8 @@ class Line:
     """Stations in a row, each hearing only the next, with one frame loss for all links."""
 
     def __init__(self, names: str, loss: float = 0.0, **channel: float) -> None:
-        self.event_queue = EventQueue()
-        self.arrived: list[tuple[float, str, Frame]] = []
+        self.event_queue = SimEventQueue()
+        self.arrived: list[tuple[float, str, RadioFrame]] = []
         self.cut: set[frozenset[str]] = set()
         places = {name: index for index, name in enumerate(names)}
 
@@ -23,10 +23,10 @@ class Line:
             near = abs(places[a] - places[b]) == 1 and frozenset((a, b)) not in self.cut
             return loss if near else 1.0
 
-        def deliver(station: str, frame: Frame) -> None:
+        def deliver(station: str, frame: RadioFrame) -> None:
             self.arrived.append((self.event_queue.now, station, frame))
 
-        self.channel = Channel(**channel)  # type: ignore[arg-type]
+        self.channel = RadioChannel(**channel)  # type: ignore[arg-type]
         self.medium = Medium(self.event_queue, self.channel, names, lost, deliver, random.Random(1))
 
     @property
@@ -50,7 +50,7 @@ def test_airtime_is_bytes_over_rate_plus_overhead_per_transmission() -> None:
     assert line.medium.counts.airtime_s == (1000 + IP_UDP_BYTES + FRAME_BYTES) / 1e6 + 1e-3
 
 
-def test_a_broadcast_reaches_everybody_once() -> None:
+def test_a_broadcast_reaches_all_once() -> None:
     line = Line("abcde")
     line.medium.send("c", None, b"x")
     line.event_queue.run_until(1.0)
@@ -87,7 +87,7 @@ def test_a_full_queue_drops_and_counts() -> None:
     assert line.medium.counts.queue_drops >= 89
 
 
-def test_a_route_is_found_anew_only_after_the_mesh_layers_time() -> None:
+def test_routes_are_recomputed_only_after_the_mesh_layers_time() -> None:
     line = Line("abc", route_s=1.0)
     line.medium.send("a", "c", b"x")
     line.event_queue.run_until(0.5)
@@ -130,7 +130,7 @@ def test_loss_grows_from_good_to_range_and_rock_stops_all() -> None:
     assert air.loss((10, 0), (10, 20)) == 1.0
 
 
-def test_a_course_is_walked_in_straight_lines() -> None:
+def test_a_trajectory_consists_of_straight_lines() -> None:
     walked = trajectory([(10, (0, 0)), (20, (100, 50))])
     assert walked.at(0) == (0, 0)
     assert walked.at(15) == (50, 25)
@@ -182,5 +182,5 @@ def test_who_waited_while_another_sent_waits_less_the_next_time() -> None:
         line.medium.send("b", "a", bytes(1000))
     line.event_queue.run_until(3.0)
     runs = [len(list(group)) for _, group in itertools.groupby(line.stations)]
-    # a count that began anew each time would let one of two stations send eight times in a row now and then
+    # a back-off that restarted each time would let one of two stations send eight times in a row now and then
     assert max(runs) <= 6

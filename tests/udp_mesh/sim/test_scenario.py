@@ -1,4 +1,4 @@
-"""Scenario files: the shipped ones load, anything wrong is told with its line, nothing raises another exception."""
+"""Scenario files: the shipped ones load, problems are reported with their line, nothing raises another exception."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def test_each_shipped_scenario_loads(name: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("a: [0, 0]", "a: [0]", "s.yaml:4: robots.a: expected [x, y] in metres, found a list"),
+        ("a: [0, 0]", "a: [0]", "s.yaml:4: robots.a: expected [x, y] in meters, found a list"),
         ("priority: 0", "priority: 99", "s.yaml:7: topics.estop.priority: expected a number of at most 15, found '99'"),
-        ("priority: 0", "priority: 1.5", "s.yaml:7: topics.estop.priority: expected a whole number, found '1.5'"),
+        ("priority: 0", "priority: 1.5", "s.yaml:7: topics.estop.priority: expected an integer, found '1.5'"),
         ("priority: 0", "destinations: [c]", "s.yaml:7: topics.estop.destinations[0]: expected one of a, b, found 'c'"),
-        ("  estop: {", "  e stop: {", "s.yaml:7: topics.e stop: expected a topic that can be used"),
+        ("  estop: {", "  e stop: {", "s.yaml:7: topics.e stop: expected a valid topic"),
         ("a: [0, 0]", "a: [0, .inf]", "s.yaml:4: robots.a[1]: expected a number of at least -1e+06, found '.inf'"),
         ("a: [0, 0]", "a: [0, inf]", "s.yaml:4: robots.a[1]: expected a number of at most 1e+06, found 'inf'"),
-        ("a: [0, 0]", "a c: [0, 0]", "s.yaml:4: robots.a c: expected the name of a node, found"),
+        ("a: [0, 0]", "a c: [0, 0]", "s.yaml:4: robots.a c: expected a valid node name, found"),
         ("a: [0, 0]", "a: [0, 0]\n  a: [0, 0]", "s.yaml:5: robots.a: expected each key once, found 'a'"),
-        ("seed: 3", "relays: {a: [1, 1]}", "s.yaml:1: relays.a: expected a name that no robot has, found 'a'"),
+        ("seed: 3", "relays: {a: [1, 1]}", "s.yaml:1: relays.a: expected a name that is not a robot's, found 'a'"),
         ("seed: 3", "seed: 1e400", "s.yaml:1: seed: expected a number of at most 1e+09, found '1e400'"),
         ("seed: 3", "window: 5000", "s.yaml:1: window: expected a number of at most 4096, found '5000'"),
         ("seed: 3", "channel: {rate: 0}", "s.yaml:1: channel.rate: expected a number of at least 1000, found '0'"),
@@ -51,7 +51,7 @@ def test_each_shipped_scenario_loads(name: str) -> None:
         ("seed: 3", "air: {least_loss: 2}", "s.yaml:1: air.least_loss: expected a number of at most 1, found '2'"),
         ("seed: 3", "air: {good_m: 9, range_m: 5}", "s.yaml:1: air: expected range_m of at least good_m, 9, found 5.0"),
         ("seed: 3", "duration: 3", "incidents (did you mean 'duration_s'?), found 'duration'"),
-        ("seed: 3", "seed: [", "s.yaml:3: expected YAML, found otherwise: "),
+        ("seed: 3", "seed: [", "s.yaml:3: expected YAML, found a syntax error: "),
         (
             "seed: 3",
             "relays: {c: [1, 1]}\nincidents: [{at_s: 3, what: crash, who: c}]",
@@ -66,7 +66,7 @@ def test_each_shipped_scenario_loads(name: str) -> None:
         ("priority: 0", "urgency: 0", "s.yaml:7: topics.estop: expected one of priority, reliable"),
         ("topic: estop,", "topic: stop,", "s.yaml:9: flows[0].topic: expected one of estop, found 'stop'"),
         ("destination: b", "destination: c", "s.yaml:9: flows[0].destination: expected one of a, b, found 'c'"),
-        ("[5, 20, 0]", "[0, 20, 0]", "rising times"),
+        ("[5, 20, 0]", "[0, 20, 0]", "increasing times"),
         ("seed: 3", "sed: 3", "s.yaml:1: scenario: expected one of name, seed"),
         (
             "duration_s: 5",
@@ -75,13 +75,13 @@ def test_each_shipped_scenario_loads(name: str) -> None:
         ),
     ],
 )
-def test_a_problem_is_told_with_its_line(old: str, new: str, message: str) -> None:
+def test_a_problem_is_reported_with_its_line(old: str, new: str, message: str) -> None:
     with pytest.raises(ScenarioError) as raised:
         parse(GOOD.replace(old, new).encode(), "s.yaml")
     assert message in str(raised.value)
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(ScenarioError) as raised:
         parse(GOOD.replace("priority: 0", "priority: x").replace("[0, 0]", "{}").encode(), "s.yaml")
     assert len(str(raised.value).splitlines()) >= 2
@@ -103,9 +103,7 @@ def test_a_number_that_would_play_nothing_is_wrong_usage(words: list[str], capsy
     assert f"argument {words[0]}: expected" in capsys.readouterr().err
 
 
-def test_where_nothing_can_be_written_is_told_before_anything_is_played(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_directory_is_reported_before_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "taken").write_text("")
     assert run_command(["final-run", "--out", str(tmp_path / "taken")]) == 2
     assert capsys.readouterr().err == f"udp-mesh: {tmp_path}/taken: File exists\n"
@@ -120,7 +118,7 @@ VALUES = ("0", "-1", "1", "1.5", "1e400", "nan", "inf", ".inf", "-0.0", "1e18", 
 
 
 @given(st.sampled_from(KEYS), st.sampled_from(VALUES))
-def test_any_number_is_played_or_told(key: str, value: str) -> None:
+def test_any_number_is_played_or_reported(key: str, value: str) -> None:
     outer, _, inner = key.partition(".")
     changed = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
     try:
@@ -131,7 +129,7 @@ def test_any_number_is_played_or_told(key: str, value: str) -> None:
         assert 0 <= play(scenario).summary()["channel"]["airtime_share"] < 50
 
 
-def test_why_messages_were_refused_is_told() -> None:
+def test_reasons_of_refused_messages_are_reported() -> None:
     summary = play(parse(GOOD.replace("a: [0, 0]", "a: [900, 0]").encode(), "s.yaml")).summary()
     assert summary["rejected_because"] == {"unknown peer": summary["rejected"]}
     assert summary["rejected"] > 0

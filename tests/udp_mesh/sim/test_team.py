@@ -9,7 +9,7 @@ import pytest
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived, Rejected
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.sim.command import find
-from udp_mesh.sim.medium import Channel
+from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import load
 from udp_mesh.sim.team import Team
@@ -19,7 +19,7 @@ TOPICS = (Topic("estop", priority=0), Topic("map", priority=8))
 
 def team(names: str, loss: float = 0.1, **channel: float) -> Team:
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in names}
-    return Team(settings, channel=Channel(**channel), loss=lambda a, b, now: loss, seed=1)  # type: ignore[arg-type]
+    return Team(settings, channel=RadioChannel(**channel), loss=lambda a, b, now: loss, seed=1)  # type: ignore[arg-type]
 
 
 def accounted(played: RunResult) -> None:
@@ -45,7 +45,7 @@ def test_an_urgent_message_overtakes_a_map_under_way() -> None:
         if robot == "b" and topic is not None:
             arrivals.append(topic)
 
-    made = Team(settings, channel=Channel(rate=2e6), loss=lambda a, b, now: 0.0, seed=1, on_event=note)
+    made = Team(settings, channel=RadioChannel(rate=2e6), loss=lambda a, b, now: 0.0, seed=1, on_event=note)
     made.event_queue.run_until(5.0)
     made.send("a", "map", bytes(2_000_000), "b")
     made.event_queue.run_until(7.0)
@@ -54,7 +54,7 @@ def test_an_urgent_message_overtakes_a_map_under_way() -> None:
     assert arrivals == ["estop", "map"]
 
 
-def test_a_repaired_broadcast_reaches_everybody_exactly_once() -> None:
+def test_a_repaired_broadcast_reaches_all_exactly_once() -> None:
     arrivals: list[tuple[str, bytes]] = []
     topics = (Topic("estop", priority=0, repair=True, deadline_s=10),)
 
@@ -64,7 +64,7 @@ def test_a_repaired_broadcast_reaches_everybody_exactly_once() -> None:
 
     made = Team(
         {name: Settings(name, unkeyed=True, topics=topics) for name in "abcd"},
-        channel=Channel(), loss=lambda a, b, now: 0.3, seed=3, on_event=note,
+        channel=RadioChannel(), loss=lambda a, b, now: 0.3, seed=3, on_event=note,
     )  # fmt: skip
     made.event_queue.run_until(5.0)
     for number in range(20):
@@ -102,7 +102,7 @@ def test_a_soak_with_partitions_and_restarts_accounts_for_every_message(seed: in
     scenario = replace(load(find("partition-soak")), seed=seed, duration_s=900.0)
     played = play(scenario)
     accounted(played)
-    # what was accepted has ended, or is still waiting in an outbox or under way at the end
+    # Every accepted message has an outcome, waits in an outbox, or is in flight at the end.
     ended = sum(played.ledger.total(kind) for kind in (MessageDelivered, MessageExpired, MessagePeerLost))
     assert 0 < ended <= played.ledger.accepted
     assert played.topics["report"].messages > 0

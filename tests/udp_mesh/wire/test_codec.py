@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 
 from tests.udp_mesh.wire.strategies import frames as any_frame
 from udp_mesh.wire import limits
-from udp_mesh.wire.codec import FRAGMENT_BYTES, decode, encode
+from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.fragment import FRAGMENT_BYTES
 from udp_mesh.wire.frames import Ack, Cancel, Fragment, Frame, Heartbeat, MessageHead, Nack, Ping, Waiting
 
 

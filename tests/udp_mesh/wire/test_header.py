@@ -31,7 +31,7 @@ def test_any_bytes_give_a_header_or_an_error(raw: bytes) -> None:
 
 
 @pytest.mark.parametrize("first", [1, 2, 4, 5])
-def test_no_fielded_datagram_looks_like_ours(first: int) -> None:
+def test_no_legacy_datagram_looks_like_ours(first: int) -> None:
     raw = bytes((first,)) + bytes(60)
     assert not is_ours(raw)
     with pytest.raises(DecodeError, match="mark"):

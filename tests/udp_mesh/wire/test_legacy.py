@@ -83,7 +83,7 @@ def test_any_bytes_give_a_message_or_an_error(raw: bytes) -> None:
         return
 
 
-def test_the_bytes_are_those_of_the_fielded_code() -> None:
+def test_the_bytes_are_those_of_the_legacy_code() -> None:
     host = encode_legacy(Host("ugv1", "10.0.0.1"))
     assert host == struct.pack("<BHIIH", 4, 0, 0, 0, 80) + struct.pack("<64p16p", b"ugv1", b"10.0.0.1") + b"\x00"
     payload = encode_legacy(LegacyPayload(0x7FFF, 2, 3, b"abc", wants_ack=True))
@@ -92,7 +92,7 @@ def test_the_bytes_are_those_of_the_fielded_code() -> None:
 
 
 @pytest.mark.parametrize(("size", "fragments"), [(0, 1), (1, 1), (1299, 1), (1300, 2), (2600, 3), (2601, 3)])
-def test_an_exact_multiple_ends_in_an_empty_fragment_as_fielded_receivers_expect(size: int, fragments: int) -> None:
+def test_an_exact_multiple_ends_in_an_empty_fragment_as_legacy_receivers_expect(size: int, fragments: int) -> None:
     message = bytes(size)
     pieces = fragment_legacy(message)
     assert len(pieces) == fragments == size // 1300 + 1
@@ -115,7 +115,7 @@ def test_defect_4_an_unknown_type_is_bad_bytes_like_any_other() -> None:
 
 
 @given(st.binary(max_size=1500))
-def test_what_is_covered_is_an_acknowledgement_to_fielded_programs_and_itself_to_us(data: bytes) -> None:
+def test_an_encapsulated_datagram_is_an_acknowledgement_to_legacy_programs_and_itself_to_us(data: bytes) -> None:
     covered = encapsulate(data)
     assert decode_legacy(covered) == LegacyAck(0xFFFF, 0xFFFFFFFF)
     assert decapsulate(covered) == data

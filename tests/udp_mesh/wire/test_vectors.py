@@ -41,7 +41,7 @@ def test_published_datagrams_open() -> None:
         assert frames.hex() == vector["frames"]
 
 
-def test_published_fielded_bytes_decode() -> None:
+def test_published_legacy_bytes_decode() -> None:
     vectors = json.loads((FOLDER / "legacy.json").read_text())
     for name, datagram in LEGACY.items():
         assert decode_legacy(bytes.fromhex(vectors["datagrams"][name]["hex"])) == datagram

@@ -41,7 +41,7 @@ REFRESH_S = 1.0
 """Interval between refreshes of the daemon's topics and peers and of the master."""
 
 
-class Bridge:
+class Ros1Bridge:
     """The running bridge."""
 
     def __init__(self, daemon: DaemonClient, own: str, given: Parameters) -> None:
@@ -161,7 +161,7 @@ def main() -> int:
     _wait_for(named, "daemon")
     if not own:
         return 0
-    bridge = Bridge(daemon, given.hostname or own[0], given)
+    bridge = Ros1Bridge(daemon, given.hostname or own[0], given)
     bridge.start(stop)
 
     def serve() -> None:

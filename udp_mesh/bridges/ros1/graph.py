@@ -24,7 +24,7 @@ from std_msgs.msg import String
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.relay import ToRos
 from udp_mesh.bridges.ros1 import legacy
-from udp_mesh.bridges.ros1.publications import Outgoing, Publications
+from udp_mesh.bridges.ros1.publications import OutgoingMessage, Publications
 from udp_mesh.bridges.types import TypeKey
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ OnMessage = Callable[[Route, str, TypeKey, str, bool, bytes], None]
 class _Opaque:
     """One advertised topic: rospy's publisher of a message class created for its type."""
 
-    def __init__(self, message: Outgoing) -> None:
+    def __init__(self, message: OutgoingMessage) -> None:
         fields = {"_type": message.key.name, "_md5sum": message.key.checksum, "_full_text": message.definition}
         self._class = type("Opaque", (rospy.AnyMsg,), fields)
         self._depth = _queue_depth(len(message.payload))
@@ -155,7 +155,9 @@ class Graph:
                     log.warning("type-unknown type=%s name=%s", key.name, message.name)
                 return
             key, definition = TypeKey(key.name, found._md5sum), found._full_text
-        self._publications.publish(Outgoing(message.name, key, definition or "", message.latched, message.payload))
+        self._publications.publish(
+            OutgoingMessage(message.name, key, definition or "", message.latched, message.payload)
+        )
 
     def publish_conditions(self, conditions: Mapping[str, Any], text: str) -> None:
         """Publishes the network conditions: as legacy messages, and as complete JSON (`text`)."""

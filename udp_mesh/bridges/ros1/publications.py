@@ -23,7 +23,7 @@ MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 1000, 16 << 20
 """Per topic, until it is advertised: seconds of telemetry or half a second of images; the oldest are dropped."""
 
 
-class Outgoing(NamedTuple):
+class OutgoingMessage(NamedTuple):
     """A message, with everything needed to advertise its topic."""
 
     name: str
@@ -51,10 +51,10 @@ class _Topic:
         self.kind: tuple[TypeKey, bool] | None = None
         self.subscribers = 0
         self.until = 0.0
-        self.waiting: Deque[Outgoing] = deque()
+        self.waiting: Deque[OutgoingMessage] = deque()
         self.waiting_bytes = 0
 
-    def matches(self, message: Outgoing) -> bool:
+    def matches(self, message: OutgoingMessage) -> bool:
         return self.advertised is not None and self.kind == (message.key, message.latched)
 
 
@@ -63,7 +63,7 @@ class Publications:
 
     def __init__(
         self,
-        advertise: Callable[[Outgoing], Advertised],
+        advertise: Callable[[OutgoingMessage], Advertised],
         subscribers_of: Callable[[str], int],
         clock: Callable[[], float],
     ) -> None:
@@ -75,7 +75,7 @@ class Publications:
         self.dropped = 0
         """Messages dropped while they waited for the master."""
 
-    def publish(self, message: Outgoing) -> None:
+    def publish(self, message: OutgoingMessage) -> None:
         """Publishes now, or once the topic is advertised; never blocks."""
         with self._changed:
             topic = self._topics.setdefault(message.name, _Topic())

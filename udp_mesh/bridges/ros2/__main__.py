@@ -81,7 +81,7 @@ def message_class(name: str) -> Any:
     return getattr(importlib.import_module("{}.msg".format(found[1])), found[2])
 
 
-class Bridge:
+class Ros2Bridge:
     """The running bridge."""
 
     def __init__(self, node: Any, daemon: DaemonClient, own: str) -> None:
@@ -210,7 +210,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Bridge(node, daemon, own)
+        bridge = Ros2Bridge(node, daemon, own)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)

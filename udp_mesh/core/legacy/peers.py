@@ -13,6 +13,7 @@ from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.legacy.acks import LegacyAcks
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
+from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.session import Meters, Peer
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
@@ -114,12 +115,12 @@ class LegacyPeers:
                 peer = self._state.peer_table.get_or_create(neighbour.name, self._state.settings)
                 if peer is not None:
                     peer.legacy = True
-                    peer.lost = False
+                    peer.transition(PeerEvent.CONFIGURED)
                     self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
 
-    def _drop(self, gone: LegacyPeer) -> None:
+    def _drop(self, removed: LegacyPeer) -> None:
         """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
-        peer, state = gone.peer, self._state
+        peer, state = removed.peer, self._state
         peer.legacy = peer.settling = False
         peer.legacy_meters = None
         heard = peer.session is not None or peer.legacy_path is not None
@@ -163,9 +164,8 @@ class LegacyPeers:
         legacy.sender.on_activity()
         peer = legacy.peer
         peer.legacy_path = (source, link, now)
-        peer.lost = False
         if not peer.online:
-            peer.online = True
+            peer.transition(PeerEvent.HEARD)
             peer.online_since = now
             self._state.event_queue.emit(PeerOnline(peer.name, source, link))
 
@@ -256,14 +256,14 @@ class LegacyPeers:
             peer = legacy.peer
             if suspended_s > SUSPENDED_S:
                 legacy.last_heard = min(now, legacy.last_heard + suspended_s)
-            quiet_s = now - legacy.last_heard
-            if peer.online and quiet_s > rates.offline_s:
-                peer.online = False
+            silent_s = now - legacy.last_heard
+            if peer.online and silent_s > rates.offline_s:
+                peer.transition(PeerEvent.SILENT)
                 peer.online_since = None
                 state.event_queue.emit(PeerOffline(peer.name, left=False))
                 store_in_outbox(state, peer, now)
-            if not peer.online and not peer.lost and quiet_s > rates.peer_lost_s:
-                peer.lost = True
+            if peer.state is PeerState.OFFLINE and silent_s > rates.peer_lost_s:
+                peer.transition(PeerEvent.GIVEN_UP)
                 peer.sender.finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)

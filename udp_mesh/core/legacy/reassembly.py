@@ -44,7 +44,7 @@ class _Finished:
         return now - self.at < REPEATED_WITHIN_S
 
 
-class _Partial:
+class _LegacyPartial:
     __slots__ = ("bytes", "payloads", "total", "touched_at")
 
     def __init__(self, total: int, now: float) -> None:
@@ -61,7 +61,7 @@ class LegacyReassembly:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._partials: dict[int, _Partial] = {}
+        self._partials: dict[int, _LegacyPartial] = {}
         self._finished: OrderedDict[int, _Finished] = OrderedDict()
         self.bytes = 0
         self.duplicates = 0
@@ -95,7 +95,7 @@ class LegacyReassembly:
         if partial is None:
             if len(self._partials) >= self._limits.partials_per_peer:
                 return False, None
-            partial = self._partials[fragment.sequence] = _Partial(fragment.total, now)
+            partial = self._partials[fragment.sequence] = _LegacyPartial(fragment.total, now)
         if fragment.position in partial.payloads:
             self.duplicates += 1
             return True, None

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.sender import PROBE_INTERVAL_S, Sender
 from udp_mesh.core.settings import Address
@@ -245,7 +246,7 @@ class LegacySender:
         urgent = message.priority <= self.sender.rates.urgent_priority
         out.append(Datagram(link, address, data, urgent))
         self.sender.sent_packets += 1
-        self.sender.sent_bytes += len(data) + 28
+        self.sender.sent_bytes += len(data) + IP_UDP_BYTES
 
     def _forget_ended(self) -> None:
         for message in [message for message in self._fragments if message.ended]:

@@ -146,13 +146,13 @@ def heartbeat_datagrams(
     out: list[Datagram] = []
     links = list(links)
     for link in links:
-        near = [neighbour for neighbour in neighbours if not neighbour.legacy and uses_link(neighbour, link, links)]
-        if link.kind is LinkKind.NEIGHBOURS and not near:
+        targets = [neighbour for neighbour in neighbours if not neighbour.legacy and uses_link(neighbour, link, links)]
+        if link.kind is LinkKind.NEIGHBOURS and not targets:
             continue
         _, data = channel.seal_long(encode_numbered(beat, channel))
         if link.kind is LinkKind.BROADCAST:
             out.append(Datagram(link.name, link.broadcast, data, True))
-        out.extend(Datagram(link.name, neighbour.address, data, True) for neighbour in near)
+        out.extend(Datagram(link.name, neighbour.address, data, True) for neighbour in targets)
     return out
 
 

@@ -27,10 +27,10 @@ def validate_path(state: State, session: Session, link: str, source: Address, no
         return
     session.challenged_at = now
     path = session.path
-    elsewhere = path.link in state.links and (path.link, path.address) != (link, source)
-    if elsewhere:
+    migrating = path.link in state.links and (path.link, path.address) != (link, source)
+    if migrating:
         _send_challenge(state, session, Challenge(path.link, path.address, now, in_use=True))
-    _send_challenge(state, session, Challenge(link, source, now, in_use=not elsewhere))
+    _send_challenge(state, session, Challenge(link, source, now, in_use=not migrating))
 
 
 def _send_challenge(state: State, session: Session, challenge: Challenge) -> None:

@@ -7,6 +7,7 @@ next boot, or dropped. Before verification only its heartbeat is believed.
 from typing import NamedTuple
 
 from udp_mesh.core.meter import Meter
+from udp_mesh.core.peers.peer_state import TRANSITIONS, PeerEvent, PeerState
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.receiver.receiver import Receiver
@@ -41,6 +42,10 @@ MAX_PENDING_CONTROL = 64
 """Small frames (pongs, repair requests, refusals) waiting for one peer; more of them indicates a flood."""
 
 
+# Compared for every peer of a large team: a global costs less than an enum member.
+_ONLINE = PeerState.ONLINE
+
+
 class Meters:
     """Byte rates of one session."""
 
@@ -64,18 +69,16 @@ class Peer:
         "due_at",
         "has_sender",
         "held_until",
-        "left",
         "legacy",
         "legacy_meters",
         "legacy_path",
-        "lost",
         "name",
-        "online",
         "online_since",
         "retired",
         "sender",
         "session",
         "settling",
+        "state",
         "timer_at",
     )
 
@@ -86,8 +89,7 @@ class Peer:
         self._settings = settings
         self.has_sender = False
         self.session: Session | None = None
-        self.online = False
-        self.left = False
+        self.state = PeerState.LOST
         self.legacy = False
         self.legacy_path: tuple[Address, str, float] | None = None
         """Address and link from which a legacy program was last heard, and when."""
@@ -95,8 +97,6 @@ class Peer:
         """Set while it speaks the legacy format; then there is no session with meters."""
         self.settling = False
         """A legacy program that has just started: outboxes do not send to it yet."""
-        self.lost = True
-        """Silent for `peer_lost_s`, or never heard: messages wait for it only in an outbox."""
         self.online_since: float | None = None
         self.conflict_reported_at = float("-inf")
         self.retired: dict[bytes, None] = {}
@@ -115,6 +115,13 @@ class Peer:
         self.has_sender = True
         self.sender = Sender(self._settings)
         return self.sender
+
+    @property
+    def online(self) -> bool:
+        return self.state is _ONLINE
+
+    def transition(self, event: PeerEvent) -> None:
+        self.state = TRANSITIONS[self.state, event]
 
     def record_held(self, levels: int, now: float, until: float) -> None:
         """Count how long the waiting levels of the mask are held back for other robots' urgent messages."""

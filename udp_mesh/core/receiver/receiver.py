@@ -5,7 +5,6 @@
 3. A datagram is acknowledged only if all of its fragments were accepted; otherwise it is retransmitted.
 """
 
-import struct
 from collections import deque
 from typing import NamedTuple
 
@@ -15,11 +14,17 @@ from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, MemoryBudg
 from udp_mesh.core.receiver.reassembly import CompleteMessage, FragmentStatus, Reassembly
 from udp_mesh.core.sender.sent_packets import REORDER_PACKETS
 from udp_mesh.core.settings import Limits, Rates
-from udp_mesh.wire.codec import FRAGMENT, FRAGMENT_ACK_NOW, FRAGMENT_BYTES, FRAGMENT_WIDE, FRAGMENT_WIDE_BYTES
+from udp_mesh.wire.fragment import (
+    FRAGMENT,
+    FRAGMENT_ACK_NOW,
+    FRAGMENT_BYTES,
+    FRAGMENT_WIDE,
+    FRAGMENT_WIDE_BYTES,
+    NARROW_HEADER,
+    WIDE_HEADER,
+)
 from udp_mesh.wire.frames import Fragment, MessageFlag, Refused, RefuseReason, TopicAnnounce
 
-_NARROW = struct.Struct(">BIH")
-_WIDE = struct.Struct(">BII")
 _PLAIN_MASK = 0xFF & ~FRAGMENT_ACK_NOW
 
 MAX_REFUSED_REMEMBERED = 256
@@ -102,10 +107,10 @@ class Receiver:
         first = frames[0]
         kind = first & _PLAIN_MASK
         if kind == FRAGMENT and len(frames) > FRAGMENT_BYTES:
-            _, message_id, position = _NARROW.unpack_from(frames)
+            _, message_id, position = NARROW_HEADER.unpack_from(frames)
             payload = frames[FRAGMENT_BYTES:]
         elif kind == FRAGMENT | FRAGMENT_WIDE and len(frames) > FRAGMENT_WIDE_BYTES:
-            _, message_id, position = _WIDE.unpack_from(frames)
+            _, message_id, position = WIDE_HEADER.unpack_from(frames)
             payload = frames[FRAGMENT_WIDE_BYTES:]
         else:
             return False

@@ -15,8 +15,9 @@ from udp_mesh.core.peers.session import Session
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, CHALLENGE_AFTER_S
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
-from udp_mesh.wire.codec import FRAGMENT, SENT_BYTES, Type, decode
+from udp_mesh.wire.codec import SENT_BYTES, Type, decode
 from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.fragment import FRAGMENT
 from udp_mesh.wire.frames import Frame, Heartbeat, Ping, Pong, Sent
 
 

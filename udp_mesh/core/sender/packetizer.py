@@ -6,8 +6,6 @@ full fragments of one message takes the fast path: one pack, one seal and one re
 datagram.
 """
 
-import struct
-
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receiver.datagram_age import clock_ms
@@ -16,11 +14,13 @@ from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
 from udp_mesh.core.sender.send_quota import ack_spacing, cwnd_room, next_send_at, send_quota, urgent_wait_until
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
-from udp_mesh.wire.codec import (
+from udp_mesh.wire.codec import ANNOUNCE_BYTES, encode
+from udp_mesh.wire.fragment import (
     FRAGMENT,
     FRAGMENT_ACK_NOW,
     FRAGMENT_BYTES,
@@ -29,7 +29,9 @@ from udp_mesh.wire.codec import (
     HEAD_BYTES,
     LENGTH_BYTES,
     LIFE_BYTES,
-    encode,
+    NARROW_HEADER,
+    WIDE_FROM,
+    WIDE_HEADER,
 )
 from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, Sent, TopicAnnounce
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
@@ -50,10 +52,6 @@ ID_BYTES = 4
 
 NO_MESSAGE_ID = 0xFFFF_FFFF
 """Messages are numbered from 0; no boot lives long enough to use this number."""
-
-_NARROW = struct.Struct(">BIH")
-_WIDE = struct.Struct(">BII")
-_NARROW_POSITIONS = 65_536
 
 
 def header_bytes(address: Address) -> int:
@@ -147,7 +145,7 @@ def send_level(
         if quota <= 0:
             sender.app_limited = False
             if urgent:
-                if sender.unresponsive_since is None:
+                if sender.state is not SendState.UNRESPONSIVE:
                     sender.wake_at = min(sender.wake_at, urgent_wait_until(sender))
             elif (next_at := next_send_at(sender, room, now, pace)) is not None:
                 sender.wake_at = min(sender.wake_at, next_at)
@@ -186,7 +184,7 @@ def send_level(
 def send_copies(sender: Sender, path: Path, now: float, out: list[Datagram]) -> None:
     """Send the redundant copies that are due and not acknowledged meanwhile."""
     for message, position in sender.copies.pop_due(now, sender.urgent_timeout_s()):
-        if sender.unresponsive_since is not None:
+        if sender.state is SendState.UNRESPONSIVE:
             continue
         run = Run(message, position, 1, retransmit=True)
         _seal_datagram(
@@ -219,7 +217,7 @@ def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
     channel = message.accepted.channel
     first = path.fragment_bytes - HEAD_BYTES
     if channel.number not in sender.announced:
-        first -= 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+        first -= ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
         first -= LENGTH_BYTES
     broadcast_number = message.accepted.broadcast_number
     if broadcast_number is not None:
@@ -241,12 +239,12 @@ def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSn
     frames = []
     spacing = ack_spacing(sender)
     since = sender.since_ack_requested
-    wide = position + count > _NARROW_POSITIONS
-    pack = _WIDE.pack if wide else _NARROW.pack
+    wide = position + count > WIDE_FROM
+    pack = WIDE_HEADER.pack if wide else NARROW_HEADER.pack
     plain = FRAGMENT | FRAGMENT_WIDE if wide else FRAGMENT
-    if wide and position < _NARROW_POSITIONS:
-        count = _NARROW_POSITIONS - position
-        pack, plain = _NARROW.pack, FRAGMENT
+    if wide and position < WIDE_FROM:
+        count = WIDE_FROM - position
+        pack, plain = NARROW_HEADER.pack, FRAGMENT
     for place in range(position, position + count):
         since += 1
         first = plain
@@ -353,7 +351,7 @@ def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
         size += HEAD_BYTES + (LIFE_BYTES if _sends_life(path, message) else 0)
         channel = message.accepted.channel
         if channel.number not in sender.announced:
-            size += 5 + len(channel.name.encode()) + len(channel.type_name.encode())
+            size += ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 

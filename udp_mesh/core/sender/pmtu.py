@@ -12,7 +12,7 @@ smaller MTU would not carry it.
 from collections.abc import Iterable, Sequence
 
 from udp_mesh.core.sender.sent_packets import Packet
-from udp_mesh.wire.codec import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
+from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 
 ETHERNET_MTU = 1500
 """RFC 894."""

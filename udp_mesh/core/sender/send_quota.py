@@ -11,6 +11,7 @@ Acknowledgements are lost in bursts or delayed by a process that was not schedul
 the link idle, so the link is assumed to keep delivering for some tens of milliseconds.
 """
 
+from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 
 MAX_ACK_SPACING = 10
@@ -38,7 +39,7 @@ def cwnd_room(sender: Sender, now: float) -> int:
     """Packets that the window has room for; negative if more are in flight."""
     congestion = sender.congestion
     packets = congestion.cwnd
-    if sender.timing_out:
+    if sender.state is SendState.TIMING_OUT:
         # Packets now leave the window by their age only, so more of them are in flight than within one round trip.
         smoothed_rtt = sender.rtt.smoothed_rtt
         if smoothed_rtt is not None and congestion.assume_delivery():
@@ -56,7 +57,7 @@ def cwnd_room(sender: Sender, now: float) -> int:
 
 def send_quota(sender: Sender, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
     """Packets that may be sent now. `packets_per_s` is the pacing rate, which urgent fragments ignore."""
-    if sender.unresponsive_since is not None:
+    if sender.state is SendState.UNRESPONSIVE:
         return sender.probe_credit
     packets = room
     if urgent:
@@ -75,12 +76,16 @@ def urgent_wait_until(sender: Sender) -> float:
 
 def next_send_at(sender: Sender, room: int, now: float, packets_per_s: float | None) -> float | None:
     """When more may be sent even if nothing arrives. None: only an acknowledgement changes anything."""
-    if sender.unresponsive_since is not None:
+    if sender.state is SendState.UNRESPONSIVE:
         return None
     if room > 0:
         return sender.pacer.wake_at(packets_per_s)
     late_at = _late_at(sender)
-    if sender.timing_out or now >= late_at + ASSUMED_DELIVERY_S or not sender.congestion.assume_delivery():
+    if (
+        sender.state is SendState.TIMING_OUT
+        or now >= late_at + ASSUMED_DELIVERY_S
+        or not sender.congestion.assume_delivery()
+    ):
         return None
     return max(now, late_at) + sender.rates.pace_quantum_s
 

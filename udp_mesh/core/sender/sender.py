@@ -23,6 +23,7 @@ from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
 from udp_mesh.core.sender.resume_backoff import RESUME_BURST_PACKETS, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
+from udp_mesh.core.sender.send_state import TRANSITIONS, SendEvent, SendState
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
@@ -78,9 +79,9 @@ class Sender(PendingMessages):
         """Mask of the levels that sent something in this round."""
         self.wake_at = float("inf")
         """When pacing permits the next quantum."""
-        self.unresponsive_since: float | None = None
-        self.timing_out = False
-        """Acknowledgements stay away: packets are declared lost by their age."""
+        self.state = SendState.ACTIVE
+        self.unresponsive_since = float("-inf")
+        """When the state last became UNRESPONSIVE."""
         self.timed_out: list[Packet] = []
         """Packets that timed out and are neither acknowledged nor retransmitted."""
         self.expired_at = float("-inf")
@@ -122,9 +123,9 @@ class Sender(PendingMessages):
     def accept(self, message: OutgoingMessage, now: float) -> None:
         """Accept a message and queue it on its level."""
         self.add(message)
-        if not self.in_flight.outstanding and self.unresponsive_since is None:
+        if not self.in_flight.outstanding and self.state is not SendState.UNRESPONSIVE:
             self.last_progress = now
-        if self.unresponsive_since is not None and message.priority <= self.rates.urgent_priority:
+        if self.state is SendState.UNRESPONSIVE and message.priority <= self.rates.urgent_priority:
             # A new urgent message is the best probe; what waited until now goes behind it.
             self.allow_probe(now)
         self.scheduler.push(message)
@@ -141,13 +142,13 @@ class Sender(PendingMessages):
         acknowledged, lost, newest = in_flight.acknowledge(ack.largest, received)
         if acknowledged:
             # Packets acknowledged late and all at once say nothing about the rate of the link.
-            after_silence = self.timing_out or self.unresponsive_since is not None
+            after_silence = self.state is not SendState.ACTIVE
             self.last_progress = now
             if not all(packet.snapshot.urgent for packet in acknowledged):
                 self.non_urgent_progress = now
-            self.timing_out = False
-            if self.unresponsive_since is not None:
+            if self.state is SendState.UNRESPONSIVE:
                 self._on_responsive()
+            self._transition(SendEvent.ACKNOWLEDGED)
             if self.pmtu.suspect:
                 self.pmtu.on_acked(acknowledged, in_flight.spurious - spurious, now)
             self._record_arrivals(acknowledged)
@@ -263,9 +264,9 @@ class Sender(PendingMessages):
     def timer(self) -> float | None:
         """When `handle_timer` is due for probes, deadlines or redundant copies. Calling it late is harmless."""
         at: float | None = None
-        if self.unresponsive_since is not None:
+        if self.state is SendState.UNRESPONSIVE:
             if self.pending or self.in_flight.outstanding:
-                at = self.probed_at + self._probe_interval_s(self.unresponsive_since)
+                at = self.probed_at + self._probe_interval_s()
         elif self.in_flight.outstanding:
             at = self._expiry_at()
         deadline = self.next_deadline()
@@ -285,15 +286,14 @@ class Sender(PendingMessages):
         self.expire(now)
         if self.wake_at <= now:
             self.wake_at = float("inf")
-        if self.unresponsive_since is not None:
+        if self.state is SendState.UNRESPONSIVE:
             awaited = self.pending or self.in_flight.outstanding
-            if awaited and now >= self.probed_at + self._probe_interval_s(self.unresponsive_since):
+            if awaited and now >= self.probed_at + self._probe_interval_s():
                 self.allow_probe(now)
         elif self.in_flight.outstanding:
             timeout = self.pto_s()
             if now >= self.last_progress + max(UNRESPONSIVE_AFTER_PTOS * timeout, UNRESPONSIVE_AFTER_S):
-                self.unresponsive_since = now
-                self.allow_probe(now)
+                self.become_unresponsive(now)
             elif now >= self._expiry_at():
                 self.expired_at = now
                 self._declare_timed_out(now - timeout)
@@ -316,7 +316,7 @@ class Sender(PendingMessages):
         The next acknowledgement shows whether they or only their acknowledgements were lost. Until then urgent
         fragments are retransmitted; others only if nothing else waits.
         """
-        self.timing_out = True
+        self._transition(SendEvent.TIMED_OUT)
         for packet in self.in_flight.declare_lost_before(sent_before):
             if packet.message.priority <= self.rates.urgent_priority:
                 self._requeue((packet,))
@@ -330,8 +330,18 @@ class Sender(PendingMessages):
         timed_out, self.timed_out = self.timed_out, []
         self._requeue(timed_out)
 
-    def _probe_interval_s(self, unresponsive_since: float) -> float:
-        return FAST_PROBE_INTERVAL_S if self.probed_at - unresponsive_since < FAST_PROBE_FOR_S else PROBE_INTERVAL_S
+    def become_unresponsive(self, now: float) -> None:
+        """Requeue everything in flight and send only probes from now on."""
+        self._transition(SendEvent.NO_PROGRESS)
+        self.unresponsive_since = now
+        self.allow_probe(now)
+
+    def _transition(self, event: SendEvent) -> None:
+        self.state = TRANSITIONS[self.state, event]
+
+    def _probe_interval_s(self) -> float:
+        fast = self.probed_at - self.unresponsive_since < FAST_PROBE_FOR_S
+        return FAST_PROBE_INTERVAL_S if fast else PROBE_INTERVAL_S
 
     def allow_probe(self, now: float) -> None:
         """Let the most urgent fragment probe an unresponsive peer, at most once per `FAST_PROBE_INTERVAL_S`."""
@@ -344,7 +354,7 @@ class Sender(PendingMessages):
     def consume_small_probe(self, now: float) -> bool:
         """Whether the probe just allowed is to be a ping: nothing waits, or full fragments may be too large for the
         path (then one probe in a few, once the peer has been unresponsive for longer)."""
-        if self.unresponsive_since is None or not self.probe_credit:
+        if self.state is not SendState.UNRESPONSIVE or not self.probe_credit:
             return False
         if self.scheduler.waiting:
             long_since = now - self.unresponsive_since > FAST_PROBE_FOR_S
@@ -365,14 +375,13 @@ class Sender(PendingMessages):
     def on_activity(self, now: float) -> None:
         """Record that an authentic datagram arrived. To an unresponsive peer a first burst is sent; the rest waits for
         an acknowledgement."""
-        if self.unresponsive_since is None or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
+        if self.state is not SendState.UNRESPONSIVE or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
             return
         if self._resume_backoff.due(now):
             self.allow_probe(now)
             self.probe_credit = min(RESUME_BURST_PACKETS, int(self.congestion.cwnd))
 
     def _on_responsive(self) -> None:
-        self.unresponsive_since = None
         self._resume_backoff.reset()
         self.probe_credit = 0
         self.scheduler.demote_stale(self.rates.urgent_priority)
@@ -393,8 +402,7 @@ class Sender(PendingMessages):
         self.cancelled.clear()
         self.next_wire_id = 0
         self.epoch += 1
-        self.unresponsive_since = None
-        self.timing_out = False
+        self._transition(SendEvent.RESTARTED)
         self.probe_credit = 0
         self.last_progress = now
         messages = list(self.pending)
@@ -418,7 +426,7 @@ class Sender(PendingMessages):
 
     def snapshot(self, now: float, *, urgent: bool = False) -> SendSnapshot:
         """The state in which one burst of packets is sent."""
-        if not self.in_flight.outstanding and not self.timing_out and self.unresponsive_since is None:
+        if not self.in_flight.outstanding and self.state is SendState.ACTIVE:
             self.delivered_at = self.delivered_sent_at = self.last_progress = now
         return SendSnapshot(
             now,

@@ -1,6 +1,6 @@
 """Golden files: one text per release, back end and mode, with everything a node gets.
 
-`python -m tests.meshctl.render.golden` writes them anew; look at `git diff` before you commit them.
+`python -m tests.meshctl.render.golden` rewrites them; check `git diff` before you commit them.
 """
 
 from __future__ import annotations

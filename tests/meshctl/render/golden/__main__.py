@@ -1,4 +1,4 @@
-"""Write every golden file anew, and delete those that no case has any more."""
+"""Rewrite every golden file, and delete files without a case."""
 
 from __future__ import annotations
 

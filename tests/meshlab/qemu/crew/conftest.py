@@ -1,4 +1,4 @@
-"""A second machine of real radios: everything encrypted, a robot whose node has two radios, a spare in its box."""
+"""A second machine with everything encrypted, a robot whose node has two radios, and a factory-fresh spare."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.meshlab.qemu.conftest import Lab, fielded
+from tests.meshlab.qemu.conftest import Lab, field_lab
 
 INVENTORY = Path(__file__).with_name("inventory")
 FIELDED = ("base", "b01", "b02", "husky")
@@ -17,31 +17,31 @@ KEYS = {"main": "a word that all of them know", "fast": "and another one for fiv
 
 @dataclass(frozen=True, slots=True)
 class Crew(Lab):
-    """The running fleet; `spare` stays on its bench, fresh from the box."""
+    """The running fleet; `spare` stays on the bench, factory-fresh."""
 
     NODES = FIELDED
 
     def write_keys(self, **keys: str) -> None:
-        """What the meshes' keys are from now on; a node has them once it is provisioned."""
+        """Set the meshes' keys in the inventory; a node gets them when it is provisioned."""
         lines = "".join(f"{mesh}: {key}\n" for mesh, key in {**KEYS, **keys}.items())
         (self.inventory.parent / "keys.yaml").write_text(lines, encoding="utf-8")
 
     def stations(self, name: str, interface: str) -> dict[str, bool]:
-        """Whom a radio of the node knows, and whether each has proven that it knows the key."""
+        """The stations of a node's radio, and whether each is authorized."""
         names = self.names()
-        told: dict[str, bool] = {}
+        authorized: dict[str, bool] = {}
         mac = ""
         for line in self.on(name, f"iw dev {interface} station dump").splitlines():
             words = line.split()
             if line.startswith("Station"):
                 mac = words[1]
             elif words[0] == "authorized:":
-                told[names[mac]] = words[1] == "yes"
-        return told
+                authorized[names[mac]] = words[1] == "yes"
+        return authorized
 
 
 @pytest.fixture(scope="package")
 def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
-    """The fielded nodes taken in on the bench and carried out: only the mesh leads to them."""
-    with fielded(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
+    """The nodes of the field, bootstrapped on the bench and unplugged: they are reached only over the mesh."""
+    with field_lab(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
         yield made

@@ -1,4 +1,4 @@
-"""Encrypted meshes of real radios, and a node with two of them: WPA2 in an ad-hoc cell, SAE in 802.11s."""
+"""Encrypted meshes of the kernel's radios, and a node with two: WPA2 in an ad-hoc cell, SAE in 802.11s."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.meshlab.qemu.crew.conftest import FIELDED, KEYS, Crew
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 TWINS = ("b02", "husky")
-# data frames on the air in ten seconds: how many are encrypted, how many carry anything but a handshake in the clear
+# data frames in ten seconds: the number of encrypted ones, and of unencrypted ones except handshakes
 _LISTEN = """
 ip link set hwsim0 up
 cat >/tmp/protected.py <<'END'
@@ -41,7 +41,7 @@ python3 /tmp/protected.py
 
 
 def heard_over(crew: Crew, name: str) -> dict[str, set[str]]:
-    """Whom each of the node's radios has heard within the last seconds, as its batman-adv tells."""
+    """The neighbors that each of the node's radios has heard within the last seconds, from its batman-adv."""
     names = crew.names()
     found: dict[str, set[str]] = {"mesh0": set(), "mesh1": set()}
     for one in json.loads(crew.on(name, "batctl meshif bat0 neighbors_json")):
@@ -51,15 +51,15 @@ def heard_over(crew: Crew, name: str) -> dict[str, set[str]]:
 
 
 def keys(crew: Crew) -> dict[str, set[str]]:
-    """The keys that the nodes' radios are configured with, by mesh."""
+    """The configured keys of the nodes' radios, by mesh."""
     words = "uci -q get wireless.mesh0.key; echo; uci -q get wireless.mesh1.key || true"
-    told = [crew.on(name, words).split("\n") for name in FIELDED]
-    return {"main": {lines[0] for lines in told}, "fast": {lines[2] for lines in told if lines[2:] and lines[2]}}
+    outputs = [crew.on(name, words).split("\n") for name in FIELDED]
+    return {"main": {lines[0] for lines in outputs}, "fast": {lines[2] for lines in outputs if lines[2:] and lines[2]}}
 
 
-def all_are_let_in(crew: Crew) -> bool:
-    neighbours = {"base": {"b01"}, "b01": {"base", "b02"}, "b02": {"b01", "husky"}, "husky": {"b02"}}
-    main = all(crew.stations(name, "mesh0") == dict.fromkeys(near, True) for name, near in neighbours.items())
+def all_authorized(crew: Crew) -> bool:
+    neighbors = {"base": {"b01"}, "b01": {"base", "b02"}, "b02": {"b01", "husky"}, "husky": {"b02"}}
+    main = all(crew.stations(name, "mesh0") == dict.fromkeys(near, True) for name, near in neighbors.items())
     return main and all(
         crew.stations(name, "mesh1") == {other: True} for name, other in zip(TWINS, TWINS[::-1], strict=True)
     )
@@ -73,7 +73,7 @@ def test_every_cell_is_the_one_that_is_configured_and_all_in_it_have_proven_the_
         info = crew.on(name, "iw dev mesh1 info")
         assert "type mesh point" in info
         assert "channel 36 (5180 MHz), width: 20 MHz" in info
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized")
 
 
 def test_nothing_but_handshakes_passes_the_air_in_the_clear(crew: Crew) -> None:
@@ -114,4 +114,4 @@ def test_the_whole_mesh_takes_a_new_key_over_itself(crew: Crew) -> None:
     assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} <= {"done", "unchanged"}
     assert keys(crew) == {"main": {"the new word of all"}, "fast": {KEYS["fast"]}}
     crew.settle()
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized with the new key")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized with the new key")

@@ -1,4 +1,4 @@
-"""New keys over the very meshes they are for: of 802.11s with SAE alone, and of both meshes of a team at one moment."""
+"""New keys over the meshes that use them: for 802.11s with SAE only, and for both meshes of a team simultaneously."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.crew.conftest import FIELDED, Crew
-from tests.meshlab.qemu.crew.test_encrypted import TWINS, all_are_let_in, heard_over, keys
+from tests.meshlab.qemu.crew.test_encrypted import TWINS, all_authorized, heard_over, keys
 
 pytestmark = [pytest.mark.proof, pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
@@ -20,13 +20,13 @@ def results(events: Iterable[dict[str, Any]]) -> dict[str, str]:
 
 
 def works(crew: Crew) -> bool:
-    """Whether every radio is known to its neighbours with a proven key, and unicast passes each of them."""
+    """Whether every radio is authorized at its neighbors, and unicast passes every link."""
     both = all(heard_over(crew, name)["mesh1"] == {other} for name, other in zip(TWINS, TWINS[::-1], strict=True))
-    return both and all_are_let_in(crew) and crew.answers("base-station", "10.42.0.10")
+    return both and all_authorized(crew) and crew.answers("base-station", "10.42.0.10")
 
 
 def switches(crew: Crew) -> list[list[str]]:
-    """The nodes of each switch that meshctl would make now."""
+    """The nodes of each simultaneous change that meshctl plans now."""
     plan = crew.fleet.directory / "plan.json"
     crew.meshctl("plan", "--out", str(plan), *FIELDED)
     stages = json.loads(plan.read_text(encoding="utf-8"))["stages"]
@@ -47,12 +47,12 @@ def test_the_key_of_a_mesh_with_sae_changes_alone_and_the_other_mesh_is_left_as_
 
 def test_both_meshes_take_new_keys_at_one_moment(crew: Crew) -> None:
     crew.write_keys(main="new for all of them", fast="new for the fast ones, too")
-    # the two meshes share the nodes with two radios, whose files change at once: so there is one switch
+    # the two meshes share the nodes with two radios, whose files change together: so there is one simultaneous change
     assert switches(crew) == [sorted(FIELDED)]
     ended = results(crew.provision(*FIELDED)[-1])
     assert set(ended) == set(FIELDED)
     assert set(ended.values()) <= {"done", "unchanged"}
     assert keys(crew) == {"main": {"new for all of them"}, "fast": {"new for the fast ones, too"}}
     crew.settle()
-    until(lambda: works(crew), "every neighbour to be authorized with the new keys")
+    until(lambda: works(crew), "every neighbor to be authorized with the new keys")
     until(lambda: crew.meshctl("provision", "--check", *FIELDED, expect=None).status == 0, "nothing left to change")

@@ -1,4 +1,4 @@
-"""Changing a mesh of real radios over that mesh itself: order, switch, undo, cuts."""
+"""Changing a mesh of the kernel's radios over that mesh itself: order, simultaneous change, rollback, cuts."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import pytest
 
 from tests.meshlab.qemu.conftest import until
 from tests.meshlab.qemu.crew.conftest import FIELDED, Crew
-from tests.meshlab.qemu.crew.test_encrypted import all_are_let_in, keys
+from tests.meshlab.qemu.crew.test_encrypted import all_authorized, keys
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
-# by how much two nodes may differ in when they heard of each other; far below the time since the mesh was made
+# tolerance between the ages of two nodes' entries of each other; far below the age of the mesh
 SLACK_S = 20
-# nobody waits long for what will not come; a whole mesh has to be ready within it, however slow
+# short, because one test waits until it expires; a whole mesh must be ready within it, however slow
 SHORT_WINDOW_S, SHORTER_WINDOW_S = 45, 25
 # the lines of the inventory's mesh main, as against those of mesh fast
 RATE_OF_MAIN = """\
@@ -44,35 +44,35 @@ def test_a_whole_mesh_changes_channel_bssid_and_key_over_itself(crew: Crew) -> N
     assert cells(crew) == {"02:ca:fe:00:00:31 2462"}
     assert keys(crew)["main"] == {"the word for another channel"}
     crew.settle()
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized with the new key")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized with the new key")
 
 
 def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     before = cells(crew)
     crew.edit("channel: 11\n", "channel: 1\n")
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
-    # at the moment of the switch b02 hears nobody any more, and the Husky behind it nobody at all
+    # at the moment of the change b02 loses its links, and with it the Husky behind it
     crew.fleet.inject_fault("b02", "sever@reload_config")
 
     def let_it_be_heard() -> None:
         crew.fleet.repair("b02")
         crew.node("b02").plug(False)
 
-    told = ("rolling back", let_it_be_heard)
-    done = crew.meshctl("provision", "--yes", "--json", *FIELDED, expect=1, when_told=told)
+    on_line = ("rolling back", let_it_be_heard)
+    done = crew.meshctl("provision", "--yes", "--json", *FIELDED, expect=1, on_line=on_line)
     results = {event["node"]: event["outcome"]["result"] for event in done.events if event["event"] == "finished"}
     assert results.keys() == set(FIELDED)
-    # on a starved host a node may be seen too late; it is back all the same
+    # on a starved host a node may be seen too late, although it is back
     assert set(results.values()) <= {"rolled back", "uncertain"}
     until(lambda: cells(crew) == before, "every node to be in the old cell again")
     crew.edit("channel: 1\n", "channel: 11\n")
     crew.edit(f"confirm_window_s: &window {SHORT_WINDOW_S}", "confirm_window_s: &window 600")
     crew.settle()
-    until(lambda: all_are_let_in(crew), "every neighbour to be authorized again")
+    until(lambda: all_authorized(crew), "every neighbor to be authorized again")
     until(lambda: crew.meshctl("provision", *FIELDED, "--check", expect=None).status == 0, "every node to be as it was")
 
 
-def test_the_running_mesh_is_changed_from_its_far_end_and_radios_that_start_anew_are_heard_again(crew: Crew) -> None:
+def test_the_running_mesh_is_changed_from_its_far_end_and_restarted_radios_are_heard_again(crew: Crew) -> None:
     # the broadcast rate restarts a radio on every release; transmit power does not
     crew.edit(RATE_OF_MAIN.format(12000), RATE_OF_MAIN.format(6000))
     far_first = sorted(FIELDED, key=lambda name: -crew.hops()[name])
@@ -84,11 +84,11 @@ def test_the_running_mesh_is_changed_from_its_far_end_and_radios_that_start_anew
     assert steps.index("watch neighbor station entries") < steps.index("apply")
     assert {crew.on(name, "uci get wireless.mesh0.mcast_rate").strip() for name in FIELDED} == {"6000"}
     crew.settle()
-    # without a word from anybody else: unicast from a node to each of its neighbours is taken
+    # without other traffic: unicast frames from a node to each of its neighbors are accepted
     for name, addresses in (("b01", ("10.42.0.1", "10.42.0.102")), ("b02", ("10.42.0.101", "10.42.0.11"))):
         for address in addresses:
             until(lambda: is_answered(crew, name, address), f"an answer from {address} to {name}")  # noqa: B023
-    until(lambda: not _known_longer_than_itself(crew, "b02"), "every neighbour to have forgotten the radio that it had")
+    until(lambda: not _known_longer_than_itself(crew, "b02"), "every neighbor to have deleted the old radio's entry")
 
 
 def is_answered(crew: Crew, node: str, address: str) -> bool:
@@ -96,11 +96,11 @@ def is_answered(crew: Crew, node: str, address: str) -> bool:
 
 
 def _known_longer_than_itself(crew: Crew, name: str) -> list[str]:
-    """The neighbours that know the node's radio for longer than it has known anybody."""
+    """The neighbors whose entry of the node's radio is older than all of the node's own entries."""
     mac = next(mac for mac, node in crew.names().items() if node == name)
     command = "iw dev mesh0 station {what} | sed -n 's/.*connected time:[^0-9]*\\([0-9]*\\).*/\\1/p'"
     own = max(int(age) for age in crew.on(name, command.format(what="dump")).split())
-    ages = {other: crew.on(other, command.format(what=f"get {mac}")).split() for other in crew.neighbours(name)}
+    ages = {other: crew.on(other, command.format(what=f"get {mac}")).split() for other in crew.neighbors(name)}
     return [other for other, age in ages.items() if not age or int(age[0]) > own + SLACK_S]
 
 
@@ -113,11 +113,11 @@ def test_a_configuration_that_cuts_a_node_off_is_taken_back_by_the_node_itself(c
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORTER_WINDOW_S}")
     done = crew.meshctl("restore", "b01", str(bad), "--yes", expect=1)
     crew.edit(f"confirm_window_s: &window {SHORTER_WINDOW_S}", "confirm_window_s: &window 600")
-    # on a starved host it may not be seen again in time; it is back all the same
+    # on a starved host it may not be seen in time, although it is back
     assert "rolled back" in done.text + done.errors or "uncertain" in done.text + done.errors
     until(lambda: cells(crew) == before, "the node to be in its cell again")
-    told = crew.on("b01", "meshctl-deadman status")
-    assert "last_outcome=restored last_reason=timeout" in told
+    status = crew.on("b01", "meshctl-deadman status")
+    assert "last_outcome=restored last_reason=timeout" in status
     crew.settle()
 
 
@@ -150,5 +150,5 @@ def test_a_power_cut_inside_the_window_leaves_the_old_configuration(crew: Crew) 
     crew.edit(changed, plain)
     until(lambda: crew.node("husky").is_up() and crew.node("husky").boot_id != boot, "the node to boot")
     until(lambda: crew.on("husky", power) == before, "its old configuration")
-    until(lambda: crew.neighbours("husky") == {"b02"}, "its radios to be in the mesh again")
+    until(lambda: crew.neighbors("husky") == {"b02"}, "its radios to be in the mesh again")
     crew.settle()

@@ -1,4 +1,4 @@
-"""A beacon is dead, and a device fresh from its box takes its name and its place in the mesh."""
+"""Replace a dead beacon by a factory-fresh device, which gets its name and its place in the mesh."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def test_a_factory_fresh_device_takes_over_a_dead_beacons_name_and_place(crew: C
     done = crew.meshctl("replace", "b01", "spare", "--at", f"{place.host}:{place.port}", "--yes", "--json")
     assert {event["outcome"]["result"] for event in done.events if event["event"] == "finished"} == {"done"}
     crew.node("spare").plug(False)
-    # the new device is where the old one was, with all that the mesh has to be told to let it in
-    until(lambda: crew.originators("base").get("husky") == "spare", "the way over the new device")
+    # the new device is at the old one's place, with the settings of the mesh
+    until(lambda: crew.originators("base").get("husky") == "spare", "the route over the new device")
     until(lambda: crew.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
     assert crew.on("spare", "uci get system.@system[0].hostname").strip() == "b01"
     assert crew.node("spare").address == "10.42.0.101"

@@ -54,13 +54,13 @@ def events_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[
     return both.events(both.b)
 
 
-def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_told_of_once_a_minute() -> None:
+def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_reported_once_a_minute() -> None:
     assert PeerOnline in map(type, events_of((1, 2), times=3, apart_s=1.0))
     assert events_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
     assert len(events_of((2, 3), times=5, apart_s=61.0)) == 5
 
 
-def test_a_recorded_heartbeat_brings_nobody_online() -> None:
+def test_a_replayed_heartbeat_brings_no_peer_online() -> None:
     world = World()
     world.add(settings("b"))
     recorded: list[Datagram] = []
@@ -106,7 +106,7 @@ def test_a_replayed_datagram_changes_nothing() -> None:
     assert both.b.conditions(both.now).counters.dropped_replayed == 2 * len(datagrams)
 
 
-def test_a_restart_is_noticed_at_once_and_told() -> None:
+def test_a_restart_is_detected_at_once_and_reported() -> None:
     world = World()
     world.add(settings("a"))
     world.add(settings("b"))
@@ -173,7 +173,7 @@ def test_keys_rotate_without_losing_a_message() -> None:
     assert not any(isinstance(event, PeerOffline | PeerRestarted | KeyMismatch) for event in events)
 
 
-def test_neighbours_are_met_without_any_broadcast() -> None:
+def test_neighbors_are_met_without_any_broadcast() -> None:
     rng = random.Random(2)
     nodes = {}
     for name, own, other in (("a", A, B), ("b", B, A)):
@@ -198,7 +198,7 @@ def test_neighbours_are_met_without_any_broadcast() -> None:
     assert [type(event) for event in events] == [PeerOnline, MessageReceived]
 
 
-def test_a_smaller_mtu_cuts_fragments_anew() -> None:
+def test_a_smaller_mtu_restarts_messages_with_smaller_fragments() -> None:
     both = pair()
     both.a.link_up(LinkInfo("mesh", LinkKind.BROADCAST, A, BROADCAST, mtu=576), both.now)
     both.a.send("any", bytes(50_000), destination="b", now=both.now)

@@ -80,7 +80,7 @@ def test_what_a_forgotten_peer_held_is_free_again() -> None:
     assert peer_table.memory.holders <= 1
 
 
-def test_whole_messages_give_back_what_their_pieces_took() -> None:
+def test_whole_messages_release_what_their_fragments_took() -> None:
     both = pair()
     for _ in range(5):
         both.a.send("any", bytes(300_000), destination="b", now=both.now)
@@ -89,7 +89,7 @@ def test_whole_messages_give_back_what_their_pieces_took() -> None:
     assert both.b._state.peer_table.memory.bytes < 2000
 
 
-def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_nobody_gets_any() -> None:
+def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_no_peer_gets_any() -> None:
     memory = MemoryBudget(1000)
     greedy, late = Account(memory), Account(memory)
     while greedy.has_room(10):

@@ -57,7 +57,7 @@ def test_an_answer_ends_it() -> None:
     assert sendings(fragment(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
 
 
-def test_best_effort_is_copied_early_only_since_nobody_answers_for_it() -> None:
+def test_best_effort_is_copied_early_only_since_its_arrival_is_unknown() -> None:
     message = fragment(reliable=False)
     message.ended = True
     assert sendings(message, twice=True, loss=0.2) == pytest.approx(EARLY_S)

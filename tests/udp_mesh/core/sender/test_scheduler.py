@@ -34,7 +34,7 @@ steps = st.lists(
 
 
 @given(steps)
-def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_piece_leaves(
+def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_fragment_is_sent(
     plan: list[tuple[str, int, int]],
 ) -> None:
     scheduler = Scheduler()

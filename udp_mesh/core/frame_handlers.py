@@ -1,0 +1,202 @@
+"""The frames of an opened unicast datagram: fragments to reassembly, acknowledgements to the sender, requests answered.
+
+`deliver` turns complete messages into events; `inflate_step` does so for compressed ones, step by step.
+"""
+
+from udp_mesh.core.broadcast import FIRST_UNREPAIRED_NUMBER
+from udp_mesh.core.events import ExpiryReason, MessageReceived
+from udp_mesh.core.peer_lifecycle import on_bye
+from udp_mesh.core.peers.path_validation import send_on_path
+from udp_mesh.core.peers.session import Session
+from udp_mesh.core.publish import report_ended
+from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
+from udp_mesh.core.settings import Address
+from udp_mesh.core.state import State
+from udp_mesh.wire.frames import (
+    Ack,
+    Bye,
+    Cancel,
+    Delivered,
+    Fragment,
+    Frame,
+    Nack,
+    Ping,
+    Pong,
+    Refused,
+    RefuseReason,
+    TopicAnnounce,
+)
+
+
+def process_frames(
+    state: State,
+    session: Session,
+    frames: list[Frame],
+    number: int,
+    link: str,
+    source: Address,
+    now: float,
+    late_s: float = 0.0,
+) -> None:
+    """Process the frames of a unicast datagram, in order."""
+    receiver = session.receiver
+    peer = session.peer
+    assert peer is not None
+    sender = peer.sender
+    wants_ack = ack_now = False
+    kept = True
+    for frame in frames:
+        match frame:
+            case Fragment():
+                wants_ack = True
+                ack_now = ack_now or frame.ack_now
+                kept = receiver.receive_fragment(frame, now, broadcast=False, late_s=late_s) and kept
+            case Ack():
+                if frame.largest < session.path.channel.next_number:
+                    session.path.confirmed = session.knows_us = True
+                    session.peer_receives = (frame.receive_rate, now)
+                    arrived_before = sender.delivered_packets
+                    sender.acknowledge(frame, now)
+                    if sender.delivered_packets > arrived_before:
+                        session.confirm_two_way()
+                    report_ended(state, peer, now)
+                    state.ready[peer] = None
+                if frame.waiting:
+                    state.priority_backoff.on_waiting(frame.waiting, now)
+            case TopicAnnounce():
+                receiver.on_topic_announce(frame)
+            case Cancel(message_ids, broadcast_ids):
+                _on_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
+            case Refused():
+                if not frame.broadcast_id:
+                    _on_refused(state, session, frame)
+                    report_ended(state, peer, now)
+                    state.ready[peer] = None
+            case Delivered(message_ids, broadcast_ids):
+                if not broadcast_ids:
+                    sender.on_delivered(message_ids)
+                    report_ended(state, peer, now)
+            case Nack(message_id):
+                _on_nack(state, session, message_id, now)
+            case Ping(token):
+                if (link, source) == (session.path.link, session.path.address):
+                    session.queue_control(Pong(token, 0))
+                    state.schedule_control(session)
+                else:
+                    # The ping validates the path it came on: answer to that address.
+                    send_on_path(state, session, Pong(token, 0), link, source, now)
+            case Pong(token):
+                sender.pmtu.on_pong(token, now)
+            case Bye():
+                on_bye(state, session, now)
+            case _:
+                # Heartbeats are processed with long headers.
+                pass
+    deliver(state, session, now)
+    if not wants_ack:
+        receiver.acks.on_packet(number, now)
+    elif kept:
+        receiver.on_accepted(number, now, ack_now=ack_now)
+        if receiver.acks.send_now:
+            state.schedule_control(session)
+    if receiver.refusals:
+        for refusal in receiver.refusals:
+            session.queue_control(refusal)
+        receiver.refusals.clear()
+        state.schedule_control(session)
+    state.arm(peer)
+
+
+def ack_mid_batch(state: State, session: Session, now: float) -> None:
+    """Acknowledge in the middle of a large batch, before its beginning leaves the bitmap."""
+    ack = session.build_ack(now, ())
+    if ack is not None:
+        session.queue_control(ack)
+
+
+def _on_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, broadcast_ids: bool) -> None:
+    if broadcast_ids:
+        repairs = state.repairs.get(session.boot_id)
+        for message_id in message_ids:
+            if repairs is not None:
+                repairs.abandon(message_id)
+        return
+    for message_id in message_ids:
+        session.receiver.unicasts.end(message_id)
+
+
+def _on_refused(state: State, session: Session, refused: Refused) -> None:
+    peer = session.peer
+    assert peer is not None
+    sender = peer.sender
+    message = sender.by_wire_id(refused.message_id)
+    if message is None:
+        return
+    match refused.reason:
+        case RefuseReason.FORGOTTEN:
+            sender.resend_from_start(message)
+        case RefuseReason.NO_MEMORY:
+            # Its packets stay unacknowledged and are retransmitted anyway.
+            return
+        case RefuseReason.TOO_LARGE | RefuseReason.CORRUPT:
+            sender.finish(message, ExpiryReason.REFUSED)
+
+
+def _on_nack(state: State, session: Session, number: int, now: float) -> None:
+    """A peer misses a broadcast: send it a unicast copy, or a Cancel if it is no longer kept."""
+    peer = session.peer
+    assert peer is not None
+    accepted = state.broadcasts.repair(number)
+    if accepted is None:
+        session.queue_control(Cancel((number,), broadcast_ids=True))
+        state.schedule_control(session)
+        return
+    if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
+        return
+    state.event_queue.counters.repairs_sent += 1
+    copy = AcceptedMessage(
+        accepted.message_id,
+        accepted.channel,
+        accepted.payload,
+        accepted.body,
+        accepted.flags,
+        accepted.accepted_at,
+        accepted.deadline,
+        number,
+    )
+    peer.sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
+    state.ready[peer] = None
+
+
+def deliver(state: State, session: Session, now: float) -> None:
+    """Turn complete messages into events."""
+    receiver = session.receiver
+    if receiver.inflating:
+        state.inflating[session] = None
+    if not receiver.completed:
+        return
+    completed, receiver.completed = receiver.completed, []
+    repairs = state.repairs.get(session.boot_id)
+    for message in completed:
+        number = message.from_broadcast
+        if number is not None and number < FIRST_UNREPAIRED_NUMBER and repairs is not None:
+            repairs.on_received(number, now, receiver.broadcasts.finished)
+            state.schedule_repair(session.boot_id, repairs)
+        state.event_queue.counters.messages_received += 1
+        state.event_queue.emit(
+            MessageReceived(
+                session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
+            )
+        )
+
+
+def inflate_step(state: State, now: float) -> None:
+    """Inflate one step of a complete message, of each session in turn."""
+    session = next(iter(state.inflating))
+    held = sum(one.receiver.inflating_bytes for one in state.inflating)
+    if not session.receiver.inflate_step():
+        state.event_queue.counters.dropped_malformed += 1
+    if held <= 2 * state.settings.limits.message_bytes or not session.receiver.inflating:
+        # In turn, unless much memory is held already: then finish this one before others grow.
+        del state.inflating[session]
+    deliver(state, session, now)
