@@ -143,7 +143,7 @@ def daemon_page() -> str:
     parts = [
         "# Daemon configuration",
         "Every key of `udp-mesh.toml` with its type and default, generated from the program."
-        "\n[The transport](udp-mesh.md#the-whole-file) explains them with examples, `key_file` and `[[links]]`"
+        "\n[The transport](udp-mesh.md) explains them with examples, `key_file` and `[[links]]`"
         "\nincluded; `udp-mesh check --json` prints all values in force.",
     ]
     for title, table, left_out in tables:

@@ -177,23 +177,21 @@ def test_man_pages_are_well_formed(name: str, tmp_path: Path, commands: dict[str
     assert done.stderr == ""
 
 
-# pages in plain English (the words are those of no message, either)
-PLAIN = [
-    "CONTRIBUTING.md",
-    *(f"docs/{name}.md" for name in ("tutorial", "glossary", "provisioning", "status", "robots", "design")),
-    *("docs/device-scripts.md", "docs/facts/node-assumptions.md", "docs/facts/openwrt-checked.md"),
-    *(str(page.relative_to(ROOT)) for part in ("how-to", "decisions") for page in sorted((DOCS / part).glob("*.md"))),
-]
 WORDS = re.compile(
     r"\b(told|tells?|anew|whoever|somebody|nobody|mend(?:s|ed)?|of a node that|takes? up|taken up|carr(?:y|ied) out"
     r"|neighbours?|behaviours?|colours?)\b"
 )
+# fenced and indented code, code spans, and anchors made of command names
+CODE_OR_ANCHOR = re.compile(r"```.*?```|^ {4}.*?$|`[^`]*`|\(#[\w-]+\)|\{ #[\w-]+ \}", re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("name", PLAIN)
-def test_pages_use_plain_words(name: str) -> None:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    without_code = re.sub(r"```.*?```|`[^`]*`", "", text, flags=re.DOTALL)
-    # the meanings of alarms are the program's own words
-    prose = "\n".join(line for line in without_code.splitlines() if not line.startswith("|  | "))
-    assert WORDS.findall(prose) == []
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.name not in FOREIGN], ids=lambda page: str(page.relative_to(ROOT))
+)
+def test_pages_use_plain_words(page: Path) -> None:
+    assert WORDS.findall(CODE_OR_ANCHOR.sub("", page.read_text(encoding="utf-8"))) == []
+
+
+@pytest.mark.parametrize("name", pages())
+def test_help_and_descriptions_of_keys_use_plain_words(name: str) -> None:
+    assert WORDS.findall(CODE_OR_ANCHOR.sub("", pages()[name])) == []
