@@ -59,8 +59,6 @@ Nodes = Annotated[
     list[str] | None,
     typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all."),
 ]
-    list[str] | None, typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.")
-]
 
 Options = Mapping[str, tuple[Any, Any]]
 """Type and default of each option, by the opener's parameter name, in the order of the help."""
