@@ -9,7 +9,7 @@ import pytest
 
 from tests.meshctl.proof.rig import Ended, Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
 def test_a_fleet_that_is_right_has_nothing_to_do(rig: Rig) -> None:

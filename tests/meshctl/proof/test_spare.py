@@ -10,7 +10,7 @@ import pytest
 from meshctl.inventory import load_fleet
 from tests.meshctl.proof.rig import Rig
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
 def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from tests.meshctl.proof.wires import WIRES, in_own_network
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab"), pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
 def test_two_devices_at_one_address_are_taken_in_at_once_each_through_its_own_interface(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.meshctl.status.terminal import PATIENCE_S, Terminal
 from tests.waiting import until
 
-pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
 
 NAMES = ("base", "b01", "b02")
 INVENTORY = """\
