@@ -37,7 +37,7 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
-from meshctl.cli.journaled_run import PlanRefused
+from meshctl.cli.plan_execution import PlanRefused
 from meshctl.cli.plan import Yes
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError

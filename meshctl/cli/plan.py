@@ -14,7 +14,7 @@ import typer
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
-from meshctl.cli.journaled_run import (
+from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
     execute_plan,
