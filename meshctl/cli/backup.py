@@ -37,8 +37,9 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
-from meshctl.cli.plan_execution import PlanRefused
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
 from meshctl.cli.plan import Yes
+from meshctl.cli.plan_execution import PlanRefused
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
@@ -120,63 +121,53 @@ def restore(
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
-        outcome = _restore(opened, there.name, saved, as_json=as_json)
-    raise typer.Exit(exit_for([outcome], opened.interrupt))
+        journaled = _restore(opened, there.name, saved, as_json=as_json)
+        raise print_totals(opened, journaled, as_json=as_json)
 
 
-def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Outcome:
+def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> JournaledRun:
     node = opened.fleet.nodes[name]
-    journal_run = opened.journal.begin(
-        "restore", fleet=opened.fleet.name, inventory=opened.inventory, nodes=(name,), plan=""
-    )
-    ended: dict[str, Outcome] = {}
-    try:
-        with (
-            progress_for(1, as_json=as_json) as progress,
-            opened.interrupt.on_signals(progress.stopping),
-        ):
-            known = opened.journal.last_known(opened.fleet.name)
-            around: dict[str, Observation] = {}
-            work = RunContext(
-                opened.fleet,
-                opened.access,
-                journal_run,
-                progress,
-                opened.interrupt,
-                opened.owner,
-                observations=around,
-                mac_owners=known_macs(opened.fleet, known),
-                base_macs=base_macs(opened.fleet, around, known),
-            )
+    with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
+        known = opened.journal.last_known(opened.fleet.name)
+        around: dict[str, Observation] = {}
+        work = RunContext(
+            opened.fleet,
+            opened.access,
+            journaled.entry,
+            journaled.progress,
+            opened.interrupt,
+            opened.owner,
+            observations=around,
+            mac_owners=known_macs(opened.fleet, known),
+            base_macs=base_macs(opened.fleet, around, known),
+        )
 
-            def one(only: str) -> Outcome:
-                connection = opened.access.open(node)
-                try:
-                    seen = observe_cleared(connection, (), opened.interrupt)
-                    problem = incompatibility(saved, name, seen)
-                    if problem:
-                        raise PlanRefused(problem)
-                    lockout = lockout_by(saved, node, opened.access.own_keys(node))
-                    if lockout is not None:
-                        raise PlanRefused(lockout.reason, hint=lockout.hint)
-                    around.update(
-                        observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
-                    )
-                    for package in uninstalled_packages(saved, seen):
-                        work.note(f"package {package} is in the backup but no longer installed", name)
-                    if saved.disabled:
-                        work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
-                    plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-                    job = NodeContext(work, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
-                except BaseException:
-                    connection.close()
-                    raise
-                return restore_backup(job, connection, saved)
+        def one(only: str) -> Outcome:
+            connection = opened.access.open(node)
+            try:
+                seen = observe_cleared(connection, (), opened.interrupt)
+                problem = incompatibility(saved, name, seen)
+                if problem:
+                    raise PlanRefused(problem)
+                lockout = lockout_by(saved, node, opened.access.own_keys(node))
+                if lockout is not None:
+                    raise PlanRefused(lockout.reason, hint=lockout.hint)
+                around.update(
+                    observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
+                )
+                for package in uninstalled_packages(saved, seen):
+                    work.note(f"package {package} is in the backup but no longer installed", name)
+                if saved.disabled:
+                    work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
+                plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
+                job = NodeContext(work, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
+            except BaseException:
+                connection.close()
+                raise
+            return restore_backup(job, connection, saved)
 
-            ended = run([name], one, parallel=1, interrupt=opened.interrupt, observer=progress)
-            for unasked in retry_unanswered(work).values():
-                ended[name] = replace(ended[name], facts={UNFLUSHED: " ".join(unasked)})
-            journal_run.finish_node(ended[name])
-    finally:
-        journal_run.end(ended[name].result.value if ended else "could not run")
-    return ended[name]
+        journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
+        for unasked in retry_unanswered(work).values():
+            journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
+        journaled.entry.finish_node(journaled.outcomes[name])
+    return journaled

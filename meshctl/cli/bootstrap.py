@@ -24,9 +24,9 @@ from meshctl.apply.bootstrap import (
 )
 from meshctl.apply.replace import adopt, identity_edits, with_identity
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
-from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
+from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node

@@ -14,6 +14,7 @@ import typer
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
@@ -23,7 +24,6 @@ from meshctl.cli.plan_execution import (
     show,
     write_text,
 )
-from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict

@@ -7,14 +7,12 @@ import secrets
 from dataclasses import asdict
 from pathlib import Path
 
-import typer
-
 from meshctl.apply.executor import RunSettings, execute
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
-from meshctl.cli.context import Session, confirm, exit_for, line_width, progress_for, selected_nodes
-from meshctl.cli.output import console, echo, echo_error, echo_json, ignore_broken_pipe
+from meshctl.cli.context import Session, confirm, line_width, selected_nodes
+from meshctl.cli.journaled_run import journaled_run, print_totals
+from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError, MeshctlError
-from meshctl.fleet import Outcome, totals
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
 
@@ -116,52 +114,18 @@ def execute_plan(
     if plan.refusal:
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
     choices = choices or PlanOptions(with_firmware)
-    run = opened.journal.begin(
-        command,
-        fleet=opened.fleet.name,
-        inventory=opened.inventory,
-        nodes=tuple(plan.nodes),
-        plan=json.dumps(
-            {"choices": asdict(choices), "stages": [[stage.kind.value, *stage.nodes] for stage in plan.stages]}
-        ),
-    )
-    outcomes: dict[str, Outcome] = {}
-    try:
-        with (
-            progress_for(len(plan.nodes), as_json=as_json) as progress,
-            opened.interrupt.on_signals(progress.stopping),
-        ):
-            setting = RunSettings(
-                opened.fleet,
-                opened.access,
-                opened.journal,
-                run,
-                opened.owner,
-                opened.interrupt,
-                progress,
-                None if rate is None else rate * 1000,
-            )
-            outcomes = execute(prepared, setting)
-    finally:
-        run.end(str(totals(outcomes.values())) if outcomes else "could not run")
-    if run.error:
-        with ignore_broken_pipe():
-            echo(f"the journal is incomplete: {run.error}", err=True)
-            echo("hint: `meshctl resume` checks the missing nodes again", err=True)
-    # a closed pipe or terminal must not change the exit code
-    with ignore_broken_pipe():
-        _print_summary(outcomes, run.id, as_json=as_json)
-    raise typer.Exit(exit_for(outcomes.values(), opened.interrupt))
-
-
-def _print_summary(outcomes: dict[str, Outcome], run_id: int, *, as_json: bool) -> None:
-    counted = totals(outcomes.values())
-    if as_json:
-        from meshctl.report.progress import outcome_object
-
-        objects = [outcome_object(outcome) for outcome in outcomes.values()]
-        echo_json(json.dumps({"event": "ended", "run": run_id, "totals": str(counted), "outcomes": objects}))
-        return
-    echo(f"run {run_id}: {counted}")
-    if not counted.all_good:
-        echo("run `meshctl resume` for the unfinished nodes", err=True)
+    stages = [[stage.kind.value, *stage.nodes] for stage in plan.stages]
+    recorded = json.dumps({"choices": asdict(choices), "stages": stages})
+    with journaled_run(opened, command, tuple(plan.nodes), plan=recorded, as_json=as_json) as run:
+        settings = RunSettings(
+            opened.fleet,
+            opened.access,
+            opened.journal,
+            run.entry,
+            opened.owner,
+            opened.interrupt,
+            run.progress,
+            None if rate is None else rate * 1000,
+        )
+        run.outcomes.update(execute(prepared, settings))
+    raise print_totals(opened, run, as_json=as_json)

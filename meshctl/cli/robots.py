@@ -15,7 +15,7 @@ import typer
 
 from meshctl.cli.context import exit_for, line_width
 from meshctl.cli.output import echo, echo_json
-from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, print_totals, run_command, with_robots_context
+from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet import Outcome, Result
@@ -37,7 +37,7 @@ def deploy_command(context: RobotsContext) -> None:
     Example: meshctl robots deploy 'husky*' --wheels wheels/
     """
     context = context.with_fleet(context.fleet)
-    raise print_totals(context, run_command(context, "deploy"))
+    raise finish(context, run_command(context, "deploy"))
 
 
 @app.command("diff")
@@ -101,7 +101,7 @@ def restart_command(context: RobotsContext) -> None:
 
     Example: meshctl robots restart husky1
     """
-    raise print_totals(context, run_command(context, "restart"))
+    raise finish(context, run_command(context, "restart"))
 
 
 @app.command("stop")
@@ -111,7 +111,7 @@ def stop_command(context: RobotsContext) -> None:
 
     Example: meshctl robots stop husky1
     """
-    raise print_totals(context, run_command(context, "stop"))
+    raise finish(context, run_command(context, "stop"))
 
 
 @app.command("logs")
@@ -146,7 +146,7 @@ def rollback_command(context: RobotsContext) -> None:
 
     Example: meshctl robots rollback husky1
     """
-    raise print_totals(context, run_command(context, "rollback"))
+    raise finish(context, run_command(context, "rollback"))
 
 
 @app.command("uninstall")
@@ -159,7 +159,7 @@ def uninstall_command(
 
     Example: meshctl robots uninstall husky1
     """
-    raise print_totals(context, run_command(context, "uninstall", purge=purge))
+    raise finish(context, run_command(context, "uninstall", purge=purge))
 
 
 @app.command("trust")

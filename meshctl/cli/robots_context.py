@@ -26,16 +26,15 @@ from meshctl.cli.context import (
     InventoryPath,
     KeyFiles,
     Session,
-    exit_for,
-    progress_for,
     read_selection,
     session,
     with_options,
 )
-from meshctl.cli.output import echo, echo_error, echo_json
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.output import echo, echo_error
 from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
-from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outcome_of_error, run, silent, totals
+from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outcome_of_error, run, silent
 from meshctl.fleet.journal import RunRecord
 from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
@@ -137,34 +136,25 @@ class RobotsContext:
 
     def run_journaled(
         self, command: str, work: Callable[[RobotsContext], RobotTask], parameters: Mapping[str, object] | None = None
-    ) -> dict[str, Outcome]:
+    ) -> JournaledRun:
         """`run_on_each` with progress and a journal entry `robots COMMAND`; `parameters` serve `meshctl resume`."""
-        journal_run = self.opened.journal.begin(
-            f"robots {command}",
-            fleet=self.fleet.name,
-            inventory=self.opened.inventory,
-            nodes=self.robots,
-            plan=json.dumps({"robots": dict(parameters or {})}),
-        )
-        outcomes: dict[str, Outcome] = {}
-        try:
-            with progress_for(len(self.robots), as_json=self.as_json) as progress:
+        plan = json.dumps({"robots": dict(parameters or {})})
+        with journaled_run(self.opened, f"robots {command}", self.robots, plan=plan, as_json=self.as_json) as journaled:
 
-                def keep(event: Event) -> None:
-                    if event.kind is EventKind.FINISHED and event.outcome is not None:
-                        journal_run.finish_node(event.outcome)
+            def keep(event: Event) -> None:
+                if event.kind is EventKind.FINISHED and event.outcome is not None:
+                    journaled.entry.finish_node(event.outcome)
 
-                @contextmanager
-                def step(robot: str, name: str, text: str) -> Iterator[None]:
-                    progress(Event(EventKind.STEP, robot, time.time(), f"{name} {text}".rstrip()))
-                    with journal_run.step(robot, name):
-                        yield
+            @contextmanager
+            def step(robot: str, name: str, text: str) -> Iterator[None]:
+                journaled.progress(Event(EventKind.STEP, robot, time.time(), f"{name} {text}".rstrip()))
+                with journaled.entry.step(robot, name):
+                    yield
 
-                context = replace(self, options=replace(self.options, step=step))
-                outcomes = context.run_on_each(work(context), Tee((progress, keep)), progress.stopping)
-        finally:
-            journal_run.end(str(totals(outcomes.values())) if outcomes else "could not run")
-        return outcomes
+            context = replace(self, options=replace(self.options, step=step))
+            observer = Tee((journaled.progress, keep))
+            journaled.outcomes.update(context.run_on_each(work(context), observer, journaled.progress.stopping))
+        return journaled
 
 
 @contextmanager
@@ -230,22 +220,12 @@ def _cache() -> Path:
     return root / "meshctl" / "wheels"
 
 
-def print_totals(context: RobotsContext, outcomes: dict[str, Outcome]) -> typer.Exit:
+def finish(context: RobotsContext, journaled: JournaledRun) -> typer.Exit:
     """Print the totals; returns the exit to raise."""
-    counted = totals(outcomes.values())
-    if context.as_json:
-        from meshctl.report.progress import outcome_object
-
-        objects = [outcome_object(outcome) for outcome in outcomes.values()]
-        echo_json(json.dumps({"event": "ended", "totals": str(counted), "outcomes": objects}))
-    else:
-        echo(str(counted))
-        if not counted.all_good:
-            echo("run `meshctl resume` for the unfinished robots", err=True)
-    return typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+    return print_totals(context.opened, journaled, as_json=context.as_json, unfinished="robots")
 
 
-def run_command(context: RobotsContext, command: str, **parameters: Any) -> dict[str, Outcome]:
+def run_command(context: RobotsContext, command: str, **parameters: Any) -> JournaledRun:
     """Run a command on all robots of the context; `parameters` are journaled with it."""
     parameters = {
         **parameters,
@@ -311,4 +291,4 @@ def resume_run(opened: Session, inventory: Path, record: RunRecord, *, as_json: 
         as_json=as_json,
     )
     context = context.with_fleet(opened.fleet, only_configuration=command == "topic")
-    return print_totals(context, run_command(context, command, **parameters))
+    return finish(context, run_command(context, command, **parameters))

@@ -15,9 +15,8 @@ import typer
 import yaml
 
 from meshctl.cli.output import echo
-from meshctl.cli.robots_context import RobotsContext, print_totals, run_command, with_robots_context
+from meshctl.cli.robots_context import RobotsContext, finish, run_command, with_robots_context
 from meshctl.errors import InputError
-from meshctl.fleet import Outcome, totals
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, FileEdit, add_topic, remove_topic, save, set_topic
 from meshctl.inventory.yaml_text import Value
@@ -93,11 +92,11 @@ def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], 
     if not context.as_json:
         for change in changes:
             echo(change.diff(), nl=False)
-    outcomes = run_command(changed, "topic", topic=topic)
-    if not any(outcome.result.is_good for outcome in outcomes.values()):
+    journaled = run_command(changed, "topic", topic=topic)
+    if not any(outcome.result.is_good for outcome in journaled.outcomes.values()):
         _undo(changes)
         echo("no robot accepted the change; the inventory edit was reverted", err=True)
-    raise print_totals(changed, outcomes)
+    raise finish(changed, journaled)
 
 
 def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[RobotsContext, tuple[FileEdit, ...]]:
@@ -137,18 +136,17 @@ def rotate_key_command(
     Example: meshctl robots rotate-key file:secrets.yaml#udp_mesh_2027
     """
     todo = rotation_stages(context.fleet.udp_mesh.keys, parse_ref(new_key))
-    outcomes: dict[str, Outcome] = {}
     for number, stage in enumerate(todo, start=1):
         if not context.as_json:
             echo(f"step {number} of {len(todo)}: {stage.title}")
         context, _ = _edited(context, partial(_set_keys, keys=stage.keys))
-        outcomes = run_command(context, "rotate-key", new_key=new_key)
-        if not totals(outcomes.values()).all_good:
-            late = ", ".join(name for name, outcome in outcomes.items() if not outcome.result.is_good)
+        journaled = run_command(context, "rotate-key", new_key=new_key)
+        late = ", ".join(name for name, outcome in journaled.outcomes.items() if not outcome.result.is_good)
+        if late:
             echo(f"stopped before the next step: {late} did not complete this one; no robot is cut off", err=True)
             echo("hint: run the same command again once they are reachable", err=True)
-            break
-    raise print_totals(context, outcomes)
+        if late or number == len(todo):
+            raise finish(context, journaled)
 
 
 def _set_keys(editor: Editor, keys: tuple[SecretRef, ...]) -> None:

@@ -60,7 +60,9 @@ def test_a_backup_brings_back_what_was(rig: Rig) -> None:
     (file,) = folder.iterdir()
     assert file.stat().st_mode & 0o077 == 0
     rig.fleet.node("n001").exec("uci set system.@system[0].log_size=999 && uci commit system").check("edit by hand")
-    restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes")
+    restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes", "--json")
+    assert restored.events[-1]["run"] == json.loads(rig.meshctl("history", "", "--json").out)[0]["run"]
+    assert restored.results == {"n001": "done"}
     assert restored.code == 0, restored.out + restored.err
     assert rig.state_of("n001", "split", rig.current) == "new"
     wrong = rig.meshctl("restore", rig.current, "n002", str(file), "--yes")

@@ -58,7 +58,7 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
     with Finger(monkeypatch, fleet.directory / "husky1/upper/opt/udp-mesh/wheels", times=1):
         output = fleet.deploy(exit_code=130)
     assert "husky1: done" in output
-    assert "husky2: pending: interrupted before its turn" in output
+    assert "husky2: pending: interrupted before it started" in output
     output = fleet.root_command("history")
     assert "robots deploy" in output
     assert "1 done, 1 pending" in output
