@@ -13,6 +13,8 @@ from hypothesis import HealthCheck, settings
 from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
 from tests.udp_mesh.bridges.ros2_processes import NEEDS_ROS2, PYTHON, expects_ros2
 
+pytest_plugins = ["tests.fleet_reports"]
+
 settings.register_profile(
     "fast", derandomize=True, deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow]
 )

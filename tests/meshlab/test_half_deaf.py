@@ -78,6 +78,14 @@ def test_a_radio_is_pending_while_it_is_set_up_and_its_interface_gone(mesh: Virt
     until(lambda: "channel 11" in near.exec("iw dev mesh0 info").stdout, "the radio")
 
 
+@pytest.mark.parametrize("configured", ["box"], indirect=True)
+def test_calls_of_netifd_are_handled_in_the_order_in_which_they_come(configured: VirtualNode) -> None:
+    configured.exec("for turn in 1 2 3 4 5 6; do wifi down; wifi up; done").check("restart the radio")
+    last = "! grep -q lab/netifd /proc/$(cat /tmp/run/netifd.call)/cmdline"
+    until(lambda: configured.exec(last).exit_status == 0, "the last call")
+    assert index(configured) != ""
+
+
 def test_a_restarted_radio_is_half_deaf_until_its_neighbors_delete_its_entry(mesh: VirtualFleet) -> None:
     base, near, far = (mesh.node(name) for name in ("base", "near", "far"))
     macs = mac(base), mac(near), mac(far)

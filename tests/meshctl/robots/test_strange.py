@@ -116,7 +116,7 @@ def test_a_computer_that_does_not_resolve_or_has_no_user_for_us_is_reported_as_t
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOGNAME", "alice")
         output = fleet.deploy(exit_code=1)
-        assert "let alice in with none of" in output
+        assert "login refused for alice; tried: " in output
         assert "the inventory has no user, so your own, alice, was tried: set robots.husky1.computer.ssh.user" in output
         patch.setenv("LOGNAME", "root")
         assert getpass.getuser() == "root"

@@ -1,4 +1,4 @@
-"""Whatever fails on a fleet, the fleet has its say."""
+"""A plugin: the report of a test that fails on a virtual fleet includes the state of its nodes."""
 
 from __future__ import annotations
 
