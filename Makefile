@@ -14,7 +14,7 @@ demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/demo
 
 test: setup
-	$(BIN)/pytest -n 3 --dist loadgroup
+	$(BIN)/pytest -n 2 --dist loadgroup
 
 check: setup
 	$(BIN)/ruff check .
