@@ -48,9 +48,27 @@ def request(
 
 
 def is_running(directory: Path) -> bool:
-    """Whether a supervisor answers in `directory`."""
+    """Whether a supervisor answers in `directory`, or runs there for a machine that does not answer."""
     try:
         request(directory, {"op": "status"})
     except LabError:
         return False
+    except InputError:
+        return True
+    return True
+
+
+def accepts_requests(directory: Path) -> bool:
+    """Whether a supervisor listens in `directory`, even one that does not answer."""
+    try:
+        directory_fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.connect(address_of(directory, directory_fd))
+    except OSError:
+        return False
+    finally:
+        os.close(directory_fd)
     return True

@@ -7,6 +7,7 @@ that another process started.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -21,9 +22,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from meshctl.device.connection import Completed, Endpoint
+from meshctl.errors import InputError
 from meshlab import fleet_directory, rootfs
 from meshlab.addresses import bench_of, loopback_of
-from meshlab.client import is_running, request
+from meshlab.client import accepts_requests, is_running, request
 from meshlab.errors import LabError
 from meshlab.qemu.qemu import find_qemu
 from meshlab.spec import FleetSpec, Medium, dump, load
@@ -331,11 +333,15 @@ def stop_fleet(directory: Path) -> str:
     """Stop the fleet that runs in `directory`, whatever version started it; returns its name, or "" when none runs."""
     try:
         status = request(directory, {"op": "status"})
-    except LabError:
-        return ""
+    except (LabError, InputError):
+        # a machine whose kernel hangs answers nothing, and must not be left behind
+        if not accepts_requests(directory):
+            return ""
+        status = {"pid": (directory / "supervisor.pid").read_text(encoding="ascii"), "fleet": directory.name}
     watched = os.pidfd_open(int(status["pid"]))
     try:
-        request(directory, {"op": "down"})
+        with contextlib.suppress(LabError):
+            request(directory, {"op": "down"})
         deadline = time.monotonic() + _DOWN_S
         while not _has_ended(watched):
             if time.monotonic() > deadline:
