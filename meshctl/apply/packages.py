@@ -24,6 +24,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome
+from meshctl.inventory.file_paths import file_path
 from meshctl.plan import PackageStep
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
 from meshctl.plan.seen import CONFIG
@@ -97,8 +98,7 @@ def _configuration(before: Observation) -> tuple[str, ...]:
 
 def _local(ctx: NodeContext, file: str) -> Path:
     """A package file's local path; a relative one is relative to the inventory."""
-    path = Path(file).expanduser()
-    path = path if path.is_absolute() else Path(ctx.run.fleet.base) / path
+    path = file_path(ctx.run.fleet, file)
     if not path.is_file():
         raise InputError(f"{path}: package file not found", hint="correct package_files in the hardware profile")
     return path

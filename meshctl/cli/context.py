@@ -116,10 +116,10 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
 def trust_of(fleet: Fleet) -> TrustStore:
     """The fleet's own known_hosts, beside the inventory."""
     from meshctl.device.trust import TrustStore
+    from meshctl.inventory.file_paths import known_hosts_path
 
-    path = Path(fleet.operators.known_hosts).expanduser()
     pinned = {node.name: node.host_keys for node in fleet.nodes.values() if node.host_keys}
-    return TrustStore(path if path.is_absolute() else Path(fleet.base) / path, inventory=pinned)
+    return TrustStore(known_hosts_path(fleet), inventory=pinned)
 
 
 def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:

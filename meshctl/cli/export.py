@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ import typer
 from meshctl.cli.context import InventoryPath
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
+from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.inventory.load import load_fleet
 from meshctl.render.host_lists import ansible_inventory, host_entries, ssh_config
 
@@ -31,11 +33,11 @@ def export(
     Example: meshctl inventory export --out fleet.ssh_config && ssh -F fleet.ssh_config b03
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    base = Path(fleet.base).resolve()
-    known_hosts = base / Path(fleet.operators.known_hosts).expanduser()
     entries = host_entries(fleet, fleet.managed())
     write = ssh_config if format is ExportFormat.SSH_CONFIG else ansible_inventory
-    text = write(entries, known_hosts, lambda name: base / Path(name).expanduser())
+    # ssh and Ansible may be started in another directory
+    placed = replace(fleet, base=str(Path(fleet.base).resolve()))
+    text = write(entries, known_hosts_path(placed), lambda name: file_path(placed, name))
     if out is None:
         echo(text, nl=False)
         return

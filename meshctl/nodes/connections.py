@@ -20,6 +20,7 @@ from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
+from meshctl.inventory.file_paths import file_path
 from meshctl.model import Fleet, Node
 
 # Closing waits up to two seconds for a connection whose other side is gone, so a fleet's are closed in parallel.
@@ -75,7 +76,7 @@ class ConnectionPool:
     def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:
         """The credentials for a node: keys, and no password only on the bench. At its own address only a login with a
         key proves that the operators are not locked out."""
-        named = tuple(_key_path(text, self.fleet) for text in node.ssh.key_files)
+        named = tuple(file_path(self.fleet, text) for text in node.ssh.key_files)
         is_new = endpoint is not None and endpoint == self.bench_endpoints.get(node.name)
         return Credentials(key_files=(*self.key_files, *named), use_agent=self.use_agent, empty_password=is_new)
 
@@ -187,8 +188,3 @@ def _close(connections: Iterable[SshConnection]) -> None:
     with ThreadPoolExecutor(MAX_PARALLEL_CLOSES, "close") as pool:
         for _ in pool.map(lambda connection: connection.close(), connections):
             pass
-
-
-def _key_path(text: str, fleet: Fleet) -> Path:
-    path = Path(text).expanduser()
-    return path if path.is_absolute() else Path(fleet.base) / path

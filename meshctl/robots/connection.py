@@ -10,13 +10,13 @@ import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from meshctl.device.connection import Connection, Credentials, Endpoint
 from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKeyUnknown
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey, HostKey, HostKeyPolicy
 from meshctl.errors import InputError, NodeError, Unreachable
+from meshctl.inventory.file_paths import file_path
 from meshctl.inventory.selection import Attributes, select
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Robot, Secret
@@ -54,7 +54,7 @@ class RobotConnector:
         `opened` gets the connection once it is established, so that it can be closed from another thread.
         """
         settings = computer_of(self.fleet, robot).ssh
-        named = tuple(self._path(text) for text in settings.key_files)
+        named = tuple(file_path(self.fleet, text) for text in settings.key_files)
         with self._connected(
             robot,
             Credentials((*self.access.key_files, *named), use_agent=self.access.use_agent),
@@ -103,10 +103,6 @@ class RobotConnector:
             if recorder.key is None:
                 raise
             return recorder.key
-
-    def _path(self, text: str) -> Path:
-        path = Path(text).expanduser()
-        return path if path.is_absolute() else Path(self.fleet.base) / path
 
 
 def local_user(robot: str) -> str:

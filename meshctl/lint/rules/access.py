@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from meshctl.device.trust import parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
+from meshctl.inventory.file_paths import known_hosts_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
-from meshctl.lint.rules.identity import known_hosts_path
 from meshctl.lint.rules.secrets import logins
 from meshctl.lint.sshkey import AuthorizedKey, BadKey, parse_authorized_key
 from meshctl.model import Fleet

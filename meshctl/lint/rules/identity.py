@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os.path
 import re
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 
 from meshctl.device.trust import Pin, parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
+from meshctl.inventory.file_paths import known_hosts_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.places import is_written
@@ -286,11 +285,6 @@ def _pins(fleet: Fleet, context: LintContext) -> tuple[Pin, ...] | None:
         return parse_pins(context.files.text(known_hosts_path(fleet)) or "")
     except InputError:
         return None
-
-
-def known_hosts_path(fleet: Fleet) -> Path:
-    """The file of pinned host keys; a relative path starts at the inventory."""
-    return Path(fleet.base or ".", os.path.expanduser(fleet.operators.known_hosts))
 
 
 @fleet_rule(

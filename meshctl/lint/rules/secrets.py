@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os.path
 import re
 from collections.abc import Hashable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
 from meshctl.diagnostics import Position, Severity
+from meshctl.inventory.file_paths import file_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
@@ -46,19 +46,14 @@ def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
         yield ("udp_mesh", "keys", str(index)), key
 
 
-def _path(fleet: Fleet, where: str, base: str) -> Path:
-    # Path.expanduser raises for an unknown user
-    return Path(base or fleet.base or ".", os.path.expanduser(where))
-
-
 def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
     """Files with plaintext secrets: secret files, age identities, private SSH keys."""
     for path, ref in secret_refs(fleet):
         match ref.kind:
             case SecretKind.FILE:
-                yield (*path, "file"), _path(fleet, ref.where, ref.base), "the secret"
+                yield (*path, "file"), file_path(fleet, ref.where, ref.base), "the secret"
             case SecretKind.AGE if ref.identity:
-                yield (*path, "identity"), _path(fleet, ref.identity, ref.base), "the age identity"
+                yield (*path, "identity"), file_path(fleet, ref.identity, ref.base), "the age identity"
             case SecretKind.AGE | SecretKind.ENV:
                 pass
     # nodes of a group share one list: report each file once
@@ -67,7 +62,7 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
         for index, file in enumerate(ssh.key_files):
             if file not in seen and not file.endswith(".pub"):
                 seen.add(file)
-                yield (*place, "key_files", str(index)), _path(fleet, file, fleet.base), "the private key"
+                yield (*place, "key_files", str(index)), file_path(fleet, file), "the private key"
 
 
 def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
@@ -153,7 +148,7 @@ def secret_in_repository(fleet: Fleet, context: LintContext) -> Iterator[Finding
 )
 def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for place, ref in secret_refs(fleet):
-        if ref.kind is SecretKind.AGE and context.files.mode(_path(fleet, ref.where, ref.base)) is None:
+        if ref.kind is SecretKind.AGE and context.files.mode(file_path(fleet, ref.where, ref.base)) is None:
             yield Finding((*place, "age"), "no such file", "a file encrypted with age", ref.where)
 
 
@@ -269,7 +264,7 @@ def too_many_transport_keys(fleet: Fleet, _context: LintContext) -> Iterator[Fin
 )
 def secret_absent(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for place, ref in secret_refs(fleet):
-        path = _path(fleet, ref.where, ref.base)
+        path = file_path(fleet, ref.where, ref.base)
         is_here = ref.kind is not SecretKind.ENV and (
             context.files.mode(path) is not None or context.files.is_special(path)
         )
