@@ -14,7 +14,7 @@ import typer
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
@@ -22,7 +22,6 @@ from meshctl.cli.plan_execution import (
     prepare_plan,
     report_check,
     show,
-    write_text,
 )
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
@@ -62,7 +61,7 @@ def plan(
         prepared = prepare_plan(opened, nodes, choices)
         saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
         if out is not None:
-            write_text(out, dump(saved))
+            write_file(out, dump(saved))
         if as_json:
             echo_json(dump(saved), nl=False)
         else:
