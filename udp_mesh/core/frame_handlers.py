@@ -42,7 +42,7 @@ def process_frames(
     receiver = session.receiver
     peer = session.peer
     assert peer is not None
-    sender = peer.sender
+    sender = peer.open_sender()
     wants_ack = ack_now = False
     kept = True
     for frame in frames:
@@ -128,7 +128,7 @@ def _on_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, 
 def _on_refused(state: State, session: Session, refused: Refused) -> None:
     peer = session.peer
     assert peer is not None
-    sender = peer.sender
+    sender = peer.open_sender()
     message = sender.by_wire_id(refused.message_id)
     if message is None:
         return
@@ -151,7 +151,8 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
         session.queue_control(Cancel((number,), broadcast_ids=True))
         state.schedule_control(session)
         return
-    if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
+    sender = peer.open_sender()
+    if any(message.accepted.broadcast_number == number for message in sender.pending):
         return
     state.event_queue.counters.repairs_sent += 1
     copy = AcceptedMessage(
@@ -164,7 +165,7 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
         accepted.deadline,
         number,
     )
-    peer.sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
+    sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
     state.ready[peer] = None
 
 

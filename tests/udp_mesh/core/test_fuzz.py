@@ -122,7 +122,7 @@ def sealed_data(fuzzer: Fuzzer) -> None:
     path = fuzzer.insider.path
     seal = path.channel.seal if fuzzer.dice.random() < 0.7 else path.channel.seal_long
     number, data = seal(fuzzer.frames())
-    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
+    fuzzer.both.a._state.peer_table.peers["b"].open_sender().in_flight.add(number, None)
     fuzzer.receive(data)
 
 
@@ -136,7 +136,7 @@ def mutated_datagrams(fuzzer: Fuzzer) -> None:
     """Sealed datagrams modified in transit: they cannot be opened."""
     assert fuzzer.insider is not None
     number, data = fuzzer.insider.path.channel.seal(fuzzer.dice.choice(fuzzer.seeds))
-    fuzzer.both.a._state.peer_table.peers["b"].sender.in_flight.add(number, None)
+    fuzzer.both.a._state.peer_table.peers["b"].open_sender().in_flight.add(number, None)
     fuzzer.receive(fuzzer.mutated(data))
 
 

@@ -60,14 +60,13 @@ class Meters:
 class Peer:
     """A name: what is being sent to it, whichever of its boots receives.
 
-    `sender` is created on first access, and `has_sender` is True from then on: in a large team most nodes send to few.
+    `sender` is None until `open_sender`: in a large team most nodes send to few.
     """
 
     __slots__ = (
         "_settings",
         "conflict_reported_at",
         "due_at",
-        "has_sender",
         "held_until",
         "legacy",
         "legacy_meters",
@@ -82,12 +81,10 @@ class Peer:
         "timer_at",
     )
 
-    sender: Sender
-
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self._settings = settings
-        self.has_sender = False
+        self.sender: Sender | None = None
         self.session: Session | None = None
         self.state = PeerState.LOST
         self.legacy = False
@@ -108,12 +105,10 @@ class Peer:
         self.held_until: dict[int, float] = {}
         """Priority -> until when its hold-back for other robots is already counted."""
 
-    def __getattr__(self, name: str) -> Sender:
-        # Only called while the slot is unset, so access costs nothing once the sender exists.
-        if name != "sender":
-            raise AttributeError(name)
-        self.has_sender = True
-        self.sender = Sender(self._settings)
+    def open_sender(self) -> Sender:
+        """The sender, created if there is none yet."""
+        if self.sender is None:
+            self.sender = Sender(self._settings)
         return self.sender
 
     @property
@@ -125,7 +120,7 @@ class Peer:
 
     def record_held(self, levels: int, now: float, until: float) -> None:
         """Count how long the waiting levels of the mask are held back for other robots' urgent messages."""
-        for priority, level in enumerate(self.sender.levels):
+        for priority, level in enumerate(self.open_sender().levels):
             if levels >> priority & 1:
                 level.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
                 self.held_until[priority] = until
@@ -133,7 +128,7 @@ class Peer:
     def apply(self, settings: Settings) -> None:
         """Apply new settings; nothing in flight is touched."""
         self._settings = settings
-        if self.has_sender:
+        if self.sender is not None:
             self.sender.apply(settings)
 
 
