@@ -8,6 +8,7 @@ from udp_mesh.core.events import ExpiryReason, MessageReceived
 from udp_mesh.core.peer_lifecycle import on_bye
 from udp_mesh.core.peers.path_validation import send_on_path
 from udp_mesh.core.peers.session import Session
+from udp_mesh.core.peers.session_state import Reception, ReceptionEvent
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Address
@@ -53,12 +54,14 @@ def process_frames(
                 kept = receiver.receive_fragment(frame, now, broadcast=False, late_s=late_s) and kept
             case Ack():
                 if frame.largest < session.path.channel.next_number:
-                    session.path.confirmed = session.knows_us = True
+                    session.path.confirmed = True
+                    if session.reception is Reception.UNKNOWN:
+                        session.on_reception(ReceptionEvent.ACKNOWLEDGED, now)
                     session.peer_receives = (frame.receive_rate, now)
                     arrived_before = sender.delivered_packets
                     sender.acknowledge(frame, now)
                     if sender.delivered_packets > arrived_before:
-                        session.confirm_two_way()
+                        session.on_reception(ReceptionEvent.CONFIRMED, now)
                     report_ended(state, peer, now)
                     state.ready[peer] = None
                 if frame.waiting:

@@ -24,6 +24,7 @@ from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
+from udp_mesh.core.peers.session_state import ReceptionEvent
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
@@ -64,7 +65,7 @@ def on_heartbeat(
     if to_all:
         session.on_heard_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
     elif lists_us:
-        session.confirm_two_way()
+        session.on_reception(ReceptionEvent.CONFIRMED, now)
     if not session.verified:
         if (link, source) == (session.path.link, session.path.address):
             session.path.heard_at = now
