@@ -13,7 +13,7 @@ from tests.udp_mesh.core.pair import World, settings
 from tests.udp_mesh.core.test_legacy import OLD, OldRobot, fragments
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.legacy.acks import LegacyAcks
+from udp_mesh.core.legacy.acks import LegacyAcks, ReceivePosition
 from udp_mesh.core.legacy.peers import MAX_TOPICS, SETTLE_S
 from udp_mesh.core.settings import Neighbour, Outbox, Topic
 from udp_mesh.wire.legacy import (
@@ -30,14 +30,22 @@ DELAY_S, TICK_S = 0.010, 0.001
 
 
 def play(
-    loss: float, seconds: float, *, seed: int = 1, restart_at: float | None = None
+    loss: float,
+    seconds: float,
+    *,
+    seed: int = 1,
+    restart_at: float | None = None,
+    down_s: float = 0.0,
+    saved_before_s: float = 0.0,
 ) -> tuple[int, int, LegacyProgram]:
-    """Send ten urgent messages and twenty bulk messages a second; returns how many of each arrived."""
+    """Send ten urgent messages and twenty bulk messages a second; returns how many of each arrived. Our node restarts
+    with what it saved `saved_before_s` earlier."""
     rng, old, program = random.Random(seed), OldRobot(), LegacyProgram()
     started = old.now
     wire: deque[tuple[float, LegacyPayload]] = deque()
     back: deque[tuple[float, LegacyAck]] = deque()
     urgent = bulk = tick = 0
+    saved: dict[str, ReceivePosition] = {}
     while old.now < started + seconds + 2.0:
         if old.now < started + seconds:
             if tick % 100 == 0:
@@ -46,12 +54,18 @@ def play(
                 program.push(5, b"bulk%d" % tick + bytes(2000))
         if tick % 1000 == 0:
             old.say(Host("old", "10.0.0.9"))
+        if restart_at is not None and tick == int((restart_at - saved_before_s) * 1000):
+            saved = old.node.legacy_positions()
         if restart_at is not None and tick == int(restart_at * 1000):
-            now = old.now
-            old = OldRobot()
-            old.now = now
-            old.say(Host("old", "10.0.0.9"))
-        wire.extend((old.now + DELAY_S, fragment) for fragment in program.fill_in_flight(old.now) if rng.random() >= loss)
+            for _ in range(int(down_s * 1000)):
+                # What it sends meanwhile is lost: three fragments, then its slots are taken.
+                program.fill_in_flight(old.now)
+                old.now += TICK_S
+            wire.clear()
+            back.clear()
+            old = OldRobot(now=old.now, positions=saved)
+        sent = program.fill_in_flight(old.now)
+        wire.extend((old.now + DELAY_S, fragment) for fragment in sent if rng.random() >= loss)
         while wire and wire[0][0] <= old.now:
             old.say(wire.popleft()[1])
         while back and back[0][0] <= old.now:
@@ -85,10 +99,24 @@ def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
     assert program.in_flight == {}
 
 
-def test_a_restart_of_ours_stalls_a_legacy_sender_for_no_ten_seconds() -> None:
-    urgent, _, program = play(0.02, 15.0, restart_at=7.0)
-    assert urgent >= 135
+@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("saved_before_s", [0.0, 1.0])
+def test_a_restart_of_ours_stalls_a_legacy_sender_for_no_ten_seconds(seed: int, saved_before_s: float) -> None:
+    """Fragments sent while our node was down take all of its three slots. A killed node knows an older position."""
+    urgent, _, program = play(0.02, 15.0, seed=seed, restart_at=7.0, down_s=2.0, saved_before_s=saved_before_s)
+    assert urgent >= 125
     assert program.flushed == 0
+
+
+def test_a_position_of_long_ago_frees_nothing_and_costs_little() -> None:
+    old = OldRobot(positions={"old": ReceivePosition(17, ((16, 2, 2), (17, 1, 9)))})
+    first = [answer for answer in old.hear() if isinstance(answer, LegacyAck)]
+    assert 0 < len(first) <= 200
+    old.say(fragments(900, b"new")[0])
+    old.hear()
+    old.now += 30.0
+    old.say(Host("old", "10.0.0.9"))
+    assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) < len(first) / 2
 
 
 def test_acknowledgements_besides_stay_few_without_loss() -> None:

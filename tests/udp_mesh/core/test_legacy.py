@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,7 @@ from udp_mesh.core.events import (
     RejectReason,
 )
 from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LAST_SEQUENCE
 from udp_mesh.core.node import Node
@@ -41,12 +43,14 @@ OLD = ("10.0.0.9", 8700)
 class OldRobot:
     """Our node with one legacy neighbor `old`, which the test plays."""
 
-    def __init__(self, **changes: object) -> None:
-        self.now = 1000.0
+    def __init__(
+        self, *, now: float = 1000.0, positions: Mapping[str, ReceivePosition] | None = None, **changes: object
+    ) -> None:
+        self.now = now
         rng = random.Random(3)
         config = settings("new", Topic("stop", priority=0), Topic("map", priority=9), **changes)
         config = replace(config, neighbours=(Neighbour(OLD, name="old", legacy=True),))
-        self.node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=self.now)
+        self.node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=self.now, legacy_positions=positions or {})
         self.node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), ("10.0.0.255", 8700)), self.now)
         self.say(Host("old", "10.0.0.9"))
         self.events()
