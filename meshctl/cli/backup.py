@@ -29,11 +29,13 @@ from meshctl.cli.context import (
     InventoryPath,
     KeyFiles,
     Lab,
+    Limit,
     Nodes,
     Session,
     confirm,
     exit_for,
     progress_for,
+    selected_node,
     selected_nodes,
     session,
 )
@@ -49,6 +51,7 @@ from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 def backup(
     nodes: Nodes = None,
+    limit: Limit = None,
     out: Annotated[Path, typer.Option("--out", help="Directory for the NODE-TIME.tgz files.")] = Path("backups"),
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
@@ -60,7 +63,7 @@ def backup(
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes, limit)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -117,7 +120,7 @@ def restore(
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = selected_nodes(opened.fleet, [node])[:1]
+        there = selected_node(opened.fleet, node)
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")

@@ -33,12 +33,19 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def prepare_plan(opened: Session, nodes: list[str] | None, choices: PlanOptions, salt: bytes | None = None) -> Prepared:
+def prepare_plan(
+    opened: Session,
+    nodes: list[str] | None,
+    choices: PlanOptions,
+    salt: bytes | None = None,
+    *,
+    limits: list[str] | None = None,
+) -> Prepared:
     with opened.interrupt.on_signals(echo_error):
         prepared = prepare(
             opened.renderer,
             opened.access,
-            selected_nodes(opened.fleet, nodes),
+            selected_nodes(opened.fleet, nodes, limits),
             opened.journal,
             salt=salt or secrets.token_bytes(SALT_BYTES),
             owner=opened.owner,
