@@ -115,12 +115,12 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
 
 
 def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscribe(client, _texts(header, "topics"))
+    service.subscriptions.add(client, _texts(header, "topics"))
     return {}
 
 
 def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.unsubscribe(client, _texts(header, "topics"))
+    service.subscriptions.remove(client, _texts(header, "topics"))
     return {}
 
 
