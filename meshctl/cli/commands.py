@@ -23,6 +23,7 @@ _CHANGE = "Change the fleet"
 _INSPECT = "Inspect and connect"
 _ROBOTS = "Robots"
 _LAB = "Lab"
+_HELP = "Help"
 
 COMMANDS: dict[str, Entry] = {
     "init": Entry("meshctl.cli.inventory", "init", "Create a commented starter inventory", _INVENTORY),
@@ -49,4 +50,5 @@ COMMANDS: dict[str, Entry] = {
     "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _INSPECT),
     "robots": Entry("meshctl.cli.robots", "app", "Deploy and manage udp_mesh on robots", _ROBOTS),
     "lab": Entry("", "app", "Run a virtual fleet on this machine", _LAB),
+    "help": Entry("meshctl.cli.help", "help_command", "Show the help of a command", _HELP),
 }
