@@ -8,9 +8,11 @@ the configuration says, and the legacy format is no longer spoken with it. Pendi
 Broadcasts stay encapsulated while the configuration names any legacy peer.
 """
 
+from collections.abc import Mapping
+
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
 from udp_mesh.core.interfaces import Datagram, RandomSource
-from udp_mesh.core.legacy.acks import LegacyAcks
+from udp_mesh.core.legacy.acks import LegacyAcks, ReceivePosition
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
@@ -68,7 +70,14 @@ class LegacyPeer:
         "unicasts",
     )
 
-    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
+    def __init__(
+        self,
+        neighbour: Neighbour,
+        peer: Peer,
+        settings: Settings,
+        rng: RandomSource,
+        position: ReceivePosition | None,
+    ) -> None:
         self.neighbour = neighbour
         self.peer = peer
         self.address = neighbour.address
@@ -77,7 +86,7 @@ class LegacyPeer:
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
-        self.acks = LegacyAcks()
+        self.acks = LegacyAcks(position)
         self.settled_at: float | None = None
         """When outboxes may send; None: they do already."""
         self.topics: set[str] = set()
@@ -96,10 +105,12 @@ class LegacyPeer:
 class LegacyPeers:
     """All legacy peers by host address. `next_at` is when something is due."""
 
-    __slots__ = ("_by_host", "_heartbeat_at", "_state")
+    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state")
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: State, positions: Mapping[str, ReceivePosition]) -> None:
+        """`positions` are those of the previous run, by peer."""
         self._state = state
+        self._restored = dict(positions)
         self._by_host: dict[str, LegacyPeer] = {}
         self._heartbeat_at = float("-inf")
         self.apply()
@@ -116,7 +127,8 @@ class LegacyPeers:
                 if peer is not None:
                     peer.legacy = True
                     peer.transition(PeerEvent.CONFIGURED)
-                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
+                    position = self._restored.pop(neighbour.name, None)
+                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng, position)
 
     def _drop(self, removed: LegacyPeer) -> None:
         """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
@@ -130,6 +142,11 @@ class LegacyPeers:
 
     def __len__(self) -> int:
         return len(self._by_host)
+
+    def positions(self) -> dict[str, ReceivePosition]:
+        """What was received from each peer, for the next run of this node."""
+        known = ((legacy.peer.name, legacy.acks.position()) for legacy in self._active())
+        return {name: position for name, position in known if position is not None}
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process a datagram without our mark: the legacy format from a configured address, or foreign."""
