@@ -8,6 +8,7 @@ import pytest
 
 from tests.start_up import imported_modules, packages
 
+ROOT = Path(__file__).resolve().parents[3]
 MAIN = "meshctl.cli.main"
 # every start of the program
 ENTRANCE = frozenset(
@@ -34,3 +35,11 @@ def test_help_and_version_import_typer_and_the_table_of_commands(words: list[str
     assert packages(imported) - {"meshctl"} <= TYPER
     # each takes milliseconds, and none is needed
     assert not imported & {"asyncio", "email", "importlib.metadata", "json", "sqlite3", "ssl"}
+
+
+def test_lint_of_shipped_templates_imports_no_ssh_no_cryptography_and_no_jinja(tmp_path: Path) -> None:
+    imported = imported_modules(MAIN, ["lint", str(ROOT / "inventory" / "lab")], tmp_path)
+    assert "meshctl.lint.check_path" in imported
+    heavy = {"bcrypt", "cryptography", "jinja2", "meshlab", "nacl", "paramiko", "pyrage", "rich"}
+    assert packages(imported).isdisjoint(heavy)
+    assert not imported & {"asyncio", "sqlite3", "ssl"}
