@@ -14,7 +14,7 @@ from udp_mesh import __version__
 from udp_mesh.cli import change, inspect, serve, traffic
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
-from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PING_S
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PING_S
 
 Command = Callable[[argparse.Namespace], int]
 
