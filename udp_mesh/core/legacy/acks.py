@@ -65,7 +65,16 @@ class ReceivePosition(NamedTuple):
 class LegacyAcks:
     """`on_fragment` returns what to acknowledge in addition to the fragment; `next_at` is when `due` returns more."""
 
-    __slots__ = ("_incomplete", "_latest", "_lossy_until", "_payload_at", "_predicted_at", "_repeats", "_restored", "_restored_step")
+    __slots__ = (
+        "_incomplete",
+        "_latest",
+        "_lossy_until",
+        "_payload_at",
+        "_predicted_at",
+        "_repeats",
+        "_restored",
+        "_restored_step",
+    )
 
     def __init__(self, position: ReceivePosition | None = None) -> None:
         """`position` is that of the previous run, if it is known."""
