@@ -23,17 +23,19 @@ from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.prepare import base_macs
-from meshctl.apply.station_flush import UNFLUSHED, retry_unanswered
+from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
     InventoryPath,
     KeyFiles,
     Lab,
+    Limit,
     Nodes,
     Session,
     confirm,
     exit_for,
     progress_for,
+    selected_node,
     selected_nodes,
     session,
 )
@@ -49,6 +51,7 @@ from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 def backup(
     nodes: Nodes = None,
+    limit: Limit = None,
     out: Annotated[Path, typer.Option("--out", help="Directory for the NODE-TIME.tgz files.")] = Path("backups"),
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
@@ -60,7 +63,7 @@ def backup(
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes, limit)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -117,7 +120,7 @@ def restore(
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = selected_nodes(opened.fleet, [node])[:1]
+        there = selected_node(opened.fleet, node)
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
@@ -130,6 +133,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
     with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
         known = opened.journal.last_known(opened.fleet.name)
         around: dict[str, Observation] = {}
+        flushes = StationFlushes()
         work = RunContext(
             opened.fleet,
             opened.access,
@@ -137,6 +141,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             journaled.progress,
             opened.interrupt,
             opened.owner,
+            flushes.listener,
             observations=around,
             mac_owners=known_macs(opened.fleet, known),
             base_macs=base_macs(opened.fleet, around, known),
@@ -167,7 +172,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             return restore_backup(job, connection, saved)
 
         journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
-        for unasked in retry_unanswered(work).values():
+        for unasked in flushes.retry_unanswered(work).values():
             journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
         journaled.entry.finish_node(journaled.outcomes[name])
     return journaled

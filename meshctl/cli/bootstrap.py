@@ -18,12 +18,22 @@ from meshctl.apply.bootstrap import (
     BenchTarget,
     FoundDevice,
     discover,
-    find_node,
     plan_discovered,
     restore_pins,
 )
 from meshctl.apply.replace import adopt, identity_edits, with_identity
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Limit,
+    Session,
+    exit_for,
+    selected_node,
+    selected_nodes,
+    session,
+)
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
@@ -59,8 +69,11 @@ Interfaces = Annotated[
 def bootstrap(
     nodes: Annotated[
         list[str] | None,
-        typer.Argument(help="Expected nodes by name, label, serial number or MAC; default: identify by MAC."),
+        typer.Argument(
+            help="Expected nodes: names, labels, serial numbers, MACs, patterns, groups; default: identify by MAC."
+        ),
     ] = None,
+    limit: Limit = None,
     at: At = None,
     interface: Interfaces = None,
     inventory: InventoryPath = Path(),
@@ -79,7 +92,7 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _expected_places(opened, nodes or [], _named_places(at or [], interface or []))
+        places = _expected_places(opened, nodes or [], limit or [], _named_places(at or [], interface or []))
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
                 opened.renderer,
@@ -140,15 +153,15 @@ def _named_places(at: list[str], interfaces: list[str]) -> list[BenchTarget]:
     return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
 
 
-def _expected_places(opened: Session, words: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
+def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
     """Which node is expected at which place."""
+    selected = selected_nodes(opened.fleet, words, limits, in_word_order=True) if words or limits else ()
+    expected = [node.name for node in selected]
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
-        names = [find_node(opened.fleet, word).name for word in words]
-        names = names or [node.name for node in opened.fleet.managed() if node.name in known]
+        names = expected or [node.name for node in opened.fleet.managed() if node.name in known]
         ends = {name: opened.lab.bench_endpoint(name) for name in names}
         return [BenchTarget(end.host, end.port, name) for name, end in ends.items()]
-    expected = [find_node(opened.fleet, word).name for word in words]
     if not at:
         if len(expected) > 1:
             raise InputError(
@@ -193,7 +206,7 @@ def replace(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        node = find_node(opened.fleet, old)
+        node = selected_node(opened.fleet, old)
         spare = _spare(opened, node, new)
         spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
@@ -248,7 +261,7 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     """The spare node; None for a device that is not in the inventory."""
     if new == BENCH:
         return None
-    spare = find_node(opened.fleet, new)
+    spare = selected_node(opened.fleet, new)
     if spare.name == old.name:
         raise InputError(f"{spare.name} cannot replace itself")
     if spare.state is not NodeState.SPARE:

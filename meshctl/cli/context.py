@@ -59,6 +59,15 @@ Nodes = Annotated[
     list[str] | None,
     typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all."),
 ]
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        "-l",
+        metavar="NODES",
+        help="Only those that this selects too; repeat to narrow the selection further.",
+    ),
+]
 
 Options = Mapping[str, tuple[Any, Any]]
 """Type and default of each option, by the opener's parameter name, in the order of the help."""
@@ -137,14 +146,23 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
     return virtual, locate
 
 
-def selected_nodes(fleet: Fleet, words: Iterable[str] | None) -> tuple[Node, ...]:
-    """The managed nodes that the words select (`inventory.selection`), in inventory order; all without words.
+def selected_nodes(
+    fleet: Fleet, words: Iterable[str] | None, limits: Iterable[str] | None = None, *, in_word_order: bool = False
+) -> tuple[Node, ...]:
+    """The managed nodes that the words and every limit select (`inventory.selection`); all without words.
 
     Raises InputError for a word that selects nothing.
     """
     from meshctl.inventory.selection import select_nodes
 
-    return select_nodes(fleet, words or (), read_selection)
+    return select_nodes(fleet, words or (), read_selection, limits or (), in_word_order=in_word_order)
+
+
+def selected_node(fleet: Fleet, word: str) -> Node:
+    """The one managed node that the word selects. Raises InputError for none or several."""
+    from meshctl.inventory.selection import select_one
+
+    return select_one(fleet, word, read_selection)
 
 
 def read_selection(path: str) -> str:

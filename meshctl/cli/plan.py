@@ -13,8 +13,8 @@ import typer
 
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, session
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Limit, Nodes, Session, session
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
@@ -22,7 +22,6 @@ from meshctl.cli.plan_execution import (
     prepare_plan,
     report_check,
     show,
-    write_text,
 )
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
@@ -43,6 +42,7 @@ Rate = Annotated[float | None, typer.Option("--rate", help="Upload limit per nod
 
 def plan(
     nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     out: Annotated[Path | None, typer.Option("--out", help="Save the plan for `meshctl apply`.")] = None,
     no_firmware: NoFirmware = False,
@@ -59,10 +59,10 @@ def plan(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepare_plan(opened, nodes, choices)
+        prepared = prepare_plan(opened, nodes, choices, limits=limit)
         saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
         if out is not None:
-            write_text(out, dump(saved))
+            write_file(out, dump(saved))
         if as_json:
             echo_json(dump(saved), nl=False)
         else:
@@ -101,6 +101,7 @@ def apply(
 
 def provision(
     nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     check: Annotated[bool, typer.Option("--check", help="Change nothing; exit with 1 if a node differs.")] = False,
     yes: Yes = False,
@@ -119,7 +120,7 @@ def provision(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepare_plan(opened, nodes, choices)
+        prepared = prepare_plan(opened, nodes, choices, limits=limit)
         if check:
             raise typer.Exit(report_check(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
         confirm_and_execute(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import secrets
 from dataclasses import asdict
-from pathlib import Path
 
 from meshctl.apply.executor import RunSettings, execute
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import journaled_run, print_totals
 from meshctl.cli.output import console, echo_error, echo_json
-from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.errors import ExitCode, MeshctlError
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
 
@@ -34,12 +33,19 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def prepare_plan(opened: Session, nodes: list[str] | None, choices: PlanOptions, salt: bytes | None = None) -> Prepared:
+def prepare_plan(
+    opened: Session,
+    nodes: list[str] | None,
+    choices: PlanOptions,
+    salt: bytes | None = None,
+    *,
+    limits: list[str] | None = None,
+) -> Prepared:
     with opened.interrupt.on_signals(echo_error):
         prepared = prepare(
             opened.renderer,
             opened.access,
-            selected_nodes(opened.fleet, nodes),
+            selected_nodes(opened.fleet, nodes, limits),
             opened.journal,
             salt=salt or secrets.token_bytes(SALT_BYTES),
             owner=opened.owner,
@@ -49,13 +55,6 @@ def prepare_plan(opened: Session, nodes: list[str] | None, choices: PlanOptions,
     if opened.interrupt.stopping:
         raise KeyboardInterrupt
     return prepared
-
-
-def write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
