@@ -156,7 +156,7 @@ class Node:
 
     @property
     def unauthenticated(self) -> int:
-        """Datagrams so far that nobody has proven to be from a peer: dropped ones, and those in the legacy format."""
+        """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
         return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
 
     def legacy_positions(self) -> dict[str, ReceivePosition]:
