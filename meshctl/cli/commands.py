@@ -10,12 +10,15 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """`attribute` of `module` is a function or, for a group, a Typer app; without `module` it is an extension."""
+    """`attribute` of `module` is a function or, for a group, a Typer app; without `module` it is an extension.
+
+    `heading` is the section of `meshctl --help`, whose commands follow one another.
+    """
 
     module: str
     attribute: str
     summary: str
-    panel: str = "Commands"
+    heading: str
 
 
 _INVENTORY = "Inventory"
@@ -23,6 +26,7 @@ _CHANGE = "Change the fleet"
 _INSPECT = "Inspect and connect"
 _ROBOTS = "Robots"
 _LAB = "Lab"
+_HELP = "Help"
 
 COMMANDS: dict[str, Entry] = {
     "init": Entry("meshctl.cli.inventory", "init", "Create a commented starter inventory", _INVENTORY),
@@ -49,4 +53,5 @@ COMMANDS: dict[str, Entry] = {
     "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _INSPECT),
     "robots": Entry("meshctl.cli.robots", "app", "Deploy and manage udp_mesh on robots", _ROBOTS),
     "lab": Entry("", "app", "Run a virtual fleet on this machine", _LAB),
+    "help": Entry("meshctl.cli.help", "help_command", "Show the help of a command", _HELP),
 }

@@ -6,6 +6,8 @@ import json
 import secrets
 from dataclasses import asdict
 
+import typer
+
 from meshctl.apply.executor import RunSettings, execute
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
@@ -14,6 +16,7 @@ from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
+from meshctl.plan.saved import SavedPlan, dump
 
 # Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
@@ -67,6 +70,15 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
         out.print(Text(line.text, line.style), soft_wrap=True)
 
 
+def report_plan(opened: Session, prepared: Prepared, choices: PlanOptions, *, as_json: bool, brief: bool) -> ExitCode:
+    """Print the plan; with `as_json`, as a saved plan."""
+    if as_json:
+        echo_json(dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)), nl=False)
+    else:
+        show(prepared.plan, opened.fleet, brief=brief)
+    return ExitCode.FINDINGS if prepared.plan.refusal else ExitCode.OK
+
+
 def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
     if as_json:
         nodes = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
@@ -88,9 +100,12 @@ def confirm_and_execute(
     as_json: bool,
     brief: bool,
     rate: float | None,
+    dry_run: bool = False,
 ) -> None:
     from meshctl.report.plan_text import question
 
+    if dry_run:
+        raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
     if not as_json:
         show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:

@@ -10,12 +10,14 @@ from __future__ import annotations
 import logging
 import select
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 
 import paramiko
 
+from meshctl import event_log
 from meshctl.device.authentication import LoginAttempt, login_attempts
 from meshctl.device.connection import Completed, Connection, Credentials, Deadlines, Endpoint
 from meshctl.device.errors import (
@@ -33,6 +35,7 @@ from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
 from meshctl.device.trust import HostKey, HostKeyPolicy
+from meshctl.errors import MeshctlError
 from meshctl.model import Release
 
 __all__ = ["SshConnection", "connect"]
@@ -89,6 +92,8 @@ def connect(
                 transport.close()
                 raise
             if accepted:
+                server = transport.remote_version
+                event_log.emit(event_log.INFO, "connected", device=endpoint.label, server=server)
                 return SshConnection(endpoint, transport, limits, activity)
             transport.close()
             tried += [attempt.name for attempt in remaining[:MAX_LOGINS_PER_CONNECTION]]
@@ -254,6 +259,22 @@ class SshConnection(Connection):
                 raise Unreachable(f"{target.label}: {self._endpoint.label} cannot reach it: {error.text}") from error
 
     def run(self, script: str, *, stdin: bytes | Iterable[bytes] = b"", timeout_s: float | None = None) -> Completed:
+        began = time.monotonic()
+        try:
+            done = self._run(script, stdin, timeout_s)
+        except MeshctlError as error:
+            self._record(script, began, error=str(error))
+            raise
+        size = len(done.stdout_bytes) + len(done.stderr_bytes)
+        self._record(script, began, exit_status=done.exit_status, output_bytes=size)
+        return done
+
+    def _record(self, script: str, began: float, **fields: str | int) -> None:
+        took_s = round(time.monotonic() - began, 3)
+        label = self._endpoint.label
+        event_log.emit(event_log.DEBUG, "command", device=label, **fields, duration_s=took_s, script=script)
+
+    def _run(self, script: str, stdin: bytes | Iterable[bytes], timeout_s: float | None) -> Completed:
         sent = framed(script)
         seconds = self._limits.run_s if timeout_s is None else timeout_s
         pieces = (stdin,) if isinstance(stdin, bytes) else stdin

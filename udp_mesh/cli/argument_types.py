@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from udp_mesh.daemon.configuration import MAX_PING_S
+from udp_mesh.daemon.interface import MAX_PING_S
 
 MAX_COUNT = 1_000_000_000
 

@@ -15,7 +15,7 @@ from udp_mesh.cli import change, inspect, serve, traffic
 from udp_mesh.cli.argument_types import count, ping_s, positive
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
-from udp_mesh.daemon.configuration import CONDITIONS_TOPIC, DEFAULT_PATH
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC, DEFAULT_PATH
 
 Command = Callable[[argparse.Namespace], int]
 

@@ -17,16 +17,9 @@ from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.settings import Settings, is_type_name
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import (
-    CONDITIONS_TOPIC,
-    MAX_PING_S,
-    RESERVED_PREFIX,
-    load,
-    read_keys,
-    read_rates,
-    topic_from_values,
-)
+from udp_mesh.daemon.configuration import load, read_keys, read_rates, topic_from_values
 from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, is_below, off_loop
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC, MAX_PING_S, RESERVED_PREFIX
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,

@@ -1,6 +1,7 @@
 """Moves datagrams, timers and events between the sockets and the core, on an asyncio loop, in batches.
 
-1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
+1. A socket becomes readable: all waiting datagrams go to the core (`_drain`). Known peers have a socket of their own;
+   during a flood the other one is read for a fifth of the time at most (`stranger_throttle`).
 2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
    and one timer for the core's next deadline.
 3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
@@ -17,16 +18,25 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from udp_mesh.core.conditions import Conditions
-from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.events import (
+    Event,
+    MessageId,
+    PeerAddressChanged,
+    PeerOffline,
+    PeerOnline,
+    PeerRestarted,
+    Rejected,
+)
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
+from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
-from udp_mesh.links.udp import UdpLink
+from udp_mesh.links.udp import Deliver, UdpLink
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +58,9 @@ RECOVERY_S = 0.1
 """Delay before the next attempt after an unexpected exception."""
 RETRY_LINK_S = 2.0
 """Delay before a socket that could not be opened is retried."""
+
+_PATH_EVENTS = (PeerOnline, PeerOffline, PeerAddressChanged, PeerRestarted)
+"""Events after which the addresses of known peers may have changed."""
 
 
 class Driver:
@@ -91,6 +104,9 @@ class Driver:
         self._drained_at = 0.0
         self._now = 0.0
         self._link_name = ""
+        self.strangers = StrangerThrottle(
+            self._loop, self._read_strangers, lambda: self.node.unauthenticated, batch=MAX_DRAIN_DATAGRAMS
+        )
 
     # Lifecycle
 
@@ -180,6 +196,7 @@ class Driver:
             if self.link_failures.get(name) != reason:
                 log.error("link-failed link=%s reason=%s", name, reason)
         self.link_failures = changes.failed
+        self._update_known_senders()
         self._watch_all()
         if changes.failed:
             self._refresh_timer = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
@@ -189,6 +206,14 @@ class Driver:
             if self._blocked.get(link.attachment.name):
                 self._loop.add_writer(link.fileno(), self._writable, link)
             self._loop.add_reader(link.fileno(), self._readable, link)
+            self.strangers.watch(link)
+
+    def _update_known_senders(self) -> None:
+        """Receive from the addresses of online peers at the sockets for them."""
+        known = self.node.peer_addresses()
+        for name, link in self.hub.links.items():
+            if not link.set_peers(frozenset(known.get(name, ()))):
+                log.warning("flood-protection-off link=%s peers=%d", name, len(known[name]))
 
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
@@ -220,23 +245,34 @@ class Driver:
     def _unwatch(self, link: UdpLink) -> None:
         self._loop.remove_reader(link.fileno())
         self._loop.remove_writer(link.fileno())
+        self.strangers.unwatch(link)
 
     # Receive
 
     def _readable(self, link: UdpLink) -> None:
-        self._drain(link)
+        self._drain(link, link.receive, MAX_DRAIN_DATAGRAMS)
+        self._after_drain()
+
+    def _read_strangers(self, link: UdpLink, limit: int) -> int:
+        count = self._drain(link, link.receive_from_strangers, limit)
+        self._after_drain()
+        return count
+
+    def _after_drain(self) -> None:
         if self.node.is_quiet:
             self._reschedule()
         else:
             self._pump()
 
-    def _drain(self, link: UdpLink) -> None:
-        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading."""
+    def _drain(self, link: UdpLink, receive: Callable[[Deliver, int, float], int], limit: int) -> int:
+        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading.
+        Returns their number."""
         self._drained_at = self._read_clocks()
         self._link_name = link.attachment.name
         assert self._wall_offset is not None
-        link.receive(self._deliver, MAX_DRAIN_DATAGRAMS, self._drained_at + self._wall_offset - LAST_ARRIVAL_S)
+        count = receive(self._deliver, limit, self._drained_at + self._wall_offset - LAST_ARRIVAL_S)
         self._now = max(self._now, self._drained_at)
+        return count
 
     def _read_clocks(self) -> float:
         """Reads the clock, and updates the offset of the wall clock, which the kernel uses for arrival timestamps.
@@ -377,8 +413,12 @@ class Driver:
         self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
 
     def _report_events(self) -> None:
+        moved = False
         while (event := self.node.next_event()) is not None:
+            moved = moved or isinstance(event, _PATH_EVENTS)
             self._on_event(event)
+        if moved and not self.closed:
+            self._update_known_senders()
 
 
 def _link_info(link: UdpLink) -> LinkInfo:

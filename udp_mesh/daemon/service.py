@@ -28,16 +28,9 @@ from udp_mesh.core.events import (
 from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import (
-    BENCH_TOPIC,
-    CONDITIONS_TOPIC,
-    PING_TOPIC,
-    PONG_TOPIC,
-    RESERVED_PREFIX,
-    Configuration,
-    load,
-)
+from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder

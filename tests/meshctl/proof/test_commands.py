@@ -31,6 +31,19 @@ def test_a_saved_plan_is_applied_exactly_and_a_node_that_moved_on_is_refused(rig
     assert rig.meshctl("provision", new, "n001", "--yes", "--json").results == {"n001": "done"}
 
 
+def test_a_dry_run_shows_the_plan_and_changes_nothing(rig: Rig) -> None:
+    before = rig.meshctl("history", "", "--json").out
+    other = "b" if rig.current == "a" else "a"
+    shown = rig.meshctl("provision", other, "--brief", "--dry-run")
+    assert (shown.code, "5 to change" in shown.out) == (0, True), shown.out + shown.err
+    assert rig.meshctl("plan", other, "--brief").out == shown.out
+    file = rig.directory / "dry.json"
+    assert rig.meshctl("plan", other, "--brief", "--out", str(file)).code == 0
+    assert json.loads(rig.meshctl("apply", other, str(file), "--dry-run", "--json").out)["fleet"] == "proof"
+    assert {rig.state_of(name, rig.current, other) for name in ("base", *rig.names)} == {"old"}
+    assert rig.meshctl("history", "", "--json").out == before
+
+
 def test_ctrl_c_ends_the_nodes_in_work_properly_and_a_resume_takes_up_the_rest(rig: Rig) -> None:
     _, new = rig.flip()
     said: list[str] = []
@@ -60,6 +73,8 @@ def test_a_backup_brings_back_what_was(rig: Rig) -> None:
     (file,) = folder.iterdir()
     assert file.stat().st_mode & 0o077 == 0
     rig.fleet.node("n001").exec("uci set system.@system[0].log_size=999 && uci commit system").check("edit by hand")
+    shown = rig.meshctl("restore", rig.current, "n001", str(file), "--dry-run", "--json")
+    assert json.loads(shown.out)["files"] == ["/etc/config/system"], shown.out + shown.err
     restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes", "--json")
     assert restored.events[-1]["run"] == json.loads(rig.meshctl("history", "", "--json").out)[0]["run"]
     assert restored.results == {"n001": "done"}
