@@ -169,7 +169,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
                 "for_s": round(error.last - error.since, 3),
                 "last_ago_s": round(driver.now() - error.last, 3),
             }
-            for error in driver.send_errors.active()
+            for error in driver.output.send_errors.active()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -198,7 +198,7 @@ def render_metrics(service: Service) -> str:
     driver = service.driver
     extra = {
         "wakeups": driver.wakeups,
-        "datagrams_lost_on_full_socket": driver.lost_on_full_socket,
+        "datagrams_lost_on_full_socket": driver.output.lost_on_full_socket,
         "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
         "outbox_messages_refused_by_disk": service.store.refused,
     }
