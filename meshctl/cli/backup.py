@@ -25,7 +25,7 @@ from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.prepare import base_macs
-from meshctl.apply.station_flush import UNFLUSHED, retry_unanswered
+from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -169,6 +169,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
     with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
         known = opened.journal.last_known(opened.fleet.name)
         around: dict[str, Observation] = {}
+        flushes = StationFlushes()
         work = RunContext(
             opened.fleet,
             opened.access,
@@ -176,6 +177,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             journaled.progress,
             opened.interrupt,
             opened.owner,
+            flushes.listener,
             observations=around,
             mac_owners=known_macs(opened.fleet, known),
             base_macs=base_macs(opened.fleet, around, known),
@@ -201,7 +203,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             return restore_backup(job, connection, saved)
 
         journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
-        for unasked in retry_unanswered(work).values():
+        for unasked in flushes.retry_unanswered(work).values():
             journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
         journaled.entry.finish_node(journaled.outcomes[name])
     return journaled

@@ -14,7 +14,7 @@ import typer
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Limit, Nodes, Session, session
-from meshctl.cli.output import echo
+from meshctl.cli.output import echo, write_file
 from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
@@ -22,7 +22,6 @@ from meshctl.cli.plan_execution import (
     prepare_plan,
     report_check,
     report_plan,
-    write_text,
 )
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
@@ -62,7 +61,7 @@ def plan(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         prepared = prepare_plan(opened, nodes, choices, limits=limit)
         if out is not None:
-            write_text(out, dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)))
+            write_file(out, dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)))
         raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
 
 

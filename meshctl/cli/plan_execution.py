@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import secrets
 from dataclasses import asdict
-from pathlib import Path
 
 import typer
 
@@ -15,7 +14,7 @@ from meshctl.apply.rollback import before_state
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
 from meshctl.cli.output import console, echo_error, echo_json
-from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
@@ -61,13 +60,6 @@ def prepare_plan(
     if opened.interrupt.stopping:
         raise KeyboardInterrupt
     return prepared
-
-
-def write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:

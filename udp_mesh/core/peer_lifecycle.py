@@ -24,6 +24,7 @@ from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
+from udp_mesh.core.peers.session_state import ReceptionEvent
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
@@ -64,7 +65,7 @@ def on_heartbeat(
     if to_all:
         session.on_heard_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
     elif lists_us:
-        session.confirm_two_way()
+        session.on_reception(ReceptionEvent.CONFIRMED, now)
     if not session.verified:
         if (link, source) == (session.path.link, session.path.address):
             session.path.heard_at = now
@@ -128,9 +129,9 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
     if old is not None:
         state.repairs.pop(old.boot_id, None)
         state.control_ready.pop(old, None)
-        if peer.has_sender:
+        if peer.sender is not None:
             old.next_wire_id = peer.sender.next_wire_id
-    if peer.has_sender:
+    if peer.sender is not None:
         peer.sender.restart(now)
         # A boot that becomes current again remembers what it had: its numbers continue.
         peer.sender.in_flight.restart(session.path.channel.next_number)
@@ -175,7 +176,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
             validate_path(state, session, link, source, now)
             return
         set_online(state, peer, session, now)
-    if peer.has_sender and peer.sender.state is SendState.UNRESPONSIVE:
+    if peer.sender is not None and peer.sender.state is SendState.UNRESPONSIVE:
         peer.sender.on_activity(now)
         state.ready[peer] = None
 
@@ -205,7 +206,7 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
     if link not in state.links:
         return
     path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    sender = session.peer.sender if session.peer is not None else None
     timing_out = sender is not None and sender.state is not SendState.ACTIVE
     first = not path.link
     quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
@@ -236,7 +237,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
     if info is None:
         return
     path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    sender = session.peer.sender if session.peer is not None else None
     first = not path.link
     old = path.address
     before = path.fragment_bytes
@@ -251,7 +252,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
 def update_mtu(state: State, session: Session, mtu: int) -> None:
     """The link or the settings changed under a session's path: fit both, and what the path was found to carry."""
     path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    sender = session.peer.sender if session.peer is not None else None
     if sender is not None and sender.pmtu.narrowed_at is not None:
         mtu = min(mtu, path.mtu)
     before = path.mtu
@@ -283,10 +284,10 @@ def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
     return end - start
 
 
-def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None:
+def _update_pmtu(state: State, peer: Peer, sender: Sender, session: Session, now: float) -> None:
     """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
-    sender, path = peer.sender, session.path
-    size, info = sender.pmtu, state.links.get(path.link)
+    path, size = session.path, sender.pmtu
+    info = state.links.get(path.link)
     fragment_bytes = state.settings.fragment_bytes
     rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
     narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
@@ -332,7 +333,11 @@ def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     peer.transition(PeerEvent.SILENT)
     peer.online_since = None
     state.event_queue.emit(PeerOffline(peer.name, left))
-    if peer.has_sender and peer.sender.state is not SendState.UNRESPONSIVE and peer.sender.in_flight.outstanding:
+    if (
+        peer.sender is not None
+        and peer.sender.state is not SendState.UNRESPONSIVE
+        and peer.sender.in_flight.outstanding
+    ):
         peer.sender.become_unresponsive(now)
     store_in_outbox(state, peer, now)
 
@@ -351,12 +356,12 @@ def maintain(state: State, now: float) -> None:
     peers = list(state.peer_table.peers.values())
     start = state.maintain_from if state.maintain_from < len(peers) else 0
     state.maintain_from = start + IDLE_PEERS_PER_ROUND
-    has_sender = [peer for peer in peers if peer.has_sender]
-    for peer in has_sender:
-        peer.sender.congestion.queue_share = queue_share
+    senders = [(peer, peer.sender) for peer in peers if peer.sender is not None]
+    for peer, sender in senders:
+        sender.congestion.queue_share = queue_share
         _maintain_peer(state, peer, now)
     for peer in peers[start : state.maintain_from]:
-        if not peer.has_sender:
+        if peer.sender is None:
             _maintain_peer(state, peer, now)
     for name in state.outboxes.peers():
         peer_with_outbox = state.peer_table.peers.get(name)
@@ -395,7 +400,7 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         set_offline(state, peer, now, left=False)
     if peer.state is PeerState.OFFLINE and max(silent_s, one_way_s) > rates.peer_lost_s:
         peer.transition(PeerEvent.GIVEN_UP)
-        if peer.has_sender:
+        if peer.sender is not None:
             peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)
     if session.receiver.fragments:
@@ -403,19 +408,20 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         session.receiver.broadcasts.purge(now)
     if session.received_bytes:
         session.meters.received.feed(session.received_bytes, now)
-    if peer.has_sender:
-        _report_starved(state, peer, now)
-        _update_pmtu(state, peer, session, now)
-        session.meters.sent.feed(peer.sender.sent_bytes, now)
-        session.meters.delivered.feed(peer.sender.delivered_bytes, now)
+    sender = peer.sender
+    if sender is not None:
+        _report_starved(state, peer.name, sender, now)
+        _update_pmtu(state, peer, sender, session, now)
+        session.meters.sent.feed(sender.sent_bytes, now)
+        session.meters.delivered.feed(sender.delivered_bytes, now)
 
 
-def _report_starved(state: State, peer: Peer, now: float) -> None:
-    for level in peer.sender.levels:
+def _report_starved(state: State, name: str, sender: Sender, now: float) -> None:
+    for level in sender.levels:
         since = level.starved_since
         if since is None or level.starved_reported or now - since < state.settings.rates.starved_s:
             continue
         oldest = level.oldest()
         if oldest is not None:
             level.starved_reported = True
-            state.event_queue.emit(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))
+            state.event_queue.emit(TopicStarved(name, oldest.accepted.channel.name, now - since))

@@ -13,11 +13,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
@@ -60,11 +62,14 @@ class Driver:
         rng: RandomSource,
         on_event: Callable[[Event], None],
         store: Store | None = None,
+        legacy_positions: Mapping[str, ReceivePosition] = MappingProxyType({}),
         urgent_dscp: int = 0,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
-        self.node = Node(settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store)
+        self.node = Node(
+            settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store, legacy_positions=legacy_positions
+        )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
         self.send_errors = SendErrors()

@@ -39,6 +39,7 @@ from udp_mesh.daemon.configuration import (
     load,
 )
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
@@ -67,6 +68,8 @@ class Service:
             configuration.daemon.state_directory / "outbox", configuration.daemon.outbox_disk_bytes
         )
         self._flusher = Flusher(self.store)
+        self._positions_file = configuration.daemon.state_directory / "legacy-positions.json"
+        self._positions = load_positions(self._positions_file)
         self.driver = Driver(
             configuration.settings,
             configuration.links,
@@ -74,6 +77,7 @@ class Service:
             rng=rng,
             on_event=self._event,
             store=self.store,
+            legacy_positions=self._positions,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
         self.counts: dict[str, TopicCount] = {}
@@ -108,6 +112,7 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
+        await self._save_positions()
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
 
@@ -369,6 +374,7 @@ class Service:
         if self.store.needs_flush:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
+        self._spawn(self._save_positions())
         wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
         if not wanted and self.recorder is None:
             return
@@ -385,6 +391,17 @@ class Service:
             for client, patterns in self._subscriptions.items():
                 if CONDITIONS_TOPIC in patterns:
                     client.send_event(header)
+
+    async def _save_positions(self) -> None:
+        """Saves what was received from legacy peers, if there are any and it changed."""
+        positions = self.driver.node.legacy_positions()
+        if positions == self._positions:
+            return
+        self._positions = positions
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._positions_file, positions)
+        except OSError as error:
+            log.warning("legacy-positions-not-saved path=%s error=%s", self._positions_file, error)
 
     def _count(self, topic: str) -> TopicCount:
         count = self.counts.get(topic)
