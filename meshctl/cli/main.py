@@ -21,7 +21,6 @@ from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
 from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
-from meshctl.cli.verbosity import with_verbosity
 from meshctl.errors import ExitCode, MeshctlError
 
 if TYPE_CHECKING:
@@ -172,6 +171,9 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     if "is_guarded" in vars(command):
         # the commands of a group are guarded in place, and the group may be registered again
         return command
+    # here, because the root command's help does not need it
+    from meshctl.cli.verbosity import with_verbosity
+
     command = with_verbosity(command)
 
     @functools.wraps(command)
