@@ -43,6 +43,8 @@ MAX_LOGINS_PER_CONNECTION = 3
 MAX_OUTPUT_BYTES = 16 << 20
 # Up to this much stdin fits the receive window of every dropbear (24 KiB) and needs no thread.
 MAX_INLINE_STDIN_BYTES = 8 << 10
+# Keepalives, which the reading thread sends when it wakes, may be late by this much.
+MAX_POLL_S = 1.0
 _READ_BYTES = 32 << 10
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
@@ -145,7 +147,8 @@ def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
 ) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    activity = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    stream = open_socket(endpoint, limits) if via is None else via.tunnel(endpoint)
+    activity = ActivityStream(stream, poll_s=min(MAX_POLL_S, limits.ask_s / 2))
     transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
