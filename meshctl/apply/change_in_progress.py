@@ -6,16 +6,15 @@ observation uses a new one (`connect`, `observe_and_decide`), and `confirm` or `
 
 from __future__ import annotations
 
-import re
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.change_set import change_of, new_change_id, new_nonce, services_of
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
-from meshctl.apply.station_flush import StationFlush
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
 from meshctl.device.deadman import Change
@@ -72,10 +71,10 @@ class ChangeInProgress:
     found_at: Endpoint | None = None
     # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
-    flush: StationFlush = field(init=False, repr=False)
+    listener: ChangeListener = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self.flush = StationFlush(self.ctx, self.radios)
+        self.listener = self.ctx.run.new_listener(self.ctx, self.radios)
 
     @property
     def new(self) -> Endpoint:
@@ -154,8 +153,7 @@ def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
 def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
     """Install the dead-man's switch unless the node has this version."""
     known = ctx.before.change
-    own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
-    if known is None or not known.installed or own is None or known.version != own[1].decode():
+    if known is None or not known.installed or known.version != deadman.version():
         deadman.install(connection)
 
 
@@ -165,7 +163,7 @@ def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: f
     The change may cut this connection while its confirm window runs, so the wait for the answer is short. Raises
     NodeRefused, Unreachable.
     """
-    change.flush.started()
+    change.listener.started()
     patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
     patience.daemon = True
     patience.start()
@@ -204,7 +202,7 @@ def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> A
     age_s = applied_age_s(change.status)
     if age_s is not None:
         change.login_refused = change.connect_error = ""
-        change.flush.observed()
+        change.listener.observed()
     change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
     if age_s is not None and age_s < change.settle_s:
         change.unmet = (*change.unmet, "its services may still be reloading")
@@ -238,7 +236,7 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
         change.is_reloaded = True
     if status.state == "applied":
         change.login_refused = change.connect_error = ""
-        change.flush.observed()
+        change.listener.observed()
     change.unmet = (RELOADING,)
     leaving = change.ctx.run.interrupt.leaving
     return next_action(

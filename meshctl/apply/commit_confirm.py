@@ -2,7 +2,7 @@
 
 `run_change` arms and starts the change over the existing connection, then polls the node's dead-man's switch over new
 connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop goes on: it
-reads the node's state and takes the next action. Meanwhile `station_flush` removes stale station entries.
+reads the node's state and takes the next action. A listener receives the events of the change.
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
     ctx = change.ctx
     try:
         arm(change, connection)
-        if change.radios:
-            change.flush.watch_own_entries(connection, for_s=_limit_s(change))
-            change.flush.watch_neighbors(for_s=_limit_s(change))
+        change.listener.armed(connection, for_s=_limit_s(change))
         start(change, connection)
     except Unreachable as error:
         # the node's status shows how far it got
@@ -77,7 +75,7 @@ def poll(change: ChangeInProgress) -> Outcome:
     backoff = Backoff(_limit_s(change), run_context.interrupt)
     run_context.interrupt.wait(change.settle_s)
     while not backoff.is_over:
-        with change.flush.flush_if_slow():
+        with change.listener.connecting():
             connection = connect(change)
         if connection is not None:
             try:
@@ -89,10 +87,10 @@ def poll(change: ChangeInProgress) -> Outcome:
             if change.last is not None:
                 run_context.record(change.ctx.name, change.last)
             if outcome is not None:
-                _flush_stations(change, outcome)
+                _notify_end(change, outcome)
                 return outcome
         else:
-            change.flush.unreachable()
+            change.listener.unreachable()
         if run_context.interrupt.leaving:
             break
         backoff.pause()
@@ -150,9 +148,9 @@ def _limit_s(change: ChangeInProgress) -> float:
     return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
-def _flush_stations(change: ChangeInProgress, outcome: Outcome) -> None:
+def _notify_end(change: ChangeInProgress, outcome: Outcome) -> None:
     if outcome.result in (Result.DONE, Result.ROLLED_BACK):
-        change.flush.ended(
+        change.listener.ended(
             change.last,
             went_back=outcome.result is Result.ROLLED_BACK,
             rebooted=change.last is not None and change.last.boot_id != change.ctx.before.boot_id,

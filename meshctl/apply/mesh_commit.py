@@ -194,7 +194,7 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
         proven = [participant for participant in commit.participants if participant.is_proven]
         if len(proven) == len(commit.participants) or backoff.is_over or commit.run.interrupt.leaving:
             break
-        _flush_unreachable(commit, proven)
+        _notify_unreachable(commit, proven)
         backoff.pause()
     has_entry = (
         not commit.entry
@@ -218,16 +218,16 @@ def unmet_of(participant: Participant) -> str:
     return f"{participant.name}: {', '.join(change.unmet)}"
 
 
-def _flush_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
+def _notify_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
     """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
     create a station entry of the radio before its restart."""
     names = {participant.name for participant in proven}
 
-    def flush_one(participant: Participant) -> None:
+    def notify_one(participant: Participant) -> None:
         if participant.change is not None and participant.is_unreachable:
-            participant.change.flush.unreachable(names)
+            participant.change.listener.unreachable(names)
 
-    commit.each(commit.participants, flush_one)
+    commit.each(commit.participants, notify_one)
 
 
 def _prove(participant: Participant) -> None:

@@ -14,7 +14,19 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, exit_for, selected_nodes, session
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Limit,
+    Nodes,
+    Session,
+    exit_for,
+    selected_node,
+    selected_nodes,
+    session,
+)
 from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
@@ -25,6 +37,7 @@ from meshctl.nodes.host_keys import HostKeyState, fetch_host_keys
 
 def trust(
     nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     change: Annotated[bool, typer.Option("--replace", "--replace-key", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
@@ -38,7 +51,10 @@ def trust(
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
         shown = fetch_host_keys(
-            opened.access, opened.trust, selected_nodes(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
+            opened.access,
+            opened.trust,
+            selected_nodes(opened.fleet, nodes, limit),
+            parallel=opened.fleet.apply.parallel,
         )
         if as_json:
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
@@ -99,6 +115,7 @@ def run(
             help="Nodes or patterns (default: all), then -- and the command.",
         ),
     ],
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     timeout: Annotated[float, typer.Option("--timeout", help="Timeout per node in seconds.")] = 60.0,
     raw: Annotated[
@@ -123,7 +140,7 @@ def run(
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        selected = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, patterns, limit)}
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
@@ -201,7 +218,7 @@ def ssh(
     if program is None:
         raise InputError("ssh is not installed", hint="install openssh-client")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = selected_nodes(opened.fleet, [node])[:1]
+        there = selected_node(opened.fleet, node)
         arguments = ssh_arguments(opened, there)
     os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
 
