@@ -21,6 +21,7 @@ from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
 from meshctl.model import Node
 from meshctl.nodes.host_keys import HostKeyState, fetch_host_keys
+from meshctl.nodes.slots import transfers_at_once
 
 
 def trust(
@@ -38,7 +39,10 @@ def trust(
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
         shown = fetch_host_keys(
-            opened.access, opened.trust, selected_nodes(opened.fleet, nodes), parallel=opened.fleet.apply.parallel
+            opened.access,
+            opened.trust,
+            selected_nodes(opened.fleet, nodes),
+            parallel=transfers_at_once(opened.fleet.apply.parallel),
         )
         if as_json:
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
@@ -142,7 +146,9 @@ def run(
             )
 
         with opened.interrupt.on_signals(echo_error):
-            ended = run_on_all(selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
+            ended = run_on_all(
+                selected, work, parallel=transfers_at_once(opened.fleet.apply.parallel), interrupt=opened.interrupt
+            )
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
                 if as_json:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import paramiko
@@ -69,7 +70,17 @@ def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
 
 
 def load_key(path: Path, passphrase: Secret | None) -> PKey:
-    """Load a private key in OpenSSH or PEM format. Raises InputError with the fault."""
+    """Load a private key in OpenSSH or PEM format; parsed once unless the file changes. Raises InputError with the
+    fault."""
+    try:
+        found = path.stat()
+    except OSError:
+        return _parsed_key(path, passphrase, (0, 0))
+    return _parsed_key(path, passphrase, (found.st_mtime_ns, found.st_size))
+
+
+@cache
+def _parsed_key(path: Path, passphrase: Secret | None, stamp: tuple[int, int]) -> PKey:
     try:
         return PKey.from_path(path, None if passphrase is None else passphrase.reveal().encode())  # type: ignore[arg-type]
     except FileNotFoundError as error:

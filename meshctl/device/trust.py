@@ -125,12 +125,14 @@ class HostKeyPolicy(Protocol):
 class TrustStore:
     """The fleet's file of pins. `inventory` adds the keys pinned in the inventory (node name -> `TYPE BASE64` lines).
 
-    Every read opens the file; a write locks it, replaces it in one rename, and keeps all unrelated lines.
+    The file is parsed again only when it has changed; a write locks it, replaces it in one rename, and keeps all
+    unrelated lines.
     """
 
     def __init__(self, path: Path, *, inventory: Mapping[str, tuple[str, ...]] | None = None) -> None:
         self.path = path
         self._inventory: dict[str, tuple[HostKey, ...]] = {}
+        self._parsed: tuple[tuple[int, int, int], tuple[Pin, ...]] | None = None
         for name, lines in (inventory or {}).items():
             try:
                 self._inventory[name] = tuple(parse_key(line) for line in lines)
@@ -139,12 +141,19 @@ class TrustStore:
 
     def pins(self) -> tuple[Pin, ...]:
         try:
+            found = self.path.stat()
+            # a write replaces the file, so it has another inode
+            stamp = (found.st_ino, found.st_mtime_ns, found.st_size)
+            if self._parsed is not None and self._parsed[0] == stamp:
+                return self._parsed[1]
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return ()
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{self.path}: cannot read the pinned host keys: {error}") from error
-        return parse_pins(text, source=str(self.path))
+        pins = parse_pins(text, source=str(self.path))
+        self._parsed = (stamp, pins)
+        return pins
 
     def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
         return self.pinned(endpoint.pin_name)
