@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,19 @@ from meshctl.errors import InputError
 from meshlab.control import address_of
 from meshlab.errors import LabError
 from meshlab.node_runner import MESSAGE_BYTES
+
+
+@contextmanager
+def _connected(directory: Path, timeout_s: float | None = None) -> Iterator[socket.socket]:
+    """A connection to the supervisor of `directory`. Raises OSError when none listens there."""
+    directory_fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+            connection.settimeout(timeout_s)
+            connection.connect(address_of(directory, directory_fd))
+            yield connection
+    finally:
+        os.close(directory_fd)
 
 
 def request(
@@ -24,21 +38,13 @@ def request(
     the fleet rejects the request.
     """
     try:
-        directory_fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise LabError(f"no virtual fleet in {directory}", hint="run `meshctl lab up` to start one") from error
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-            connection.settimeout(timeout_s)
-            connection.connect(address_of(directory, directory_fd))
+        with _connected(directory, timeout_s) as connection:
             socket.send_fds(connection, [json.dumps(message).encode()], list(descriptors))
             answer = connection.recv(MESSAGE_BYTES * 4)
     except TimeoutError as error:
         raise LabError(f"the fleet in {directory} did not answer {message['op']} within {timeout_s:g} s") from error
     except OSError as error:
         raise LabError(f"no virtual fleet runs in {directory}", hint="run `meshctl lab up` to start one") from error
-    finally:
-        os.close(directory_fd)
     if not answer:
         raise LabError(f"the fleet in {directory} ended before it answered {message['op']}")
     result: dict[str, Any] = json.loads(answer)
@@ -48,27 +54,9 @@ def request(
 
 
 def is_running(directory: Path) -> bool:
-    """Whether a supervisor answers in `directory`, or runs there for a machine that does not answer."""
-    try:
-        request(directory, {"op": "status"})
-    except LabError:
-        return False
-    except InputError:
-        return True
-    return True
-
-
-def accepts_requests(directory: Path) -> bool:
     """Whether a supervisor listens in `directory`, even one that does not answer."""
     try:
-        directory_fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+        with _connected(directory):
+            return True
     except OSError:
         return False
-    try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-            connection.connect(address_of(directory, directory_fd))
-    except OSError:
-        return False
-    finally:
-        os.close(directory_fd)
-    return True

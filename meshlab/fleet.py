@@ -25,7 +25,7 @@ from meshctl.device.connection import Completed, Endpoint
 from meshctl.errors import InputError
 from meshlab import fleet_directory, rootfs
 from meshlab.addresses import bench_of, loopback_of
-from meshlab.client import accepts_requests, is_running, request
+from meshlab.client import is_running, request
 from meshlab.errors import LabError
 from meshlab.qemu.qemu import find_qemu
 from meshlab.spec import FleetSpec, Medium, dump, load
@@ -223,9 +223,10 @@ class VirtualFleet:
                 reason = lines[0] if lines else f"its process ended with status {process.returncode}"
                 hint = lines[1] if len(lines) > 1 and lines[1] else self._log_tail()
                 raise LabError(f"the virtual fleet did not start: {reason}", hint=hint)
-            if not (self.directory / "supervisor.pid").exists() or not is_running(self.directory):
+            try:
+                nodes = self.status()["nodes"]
+            except LabError:
                 return False
-            nodes = self.status()["nodes"]
             for node in nodes:
                 if node["power"] == Power.FAILED.value:
                     raise LabError(
@@ -335,7 +336,7 @@ def stop_fleet(directory: Path) -> str:
         status = request(directory, {"op": "status"})
     except (LabError, InputError):
         # a machine whose kernel hangs answers nothing, and must not be left behind
-        if not accepts_requests(directory):
+        if not is_running(directory):
             return ""
         status = {"pid": (directory / "supervisor.pid").read_text(encoding="ascii"), "fleet": directory.name}
     watched = os.pidfd_open(int(status["pid"]))

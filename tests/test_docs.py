@@ -14,6 +14,7 @@ import yaml
 
 from docgen.commands import Command, programs
 from docgen.pages import man_pages, pages
+from tests.plain_english import bad_page_words
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -177,21 +178,13 @@ def test_man_pages_are_well_formed(name: str, tmp_path: Path, commands: dict[str
     assert done.stderr == ""
 
 
-WORDS = re.compile(
-    r"\b(told|tells?|anew|whoever|somebody|nobody|mend(?:s|ed)?|of a node that|takes? up|taken up|carr(?:y|ied) out"
-    r"|neighbours?|behaviours?|colours?)\b"
-)
-# fenced and indented code, code spans, and anchors made of command names
-CODE_OR_ANCHOR = re.compile(r"```.*?```|^ {4}.*?$|`[^`]*`|\(#[\w-]+\)|\{ #[\w-]+ \}", re.MULTILINE | re.DOTALL)
-
-
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if page.name not in FOREIGN], ids=lambda page: str(page.relative_to(ROOT))
 )
 def test_pages_use_plain_words(page: Path) -> None:
-    assert WORDS.findall(CODE_OR_ANCHOR.sub("", page.read_text(encoding="utf-8"))) == []
+    assert bad_page_words(page.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize("name", pages())
 def test_help_and_descriptions_of_keys_use_plain_words(name: str) -> None:
-    assert WORDS.findall(CODE_OR_ANCHOR.sub("", pages()[name])) == []
+    assert bad_page_words(pages()[name]) == []

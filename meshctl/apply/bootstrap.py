@@ -17,7 +17,7 @@ from meshctl.device.connection import Endpoint
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
-from meshctl.errors import InputError, NodeError
+from meshctl.errors import NodeError
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node
@@ -59,26 +59,8 @@ class FoundDevice:
     old_pins: tuple[HostKey, ...] = ()
 
 
-def find_node(fleet: Fleet, word: str) -> Node:
-    """The managed node with this name, label, serial number or MAC. Raises InputError for none or several."""
-    folded = word.lower()
-    found = [
-        node
-        for node in fleet.managed()
-        if folded in {node.name.lower(), node.label.lower(), node.serial.lower(), node.mac.lower()} - {""}
-        or any(radio.mac.lower() == folded for radio in node.radios if radio.mac)
-    ]
-    if len(found) != 1:
-        names = ", ".join(node.name for node in found)
-        raise InputError(
-            f"{word!r} matches {names if found else 'no node of the fleet'}",
-            hint="give a node's name, label, serial number or MAC",
-        )
-    return found[0]
-
-
 def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[str] = ()) -> Node:
-    """The node this device is: by MAC, or by the operator's word (`said`) where the inventory has no MAC.
+    """The node this device is: by MAC, or by the name that the operator gave (`said`) where the inventory has no MAC.
 
     Raises NodeError for a device that is another node than `said`, or that cannot be identified.
     """
@@ -92,7 +74,7 @@ def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[st
     if len(by_mac) > 1:
         raise NodeError(f"its MACs ({shown}) belong to several nodes: {', '.join(node.name for node in by_mac)}")
     if said:
-        node = find_node(fleet, said)
+        node = fleet.nodes[said]
         if by_mac and by_mac[0].name != node.name:
             raise NodeError(f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}")
         if _macs(node) and not by_mac:
@@ -172,7 +154,7 @@ def _connect(
     """Log in without a password, or with the fleet's keys where an earlier run was cut short."""
     some = next(fleet.managed())
     credentials = replace(connections.credentials(some), empty_password=True)
-    release = find_node(fleet, target.node).release if target.node else None
+    release = fleet.nodes[target.node].release if target.node else None
     return connect(
         target.endpoint,
         credentials=credentials,
@@ -185,7 +167,7 @@ def _connect(
 def _paths(renderer: Renderer, target: BenchTarget) -> tuple[str, ...]:
     """The files to observe. The node may not be identified yet, but the paths hardly differ between nodes."""
     fleet = renderer.fleet
-    node = find_node(fleet, target.node) if target.node else next(fleet.managed())
+    node = fleet.nodes[target.node] if target.node else next(fleet.managed())
     return other_paths(renderer.desired(node))
 
 

@@ -10,11 +10,11 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.change_set import change_of, new_change_id, new_nonce, services_of
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
-from meshctl.apply.station_flush import StationFlush
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
 from meshctl.device.deadman import Change, Payload
@@ -74,11 +74,11 @@ class ChangeInProgress:
     found_at: Endpoint | None = None
     # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
-    flush: StationFlush = field(init=False, repr=False)
+    listener: ChangeListener = field(init=False, repr=False)
     sent: Payload = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self.flush = StationFlush(self.ctx, self.radios)
+        self.listener = self.ctx.run.new_listener(self.ctx, self.radios)
         self.sent = Payload.of(self.payload)
 
     @property
@@ -178,9 +178,9 @@ def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> Non
     await_flash(ctx, connection)
     with ctx.step("apply"):
         install_switch(ctx, connection)
-        change.flush.started()
+        change.listener.started()
         await_reload_s = AWAIT_RELOAD_S if connection.endpoint.host == change.new.host else 0
-        with change.flush.flush_if_silent(connection):
+        with change.listener.waiting(connection):
             status = deadman.change(
                 connection,
                 ctx.run.owner,
@@ -200,7 +200,7 @@ def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: f
     The change may cut this connection while its confirm window runs, so the wait for the answer is short. Raises
     NodeRefused, Unreachable.
     """
-    change.flush.started()
+    change.listener.started()
     change.is_reloaded = False
     patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
     patience.daemon = True
@@ -244,7 +244,7 @@ def observe_and_decide(
     age_s = applied_age_s(change.status)
     if age_s is not None:
         change.login_refused = change.connect_error = ""
-        change.flush.observed()
+        change.listener.observed()
     change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
     if age_s is not None and age_s < change.settle_s:
         change.unmet = (*change.unmet, "its services may still be reloading")
@@ -278,7 +278,7 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
         change.is_reloaded = True
     if status.state == "applied":
         change.login_refused = change.connect_error = ""
-        change.flush.observed()
+        change.listener.observed()
     change.unmet = (RELOADING,)
     leaving = change.ctx.run.interrupt.leaving
     return next_action(

@@ -2,7 +2,7 @@
 
 `run_change` arms and starts the change over the existing connection, then polls the node's dead-man's switch over new
 connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop goes on: it
-reads the node's state and takes the next action. Meanwhile `station_flush` removes stale station entries.
+reads the node's state and takes the next action. A listener receives the events of the change.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
     try:
         with ctx.run.connections.slots.use(ctx.name) as slot:
             if is_one_command(change):
-                _watch_stations(change, connection)
+                change.listener.armed(connection, for_s=_limit_s(change))
                 send(change, connection, slot)
             else:
                 arm(change, connection)
-                _watch_stations(change, connection)
+                change.listener.armed(connection, for_s=_limit_s(change))
                 start(change, connection)
     except Unreachable as error:
         # the node's status shows how far it got
@@ -74,12 +74,6 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
         connection.close()
     with ctx.step("prove"):
         return poll(change)
-
-
-def _watch_stations(change: ChangeInProgress, connection: SshConnection) -> None:
-    if change.radios:
-        change.flush.watch_own_entries(connection, for_s=_limit_s(change))
-        change.flush.watch_neighbors(for_s=_limit_s(change))
 
 
 def poll(change: ChangeInProgress) -> Outcome:
@@ -97,7 +91,7 @@ def poll(change: ChangeInProgress) -> Outcome:
             with run_context.connections.slots.use(change.ctx.name):
                 outcome, proof = _observe_once(change, proof)
             if outcome is not None:
-                _flush_stations(change, outcome)
+                _notify_end(change, outcome)
                 return outcome
             if run_context.interrupt.leaving:
                 break
@@ -114,10 +108,10 @@ def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tupl
     if proof is not None and proof.is_open:
         connection: SshConnection | None = proof
     else:
-        with change.flush.flush_if_slow():
+        with change.listener.connecting():
             connection = connect(change)
     if connection is None:
-        change.flush.unreachable()
+        change.listener.unreachable()
         return None, None
     try:
         outcome = _act(change, connection, is_proof=was_reloaded)
@@ -189,9 +183,9 @@ def _limit_s(change: ChangeInProgress) -> float:
     return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
-def _flush_stations(change: ChangeInProgress, outcome: Outcome) -> None:
+def _notify_end(change: ChangeInProgress, outcome: Outcome) -> None:
     if outcome.result in (Result.DONE, Result.ROLLED_BACK):
-        change.flush.ended(
+        change.listener.ended(
             change.last,
             went_back=outcome.result is Result.ROLLED_BACK,
             rebooted=change.last is not None and change.last.boot_id != change.ctx.before.boot_id,

@@ -6,8 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
+from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.health_checks import Expectation
 from meshctl.device.observation import Observation
 from meshctl.device.upload import UploadProgress
@@ -16,31 +16,16 @@ from meshctl.fleet.journal import Run
 from meshctl.model import Fleet, Node
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.plan import DesiredState, NodePlan
+from meshctl.plan.radios import Radios
 from meshctl.topology import mesh_macs
-
-
-class UnfinishedFlush(Protocol):
-    """A station flush whose neighbors did not all answer (`station_flush.StationFlush`)."""
-
-    @property
-    def node(self) -> str: ...
-
-    def retries(self) -> Mapping[str, Callable[[], str]]:
-        """Neighbor -> the script to run there."""
-
-    def own_lines(self, answer: str) -> str:
-        """The lines of an answer that concern this node."""
-
-    def report(self, answers: Mapping[str, str]) -> None:
-        """Note what the neighbors that answered did."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
     """What all nodes of a run share. `owner` identifies this process in the nodes' locks. `remember` stores a node's
     facts for later runs. `observations` were made before any change, of the plan's nodes and their meshes.
-    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base. `unfinished_flushes` are retried
-    at the end of the run.
+    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base. `new_listener` makes the
+    listener of a change on one node that restarts the given radios.
 
     `macs` are the MACs each node's radios have had during the run: OpenWrt 24.10 and 25.12 give a recreated radio
     interface a new one.
@@ -52,12 +37,12 @@ class RunContext:
     observer: Observer
     interrupt: Interrupt
     owner: str
+    new_listener: Callable[[NodeContext, Radios], ChangeListener]
     remember: Callable[[str, Observation], None] = lambda name, seen: None
     rate_bytes_per_s: float | None = None
     observations: Mapping[str, Observation] = field(default_factory=dict)
     mac_owners: Mapping[str, str] = field(default_factory=dict)
     base_macs: Sequence[str] = ()
-    unfinished_flushes: list[UnfinishedFlush] = field(default_factory=list)
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def record(self, name: str, seen: Observation) -> None:

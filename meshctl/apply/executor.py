@@ -7,7 +7,7 @@ as one. A failed canary, an exhausted failure budget or Ctrl-C prevents further 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.packages import install
 from meshctl.apply.prepare import Prepared, base_macs
 from meshctl.apply.stale_stations import unflushed_boot_s
-from meshctl.apply.station_flush import UNFLUSHED, flush_later, retry_unanswered
+from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.apply.sysupgrade import checked_image, flash
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
@@ -68,13 +68,14 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     }
     _assign_slots(prepared, settings)
     unflushed = _unflushed(prepared, settings)
-    run_context = _run_context(prepared, settings, unflushed)
+    flushes = StationFlushes()
+    run_context = _run_context(prepared, settings, unflushed, flushes)
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
         _finish(settings, outcome)
     contexts = _node_contexts(prepared, run_context)
     for name, since_s in unflushed.items():
-        flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
+        flushes.flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
     budget = FailureBudget(fleet.apply.stop_after_failures)
     stopped = ""
     for stage in plan.stages:
@@ -92,7 +93,7 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
         elif budget.spent:
             stopped = budget.reason
     outcomes.update(_with_last_seen(prepared, settings, contexts, outcomes))
-    outcomes.update(_with_unflushed_neighbors(run_context, outcomes))
+    outcomes.update(_with_unflushed_neighbors(flushes.retry_unanswered(run_context), run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
@@ -113,7 +114,9 @@ def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
 
 
-def _run_context(prepared: Prepared, settings: RunSettings, unflushed: Iterable[str]) -> RunContext:
+def _run_context(
+    prepared: Prepared, settings: RunSettings, unflushed: Iterable[str], flushes: StationFlushes
+) -> RunContext:
     fleet, seen = settings.fleet, prepared.observed.observations
     known = settings.journal.last_known(fleet.name)
     observations = {**seen, **prepared.neighbor_observations}
@@ -128,6 +131,7 @@ def _run_context(prepared: Prepared, settings: RunSettings, unflushed: Iterable[
         settings.observer,
         settings.interrupt,
         settings.owner,
+        flushes.listener,
         remember=lambda name, seen: settings.journal_run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
         rate_bytes_per_s=settings.rate_bytes_per_s,
         observations=observations,
@@ -162,11 +166,13 @@ def _with_last_seen(
     return updated
 
 
-def _with_unflushed_neighbors(run_context: RunContext, outcomes: Mapping[str, Outcome]) -> dict[str, Outcome]:
+def _with_unflushed_neighbors(
+    unflushed: Mapping[str, Sequence[str]], run_context: RunContext, outcomes: Mapping[str, Outcome]
+) -> dict[str, Outcome]:
     """The outcomes of nodes of which some neighbors may still hold a stale station entry, with these neighbors."""
     updated = {}
-    for name, unflushed in retry_unanswered(run_context).items():
-        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(unflushed)})
+    for name, neighbors in unflushed.items():
+        updated[name] = replace(outcomes[name], facts={**outcomes[name].facts, UNFLUSHED: " ".join(neighbors)})
         run_context.journal_run.finish_node(updated[name])
     return updated
 

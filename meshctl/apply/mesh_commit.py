@@ -40,6 +40,8 @@ LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
+# Each of the others has its own reason in its own outcome.
+MAX_NAMED = 3
 # The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
 LEFT_BEHIND = "left_behind"
 
@@ -94,16 +96,29 @@ def commit_mesh(
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
-            return _cancel(commit, "the mesh change was canceled: not every node could be armed")
+            return _cancel(commit, canceled_because(participants, "armed"))
         _schedule(commit)
         if not all(participant.is_scheduled for participant in participants):
-            return _cancel(commit, "the mesh change was canceled: not every node could be scheduled")
+            return _cancel(commit, canceled_because(participants, "scheduled"))
         needed = quorum_of(participants, quorum)
         quorum_text = ", ".join(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
         )
         run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must rejoin")
         return _decide(commit, needed)
+
+
+def canceled_because(participants: Iterable[Participant], step: str) -> str:
+    """Why nobody changes: the participants that could not be armed or scheduled, each with its reason."""
+    failed = [
+        f"{participant.name} could not be {step}: {participant.failure.reason}"
+        for participant in participants
+        if participant.failure is not None
+    ]
+    if not failed:
+        return "the mesh change was canceled: interrupted"
+    more = f"; and {len(failed) - MAX_NAMED} more" if len(failed) > MAX_NAMED else ""
+    return f"the mesh change was canceled: {'; '.join(failed[:MAX_NAMED])}{more}"
 
 
 def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
@@ -194,7 +209,7 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
         proven = [participant for participant in commit.participants if participant.is_proven]
         if len(proven) == len(commit.participants) or backoff.is_over or commit.run.interrupt.leaving:
             break
-        _flush_unreachable(commit, proven)
+        _notify_unreachable(commit, proven)
         backoff.pause()
     has_entry = (
         not commit.entry
@@ -218,16 +233,16 @@ def unmet_of(participant: Participant) -> str:
     return f"{participant.name}: {', '.join(change.unmet)}"
 
 
-def _flush_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
+def _notify_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
     """Where a cell keeps its channel and BSSID, a node that changed early still hears one that changes late, and may
     create a station entry of the radio before its restart."""
     names = {participant.name for participant in proven}
 
-    def flush_one(participant: Participant) -> None:
+    def notify_one(participant: Participant) -> None:
         if participant.change is not None and participant.is_unreachable:
-            participant.change.flush.unreachable(names)
+            participant.change.listener.unreachable(names)
 
-    commit.each(commit.participants, flush_one)
+    commit.each(commit.participants, notify_one)
 
 
 def _prove(participant: Participant) -> None:

@@ -1,10 +1,12 @@
 """Flush stale station entries: neighbors remove them over SSH while a node's radios restart.
 
-    armed: nodes reached through the node, and the node itself, start to watch their entries (`watch_neighbors`)
-    unreachable: the other holders are queried, with growing pauses (`unreachable`)
-    ended: all holders that do not watch, and the nodes it hears now, are queried (`ended`)
+    armed: nodes reached through the node, and the node itself, start to watch their entries
+    unreachable: the other holders are queried, with growing pauses
+    ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
+
+The first three are events of a change (`change_listener`).
 
 A query is harmless where no radio restarted: each neighbor verifies that its entry is stale before it removes it. All
 are queried in parallel, each for at most `QUERY_TIMEOUT_S`. A neighbor that does not answer, or cannot remove its entry
@@ -74,10 +76,14 @@ Script: TypeAlias = Callable[[], str]
 
 @dataclass(slots=True)
 class StationFlush:
-    """The station flush of one node whose `radios` restart: which neighbors watch, were queried, or did not answer."""
+    """The station flush of one node whose `radios` restart: which neighbors watch, were queried, or did not answer.
+
+    A ChangeListener. It adds itself to `unfinished` if holders did not answer at the end.
+    """
 
     ctx: NodeContext
-    radios: Radios = EVERY_RADIO
+    radios: Radios
+    unfinished: list[StationFlush] = field(repr=False)
     _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
@@ -99,8 +105,16 @@ class StationFlush:
     def node(self) -> str:
         return self.ctx.name
 
-    def watch_neighbors(self, *, for_s: float) -> None:
-        """Start watches on the nodes reached through this one; call it while the node still forwards their frames."""
+    def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
+        """Start watches on the node itself and on the nodes reached through it. Raises Unreachable."""
+        if not self.radios:
+            return
+        if connection is not None:
+            self._watch_own_entries(connection, for_s=for_s)
+        self._watch_neighbors(for_s=for_s)
+
+    def _watch_neighbors(self, *, for_s: float) -> None:
+        """Start watches on the nodes reached through this one."""
         run_context = self.ctx.run
         hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
         names = [name for name in self._holders if name in hidden]
@@ -115,9 +129,9 @@ class StationFlush:
                 f"{_listed(unwatched)} did not answer and cannot watch their entries of its radio", self.node
             )
 
-    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+    def _watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
         """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
-        node removes its own, and both count from 0. Raises Unreachable."""
+        node removes its own, and both count from 0."""
         entries = own_entries(self.node, self.ctx.before, self.radios)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
@@ -135,7 +149,7 @@ class StationFlush:
         self._observed_s = time.monotonic()
 
     @contextmanager
-    def flush_if_slow(self) -> Iterator[None]:
+    def connecting(self) -> Iterator[None]:
         """Query the neighbors in the background if the block takes so long that the node must be unreachable."""
         timer = threading.Timer(SLOW_CONNECT_S, self.unreachable)
         timer.daemon = True
@@ -147,7 +161,7 @@ class StationFlush:
             timer.join()
 
     @contextmanager
-    def flush_if_silent(self, connection: SshConnection) -> Iterator[None]:
+    def waiting(self, connection: SshConnection) -> Iterator[None]:
         """Query the neighbors in the background whenever the connection is silent for so long, within the block, that
         the node must be unreachable. Keepalives make a node that is reachable answer sooner."""
         ended = threading.Event()
@@ -193,7 +207,7 @@ class StationFlush:
             self._flush_seen(unsure, asked, now, since_s)
         self._unanswered = {name: entries for name, entries in asked.items() if name not in answers}
         if self._unanswered:
-            self.ctx.run.unfinished_flushes.append(self)
+            self.unfinished.append(self)
 
     def _flush_seen(
         self, unsure: Sequence[str], asked: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float
@@ -272,37 +286,47 @@ class StationFlush:
             return _query_all(self.ctx.run, scripts)
 
 
-def retry_unanswered(run_context: RunContext) -> dict[str, tuple[str, ...]]:
-    """Query the neighbors that did not answer again, each once for all nodes.
+@dataclass(frozen=True, slots=True)
+class StationFlushes:
+    """The station flushes of a run."""
 
-    Returns node -> neighbors that still did not answer, and reports them.
-    """
-    unfinished = [(flush, flush.retries()) for flush in run_context.unfinished_flushes]
-    if not unfinished or run_context.interrupt.leaving:
-        return {}
-    names = dict.fromkeys(name for _, scripts in unfinished for name in scripts)
-    of_each = {name: [scripts[name] for _, scripts in unfinished if name in scripts] for name in names}
-    answers = _query_all(run_context, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
-    unflushed: dict[str, tuple[str, ...]] = {}
-    for flush, scripts in unfinished:
-        flush.report({name: flush.own_lines(answers[name]) for name in scripts if name in answers})
-        unanswered = tuple(name for name in scripts if name not in answers)
-        if unanswered:
-            unflushed[flush.node] = unanswered
-            run_context.note(
-                f"{_listed(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}", flush.node
-            )
-    return unflushed
+    _unfinished: list[StationFlush] = field(default_factory=list)
 
+    def listener(self, ctx: NodeContext, radios: Radios) -> StationFlush:
+        """The listener of a change on a node that restarts `radios`."""
+        return StationFlush(ctx, radios, self._unfinished)
 
-def flush_later(ctx: NodeContext, ago_s: float) -> None:
-    """Flush the entries of radios that have restarted within `ago_s`, since a change whose end was not observed, or
-    since a boot."""
-    flush = StationFlush(ctx, started_within(ctx.before, ago_s))
-    if ctx.before.uptime_s is not None:
-        ago_s = min(ago_s, ctx.before.uptime_s + time.time() - ctx.before.asked_at_s)
-    flush.started_ago(ago_s)
-    flush.ended(ctx.before)
+    def flush_later(self, ctx: NodeContext, ago_s: float) -> None:
+        """Flush the entries of radios that have restarted within `ago_s`, since a change whose end was not observed, or
+        since a boot."""
+        flush = self.listener(ctx, started_within(ctx.before, ago_s))
+        if ctx.before.uptime_s is not None:
+            ago_s = min(ago_s, ctx.before.uptime_s + time.time() - ctx.before.asked_at_s)
+        flush.started_ago(ago_s)
+        flush.ended(ctx.before)
+
+    def retry_unanswered(self, run_context: RunContext) -> dict[str, tuple[str, ...]]:
+        """Query the neighbors that did not answer again, each once for all nodes.
+
+        Returns node -> neighbors that still did not answer, and reports them.
+        """
+        unfinished = [(flush, flush.retries()) for flush in self._unfinished]
+        if not unfinished or run_context.interrupt.leaving:
+            return {}
+        names = dict.fromkeys(name for _, scripts in unfinished for name in scripts)
+        of_each = {name: [scripts[name] for _, scripts in unfinished if name in scripts] for name in names}
+        answers = _query_all(run_context, {name: partial(_joined, scripts) for name, scripts in of_each.items()})
+        unflushed: dict[str, tuple[str, ...]] = {}
+        for flush, scripts in unfinished:
+            flush.report({name: flush.own_lines(answers[name]) for name in scripts if name in answers})
+            unanswered = tuple(name for name in scripts if name not in answers)
+            if unanswered:
+                unflushed[flush.node] = unanswered
+                run_context.note(
+                    f"{_listed(unanswered)} did not answer and may hold a stale entry of its radio{MAY_LOSE}",
+                    flush.node,
+                )
+        return unflushed
 
 
 def _flush_since(entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False) -> str:

@@ -15,8 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from meshctl.apply.change_in_progress import LOCK_SLACK_S, install_switch
+from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.context import NodeContext
-from meshctl.apply.station_flush import StationFlush
 from meshctl.archive import TarMember, tar_of
 from meshctl.device import deadman, openwrt
 from meshctl.device.observation import Observation
@@ -31,6 +31,7 @@ from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
 from meshctl.nodes.backoff import Backoff
 from meshctl.plan import DesiredState
+from meshctl.plan.radios import EVERY_RADIO
 
 IMAGE_PATH = "/tmp/meshctl/firmware.bin"
 ARCHIVE_PATH = "/tmp/meshctl/firmware.tgz"
@@ -57,9 +58,9 @@ def checked_image(profile: HardwareProfile) -> Path:
 
 def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing is stopped on the node."""
-    flush = StationFlush(ctx)
+    listener = ctx.run.new_listener(ctx, EVERY_RADIO)
     try:
-        marker = _upload_and_start(ctx, connection, image, flush)
+        marker = _upload_and_start(ctx, connection, image, listener)
     except NodeError:
         with suppress(NodeError):
             deadman.unlock(connection, ctx.run.owner)
@@ -67,10 +68,10 @@ def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
     finally:
         connection.close()
     with ctx.step("flash"):
-        return _await_return(ctx, marker, flush)
+        return _await_return(ctx, marker, listener)
 
 
-def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, flush: StationFlush) -> str:
+def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, listener: ChangeListener) -> str:
     """All steps up to the start of sysupgrade; returns the marker that the new system will have."""
     size = image.stat().st_size
     with ctx.step("check"):
@@ -99,8 +100,8 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
         upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
-    flush.watch_neighbors(for_s=RETURN_TIMEOUT_S)
-    flush.started()
+    listener.armed(None, for_s=RETURN_TIMEOUT_S)
+    listener.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
@@ -126,7 +127,7 @@ def archive(desired: DesiredState, host_keys: Mapping[str, FetchedFile], marker:
     return gzip.compress(tar_of(members), mtime=0)
 
 
-def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome:
+def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Outcome:
     """Poll the node until it is back and verified, or the timeout."""
     backoff = Backoff(RETURN_TIMEOUT_S, ctx.run.interrupt)
     last_error = ""
@@ -139,11 +140,11 @@ def _await_return(ctx: NodeContext, marker: str, flush: StationFlush) -> Outcome
                 connection.close()
         except NodeError as error:
             last_error = str(error)
-            flush.unreachable()
+            listener.unreachable()
         else:
             ctx.run.record(ctx.name, seen)
             if seen.boot_id != ctx.before.boot_id:
-                flush.ended(seen, rebooted=True)
+                listener.ended(seen, rebooted=True)
                 return _verdict(ctx, seen, marker)
             if backoff.elapsed_s > START_TIMEOUT_S:
                 return Outcome(

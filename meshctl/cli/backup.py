@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import replace
@@ -12,6 +13,7 @@ import typer
 
 from meshctl.apply.backup import (
     Backup,
+    differing_files,
     fetch,
     incompatibility,
     lockout_by,
@@ -23,26 +25,31 @@ from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.prepare import base_macs
-from meshctl.apply.station_flush import UNFLUSHED, retry_unanswered
+from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
+    DryRun,
     InventoryPath,
     KeyFiles,
     Lab,
+    Limit,
     Nodes,
     Session,
     confirm,
     exit_for,
     progress_for,
+    selected_node,
     selected_nodes,
     session,
 )
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
+from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
@@ -50,6 +57,7 @@ from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 def backup(
     nodes: Nodes = None,
+    limit: Limit = None,
     out: Annotated[Path, typer.Option("--out", help="Directory for the NODE-TIME.tgz files.")] = Path("backups"),
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
@@ -61,7 +69,7 @@ def backup(
     Example: meshctl backup 'husky*' --out backups
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, nodes, limit)}
         try:
             out.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -108,6 +116,7 @@ def restore(
     node: Annotated[str, typer.Argument(help="Node to restore.")],
     file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -122,7 +131,10 @@ def restore(
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = selected_nodes(opened.fleet, [node])[:1]
+        there = selected_node(opened.fleet, node)
+        if dry_run:
+            _show_restore(opened, there, saved, as_json=as_json)
+            return
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
@@ -130,11 +142,39 @@ def restore(
         raise print_totals(opened, journaled, as_json=as_json)
 
 
+def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) -> None:
+    """Print what a restore would change. Raises PlanRefused as the restore would."""
+    with opened.access.borrow(node) as connection:
+        seen = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, seen)
+        paths = differing_files(saved, seen, connection)
+    missing = uninstalled_packages(saved, seen)
+    if as_json:
+        report = {"node": node.name, "files": paths, "uninstalled_packages": missing, "disabled": saved.disabled}
+        echo_json(json.dumps(report, indent=1))
+        return
+    echo(f"{node.name}: {len(paths)} files would change" if paths else f"{node.name}: matches the backup")
+    for path in paths:
+        echo(f"  {path}")
+    for package in missing:
+        echo(f"  package {package} is in the backup but no longer installed")
+
+
+def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observation) -> None:
+    """Raises PlanRefused for a backup of another device, or one that would lock us out."""
+    if problem := incompatibility(saved, node.name, seen):
+        raise PlanRefused(problem)
+    lockout = lockout_by(saved, node, opened.access.own_keys(node))
+    if lockout is not None:
+        raise PlanRefused(lockout.reason, hint=lockout.hint)
+
+
 def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> JournaledRun:
     node = opened.fleet.nodes[name]
     with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
         known = opened.journal.last_known(opened.fleet.name)
         around: dict[str, Observation] = {}
+        flushes = StationFlushes()
         work = RunContext(
             opened.fleet,
             opened.access,
@@ -142,6 +182,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             journaled.progress,
             opened.interrupt,
             opened.owner,
+            flushes.listener,
             observations=around,
             mac_owners=known_macs(opened.fleet, known),
             base_macs=base_macs(opened.fleet, around, known),
@@ -151,12 +192,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             connection = opened.access.open(node)
             try:
                 seen = observe_cleared(connection, (), opened.interrupt)
-                problem = incompatibility(saved, name, seen)
-                if problem:
-                    raise PlanRefused(problem)
-                lockout = lockout_by(saved, node, opened.access.own_keys(node))
-                if lockout is not None:
-                    raise PlanRefused(lockout.reason, hint=lockout.hint)
+                _require_restorable(opened, node, saved, seen)
                 around.update(
                     observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
                 )
@@ -172,7 +208,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             return restore_backup(job, connection, saved)
 
         journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
-        for unasked in retry_unanswered(work).values():
+        for unasked in flushes.retry_unanswered(work).values():
             journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
         journaled.entry.finish_node(journaled.outcomes[name])
     return journaled

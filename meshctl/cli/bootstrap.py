@@ -18,12 +18,23 @@ from meshctl.apply.bootstrap import (
     BenchTarget,
     FoundDevice,
     discover,
-    find_node,
     plan_discovered,
     restore_pins,
 )
 from meshctl.apply.replace import adopt, identity_edits, with_identity
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Session, exit_for, session
+from meshctl.cli.context import (
+    AsJson,
+    DryRun,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Limit,
+    Session,
+    exit_for,
+    selected_node,
+    selected_nodes,
+    session,
+)
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
@@ -60,12 +71,16 @@ Interfaces = Annotated[
 def bootstrap(
     nodes: Annotated[
         list[str] | None,
-        typer.Argument(help="Expected nodes by name, label, serial number or MAC; default: identify by MAC."),
+        typer.Argument(
+            help="Expected nodes: names, labels, serial numbers, MACs, patterns, groups; default: identify by MAC."
+        ),
     ] = None,
+    limit: Limit = None,
     at: At = None,
     interface: Interfaces = None,
     inventory: InventoryPath = Path(),
     replace_key: Annotated[bool, typer.Option("--replace-key", "--replace", help="Accept a changed host key.")] = False,
+    dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,
@@ -80,7 +95,7 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _expected_places(opened, nodes or [], _named_places(at or [], interface or []))
+        places = _expected_places(opened, nodes or [], limit or [], _named_places(at or [], interface or []))
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
                 opened.renderer,
@@ -109,10 +124,18 @@ def bootstrap(
             interrupt=opened.interrupt,
         )
         refused = [plan.node for plan in prepared.plan.of(Verdict.REFUSED) if plan.node in arrivals.found]
-        restore_pins(opened.trust, arrivals, refused)
+        restore_pins(opened.trust, arrivals, arrivals.found if dry_run else refused)
         try:
             confirm_and_execute(
-                opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate
+                opened,
+                prepared,
+                "bootstrap",
+                choices,
+                yes=yes,
+                as_json=as_json,
+                brief=brief,
+                rate=rate,
+                dry_run=dry_run,
             )
         except typer.Exit as ended:
             if arrivals.outcomes and ended.exit_code == ExitCode.OK:
@@ -141,15 +164,15 @@ def _named_places(at: list[str], interfaces: list[str]) -> list[BenchTarget]:
     return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
 
 
-def _expected_places(opened: Session, words: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
+def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
     """Which node is expected at which place."""
+    selected = selected_nodes(opened.fleet, words, limits, in_word_order=True) if words or limits else ()
+    expected = [node.name for node in selected]
     if opened.lab is not None and not at:
         known = set(opened.lab.node_names)
-        names = [find_node(opened.fleet, word).name for word in words]
-        names = names or [node.name for node in opened.fleet.managed() if node.name in known]
+        names = expected or [node.name for node in opened.fleet.managed() if node.name in known]
         ends = {name: opened.lab.bench_endpoint(name) for name in names}
         return [BenchTarget(end.host, end.port, name) for name, end in ends.items()]
-    expected = [find_node(opened.fleet, word).name for word in words]
     if not at:
         if len(expected) > 1:
             raise InputError(
@@ -181,6 +204,7 @@ def replace(
         str, typer.Option("--interface", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,
@@ -194,7 +218,7 @@ def replace(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        node = find_node(opened.fleet, old)
+        node = selected_node(opened.fleet, old)
         spare = _spare(opened, node, new)
         spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
         place = with_changes(spots[0], node=node.name) if spots else None
@@ -225,14 +249,25 @@ def replace(
                 choices=choices,
                 interrupt=opened.interrupt,
             )
-            confirm_and_execute(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
+            confirm_and_execute(
+                opened,
+                prepared,
+                "replace",
+                choices,
+                yes=yes,
+                as_json=as_json,
+                brief=True,
+                rate=rate,
+                dry_run=dry_run,
+            )
         except typer.Exit as ended:
             status = ended.exit_code
         finally:
-            if status != ExitCode.OK:
+            if status != ExitCode.OK or dry_run:
                 restore_pins(opened.trust, successor.discovered, [node.name])
         if status == ExitCode.OK:
-            changes = _record_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
+            found = successor.discovered.found[node.name]
+            changes = _record_identity(opened, inventory, node, spare, found, dry_run=dry_run)
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
@@ -249,7 +284,7 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     """The spare node; None for a device that is not in the inventory."""
     if new == BENCH:
         return None
-    spare = find_node(opened.fleet, new)
+    spare = selected_node(opened.fleet, new)
     if spare.name == old.name:
         raise InputError(f"{spare.name} cannot replace itself")
     if spare.state is not NodeState.SPARE:
@@ -258,13 +293,18 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     return spare
 
 
-def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice) -> Changes:
+def _record_identity(
+    opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice, *, dry_run: bool
+) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     mine, theirs = identity_edits(node, spare, found.seen)
+    if dry_run:
+        return _identity_changes(inventory, node, spare, found, mine, theirs)
     if spare is not None:
         opened.trust.forget(spare.name)
     try:
-        return _write_identity(inventory, node, spare, found, mine, theirs)
+        changes = _identity_changes(inventory, node, spare, found, mine, theirs)
+        save(changes)
     except MeshctlError as error:
         both = {node.name: dict(mine), **({spare.name: dict(theirs)} if spare is not None else {})}
         edits = {name: edit for name, edit in both.items() if edit}
@@ -272,9 +312,10 @@ def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node |
             f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
             hint=f"fix the inventory, then add under `nodes`: {json.dumps(edits)}",
         ) from error
+    return changes
 
 
-def _write_identity(
+def _identity_changes(
     inventory: Path,
     node: Node,
     spare: Node | None,
@@ -289,10 +330,12 @@ def _write_identity(
         for word in ("mac", "serial", "label"):
             if editor.has(("nodes", spare.name, word)):
                 editor.remove(("nodes", spare.name, word))
+    # those of the old device: another device may have them one day, and this one's are observed
+    for radio in node.radios:
+        if editor.has(("nodes", node.name, "radios", radio.name, "mac")):
+            editor.remove(("nodes", node.name, "radios", radio.name, "mac"))
     if mine:
         set_node(editor, node.name, dict(mine))
     if node.host_keys:
         set_node(editor, node.name, {"host_keys": [found.key.text]})
-    changes = editor.changes()
-    save(changes)
-    return changes
+    return editor.changes()

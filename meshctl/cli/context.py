@@ -14,12 +14,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from meshctl import event_log
 from meshctl.cli.extensions import LabFleet, attach_lab
 from meshctl.cli.output import console, echo
 from meshctl.errors import ExitCode, InputError
@@ -59,6 +60,17 @@ Nodes = Annotated[
     list[str] | None,
     typer.Argument(help="Nodes: names, patterns, groups, role:beacon, '!b07', @FILE; default: all."),
 ]
+Limit = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--limit",
+        "-l",
+        metavar="NODES",
+        help="Only those that this selects too; repeat to narrow the selection further.",
+    ),
+]
+
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would change, and change nothing.")]
 
 Options = Mapping[str, tuple[Any, Any]]
 """Type and default of each option, by the opener's parameter name, in the order of the help."""
@@ -90,13 +102,17 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     from meshctl.nodes.connections import ConnectionPool
     from meshctl.nodes.desired import Renderer
 
-    fleet = load_fleet(inventory, environ=os.environ)
+    fleet = _with_parallel(load_fleet(inventory, environ=os.environ), os.environ.get("MESHCTL_PARALLEL", ""))
     trust = trust_of(fleet)
     virtual, locate = _lab(lab)
     # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
-        Journal(default_path(os.environ), lab=lab_directory) as journal,
+        Journal(
+            default_path(os.environ),
+            lab=lab_directory,
+            pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
+        ) as journal,
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
         journal.move_lab_runs(fleet.name, lab_of)
@@ -111,6 +127,15 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
             Interrupt(),
             virtual,
         )
+
+
+def _with_parallel(fleet: Fleet, wanted: str) -> Fleet:
+    """The fleet with the operator's number of parallel connections, if given."""
+    if not wanted:
+        return fleet
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise InputError(f"MESHCTL_PARALLEL: expected an integer of 1 or more, found {wanted!r}")
+    return replace(fleet, apply=replace(fleet.apply, parallel=int(wanted)))
 
 
 def trust_of(fleet: Fleet) -> TrustStore:
@@ -137,14 +162,23 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
     return virtual, locate
 
 
-def selected_nodes(fleet: Fleet, words: Iterable[str] | None) -> tuple[Node, ...]:
-    """The managed nodes that the words select (`inventory.selection`), in inventory order; all without words.
+def selected_nodes(
+    fleet: Fleet, words: Iterable[str] | None, limits: Iterable[str] | None = None, *, in_word_order: bool = False
+) -> tuple[Node, ...]:
+    """The managed nodes that the words and every limit select (`inventory.selection`); all without words.
 
     Raises InputError for a word that selects nothing.
     """
     from meshctl.inventory.selection import select_nodes
 
-    return select_nodes(fleet, words or (), read_selection)
+    return select_nodes(fleet, words or (), read_selection, limits or (), in_word_order=in_word_order)
+
+
+def selected_node(fleet: Fleet, word: str) -> Node:
+    """The one managed node that the word selects. Raises InputError for none or several."""
+    from meshctl.inventory.selection import select_one
+
+    return select_one(fleet, word, read_selection)
 
 
 def read_selection(path: str) -> str:
@@ -153,12 +187,13 @@ def read_selection(path: str) -> str:
 
 
 def progress_for(count: int, *, as_json: bool) -> RunProgress:
-    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere."""
+    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere and with `--verbose`."""
     from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
     if as_json:
         return ThreadedProgress(JsonProgress(sys.stdout))
-    if sys.stdout.isatty():
+    # events on the same terminal would be painted over
+    if sys.stdout.isatty() and not event_log.is_verbose():
         return ThreadedProgress(LiveProgress(console(), count))
     return ThreadedProgress(PlainProgress(sys.stdout))
 

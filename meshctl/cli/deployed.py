@@ -7,23 +7,26 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import InventoryPath
+from meshctl.cli.context import InventoryPath, Limit, read_selection
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.load import load_fleet
-from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.selection import LIST_HINT, attributes_of, select
 from meshctl.model import Fleet, Node, NodeState, Role
 
 
 def deployed(
-    beacons: Annotated[list[str], typer.Argument(help="Beacons by name, label, or pattern such as 'h1-b0*'.")],
+    beacons: Annotated[
+        list[str],
+        typer.Argument(help="Beacons: names, labels, patterns, groups, robot:husky1, '!b07', @FILE."),
+    ],
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     back: Annotated[bool, typer.Option("--back", help="Mark as carried again, after pick-up.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
@@ -34,7 +37,7 @@ def deployed(
     """
     fleet = load_fleet(inventory, environ=os.environ)
     before, after = (NodeState.DEPLOYED, NodeState.CARRIED) if back else (NodeState.CARRIED, NodeState.DEPLOYED)
-    chosen = chosen_beacons(fleet, beacons)
+    chosen = chosen_beacons(fleet, beacons, limit or ())
     wrong = [node for node in chosen if node.state not in (before, after)]
     if wrong:
         states = ", ".join(f"{node.name} is {node.state.value}" for node in wrong)
@@ -56,27 +59,22 @@ def deployed(
         save(changes)
 
 
-def chosen_beacons(fleet: Fleet, words: Iterable[str]) -> list[Node]:
-    """The beacons that the words select, each once. Raises InputError for no match, or for another radio."""
-    chosen: dict[str, Node] = {}
-    for word in words:
-        named = [fleet.nodes[word]] if word in fleet.nodes else _labeled(fleet, word) or _matching(fleet, word)
-        if not named:
-            names = (*fleet.nodes, *(node.label for node in fleet.nodes.values() if node.label))
-            raise InputError(f"no beacon has the name or label '{word}'", hint=did_you_mean(word, names))
-        if named[0].role is not Role.BEACON:
-            raise InputError(f"{named[0].name} is not a beacon: its role is {named[0].role.value}")
-        chosen |= {node.name: node for node in named}
-    return list(chosen.values())
-
-
-def _labeled(fleet: Fleet, word: str) -> list[Node]:
-    """Case-insensitive; labels of managed nodes are unique (MC116)."""
-    found = [node for node in fleet.managed() if node.label and node.label.lower() == word.lower()]
-    if len(found) > 1:
-        raise InputError(f"label '{word}' is ambiguous: {', '.join(node.name for node in found)}")
-    return found
-
-
-def _matching(fleet: Fleet, pattern: str) -> list[Node]:
-    return [node for node in fleet.managed() if node.role is Role.BEACON and fnmatchcase(node.name, pattern)]
+def chosen_beacons(fleet: Fleet, words: Iterable[str], limits: Iterable[str] = ()) -> list[Node]:
+    """The beacons that the words select. Raises InputError for no match, an ambiguous label, or another radio."""
+    wanted = tuple(words)
+    for word in wanted:
+        node = fleet.nodes.get(word)
+        if node is not None and node.role is not Role.BEACON:
+            raise InputError(f"{node.name} is not a beacon: its role is {node.role.value}")
+        labeled = [node.name for node in fleet.managed() if node.label and node.label.lower() == word.lower()]
+        if len(labeled) > 1:
+            raise InputError(f"label '{word}' is ambiguous: {', '.join(labeled)}")
+    # a word names unmanaged beacons too, which are refused with their state
+    beacons = [
+        node
+        for node in fleet.nodes.values()
+        if node.role is Role.BEACON and (node.state.is_managed or node.name in wanted)
+    ]
+    candidates = {node.name: attributes_of(node) for node in beacons}
+    names = select(wanted, candidates, read_selection, limits, what="beacon", hint=LIST_HINT)
+    return [fleet.nodes[name] for name in names]

@@ -11,8 +11,7 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.context import InventoryPath
-from meshctl.cli.output import echo
-from meshctl.errors import InputError
+from meshctl.cli.output import echo, write_file
 from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.inventory.load import load_fleet
 from meshctl.render.host_lists import ansible_inventory, host_entries, ssh_config
@@ -40,8 +39,5 @@ def export(
     text = write(entries, known_hosts_path(placed), lambda name: file_path(placed, name))
     if out is None:
         echo(text, nl=False)
-        return
-    try:
-        out.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{out}: cannot write: {error.strerror}") from error
+    else:
+        write_file(out, text)

@@ -12,7 +12,7 @@ import typer
 
 from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.export import export
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import ExplainedValue, explain
@@ -59,11 +59,8 @@ def schema(
     text = json.dumps(json_schema(), indent=2) + "\n"
     if out is None:
         echo(text, nl=False)
-        return
-    try:
-        out.write_text(text, encoding="utf-8")
-    except OSError as reason:
-        raise InputError(f"cannot write {out}: {reason.strerror}") from reason
+    else:
+        write_file(out, text)
 
 
 @app.command("list")

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.diagnostics import Severity, sorted_diagnostics
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.codes import MEANINGS
@@ -96,14 +96,14 @@ def lint(
     if select:
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
-        _write(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
+        write_file(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
         echo(f"wrote {len(findings.diagnostics)} findings to {baseline}", err=True)
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)
     report = FORMATS["json" if json else format.value](findings)
     if output is not None:
-        _write(output, report)
+        write_file(output, report)
     else:
         # JSON and SARIF are escaped, which keeps their values; other formats are sanitized
         is_json = json or format in (LintFormat.JSON, LintFormat.SARIF)
@@ -173,13 +173,6 @@ def _without_known(findings: Findings, path: Path, rules: Iterable[Rule]) -> Fin
     compared = baselines.compare(findings.diagnostics, entries, path, (rule.code for rule in rules))
     reported = sorted_diagnostics((*compared.new, *compared.stale))
     return Findings(reported, findings.sources, findings.excused, compared.known, findings.files)
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _rule_page(code: str) -> str:

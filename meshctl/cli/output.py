@@ -10,10 +10,12 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
+from meshctl.errors import InputError
 from meshctl.report.terminal_escapes import clean, clean_styled, json_safe
 
 if TYPE_CHECKING:
@@ -39,6 +41,14 @@ def echo_error(text: str) -> None:
 def echo_bytes(raw: bytes, *, err: bool = False) -> None:
     """Print bytes unchanged."""
     typer.echo(raw, err=err, nl=False)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails."""
+    try:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def is_plain() -> bool:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath, read_selection
+from meshctl.cli.context import AsJson, InventoryPath, Limit, Nodes, read_selection
 from meshctl.cli.git_revision import checkout
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode
@@ -33,7 +33,8 @@ from meshctl.render import (
 
 
 def render(
-    nodes: Annotated[list[str] | None, typer.Argument(help="Nodes or patterns such as 'husky*'; default: all.")] = None,
+    nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     out: Annotated[Path | None, typer.Option("--out", help="Write each node's files to DIR/NODE/.")] = None,
     imagebuilder: Annotated[
@@ -48,7 +49,7 @@ def render(
     """
     fleet = load_fleet(inventory, environ=os.environ)
     # render all before writing any: a fleet is written completely or not at all
-    rendered = render_nodes(fleet, _selected_names(fleet, nodes or []), _secrets(fleet))
+    rendered = render_nodes(fleet, _selected_names(fleet, nodes or [], limit or []), _secrets(fleet))
     folders = {item.node: write_node(item, out) for item in rendered} if out is not None else {}
     builds = (
         [(item, _write_build(item, imagebuilder)) for item in image_folders(fleet, rendered)] if imagebuilder else []
@@ -83,11 +84,11 @@ def _secrets(fleet: Fleet) -> Callable[[SecretRef], Secret]:
     return lambda ref: store.get(ref)
 
 
-def _selected_names(fleet: Fleet, patterns: Iterable[str]) -> list[str]:
-    """The nodes that match any pattern, in inventory order. Raises InputError for a pattern without a match."""
+def _selected_names(fleet: Fleet, patterns: Iterable[str], limits: Iterable[str]) -> list[str]:
+    """The nodes that match any pattern and every limit, in inventory order. Raises InputError for no match."""
     wanted = list(patterns)
     candidates = {name: attributes_of(node) for name, node in fleet.nodes.items()}
-    chosen = select(wanted, candidates, read_selection, what="node", hint=LIST_HINT)
+    chosen = select(wanted, candidates, read_selection, limits, what="node", hint=LIST_HINT)
     # patterns skip unmanaged nodes; an exact name reports why it cannot be rendered
     return [name for name in chosen if name in wanted or fleet.nodes[name].state.is_managed]
 

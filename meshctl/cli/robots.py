@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import exit_for, line_width
+from meshctl.cli.context import DryRun, exit_for, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
@@ -30,24 +30,34 @@ app.command("rotate-key")(rotate_key_command)
 
 
 @app.command("deploy")
-@with_robots_context("robots", "inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
-def deploy_command(context: RobotsContext) -> None:
+@with_robots_context("robots", "limit", "inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
+def deploy_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """Install or upgrade udp_mesh with the inventory's configuration; an unhealthy release is rolled back.
 
     Example: meshctl robots deploy 'husky*' --wheels wheels/
     """
     context = context.with_fleet(context.fleet)
+    if dry_run:
+        refused = any(one.result is Result.REFUSED for one in _differences(context).values())
+        raise typer.Exit(ExitCode.FINDINGS if refused else ExitCode.OK)
     raise finish(context, run_command(context, "deploy"))
 
 
 @app.command("diff")
-@with_robots_context("robots", "inventory", "wheels", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "wheels", "ask_sudo", "as_json", "key")
 def diff_command(context: RobotsContext) -> None:
     """Show what a deploy would change on each robot, including changes by hand. Exit with 1 if there are any.
 
     Example: meshctl robots diff
     """
-    context = context.with_fleet(context.fleet)
+    outcomes = _differences(context.with_fleet(context.fleet))
+    if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
+        raise typer.Exit(ExitCode.FINDINGS)
+    raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+
+
+def _differences(context: RobotsContext) -> dict[str, Outcome]:
+    """Print what a deploy would change on each robot."""
 
     def work(host: Host, robot: str) -> Outcome:
         plan = plan_deploy(host, robot, context.options)
@@ -66,13 +76,11 @@ def diff_command(context: RobotsContext) -> None:
         for name, one in outcomes.items():
             for line in (one.reason or "no changes").splitlines():
                 echo(f"{name}: {line}")
-    if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
-        raise typer.Exit(ExitCode.FINDINGS)
-    raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+    return outcomes
 
 
 @app.command("status")
-@with_robots_context("robots", "inventory", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
 def status_command(context: RobotsContext) -> None:
     """Show each daemon: service state, uptime, peers and queues. Exit with 0 only if all are healthy.
 
@@ -95,7 +103,7 @@ def status_command(context: RobotsContext) -> None:
 
 
 @app.command("restart")
-@with_robots_context("robots", "inventory", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
 def restart_command(context: RobotsContext) -> None:
     """Restart the daemons and bridges. Messages queued in memory are lost; those on disk are kept.
 
@@ -105,7 +113,7 @@ def restart_command(context: RobotsContext) -> None:
 
 
 @app.command("stop")
-@with_robots_context("robots", "inventory", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
 def stop_command(context: RobotsContext) -> None:
     """Stop the daemons and bridges until the next deploy, restart or boot.
 
@@ -115,7 +123,7 @@ def stop_command(context: RobotsContext) -> None:
 
 
 @app.command("logs")
-@with_robots_context("robots", "inventory", "ask_sudo", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "key")
 def logs_command(
     context: RobotsContext,
     lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="Number of lines per robot.")] = 50,
@@ -140,7 +148,7 @@ def logs_command(
 
 
 @app.command("rollback")
-@with_robots_context("robots", "inventory", "wait_s", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "wait_s", "ask_sudo", "as_json", "key")
 def rollback_command(context: RobotsContext) -> None:
     """Roll back to the previous release, with its configuration and keys.
 
@@ -150,7 +158,7 @@ def rollback_command(context: RobotsContext) -> None:
 
 
 @app.command("uninstall")
-@with_robots_context("named", "inventory", "ask_sudo", "as_json", "key")
+@with_robots_context("named", "limit", "inventory", "ask_sudo", "as_json", "key")
 def uninstall_command(
     context: RobotsContext,
     purge: Annotated[bool, typer.Option("--purge", help="Also remove stored messages and the system user.")] = False,
@@ -163,7 +171,7 @@ def uninstall_command(
 
 
 @app.command("trust")
-@with_robots_context("robots", "inventory", "key")
+@with_robots_context("robots", "limit", "inventory", "key")
 def trust_command(
     context: RobotsContext,
     change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,

@@ -25,6 +25,7 @@ from meshctl.cli.context import (
     AsJson,
     InventoryPath,
     KeyFiles,
+    Limit,
     Session,
     read_selection,
     session,
@@ -46,7 +47,9 @@ from meshctl.robots.deploy import DeployOptions, Wheelhouse, claim, deploy, roll
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import stock_units
 
-Robots = Annotated[list[str] | None, typer.Argument(help="Robots or patterns such as 'husky*'; default: all.")]
+Robots = Annotated[
+    list[str] | None, typer.Argument(help="Robots: names, patterns, groups, '!husky2', @FILE; default: all.")
+]
 Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots or patterns such as 'husky*'.")]
 Wheels = Annotated[
     Path | None,
@@ -69,6 +72,7 @@ _LEAVE_POLL_S = 0.25
 # Shared options by the parameters of `open_robots_context`, in the order of the help.
 _SHARED: dict[str, tuple[Any, Any]] = {
     "robots": (Robots, None),
+    "limit": (Limit, None),
     # required: for commands that must not default to all robots
     "named": (Named, inspect.Parameter.empty),
     "inventory": (InventoryPath, Path()),
@@ -169,6 +173,7 @@ def open_robots_context(
     inventory: Path,
     robots: list[str] | None = None,
     *,
+    limit: list[str] | None = None,
     key: list[Path] | None = None,
     ask_sudo: bool = False,
     wheels: Path | None = None,
@@ -178,7 +183,9 @@ def open_robots_context(
     """Open a session and its context. Raises InvalidInput and InputError for a bad inventory or selection."""
     password = sudo_password(ask_sudo)
     with session(inventory, key_files=key or ()) as opened:
-        yield robots_context(opened, inventory, robots, password, wheels=wheels, wait_s=wait_s, as_json=as_json)
+        yield robots_context(
+            opened, inventory, robots, password, limits=limit, wheels=wheels, wait_s=wait_s, as_json=as_json
+        )
 
 
 def robots_context(
@@ -187,6 +194,7 @@ def robots_context(
     robots: list[str] | None,
     password: Secret | None,
     *,
+    limits: list[str] | None = None,
     wheels: Path | None = None,
     wait_s: int = 30,
     as_json: bool = False,
@@ -196,9 +204,8 @@ def robots_context(
     secrets = SecretStore(os.environ, Path(fleet.base)).get
     options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
     connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
-    return RobotsContext(
-        opened, connector, selected_robots(fleet, robots, read_selection), options, inventory, wheels, as_json
-    )
+    selected = selected_robots(fleet, robots, read_selection, limits or ())
+    return RobotsContext(opened, connector, selected, options, inventory, wheels, as_json)
 
 
 def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

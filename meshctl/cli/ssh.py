@@ -14,7 +14,19 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Nodes, Session, exit_for, selected_nodes, session
+from meshctl.cli.context import (
+    AsJson,
+    InventoryPath,
+    KeyFiles,
+    Lab,
+    Limit,
+    Nodes,
+    Session,
+    exit_for,
+    selected_node,
+    selected_nodes,
+    session,
+)
 from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
@@ -26,6 +38,7 @@ from meshctl.nodes.slots import transfers_at_once
 
 def trust(
     nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     change: Annotated[bool, typer.Option("--replace", "--replace-key", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
@@ -41,7 +54,7 @@ def trust(
         shown = fetch_host_keys(
             opened.access,
             opened.trust,
-            selected_nodes(opened.fleet, nodes),
+            selected_nodes(opened.fleet, nodes, limit),
             parallel=transfers_at_once(opened.fleet.apply.parallel),
         )
         if as_json:
@@ -103,6 +116,7 @@ def run(
             help="Nodes or patterns (default: all), then -- and the command.",
         ),
     ],
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     timeout: Annotated[float, typer.Option("--timeout", help="Timeout per node in seconds.")] = 60.0,
     raw: Annotated[
@@ -127,7 +141,7 @@ def run(
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        selected = {node.name: node for node in selected_nodes(opened.fleet, patterns)}
+        selected = {node.name: node for node in selected_nodes(opened.fleet, patterns, limit)}
         out = threading.Lock()
 
         def work(name: str) -> Outcome:
@@ -207,7 +221,7 @@ def ssh(
     if program is None:
         raise InputError("ssh is not installed", hint="install openssh-client")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        (there,) = selected_nodes(opened.fleet, [node])[:1]
+        there = selected_node(opened.fleet, node)
         arguments = ssh_arguments(opened, there)
     os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
 

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, line_width
+from meshctl.cli.context import AsJson, Limit, line_width, read_selection
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
 from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
@@ -21,7 +21,7 @@ from meshctl.errors import ExitCode
 from meshctl.status import Check, FleetStatus, assess
 from meshctl.status import preflight as checks_of
 from meshctl.status.assess import Snapshot
-from meshctl.status.filters import ROLES, STATES, Filter
+from meshctl.status.filters import ROLES, STATES, Filter, select_devices
 from meshctl.status.json_output import as_json as status_json
 from meshctl.status.json_output import preflight_json
 from meshctl.status.last_known import facts_to_record
@@ -29,7 +29,11 @@ from meshctl.status.robots import is_active
 from meshctl.status.text import preflight_text, text
 
 Names = Annotated[
-    list[str] | None, typer.Argument(metavar="[NAME]...", help="Radios and robots, or patterns such as 'husky*'.")
+    list[str] | None,
+    typer.Argument(
+        metavar="[NAME]...",
+        help="Radios and robots: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.",
+    ),
 ]
 
 
@@ -37,6 +41,7 @@ Names = Annotated[
 def status(
     fleet_view: FleetView,
     names: Names = None,
+    limit: Limit = None,
     watch: Annotated[
         float | None,
         typer.Option("--watch", "-w", min=1.0, metavar="S", help="Refresh every S seconds until Ctrl-C."),
@@ -64,11 +69,11 @@ def status(
     Exit code (of the devices shown): 0 healthy, 1 degraded, 3 a required device is unreachable, 2 could not run.
 
     Example: meshctl status --watch 5
-    Example: meshctl status --role beacon --state deployed
+    Example: meshctl status role:beacon --limit state:deployed
     Example: meshctl status --alarm any
     """
-    chosen = Filter(*(tuple(values or ()) for values in (names, group, robot, role, state, alarm)))
-    chosen.check(fleet_view.fleet)
+    attributes = {"group": group or (), "robot": robot or (), "role": role or (), "state": state or ()}
+    chosen = select_devices(fleet_view.fleet, names or (), read_selection, limit or (), attributes, alarm or ())
     query = _StatusQuery(fleet_view, chosen, only, topics, wide)
     if watch is None:
         found = query.status(query.collect(), time.time())
@@ -90,10 +95,9 @@ class _StatusQuery:
         self._chosen = chosen
         self._topics = topics
         self._wide = wide
-        fleet = fleet_view.fleet
         self._is_partial = only and not chosen.is_empty
-        self._nodes = tuple(n for n in fleet_view.nodes if not only or chosen.matches_node(n))
-        self._robots = tuple(name for name in fleet_view.robots if not only or chosen.matches_robot(fleet, name))
+        self._nodes = tuple(node for node in fleet_view.nodes if not only or chosen.selects_node(node.name))
+        self._robots = tuple(name for name in fleet_view.robots if not only or chosen.selects_robot(name))
 
     def collect(self, *, show_progress: bool = True) -> Snapshot:
         """Take a snapshot and record it in the journal; `show_progress` counts answers on a terminal."""
@@ -105,7 +109,7 @@ class _StatusQuery:
 
     def status(self, snapshot: Snapshot, now: float) -> FleetStatus:
         """The status of the selected devices, with ages as of `now`."""
-        return self._chosen.apply(self._fleet_view.fleet, assess(snapshot, self._nodes, now, self._robots))
+        return self._chosen.apply(assess(snapshot, self._nodes, now, self._robots))
 
     def text(self, status: FleetStatus, width: int | None = None, *, brief: bool = False) -> str:
         room = width if width is not None and not self._wide else line_width(wide=self._wide)
@@ -145,21 +149,30 @@ def _watch(query: _StatusQuery, period_s: float) -> None:
 
 
 @with_fleet_view
-def preflight(fleet_view: FleetView, as_json: AsJson = False) -> None:
+def preflight(fleet_view: FleetView, names: Names = None, limit: Limit = None, as_json: AsJson = False) -> None:
     """Run the go/no-go checks before a mission, including urgent test messages between all robots.
+
+    With a selection, only those devices and the base must be ready, and the verdict says that others were not checked.
 
     Exit code: 0 go, 1 no-go, 2 could not run.
 
     Example: meshctl preflight
+    Example: meshctl preflight robot:husky1 robot:husky2
     """
-    found = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
-    fleet_view.opened.journal.remember_all(fleet_view.fleet.name, facts_to_record(found), time.time())
+    fleet = fleet_view.fleet
+    chosen = select_devices(fleet, names or (), read_selection, limit or ())
+    if chosen.nodes is not None and fleet.base_node is not None:
+        chosen = replace(chosen, nodes=chosen.nodes | {fleet.base_node.name})
+    whole = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
+    fleet_view.opened.journal.remember_all(fleet.name, facts_to_record(whole), time.time())
+    found = chosen.devices_of(whole)
+    unselected = [device.name for device in whole if device not in tuple(found)]
     answering = [
         robot.name
         for robot in found.robots
         if is_active(robot.state) and robot.facts is not None and robot.facts.answers
     ]
-    checks = checks_of(fleet_view.fleet, found, fleet_view.collector.ping(answering))
+    checks = checks_of(fleet, found, fleet_view.collector.ping(answering), unselected)
     show_preflight(checks, as_json=as_json)
     raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
 

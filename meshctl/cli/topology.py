@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import InventoryPath, KeyFiles, Lab
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, Nodes, selected_nodes
 from meshctl.cli.fleet_view import CONNECT_S, Timeout, collect, open_fleet_view
 from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
@@ -32,6 +32,8 @@ class TopologyFormat(str, Enum):  # noqa: UP042 - typer shows the values of a st
 
 
 def topology(
+    nodes: Nodes = None,
+    limit: Limit = None,
     mesh: Annotated[str, typer.Option("--mesh", help="Mesh to show if the fleet has several.")] = "",
     form: Annotated[TopologyFormat, typer.Option("--format", "-f", help="Output format.")] = TopologyFormat.TREE,
     inventory: InventoryPath = Path(),
@@ -41,6 +43,8 @@ def topology(
     lab: Lab = None,
 ) -> None:
     """Show the mesh topology: links with quality in both directions, hops to the base, and cut vertices.
+
+    With a selection, only those nodes are queried: links that only others report are missing.
 
     Exit code: 0 success, 3 no node answered, 2 could not run.
 
@@ -52,9 +56,9 @@ def topology(
             hint = did_you_mean(mesh, fleet.meshes) or f"its meshes are {', '.join(fleet.meshes)}"
             raise InputError(f"{fleet.name} has no mesh {mesh!r}", hint=hint)
         names = {node.name for node in fleet.members(mesh)} if mesh else set(fleet.nodes)
-        nodes = tuple(node for node in fleet_view.nodes if node.name in names)
-        snapshot = collect(fleet_view, nodes)
-        found = assess(snapshot, nodes, time.time())
+        queried = tuple(node for node in selected_nodes(fleet, nodes, limit) if node.name in names)
+        snapshot = collect(fleet_view, queried)
+        found = assess(snapshot, queried, time.time())
     if mesh:
         reports = mesh_reports(fleet, snapshot.observations, mesh)
         wires = [(link.a, link.b) for link in snapshot.graph.links if link.wired]
@@ -77,13 +81,13 @@ def topology(
     if drawn:
         echo(drawn)
     if not snapshot.observations:
-        is_new = bool(nodes) and all(node.age_s is None for node in found.nodes)
+        is_new = bool(queried) and all(node.age_s is None for node in found.nodes)
         why = (
             "no node was ever seen; run `meshctl bootstrap` to set up factory-default devices"
             if is_new
             else "run `meshctl status` for the reason"
         )
         echo(f"no node answered: {why}", err=True)
-    elif apart := [node.name for node in nodes if node.name not in graph]:
+    elif apart := [node.name for node in queried if node.name not in graph]:
         echo(f"no node reports {', '.join(apart)}; run `meshctl status` for the reason", err=True)
-    raise typer.Exit(ExitCode.OK if snapshot.observations or not nodes else ExitCode.UNREACHABLE)
+    raise typer.Exit(ExitCode.OK if snapshot.observations or not queried else ExitCode.UNREACHABLE)

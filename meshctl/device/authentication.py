@@ -6,10 +6,10 @@ makes at most that many on one connection. dropbear does not count `auth_none`, 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import paramiko
@@ -17,6 +17,7 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from paramiko.pkey import PKey, UnknownKeyType
 
 from meshctl.device.connection import Credentials, OwnKey
+from meshctl.device.file_state import FileState, file_state
 from meshctl.device.legacy_rsa import with_sha1
 from meshctl.errors import InputError
 from meshctl.model import Secret
@@ -69,18 +70,27 @@ def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
         return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
 
 
+# File, its state and passphrase -> parsed key. Checking an RSA key, or deriving the key of an encrypted file, takes
+# longer than the whole SSH handshake, and the nodes of a fleet share a few key files.
+_parsed_keys: dict[tuple[Path, FileState, Secret | None], PKey] = {}
+_parse_lock = threading.Lock()
+
+
 def load_key(path: Path, passphrase: Secret | None) -> PKey:
-    """Load a private key in OpenSSH or PEM format; parsed once unless the file changes. Raises InputError with the
-    fault."""
-    try:
-        found = path.stat()
-    except OSError:
-        return _parsed_key(path, passphrase, (0, 0))
-    return _parsed_key(path, passphrase, (found.st_mtime_ns, found.st_size))
+    """The private key of a file in OpenSSH or PEM format, parsed once per process and again after the file changed.
+    Thread-safe; a key may sign in several threads. Raises InputError with the fault."""
+    # parsed under the lock: threads that start together wait for the first instead of parsing the same file
+    with _parse_lock:
+        try:
+            identity = (path, file_state(path), passphrase)
+        except OSError:
+            return _parse_key(path, passphrase)
+        if identity not in _parsed_keys:
+            _parsed_keys[identity] = _parse_key(path, passphrase)
+        return _parsed_keys[identity]
 
 
-@cache
-def _parsed_key(path: Path, passphrase: Secret | None, stamp: tuple[int, int]) -> PKey:
+def _parse_key(path: Path, passphrase: Secret | None) -> PKey:
     try:
         return PKey.from_path(path, None if passphrase is None else passphrase.reveal().encode())  # type: ignore[arg-type]
     except FileNotFoundError as error:

@@ -23,6 +23,7 @@ from typing import Protocol
 
 from meshctl.device.connection import Endpoint, fingerprint_of
 from meshctl.device.errors import HostKeyChanged, HostKeyUnknown
+from meshctl.device.file_state import FileState, file_state
 from meshctl.errors import InputError
 
 
@@ -122,52 +123,79 @@ class HostKeyPolicy(Protocol):
         ...
 
 
+class _PinTable:
+    """The pins of one state of the file, by name."""
+
+    def __init__(self, pins: tuple[Pin, ...]) -> None:
+        self.pins = pins
+        self.revoked = frozenset(pin.key for pin in pins if pin.marker)
+        # name -> line number and key; a hashed name can only be compared with each name looked up
+        self._by_name: dict[str, list[tuple[int, HostKey]]] = {}
+        self._hashed: list[tuple[int, Pin]] = []
+        for number, pin in enumerate(pins):
+            if pin.marker:
+                continue
+            if any(name.startswith("|1|") for name in pin.names):
+                self._hashed.append((number, pin))
+            else:
+                for name in pin.names:
+                    self._by_name.setdefault(name, []).append((number, pin.key))
+
+    def keys(self, name: str) -> list[HostKey]:
+        """The keys pinned for `name` and not marked, in the order of the file."""
+        hashed = [(number, pin.key) for number, pin in self._hashed if pin.covers(name)]
+        found = [*self._by_name.get(name, ()), *hashed]
+        return [key for _, key in sorted(found, key=lambda entry: entry[0])]
+
+
 class TrustStore:
     """The fleet's file of pins. `inventory` adds the keys pinned in the inventory (node name -> `TYPE BASE64` lines).
 
-    The file is parsed again only when it has changed; a write locks it, replaces it in one rename, and keeps all
-    unrelated lines.
+    Every read checks whether the file changed, and parses it only then: each connection reads it several times. A write
+    locks the file, replaces it in one rename, and keeps all unrelated lines.
     """
 
     def __init__(self, path: Path, *, inventory: Mapping[str, tuple[str, ...]] | None = None) -> None:
         self.path = path
         self._inventory: dict[str, tuple[HostKey, ...]] = {}
-        self._parsed: tuple[tuple[int, int, int], tuple[Pin, ...]] | None = None
         for name, lines in (inventory or {}).items():
             try:
                 self._inventory[name] = tuple(parse_key(line) for line in lines)
             except ValueError as error:
                 raise InputError(f"host key of {name}: {error}") from error
+        # the file's state and its pins, replaced together: threads read them without a lock
+        self._parsed: tuple[FileState, _PinTable] | None = None
 
     def pins(self) -> tuple[Pin, ...]:
+        return self._table().pins
+
+    def _table(self) -> _PinTable:
         try:
-            found = self.path.stat()
-            # a write replaces the file, so it has another inode
-            stamp = (found.st_ino, found.st_mtime_ns, found.st_size)
-            if self._parsed is not None and self._parsed[0] == stamp:
-                return self._parsed[1]
+            # before it is read: a change in between makes the next read parse it again
+            state = file_state(self.path)
+            parsed = self._parsed
+            if parsed is not None and parsed[0] == state:
+                return parsed[1]
             text = self.path.read_text(encoding="utf-8")
         except FileNotFoundError:
-            return ()
+            return _PinTable(())
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{self.path}: cannot read the pinned host keys: {error}") from error
-        pins = parse_pins(text, source=str(self.path))
-        self._parsed = (stamp, pins)
-        return pins
+        table = _PinTable(parse_pins(text, source=str(self.path)))
+        self._parsed = (state, table)
+        return table
 
     def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
         return self.pinned(endpoint.pin_name)
 
     def pinned(self, name: str) -> tuple[HostKey, ...]:
         """The trusted keys of `name`, those of the file first."""
-        pins = self.pins()
-        revoked = {pin.key for pin in pins if pin.marker}
-        keys = [pin.key for pin in pins if not pin.marker and pin.covers(name)]
-        keys += self._inventory.get(name, ())
-        return tuple(key for key in dict.fromkeys(keys) if key not in revoked)
+        table = self._table()
+        keys = [*table.keys(name), *self._inventory.get(name, ())]
+        return tuple(key for key in dict.fromkeys(keys) if key not in table.revoked)
 
     def check(self, endpoint: Endpoint, key: HostKey) -> None:
-        if any(pin.marker and pin.key == key for pin in self.pins()):
+        if key in self._table().revoked:
             raise HostKeyChanged(
                 f"{endpoint.label}: has a revoked host key {key.fingerprint} ({key.key_type})",
                 fingerprint=key.fingerprint,

@@ -4,25 +4,39 @@ A word is one term or several separated by commas:
 
     b03  'husky*'           a node by name or pattern
     beacons                 a group by name, where no node has that name
-    role:beacon  state:carried  mesh:main  group:spares  robot:spot1  hardware:box  release:24.10    an attribute
+    B3  02:00:5e:00:00:03   a node by label, serial number or MAC, where no node or group has that name
+    role:beacon  state:carried  mesh:main  group:spares  robot:spot1  hardware:box  release:24.10  label:B3
+                            an attribute
     '!b07'  '!role:base'    excludes; a selection of exclusions alone starts from everything
     @FILE                   the terms in a file, one or more per line, `#` starts a comment
+
+Words add to each other; `limits` (`--limit`) narrow the selection: each must select a candidate as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import TypeVar
 
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Node
+from meshctl.model import Fleet, Node, Robot
 
 LIST_HINT = "run `meshctl inventory list` to list all nodes"
+COMPUTER = "computer"
+"""The role of a robot's computer, beside the roles of radios."""
+
+_MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
+# what is printed on a device; compared regardless of case
+_PRINTED = ("label", "serial", "mac")
 
 Attributes = Mapping[str, Collection[str]]
 """What a candidate can be selected by besides its name: attribute -> values."""
+
+K = TypeVar("K", bound=Hashable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +50,7 @@ class Term:
 
 
 def attributes_of(node: Node) -> Attributes:
+    macs = (node.mac, *(radio.mac for radio in node.radios))
     return {
         "role": (node.role.value,),
         "state": (node.state.value,),
@@ -44,39 +59,95 @@ def attributes_of(node: Node) -> Attributes:
         "robot": (node.robot,) if node.robot else (),
         "hardware": (node.hardware.name,),
         "release": (node.release.value,),
+        "label": (node.label,) if node.label else (),
+        "serial": (node.serial,) if node.serial else (),
+        "mac": tuple(dict.fromkeys(mac for mac in macs if mac)),
     }
 
 
-def select_nodes(fleet: Fleet, words: Iterable[str], read_file: Callable[[str], str]) -> tuple[Node, ...]:
+def robot_attributes(fleet: Fleet, robot: Robot) -> Attributes:
+    """A robot's computer has the groups, states and meshes of its radios."""
+    radios = [attributes_of(fleet.nodes[name]) for name in robot.nodes if name in fleet.nodes]
+    of_radios = {key: tuple(value for each in radios for value in each[key]) for key in ("state", "mesh", "group")}
+    return {"role": (COMPUTER,), "robot": (robot.name,), **of_radios}
+
+
+def select_nodes(
+    fleet: Fleet,
+    words: Iterable[str],
+    read_file: Callable[[str], str],
+    limits: Iterable[str] = (),
+    *,
+    in_word_order: bool = False,
+) -> tuple[Node, ...]:
     """The managed nodes that the words select; all if there are none. Raises InputError, see `select`."""
     managed = {node.name: node for node in fleet.managed()}
     candidates = {name: attributes_of(node) for name, node in managed.items()}
-    names = select(words, candidates, read_file, what=f"managed node of {fleet.name}", hint=LIST_HINT)
+    what = f"managed node of {fleet.name}"
+    names = select(words, candidates, read_file, limits, what=what, hint=LIST_HINT, in_word_order=in_word_order)
     return tuple(managed[name] for name in names)
+
+
+def select_one(fleet: Fleet, word: str, read_file: Callable[[str], str]) -> Node:
+    """The one managed node that the word selects. Raises InputError for none or several."""
+    found = select_nodes(fleet, [word], read_file)
+    if len(found) != 1:
+        names = ", ".join(node.name for node in found)
+        raise InputError(f"{word!r} selects {len(found)} nodes: expected one, found {names}")
+    return found[0]
 
 
 def select(
     words: Iterable[str],
-    candidates: Mapping[str, Attributes],
+    candidates: Mapping[K, Attributes],
     read_file: Callable[[str], str],
+    limits: Iterable[str] = (),
     *,
     what: str,
     hint: str = "",
-) -> tuple[str, ...]:
-    """The names that the words select, in the candidates' order; all if there are no words.
+    name_of: Callable[[K], str] = str,
+    in_word_order: bool = False,
+) -> tuple[K, ...]:
+    """The candidates that the words select and every limit selects too; all if there are neither.
 
-    `read_file` returns the text of a file or raises OSError; `what` names a candidate in messages, `hint` follows
-    the error for an unknown name. Raises InputError for a term that selects nothing, an unknown attribute, an
-    unreadable file, or a selection that leaves nothing.
+    They come in the candidates' order, or with `in_word_order` in that of the words. `read_file` returns the text of a
+    file or raises OSError; `what` names a candidate in messages, `hint` follows the error for an unknown name. Raises
+    InputError for a term that selects nothing, an unknown attribute, an unreadable file, or a selection that leaves
+    nothing.
     """
+    named = {key: (name_of(key), attributes) for key, attributes in candidates.items()}
+    chosen = _select(tuple(words), named, read_file, what, hint)
+    for limit in limits:
+        allowed = set(_select((limit,), named, read_file, what, hint))
+        left = [key for key in chosen if key in allowed]
+        if chosen and not left:
+            raise InputError(f"{limit}: selects no {what} among those selected without it")
+        chosen = left
+    if in_word_order:
+        return tuple(chosen)
+    remaining = set(chosen)
+    return tuple(key for key in candidates if key in remaining)
+
+
+_Named = Mapping[K, tuple[str, Attributes]]
+
+
+def _select(
+    words: tuple[str, ...], candidates: _Named[K], read_file: Callable[[str], str], what: str, hint: str
+) -> list[K]:
+    """In the order of the terms, and for each in that of the candidates."""
     terms = tuple(_terms(words, read_file))
+    if words and not terms:
+        # an empty variable of a script, or an empty file, must not select everything
+        raise InputError(f"{' '.join(repr(word) for word in words)}: selects no {what}")
     chosen = {term: _matching(term, candidates, what, hint) for term in terms}
     included = [term for term in terms if not term.is_exclusion]
-    names = {name for term in included for name in chosen[term]} if included else set(candidates)
-    left = names.difference(*(chosen[term] for term in terms if term.is_exclusion))
+    found = [key for term in included for key in chosen[term]] if included else list(candidates)
+    excluded = {key for term in terms if term.is_exclusion for key in chosen[term]}
+    left = [key for key in dict.fromkeys(found) if key not in excluded]
     if terms and not left:
         raise InputError(f"{','.join(term.text for term in terms)}: selects no {what}")
-    return tuple(name for name in candidates if name in left)
+    return left
 
 
 def _terms(words: Iterable[str], read_file: Callable[[str], str], source: str = "") -> Iterator[Term]:
@@ -87,7 +158,7 @@ def _terms(words: Iterable[str], read_file: Callable[[str], str], source: str = 
             yield from _terms_of_file(text[1:], read_file)
             continue
         is_exclusion, bare = text.startswith("!"), text.removeprefix("!")
-        attribute, colon, pattern = bare.partition(":")
+        attribute, colon, pattern = ("", "", bare) if _MAC.fullmatch(bare) else bare.partition(":")
         if not bare or bare.startswith("@") or (colon and not pattern):
             raise InputError(
                 f"{source}{text!r}: expected a name, a pattern, ATTRIBUTE:VALUE or !TERM",
@@ -106,13 +177,15 @@ def _terms_of_file(path: str, read_file: Callable[[str], str]) -> Iterator[Term]
         yield from _terms(line.partition("#")[0].split(), read_file, source=f"{path}:{number}: ")
 
 
-def _matching(term: Term, candidates: Mapping[str, Attributes], what: str, hint: str) -> set[str]:
+def _matching(term: Term, candidates: _Named[K], what: str, hint: str) -> list[K]:
     if term.attribute:
         return _matching_attribute(term, candidates, what)
-    by_name = {name for name in candidates if fnmatchcase(name, term.pattern)}
-    found = by_name or {name for name, each in candidates.items() if term.pattern in each.get("group", ())}
+    found = [key for key, (name, _) in candidates.items() if fnmatchcase(name, term.pattern)]
+    for attribute in ("group", *_PRINTED):
+        found = found or _having(attribute, term.pattern, candidates, exactly=True)
+    found = found or [key for key, (name, _) in candidates.items() if name.lower() == term.pattern.lower()]
     if not found:
-        known = [*candidates, *_values("group", candidates)]
+        known = [*(name for name, _ in candidates.values()), *_values("group", candidates)]
         raise InputError(
             f"no {what} matches {term.pattern!r}",
             hint=did_you_mean(term.pattern, known) or hint,
@@ -120,18 +193,14 @@ def _matching(term: Term, candidates: Mapping[str, Attributes], what: str, hint:
     return found
 
 
-def _matching_attribute(term: Term, candidates: Mapping[str, Attributes], what: str) -> set[str]:
-    attributes = dict.fromkeys(key for each in candidates.values() for key in each)
+def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]:
+    attributes = dict.fromkeys(key for _, each in candidates.values() for key in each)
     if term.attribute not in attributes:
         raise InputError(
             f"{term.text!r}: unknown attribute {term.attribute!r}",
             hint=did_you_mean(term.attribute, attributes) or f"expected one of: {', '.join(attributes)}",
         )
-    found = {
-        name
-        for name, each in candidates.items()
-        if any(fnmatchcase(value, term.pattern) for value in each.get(term.attribute, ()))
-    }
+    found = _having(term.attribute, term.pattern, candidates)
     if not found:
         values = _values(term.attribute, candidates)
         raise InputError(
@@ -141,5 +210,15 @@ def _matching_attribute(term: Term, candidates: Mapping[str, Attributes], what: 
     return found
 
 
-def _values(attribute: str, candidates: Mapping[str, Attributes]) -> list[str]:
-    return list(dict.fromkeys(value for each in candidates.values() for value in each.get(attribute, ())))
+def _having(attribute: str, pattern: str, candidates: _Named[K], *, exactly: bool = False) -> list[K]:
+    fold = str.lower if attribute in _PRINTED else str
+    wanted = fold(pattern)
+
+    def matches(value: str) -> bool:
+        return fold(value) == wanted if exactly else fnmatchcase(fold(value), wanted)
+
+    return [key for key, (_, each) in candidates.items() if any(matches(value) for value in each.get(attribute, ()))]
+
+
+def _values(attribute: str, candidates: _Named[K]) -> list[str]:
+    return list(dict.fromkeys(value for _, each in candidates.values() for value in each.get(attribute, ())))

@@ -35,11 +35,11 @@ class AdaptiveLimit:
     most: int
     fastest_s: float = float("inf")
     _slots: float = field(init=False)
-    _ended_since_shrink: int = field(init=False)
+    # how many logins were under way at the latest shrinking and have not ended
+    _under_way: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         self._slots = float(self.first)
-        self._ended_since_shrink = self.first
 
     @property
     def slots(self) -> int:
@@ -47,12 +47,12 @@ class AdaptiveLimit:
 
     def login_ended(self, took_s: float) -> None:
         self.fastest_s = min(self.fastest_s, took_s)
-        self._ended_since_shrink += 1
         if took_s <= max(SLOW_FACTOR * self.fastest_s, self.fastest_s + SLOW_S):
             self._slots = min(self.most, self._slots + 1)
-        elif self._ended_since_shrink >= self._slots:
+        elif not self._under_way:
+            self._under_way = self.slots
             self._slots = max(1.0, self.first / 2, self._slots * SHRINK)
-            self._ended_since_shrink = 0
+        self._under_way = max(0, self._under_way - 1)
 
 
 @dataclass(slots=True)

@@ -56,15 +56,17 @@ def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None
     steady = {section.name for section in network.of_type("interface") if section.get("proto") == "static"}
     sections = [section for section in dropbear.of_type("dropbear") if section.get("enable", "1") not in _OFF]
     options = ("DirectInterface", "Interface")
-    named = [(option, section.get(option)) for section in sections for option in options if section.get(option)]
-    bad = [(option, name) for option, name in named if name not in steady]
-    if sections and len(bad) < len(sections):
-        return None
+    missing = [
+        [(option, name) for option in options if (name := section.get(option)) and name not in steady]
+        for section in sections
+    ]
     if not sections:
         return FailedPrecondition(
             "no login would be possible afterwards: its dropbear is disabled", "remove `enable` from extra_uci"
         )
-    option, name = bad[0]
+    if not all(missing):
+        return None
+    option, name = missing[0][0]
     return FailedPrecondition(
         f"no login would be possible after its next boot: dropbear would wait for {option} {name}, "
         "which is not a network of the node with a static address",

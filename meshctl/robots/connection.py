@@ -17,9 +17,9 @@ from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey, HostKey, HostKeyPolicy
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.inventory.file_paths import file_path
-from meshctl.inventory.selection import Attributes, select
+from meshctl.inventory.selection import robot_attributes, select
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Robot, Secret
+from meshctl.model import Fleet, Secret
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.robots.host import Host, SshHost, become_root
 from meshctl.robots.preconditions import computer_of
@@ -136,7 +136,9 @@ def _hint_for(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_writt
             return ""
 
 
-def selected_robots(fleet: Fleet, words: Iterable[str] | None, read_file: Callable[[str], str]) -> tuple[str, ...]:
+def selected_robots(
+    fleet: Fleet, words: Iterable[str] | None, read_file: Callable[[str], str], limits: Iterable[str] = ()
+) -> tuple[str, ...]:
     """The robots with a computer that the words select (`inventory.selection`), in inventory order; all without words.
 
     Raises InputError for a word that selects nothing, and for a named robot without a computer.
@@ -152,15 +154,5 @@ def selected_robots(fleet: Fleet, words: Iterable[str] | None, read_file: Callab
             raise InputError(
                 f"robot {name} has no computer in the inventory", hint=f"set robots.{name}.computer{instead}"
             )
-    candidates = {name: _attributes_of(fleet, fleet.robots[name]) for name in able}
-    return select(wanted, candidates, read_file, what=f"robot of {fleet.name}")
-
-
-def _attributes_of(fleet: Fleet, robot: Robot) -> Attributes:
-    """A robot has the groups, states and meshes of its radios."""
-    radios = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
-    return {
-        "group": {group for node in radios for group in node.groups},
-        "state": {node.state.value for node in radios},
-        "mesh": {mesh for node in radios for mesh in node.meshes},
-    }
+    candidates = {name: robot_attributes(fleet, fleet.robots[name]) for name in able}
+    return select(wanted, candidates, read_file, limits, what=f"robot of {fleet.name}")

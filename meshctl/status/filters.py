@@ -1,21 +1,20 @@
-"""Select the radios and robots of a status to show: by name, group, robot, role, state or alarm.
+"""Select the radios and robots to show or check: one selection (`inventory.selection`) over both kinds of device.
 
-Values of one kind are alternatives; different kinds must all match. Devices that are not shown are usually still
-queried, since hop counts and "heard by" come from them.
+`select_devices` decides which; `Filter` is the decision, and also selects by alarm. Devices that are not shown are
+usually still queried, since hop counts and "heard by" come from them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from enum import Enum
 
 from meshctl.errors import InputError
+from meshctl.inventory.selection import COMPUTER, LIST_HINT, attributes_of, robot_attributes, select
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Node, NodeState, Role
+from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarm_codes import CODES
-from meshctl.status.robots import robot_state
-from meshctl.status.rows import COMPUTER
 from meshctl.status.values import Alarm, FleetStatus, Level
 
 ROLES = (*(role.value for role in Role), COMPUTER)
@@ -24,68 +23,42 @@ ANY_ALARM = "any"
 MAX_HINT_NAMES = 12
 
 
+class _Kind(Enum):
+    RADIO = "radio"
+    ROBOT = "robot"
+
+
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Empty matches all. `names` match radios and robots; `alarms` are codes, levels or `any` (error, warning)."""
+    """The selected radios and robots by name, None for all; `alarms` are codes, levels or `any` (error, warning)."""
 
-    names: tuple[str, ...] = ()
-    groups: tuple[str, ...] = ()
-    robots: tuple[str, ...] = ()
-    roles: tuple[str, ...] = ()
-    states: tuple[str, ...] = ()
+    nodes: frozenset[str] | None = None
+    robots: frozenset[str] | None = None
     alarms: tuple[str, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         return self == Filter()
 
-    def check(self, fleet: Fleet) -> None:
-        """Raises InputError for a value that can match nothing in this fleet."""
-        names = [*(node.name for node in fleet.managed()), *fleet.robots]
-        _require_match("node or robot", self.names, names, fleet.name)
-        _require_match(
-            "group", self.groups, {group for node in fleet.nodes.values() for group in node.groups}, fleet.name
-        )
-        _require_match("robot", self.robots, fleet.robots, fleet.name)
-        _require_match("role", self.roles, ROLES, "a status")
-        _require_match("state", self.states, STATES, "a status")
-        _require_match("alarm", self.alarms, (*CODES, *(level.text for level in Level), ANY_ALARM), "a status")
+    def selects_node(self, name: str) -> bool:
+        return self.nodes is None or name in self.nodes
 
-    def matches_node(self, node: Node) -> bool:
-        return (
-            _matches(node.name, self.names)
-            and (not self.groups or any(_matches(group, self.groups) for group in node.groups))
-            and _matches(node.robot, self.robots)
-            and (not self.roles or node.role.value in self.roles)
-            and (not self.states or node.state.value in self.states)
-        )
+    def selects_robot(self, name: str) -> bool:
+        return self.robots is None or name in self.robots
 
-    def matches_robot(self, fleet: Fleet, name: str) -> bool:
-        """A robot has the groups and the state of its radios."""
-        robot = fleet.robots[name]
-        groups = {group for node in robot.nodes if node in fleet.nodes for group in fleet.nodes[node].groups}
-        state = robot_state(fleet, robot)
-        return (
-            _matches(name, self.names)
-            and (not self.groups or any(_matches(group, self.groups) for group in groups))
-            and _matches(name, self.robots)
-            and (not self.roles or COMPUTER in self.roles)
-            and (not self.states or (state is not None and state.value in self.states))
-        )
-
-    def apply(self, fleet: Fleet, status: FleetStatus) -> FleetStatus:
-        """The status of the matching devices; a filter drops the alarms of the whole fleet."""
-        if self.is_empty:
-            return status
+    def devices_of(self, status: FleetStatus) -> FleetStatus:
+        """The status with the selected devices alone."""
         return replace(
             status,
-            nodes=tuple(one for one in status.nodes if self.matches_node(one.node) and self._has_alarm(one.alarms)),
-            robots=tuple(
-                one for one in status.robots if self.matches_robot(fleet, one.name) and self._has_alarm(one.alarms)
-            ),
-            alarms=(),
-            strangers=(),
+            nodes=tuple(one for one in status.nodes if self.selects_node(one.name) and self._has_alarm(one.alarms)),
+            robots=tuple(one for one in status.robots if self.selects_robot(one.name) and self._has_alarm(one.alarms)),
         )
+
+    def apply(self, status: FleetStatus) -> FleetStatus:
+        """The status of the selected devices; a filter drops the alarms of the whole fleet."""
+        if self.is_empty:
+            return status
+        return replace(self.devices_of(status), alarms=(), strangers=())
 
     def _has_alarm(self, alarms: Iterable[Alarm]) -> bool:
         if not self.alarms:
@@ -97,13 +70,41 @@ class Filter:
         )
 
 
-def _matches(name: str, patterns: tuple[str, ...]) -> bool:
-    return not patterns or any(fnmatchcase(name, pattern) for pattern in patterns)
+def select_devices(
+    fleet: Fleet,
+    words: Iterable[str],
+    read_file: Callable[[str], str],
+    limits: Iterable[str] = (),
+    attributes: Mapping[str, Sequence[str]] | None = None,
+    alarms: Iterable[str] = (),
+) -> Filter:
+    """The radios and robots that the words and every limit select, and that have each of the `attributes`.
 
-
-def _require_match(what: str, patterns: tuple[str, ...], names: Iterable[str], where: str) -> None:
-    listed = list(names)
-    for pattern in patterns:
-        if not any(fnmatchcase(name, pattern) for name in listed):
-            hint = did_you_mean(pattern, listed) or f"expected one of {', '.join(listed[:MAX_HINT_NAMES])}"
-            raise InputError(f"no {what} of {where} matches {pattern!r}", hint=hint)
+    Values of one attribute are alternatives. Raises InputError for a value that can match nothing in this fleet.
+    """
+    wanted = tuple(alarms)
+    known = (*CODES, *(level.text for level in Level), ANY_ALARM)
+    for alarm in wanted:
+        if alarm not in known:
+            hint = did_you_mean(alarm, known) or f"expected one of {', '.join(known[:MAX_HINT_NAMES])}"
+            raise InputError(f"no alarm of a status is called {alarm!r}", hint=hint)
+    named = (tuple(f"{key}:{value}" for value in values) for key, values in (attributes or {}).items() if values)
+    restrictions = [tuple(words), *((limit,) for limit in limits), *named]
+    if not any(restrictions):
+        return Filter(alarms=wanted)
+    radios = {(_Kind.RADIO, node.name): attributes_of(node) for node in fleet.managed()}
+    computers = {(_Kind.ROBOT, name): robot_attributes(fleet, robot) for name, robot in fleet.robots.items()}
+    chosen = select(
+        restrictions[0],
+        {**radios, **computers},
+        read_file,
+        [",".join(one) for one in restrictions[1:]],
+        what=f"node or robot of {fleet.name}",
+        hint=LIST_HINT,
+        name_of=lambda device: device[1],
+    )
+    return Filter(
+        frozenset(name for kind, name in chosen if kind is _Kind.RADIO),
+        frozenset(name for kind, name in chosen if kind is _Kind.ROBOT),
+        wanted,
+    )

@@ -20,6 +20,8 @@ from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus,
 MAX_REASONS = 4
 # stands for all checks of robots when they were not queried
 ROBOTS = "robots"
+# stands for all checks of the devices that were not selected
+OTHERS = "others"
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,14 +37,26 @@ class Check:
     is_checked: bool = True
 
 
-def preflight(fleet: Fleet, status: FleetStatus, pings: Pings | None = None) -> tuple[Check, ...]:
-    """Run all checks. `pings` None: no test messages were sent."""
+def preflight(
+    fleet: Fleet, status: FleetStatus, pings: Pings | None = None, unselected: Sequence[str] = ()
+) -> tuple[Check, ...]:
+    """Run all checks. `pings` None: no test messages were sent; `unselected` are devices left out of `status`."""
     checks = [check(fleet, status) for check in _CHECKS]
-    if any(robot.computer is not None for robot in fleet.robots.values()) and not _skipped_reason(status):
+    skipped = _skipped_reason(status)
+    if unselected and not skipped and not _active_robots(status):
+        skipped = "no robot is selected"
+    if skipped:
+        checks.append(Check(ROBOTS, True, skipped, is_checked=False))
+    elif any(robot.computer is not None for robot in fleet.robots.values()):
         checks += [check(fleet, status) for check in _ROBOT_CHECKS]
-        checks.append(_delivery(fleet, status, pings or Pings()))
-    elif _skipped_reason(status):
-        checks.append(Check(ROBOTS, True, _skipped_reason(status), is_checked=False))
+        alone = bool(unselected) and len(_active_robots(status)) < 2
+        checks.append(
+            Check("delivery", True, "fewer than two robots are selected: no test messages", is_checked=False)
+            if alone
+            else _delivery(fleet, status, pings or Pings())
+        )
+    if unselected:
+        checks.append(Check(OTHERS, True, f"not selected: {join_limited(tuple(unselected))}", is_checked=False))
     return tuple(checks)
 
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from meshctl.status.node_alarms import duration
+from meshctl.inventory.selection import COMPUTER
+from meshctl.report.duration import duration
 from meshctl.status.robot_alarms import size
 from meshctl.status.values import NodeStatus, RobotStatus
-
-COMPUTER = "computer"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson, LabDirectory, lab_directory
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.errors import InputError
 from meshctl.model import Release
 from meshctl.resources import shipped
@@ -194,10 +194,7 @@ def image(
     """
     named = revision or facts(release).revision
     content = firmware_image(release, board=board, extra=tuple(package or ()), revision=named)
-    try:
-        out.write_bytes(content)
-    except OSError as error:
-        raise InputError(f"cannot write {out}: {error.strerror}") from error
+    write_file(out, content)
     echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
 
 

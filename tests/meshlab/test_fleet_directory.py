@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import socket
-import threading
 from pathlib import Path
 
 import pytest
@@ -72,19 +70,10 @@ def test_a_directory_in_which_a_fleet_runs_keeps_everything(tmp_path: Path) -> N
     folder = os.open(tmp_path, os.O_RDONLY | os.O_DIRECTORY)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as supervisor:
         supervisor.bind(address_of(tmp_path, folder))
+        # it never answers, as behind a machine whose kernel hangs
         supervisor.listen(1)
-
-        def answer() -> None:
-            connection, _ = supervisor.accept()
-            with connection:
-                connection.recv(1000)
-                connection.send(json.dumps({"fleet": "x"}).encode())
-
-        thread = threading.Thread(target=answer)
-        thread.start()
         with pytest.raises(LabError, match=r"runs in .* already"):
             copy_inventory(EXAMPLE, tmp_path)
-        thread.join()
     os.close(folder)
     assert contents(tmp_path) == before
 

@@ -29,7 +29,7 @@ def test_a_supervisor_that_does_not_answer_is_killed(tmp_path: Path, monkeypatch
     monkeypatch.setattr("meshlab.fleet.request", partial(client.request, timeout_s=0.2))
     monkeypatch.setattr("meshlab.fleet._DOWN_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", _LISTEN, "."]) as supervisor:
-        until(lambda: client.accepts_requests(tmp_path), "the supervisor")
+        until(lambda: client.is_running(tmp_path), "the supervisor")
         assert fleet.stop_fleet(tmp_path) == tmp_path.name
         assert supervisor.wait(60) == -signal.SIGKILL
     assert fleet.stop_fleet(tmp_path) == ""

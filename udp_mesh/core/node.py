@@ -5,13 +5,15 @@ A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` is du
 returns none, then `next_event` until None.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from udp_mesh.core import publish, reconfigure, transmit
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
@@ -36,13 +38,21 @@ class Node:
     """One run of one named node. `boot_id` (16 random bytes, never used before) identifies the run."""
 
     def __init__(
-        self, settings: Settings, *, boot_id: bytes, rng: RandomSource, now: float, store: Store | None = None
+        self,
+        settings: Settings,
+        *,
+        boot_id: bytes,
+        rng: RandomSource,
+        now: float,
+        store: Store | None = None,
+        legacy_positions: Mapping[str, ReceivePosition] = MappingProxyType({}),
     ) -> None:
-        """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory)."""
+        """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory).
+        `legacy_positions` are those of the previous run."""
         if len(boot_id) != BOOT_ID_BYTES:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
         self._state = State(settings, boot_id, rng, now, store)
-        self._legacy = LegacyPeers(self._state)
+        self._legacy = LegacyPeers(self._state, legacy_positions)
         reconfigure.restore_outboxes(self._state, now)
 
     @property
@@ -135,6 +145,24 @@ class Node:
         """A snapshot for the autonomy, the status page and the metrics."""
         return _snapshot(self._state, now)
 
+    def peer_addresses(self) -> dict[str, set[Address]]:
+        """Link -> the addresses from which authenticated peers send: a driver reads what comes from elsewhere with less
+        priority. It changes with the events of peers and with links."""
+        addresses: dict[str, set[Address]] = {name: set() for name in self._state.links}
+        for peer in self._state.peer_table.online():
+            if peer.session is not None and peer.session.path.link in addresses:
+                addresses[peer.session.path.link].add(peer.session.path.address)
+        return addresses
+
+    @property
+    def unauthenticated(self) -> int:
+        """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
+        return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
+
+    def legacy_positions(self) -> dict[str, ReceivePosition]:
+        """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
+        return self._legacy.positions()
+
     def close(self, now: float) -> None:
         """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
         reconfigure.close(self._state, now)
@@ -144,10 +172,9 @@ def _snapshot(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
     idle = Sender(state.settings)
     peers = tuple(
-        _peer_conditions(state, peer, peer.sender if peer.has_sender else idle, now)
-        for _, peer in sorted(state.peer_table.peers.items())
+        _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
     )
-    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
+    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.sender is not None]
     counters = state.event_queue.counters
     sent_bits_per_s = _bits_per_s(state.sent, now)
     receivers = [session.receiver for session in state.peer_table.sessions.values()]

@@ -10,7 +10,7 @@ from meshctl.report.findings.document import Findings, counted, printable, shown
 
 
 def text(findings: Findings) -> str:
-    """Plain text without colours, one block for each finding; ends with a line end."""
+    """Plain text without colors, one block for each finding; ends with a line end."""
     lines = findings.excerpts()
     blocks = ["\n".join(_block(item, lines)) for item in findings.diagnostics]
     return "\n".join([*blocks, _summary(findings)]) + "\n"

@@ -8,11 +8,11 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, find_node, identify, restore_pins
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, identify, restore_pins
 from meshctl.apply.replace import identity_edits
 from meshctl.device.observation import BoardInfo, Observation
 from meshctl.device.trust import HostKey, TrustStore
-from meshctl.errors import InputError, NodeError
+from meshctl.errors import NodeError
 from meshctl.model import Fleet, NodeState
 from tests.meshctl.plan.support import factory, fleet
 
@@ -28,17 +28,6 @@ def labelled() -> Fleet:
 
 def device(*macs: str) -> Observation:
     return replace(factory(fleet(), "b01"), macs={f"eth{index}": mac for index, mac in enumerate(macs)})
-
-
-@pytest.mark.parametrize("word", ["b01", "B01", "h1-1", "sn1", MAC.upper()])
-def test_a_node_is_found_by_name_label_serial_or_mac(word: str) -> None:
-    assert find_node(labelled(), word).name == "b01"
-
-
-@pytest.mark.parametrize("word", ["b99", "", "02:00:00:00:00:99"])
-def test_what_means_no_node_is_refused(word: str) -> None:
-    with pytest.raises(InputError, match="no node of the fleet"):
-        find_node(labelled(), word)
 
 
 def test_a_mac_identifies_the_node() -> None:

@@ -15,8 +15,9 @@ import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
-from meshctl.apply.station_flush import StationFlush, flush_later, retry_unanswered
-from meshctl.device.observation import Observation, Station, WirelessLink
+from meshctl.apply.station_flush import StationFlushes
+from meshctl.device.observation import Observation, Originator, Station, WirelessLink
+from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Release
@@ -42,6 +43,7 @@ class Neighbours:
     """A fleet whose neighbors answer or do not: the queries, and the notes for the operator."""
 
     def __init__(self, around: dict[str, Observation], *, silent: tuple[str, ...] = (), answer: str = f"gone {MAC}\n"):
+        self.flushes = StationFlushes()
         self.silent = set(silent)
         self.log_in: Callable[[], None] = lambda: None
         self.answer = answer
@@ -55,7 +57,6 @@ class Neighbours:
                 observations=around,
                 current_mac_owners=lambda: {mac: name for name, mac in MACS.items()},
                 base_macs=(),
-                unfinished_flushes=[],
                 interrupt=SimpleNamespace(leaving=False),
                 connections=SimpleNamespace(
                     acquire=lambda name: None, open=self._open, release=lambda name, kept: None
@@ -93,11 +94,11 @@ def test_repeated_queries_are_journaled_and_reported_once(
 ) -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     monkeypatch.setattr("meshctl.apply.station_flush.next_query_s", lambda asked_s: float("-inf"))
-    forgetting = StationFlush(near.job)
-    forgetting.started()
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
     for _ in range(5):
-        forgetting.unreachable()
-    forgetting.ended()
+        flush.unreachable()
+    flush.ended()
     assert near.names == ["b01"] * 6
     assert near.steps == ["flush neighbor station entries"]
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
@@ -105,40 +106,61 @@ def test_repeated_queries_are_journaled_and_reported_once(
 
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
-    forgetting = StationFlush(near.job, NO_RADIOS)
-    forgetting.started()
-    forgetting.unreachable()
-    forgetting.ended(node("b02"))
+    flush = near.flushes.listener(near.job, NO_RADIOS)
+    flush.started()
+    flush.unreachable()
+    flush.ended(node("b02"))
     assert near.asked == []
-    forgetting.ended(node("b02"), rebooted=True)
+    flush.ended(node("b02"), rebooted=True)
     assert near.names == ["b01"]
+
+
+def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through_it() -> None:
+    base = "02:00:00:00:01:00"
+    route = Originator(base, MAC, "mesh0", last_seen_ms=100, best=True)
+    around = {"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02"), "b03": node("b03", "b02")}
+    near = Neighbours({**around, "b03": replace(around["b03"], originators=(route,))}, answer="watching\n")
+    near.work.base_macs = (base,)  # type: ignore[misc]
+    own: list[str] = []
+    connection = cast("SshConnection", SimpleNamespace(run=own.append))
+    near.flushes.listener(near.job, NO_RADIOS).armed(connection, for_s=100.0)
+    assert (own, near.asked) == ([], [])
+    near.flushes.listener(near.job, EVERY_RADIO).armed(None, for_s=100.0)
+    assert (own, near.names) == ([], ["b03"])
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.armed(connection, for_s=100.0)
+    assert ["watch_stale 100" in script for script in own] == [True]
+    flush.started()
+    flush.unreachable()
+    # b03 cannot be reached, and watches by itself
+    assert near.names == ["b01", "b03", "b03"]
 
 
 def test_unobserved_neighbors_are_queried_when_the_node_is_back() -> None:
     near = Neighbours({"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02")}, silent=("b03",))
-    forgetting = StationFlush(near.job)
-    forgetting.started()
-    forgetting.unreachable()
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
+    flush.unreachable()
     assert near.names == ["b01"]
     near.silent.clear()
-    forgetting.ended(node("b02", "b04"))
+    flush.ended(node("b02", "b04"))
     # b03 was heard before, b04 is heard now: neither was observed, so each checks all of its interfaces
     assert near.names == ["b01", "b01", "b03", "b04"]
     assert all("iw dev 2>/dev/null" in script for name, script in near.asked if name != "b01")
-    assert near.work.unfinished_flushes == []
+    assert near.flushes.retry_unanswered(near.work) == {}
 
 
 def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() -> None:
     near = Neighbours(
         {"b02": node("b02", "b01", "b03", "b04"), "b01": node("b01", "b02")}, silent=("b01", "b03", "b04")
     )
-    forgetting = StationFlush(near.job)
-    forgetting.started()
-    forgetting.ended(node("b02"))
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
+    flush.ended(node("b02"))
     assert near.asked == []
     assert near.notes == []
     near.silent = {"b03", "b04"}
-    assert retry_unanswered(near.work) == {"b02": ("b03", "b04")}
+    assert near.flushes.retry_unanswered(near.work) == {"b02": ("b03", "b04")}
     assert near.names == ["b01"]
     assert near.notes == [
         "b02: b01 removed a stale entry of its radio",
@@ -151,48 +173,48 @@ def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytes
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    forgetting = StationFlush(near.job)
-    forgetting.started()
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
     now_s[0] += 10.0
     near.log_in = lambda: now_s.__setitem__(0, now_s[0] + 7.0)
-    forgetting.ended(node("b02"))
+    flush.ended(node("b02"))
     assert f"flush_stale mesh0 {MAC} 17\n" in near.asked[0][1]
 
 
 def test_a_neighbor_that_cannot_remove_its_entry_is_reported() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"kept {MAC}\n")
-    forgetting = StationFlush(near.job)
-    forgetting.started()
-    forgetting.ended(node("b02"))
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
+    flush.ended(node("b02"))
     assert near.notes == ["b02: b01 cannot remove its stale entry: unicast frames to them may be lost for minutes"]
 
 
 def test_an_unverifiable_entry_is_removed_only_for_an_observed_restart() -> None:
     for index, has_restarted in ((7, False), (8, True)):
         near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")}, answer=f"unknown {MAC}\n")
-        forgetting = StationFlush(near.job)
-        forgetting.started()
-        forgetting.ended(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
+        flush = near.flushes.listener(near.job, EVERY_RADIO)
+        flush.started()
+        flush.ended(replace(node("b02", "b01"), ifindexes={"mesh0": index}))
         assert ["flush_restarted mesh0" in script for _, script in near.asked] == [False, True][: 1 + has_restarted]
 
 
 def test_a_change_without_an_observed_end_is_flushed_later_if_the_radio_has_restarted() -> None:
     same = Neighbours({"b02": node("b02", "b01", connected_s=500)})
-    flush_later(same.job, ago_s=100.0)
+    same.flushes.flush_later(same.job, ago_s=100.0)
     assert same.asked == []
-    anew = Neighbours({"b02": node("b02", "b01", connected_s=50)})
-    flush_later(anew.job, ago_s=100.0)
-    assert anew.names == ["b01"]
-    assert re.search(r"flush_stale .* 10[01]\n", anew.asked[0][1])
+    again = Neighbours({"b02": node("b02", "b01", connected_s=50)})
+    again.flushes.flush_later(again.job, ago_s=100.0)
+    assert again.names == ["b01"]
+    assert re.search(r"flush_stale .* 10[01]\n", again.asked[0][1])
 
 
-def test_of_a_node_that_booted_since_what_was_known_before_its_boot_is_forgotten(
+def test_entries_from_before_a_boot_are_flushed_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: 0.0, time=lambda: 1003.0))
     seen = replace(node("b02", "b01"), asked_at_s=1000.0, uptime_s=40.0)
     booted = Neighbours({"b02": seen})
-    flush_later(booted.job, ago_s=500.0)
+    booted.flushes.flush_later(booted.job, ago_s=500.0)
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
 
 
@@ -222,14 +244,14 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 def notes(ended: Ended) -> list[str]:
     """The notes about the node's radio."""
-    told = [event for event in ended.events if event["event"] == "note" and event["node"] == "n001"]
-    return [event["text"] for event in told if "its radio" in event["text"]]
+    events = [event for event in ended.events if event["event"] == "note" and event["node"] == "n001"]
+    return [event["text"] for event in events if "its radio" in event["text"]]
 
 
 def known_for_s(rig: Rig) -> list[int]:
     """For how many seconds base has known each radio that it hears."""
-    told = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
-    return [int(age) for age in re.findall(r"connected time:\s*(\d+)", told)]
+    dump = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
+    return [int(age) for age in re.findall(r"connected time:\s*(\d+)", dump)]
 
 
 def is_set_up(node: VirtualNode, *, distance: int) -> bool:
@@ -238,7 +260,7 @@ def is_set_up(node: VirtualNode, *, distance: int) -> bool:
     return radio["up"] and not radio["pending"] and int(radio["config"]["distance"]) == distance
 
 
-FORGOT = ["base removed a stale entry of its radio"]
+FLUSHED = ["base removed a stale entry of its radio"]
 
 
 @pytest.mark.lab
@@ -251,7 +273,7 @@ class TestOnAVirtualFleet:
         _, new = rig.flip()
         ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
         assert ended.results == {"n001": "done"}, ended.out + ended.err
-        assert notes(ended) == FORGOT
+        assert notes(ended) == FLUSHED
 
     def test_a_change_of_other_files_flushes_no_entry(self, rig: Rig) -> None:
         text = rig.inventory(rig.current).read_text(encoding="utf-8")
@@ -272,7 +294,7 @@ class TestOnAVirtualFleet:
         waiting.until(lambda: is_set_up(node, distance=777), "its radio to be set up with the edit")
         restored = rig.meshctl("restore", rig.current, "n001", str(file), "--yes", "--json")
         assert restored.code == 0, restored.out + restored.err
-        assert notes(restored) == FORGOT
+        assert notes(restored) == FLUSHED
         assert rig.state_of("n001", "split", rig.current) == "new"
 
     def test_an_unreachable_neighbor_is_reported_unless_a_retry_succeeds(self, rig: Rig) -> None:
@@ -298,7 +320,7 @@ class TestOnAVirtualFleet:
             rest, err = process.communicate()
         ended = Ended(process.returncode, "".join(said) + rest, err)
         assert ended.results == {"n001": "done"}, ended.out + ended.err
-        assert notes(ended) == FORGOT
+        assert notes(ended) == FLUSHED
 
     def test_after_a_reboot_the_next_run_flushes_the_neighbors_entry_once(self, rig: Rig) -> None:
         boot = rig.fleet.node("n001").boot_id
@@ -307,10 +329,10 @@ class TestOnAVirtualFleet:
         waiting.until(lambda: rig.fleet.node("n001").boot_id != boot, "the node to boot")
         rig.fleet.node("n001").wait_up(wait_s=120.0)
         waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
-        for told in (FORGOT, []):
+        for expected in (FLUSHED, []):
             ended = rig.meshctl("provision", rig.current, "--yes", "--json")
             assert ended.results["n001"] == "unchanged", ended.out + ended.err
-            assert notes(ended) == told
+            assert notes(ended) == expected
 
     def test_an_unobserved_radio_restart_is_flushed_later(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]
@@ -328,6 +350,6 @@ class TestOnAVirtualFleet:
         waiting.until(lambda: bool(known_for_s(rig)), "its radio to be heard again")
         ended = rig.meshctl("provision", old, "n001", "--yes", "--json")
         assert ended.results == {"n001": "unchanged"}, ended.out + ended.err
-        assert notes(ended) == FORGOT
+        assert notes(ended) == FLUSHED
         again = rig.meshctl("provision", old, "n001", "--yes", "--json")
         assert (again.results, notes(again)) == ({"n001": "unchanged"}, [])

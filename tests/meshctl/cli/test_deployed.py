@@ -82,9 +82,9 @@ def test_a_dry_run_shows_the_edit_and_writes_nothing(inventory: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("husky1-b9",), "no beacon has the name or label 'husky1-b9'"),
+        (("husky1-b9",), "no beacon matches 'husky1-b9'"),
         (("base",), "base is not a beacon: its role is base"),
-        (("x*",), "no beacon has the name or label 'x*'"),
+        (("x*",), "no beacon matches 'x*'"),
     ],
 )
 def test_what_is_no_beacon_is_refused_and_nothing_is_written(

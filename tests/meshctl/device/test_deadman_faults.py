@@ -145,6 +145,8 @@ def test_a_kill_at_any_command_without_a_reboot_is_taken_back_or_completed(name:
     steps = len(do(faults, name).commands)
     gone_on_from: set[str] = set()
     for step in range(1, steps + 1):
+        # `change` starts the processes that apply it
+        node.close_processes()
         for directory, kept in keep.items():
             shutil.rmtree(node.path(directory))
             shutil.copytree(kept, node.path(directory), symlinks=True)

@@ -173,6 +173,38 @@ def test_after_a_flash_only_the_announced_key_of_that_node_may_change(tmp_path: 
         trust.check(B03, key(1))
 
 
+def test_the_file_is_parsed_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[str] = []
+
+    def parse(text: str, *, source: str) -> tuple[Pin, ...]:
+        parsed.append(text)
+        return parse_pins(text, source=source)
+
+    trust = store(tmp_path, f"b03 {key(1).text}\n")
+    monkeypatch.setattr("meshctl.device.trust.parse_pins", parse)
+    for _ in range(3):
+        assert trust.known(B03) == (key(1),)
+        trust.check(B03, key(1))
+    assert len(parsed) == 1
+    with trust.path.open("a") as file:
+        file.write(f"@revoked b04 {key(1).text}\n")
+    with pytest.raises(HostKeyChanged, match="revoked"):
+        trust.check(B03, key(1))
+    trust.path.write_text(f"b03 {key(2).text}\n")
+    trust.check(B03, key(2))
+    trust.path.unlink()
+    assert trust.known(B03) == ()
+
+
+def test_keys_come_in_the_order_of_the_file_also_under_hashed_names(tmp_path: Path) -> None:
+    path = tmp_path / "hashed"
+    path.write_text(f"b03 {key(2).text}\n")
+    subprocess.run(["ssh-keygen", "-q", "-H", "-f", path], capture_output=True, check=True)
+    trust = store(tmp_path, f"b03,b04 {key(1).text}\n{path.read_text()}b03 {key(3).text}\n")
+    assert trust.pinned("b03") == (key(1), key(2), key(3))
+    assert trust.pinned("b04") == (key(1),)
+
+
 def test_many_writers_lose_no_pin(tmp_path: Path) -> None:
     trust = store(tmp_path)
     threads = [threading.Thread(target=trust.add, args=(f"b{n:02}", key(n))) for n in range(24)]

@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from types import MappingProxyType
+
 import pytest
 
 from meshctl.errors import InputError
-from meshctl.inventory.selection import Attributes, select
+from meshctl.inventory.selection import Attributes, select, select_nodes, select_one
+from tests.meshctl.plan.support import fleet
 
 CANDIDATES: dict[str, Attributes] = {
     "base": {"role": ("base",), "group": (), "mesh": ("main",)},
@@ -11,7 +16,7 @@ CANDIDATES: dict[str, Attributes] = {
     "b02": {"role": ("beacon",), "group": ("drops", "west"), "mesh": ("main", "side")},
     "husky1": {"role": ("robot",), "group": ("west",), "mesh": ("side",)},
 }
-FILES = {"run": "b01  # the first\n\nrole:base,!b02\n", "nested": "@run\n"}
+FILES = {"nothing": "# none yet\n", "run": "b01  # the first\n\nrole:base,!b02\n", "nested": "@run\n"}
 
 
 def read(path: str) -> str:
@@ -57,6 +62,8 @@ def test_words_select(words: tuple[str, ...], names: list[str]) -> None:
         (("b01", "!b0*"), "b01,!b0*: selects no managed node of lab", ""),
         (("!",), "'!': expected a name, a pattern, ATTRIBUTE:VALUE or !TERM", "for example"),
         (("role:",), "'role:': expected a name, a pattern, ATTRIBUTE:VALUE or !TERM", "for example"),
+        (("",), "'': selects no managed node of lab", ""),
+        (("@nothing",), "'@nothing': selects no managed node of lab", ""),
         (("@gone",), "@gone: cannot read the selection: No such file or directory", ""),
         (("@nested",), "nested:1: '@run': expected a name, a pattern, ATTRIBUTE:VALUE or !TERM", "for example"),
     ],
@@ -66,3 +73,59 @@ def test_a_term_that_selects_nothing_is_an_error(words: tuple[str, ...], message
         chosen(*words)
     assert str(caught.value) == message
     assert hint in (caught.value.hint or "")
+
+
+@pytest.mark.parametrize(
+    ("limits", "names"),
+    [
+        (["b0*"], ["b01", "b02"]),
+        (["!b01"], ["base", "b02"]),
+        (["b0*", "mesh:side"], ["b02"]),
+        (["role:base,role:beacon", "!b02"], ["base", "b01"]),
+    ],
+)
+def test_every_limit_narrows_the_selection(limits: list[str], names: list[str]) -> None:
+    assert list(select(["base", "b0*"], CANDIDATES, read, limits, what="node")) == names
+
+
+def test_a_limit_that_leaves_nothing_is_an_error() -> None:
+    with pytest.raises(InputError, match="husky1: selects no node among those selected without it"):
+        select(["b0*"], CANDIDATES, read, ["husky1"], what="node")
+
+
+def test_candidates_of_two_kinds_may_share_a_name() -> None:
+    """A robot's radio may have the robot's name."""
+    devices: dict[tuple[str, str], Attributes] = {
+        ("radio", "rover"): {"role": ("robot",)},
+        ("robot", "rover"): {"role": ("computer",)},
+    }
+
+    def chosen_kinds(word: str) -> list[str]:
+        name_of: Callable[[tuple[str, str]], str] = lambda device: device[1]  # noqa: E731
+        return [kind for kind, _ in select([word], devices, read, what="device", name_of=name_of)]
+
+    assert chosen_kinds("rover") == ["radio", "robot"]
+    assert chosen_kinds("role:computer") == ["robot"]
+
+
+def test_words_may_decide_the_order() -> None:
+    """One --at or --interface per node, in the order of the words."""
+    found = select(["b02", "b*", "!base"], CANDIDATES, read, what="node", in_word_order=True)
+    assert found == ("b02", "b01")
+
+
+MAC = "02:4d:00:00:00:01"
+
+
+@pytest.mark.parametrize("word", ["b01", "B01", "h1-1", "label:h1-*", "sn1", MAC.upper(), f"mac:{MAC}"])
+def test_a_node_is_selected_by_what_is_printed_on_it(word: str) -> None:
+    team = fleet()
+    b01 = replace(team.nodes["b01"], mac=MAC, label="H1-1", serial="SN1")
+    team = replace(team, nodes=MappingProxyType({**team.nodes, "b01": b01}))
+    assert select_one(team, word, read).name == "b01"
+    assert "b01" not in [node.name for node in select_nodes(team, [f"!{word}"], read)]
+
+
+def test_a_command_for_one_node_refuses_several() -> None:
+    with pytest.raises(InputError, match=r"'b0\*' selects \d nodes: expected one, found b01, b02"):
+        select_one(fleet(), "b0*", read)

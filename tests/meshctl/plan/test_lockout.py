@@ -109,6 +109,9 @@ def test_a_dropbear_that_would_not_listen_after_a_boot_is_refused(options: str, 
     assert found is None or "extra_uci" in found.hint
 
 
-def test_one_server_that_listens_is_enough() -> None:
-    text = "config dropbear 'main'\n\toption enable '1'\n\nconfig dropbear 'other'\n\toption Interface 'nosuch'\n"
+@pytest.mark.parametrize(
+    "missing", ["\toption Interface 'nosuch'\n", "\toption Interface 'nosuch'\n\toption DirectInterface 'nosuch'\n"]
+)
+def test_one_server_that_listens_is_enough(missing: str) -> None:
+    text = f"config dropbear 'main'\n\toption enable '1'\n\nconfig dropbear 'other'\n{missing}"
     assert server_lockout({"network": parse(NETWORK, "network"), "dropbear": parse(text, "dropbear")}) is None

@@ -1,4 +1,4 @@
-"""What other tools get is read by these tools."""
+"""Other tools read what is exported for them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "inventory" / "subt-final"
 
 
-def export(*words: str) -> str:
+def inventory(command: str, *options: str) -> str:
+    """The output of `meshctl inventory` for the example."""
     done = subprocess.run(
-        [sys.executable, "-m", "meshctl", "inventory", "export", "-i", str(EXAMPLE), *words],
+        [sys.executable, "-m", "meshctl", "inventory", command, "-i", str(EXAMPLE), *options],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
@@ -33,18 +34,9 @@ def parsed(name: str, file: Path) -> dict[str, str]:
 
 def test_openssh_reads_the_configuration(tmp_path: Path) -> None:
     file = tmp_path / "ssh_config"
-    export("--out", str(file))
+    inventory("export", "--out", str(file))
     names = [line.split()[1] for line in file.read_text().splitlines() if line.startswith("Host ")]
-    listed = json.loads(
-        subprocess.run(
-            [sys.executable, "-m", "meshctl", "inventory", "list", "-i", str(EXAMPLE), "--json"],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-    )["nodes"]
-    for node in listed:
+    for node in json.loads(inventory("list", "--json"))["nodes"]:
         if node["state"] not in ("lost", "retired"):
             seen = parsed(node["name"], file)
             assert (seen["hostname"], seen["user"]) == (node["address"].partition("/")[0], "root")
@@ -56,7 +48,7 @@ def test_openssh_reads_the_configuration(tmp_path: Path) -> None:
 
 
 def test_the_ansible_inventory_lists_every_host_with_its_address_once() -> None:
-    children = json.loads(export("--format", "ansible"))["all"]["children"]
+    children = json.loads(inventory("export", "--format", "ansible"))["all"]["children"]
     assert {"openwrt", "computers", "role_base", "role_beacon", "role_robot"} <= set(children)
     for name, host in children["openwrt"]["hosts"].items():
         assert host["ansible_host"]
@@ -66,7 +58,8 @@ def test_the_ansible_inventory_lists_every_host_with_its_address_once() -> None:
 
 @pytest.mark.parametrize("kind", ["ssh-config", "ansible"])
 def test_a_file_that_cannot_be_written_is_an_error(kind: str, tmp_path: Path) -> None:
+    absent = tmp_path / "absent" / "file"
     with pytest.raises(subprocess.CalledProcessError) as caught:
-        export("--format", kind, "--out", str(tmp_path / "absent" / "file"))
+        inventory("export", "--format", kind, "--out", str(absent))
     assert caught.value.returncode == 2
-    assert "cannot write: No such file or directory" in caught.value.stderr
+    assert f"cannot write {absent}: No such file or directory" in caught.value.stderr

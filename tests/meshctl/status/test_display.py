@@ -20,7 +20,7 @@ from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import FleetStatus, assess, preflight
 from meshctl.status.alarm_codes import CODES
-from meshctl.status.filters import Filter
+from meshctl.status.filters import select_devices
 from meshctl.status.json_output import as_json, preflight_json
 from meshctl.status.preflight import Check
 from meshctl.status.rows import COLUMNS, TableCell
@@ -188,39 +188,47 @@ def test_a_fact_that_is_not_known_is_null_and_never_zero(fleet: Fleet) -> None:
     assert rover["last_known"]["hops"] == 2
 
 
+def filtered(fleet: Fleet, words: list[str], alarms: list[str], **attributes: list[str]) -> list[str]:
+    chosen = select_devices(fleet, words, Path.read_text, (), attributes, alarms)  # type: ignore[arg-type]
+    return [one.name for one in chosen.apply(broken(fleet))]
+
+
 @pytest.mark.parametrize(
-    ("chosen", "shown"),
+    ("words", "options", "alarms", "shown"),
     [
-        (Filter(), ["base", "station", "b01", "b02", "rover", "rover", "shelf", "shelf"]),
-        (Filter(names=("b*",)), ["base", "b01", "b02"]),
-        (Filter(groups=("beacons",)), ["b01", "b02"]),
-        (Filter(groups=("beacons",), states=("deployed",)), ["b01"]),
-        (Filter(robots=("rover",)), ["rover", "rover"]),
-        (Filter(roles=("computer",)), ["station", "rover", "shelf"]),
-        (Filter(roles=("robot", "beacon"), states=("carried",)), ["b02", "shelf"]),
-        (Filter(alarms=("unreachable",)), ["rover"]),
-        (Filter(alarms=("any",)), ["b01", "rover", "rover"]),
-        (Filter(alarms=("drift",), roles=("beacon",)), ["b01"]),
+        ([], {}, [], ["base", "station", "b01", "b02", "rover", "rover", "shelf", "shelf"]),
+        (["b*"], {}, [], ["base", "b01", "b02"]),
+        (["beacons", "!b02"], {}, [], ["b01"]),
+        (["role:computer,!shelf"], {}, [], ["station", "rover"]),
+        ([], {"group": ["beacons"]}, [], ["b01", "b02"]),
+        ([], {"group": ["beacons"], "state": ["deployed"]}, [], ["b01"]),
+        ([], {"robot": ["rover"]}, [], ["rover", "rover"]),
+        ([], {"role": ["computer"]}, [], ["station", "rover", "shelf"]),
+        ([], {"role": ["robot", "beacon"], "state": ["carried"]}, [], ["b02", "shelf"]),
+        ([], {}, ["unreachable"], ["rover"]),
+        ([], {}, ["any"], ["b01", "rover", "rover"]),
+        ([], {"role": ["beacon"]}, ["drift"], ["b01"]),
     ],
 )
-def test_a_filter_shows_what_it_names(fleet: Fleet, chosen: Filter, shown: list[str]) -> None:
-    chosen.check(fleet)
-    assert [one.name for one in chosen.apply(fleet, broken(fleet))] == shown
+def test_a_filter_shows_what_it_names(
+    fleet: Fleet, words: list[str], options: dict[str, list[str]], alarms: list[str], shown: list[str]
+) -> None:
+    assert filtered(fleet, words, alarms, **options) == shown
 
 
 @pytest.mark.parametrize(
-    ("chosen", "hint"),
+    ("words", "options", "alarms", "hint"),
     [
-        (Filter(names=("rovr",)), "did you mean 'rover'"),
-        (Filter(groups=("beacon",)), "did you mean 'beacons'"),
-        (Filter(roles=("radio",)), "base, robot, beacon, computer"),
-        (Filter(states=("lost",)), "carried, deployed, spare"),
-        (Filter(alarms=("unreachble",)), "did you mean 'unreachable'"),
+        (["rovr"], {}, [], "did you mean 'rover'"),
+        ([], {"group": ["beacon"]}, [], "did you mean 'beacons'"),
+        ([], {"role": ["radio"]}, [], "base, beacon, robot, computer"),
+        ([], {"state": ["lost"]}, [], "deployed, carried"),
+        ([], {}, ["unreachble"], "did you mean 'unreachable'"),
     ],
 )
 def test_a_filter_that_can_select_nothing_is_refused_with_what_there_is(
-    fleet: Fleet, chosen: Filter, hint: str
+    fleet: Fleet, words: list[str], options: dict[str, list[str]], alarms: list[str], hint: str
 ) -> None:
     with pytest.raises(InputError) as raised:
-        chosen.check(fleet)
+        filtered(fleet, words, alarms, **options)
     assert hint in raised.value.hint

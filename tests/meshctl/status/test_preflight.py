@@ -11,6 +11,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
+from meshctl.status.filters import select_devices
 from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
@@ -161,3 +162,29 @@ def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None
     pings = pings_of({"x": answers})
     assert pings.round_trips_s == {("x", "a"): 0.5}
     assert pings.failed["x", "b"] == "no-answer"
+
+
+def selected(fleet: Fleet, *words: str) -> tuple[Check, ...]:
+    """The checks of what `words` select, while rover is unreachable and b02 was never seen."""
+    whole = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, CREW, known={})
+    chosen = select_devices(fleet, words, lambda path: path).devices_of(whole)
+    left_out = [one.name for one in whole if one not in tuple(chosen)]
+    return preflight(fleet, chosen, DELIVERED, left_out)
+
+
+def test_a_selection_is_a_go_that_names_what_was_left_out(fleet: Fleet) -> None:
+    found = {check.name: check for check in selected(fleet, "base", "b01")}
+    assert stopped(found) == []
+    assert "not selected: station, b02, rover" in found["others"].reason
+    assert "no robot is selected" in found["robots"].reason
+    assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: robots, others)"
+
+
+def test_a_selected_device_that_is_not_ready_is_a_no_go(fleet: Fleet) -> None:
+    assert "beacons" in [check.name for check in selected(fleet, "base", "b02") if not check.is_go]
+
+
+def test_one_selected_robot_has_nobody_to_send_test_messages_to(fleet: Fleet) -> None:
+    found = {check.name: check for check in selected(fleet, "base", "robot:station")}
+    assert found["delivery"].is_go
+    assert not found["delivery"].is_checked

@@ -7,9 +7,9 @@ from collections.abc import Generator
 
 import pytest
 
+from tests.udp_mesh.bridges.bridge_processes import LOG_FOLDERS
 from tests.udp_mesh.bridges.interpreters import expects_ros
 from tests.udp_mesh.bridges.ros2_processes import expects_ros2
-from tests.udp_mesh.bridges.ros_processes import FOLDERS
 
 collect_ignore = [] if expects_ros() else ["test_ros1_quick.py"]
 collect_ignore += [] if expects_ros2() else ["test_ros2.py"]
@@ -23,6 +23,6 @@ def pytest_runtest_makereport(
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
     if report.failed:
-        for log in sorted(log for folder in FOLDERS if folder.is_dir() for log in folder.glob("*.log")):
+        for log in sorted(log for folder in LOG_FOLDERS if folder.is_dir() for log in folder.glob("*.log")):
             report.sections.append((log.name, log.read_text(errors="replace")[-LAST_WORDS:]))
     return report

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.link.laboratory import INTERFACE, Laboratory, Link, laboratory
-from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
+from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import KEY, PATIENT_RATES, RunningDaemon, poll, wait_online
 
 LOSSY = Link(rate=20e6, delay_ms=5.0, loss=0.05)
@@ -61,8 +61,8 @@ class Member:
     name: str
     daemon: RobotsDaemon
     master: Master
-    bridge: BridgeProcess
-    node: Robot
+    bridge: Ros1Bridge
+    node: Ros1Node
 
 
 @contextmanager
@@ -85,10 +85,10 @@ def team(*names: str, link: Link = LOSSY, topics: str = TOPICS) -> Iterator[tupl
             daemon = RobotsDaemon(folder, name, places[name], topics)
             kept.enter_context(daemon)
             master.wait()
-            bridge = BridgeProcess(master, daemon)
+            bridge = Ros1Bridge(master, daemon)
             kept.callback(bridge.stop)
             bridge.start()
-            node = Robot(master, f"{name}_node")
+            node = Ros1Node(master, f"{name}_node")
             kept.callback(node.close)
             members.append(Member(name, daemon, master, bridge, node))
         for member in members:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import udp_mesh
-from tests.udp_mesh.bridges.ros_processes import free_tcp_port
+from tests.udp_mesh.bridges.ros1_processes import free_tcp_port
 from tests.udp_mesh.daemon.processes import RunningDaemon, poll, two_daemons, wait_online
 from tests.udp_mesh.links.sockets import WAIT_S
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.udp_mesh.bridges.ros_processes import OLD_PYTHON, ROOT, BridgeProcess, Master, Robot
+from tests.udp_mesh.bridges.ros1_processes import OLD_PYTHON, ROOT, Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import PATIENT_RATES, RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 
@@ -58,8 +58,8 @@ class Side:
 
     daemon: RunningDaemon
     master: Master
-    bridge: BridgeProcess
-    robot: Robot
+    bridge: Ros1Bridge
+    robot: Ros1Node
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def team() -> Iterator[tuple[Side, Side]]:
             kept.enter_context(daemon)
             master = masters[name]
             master.wait()
-            bridge = BridgeProcess(master, daemon, python=OLD_PYTHON)
+            bridge = Ros1Bridge(master, daemon, python=OLD_PYTHON)
             kept.callback(bridge.stop)
             if name == "alice":
                 launch = folder / "robot.launch"
@@ -85,7 +85,7 @@ def team() -> Iterator[tuple[Side, Side]]:
                 bridge.start(launch=str(launch))
             else:
                 bridge.start()
-            robot = Robot(master, f"{name}_node")
+            robot = Ros1Node(master, f"{name}_node")
             kept.callback(robot.close)
             sides.append(Side(daemon, master, bridge, robot))
         wait_online(sides[0].daemon, "bob")
@@ -96,15 +96,16 @@ def team() -> Iterator[tuple[Side, Side]]:
 def test_a_message_to_one_robot_comes_out_typed_under_the_legacy_name(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.robot.subscribe("/alice/mesh_comm/bob/status")
-    heard = alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "ready", bob.robot)
+    heard = alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "ready", bob.robot)
     assert heard["type"] == "std_msgs/String"
     assert heard["definition"].strip() == "string data"
 
 
 def test_a_message_to_all_comes_out_per_receiver(team: tuple[Side, Side]) -> None:
     alice, bob = team
-    alice.robot.subscribe("/bob/mesh_comm/alice/map")
-    bob.robot.publish_until_heard("/bob/mesh_comm/map", "a map", alice.robot)
+    name = "/bob/mesh_comm/alice/map"
+    alice.robot.subscribe(name)
+    bob.robot.publish_until_received("/bob/mesh_comm/map", "a map", alice.robot, received_as=name)
 
 
 def test_a_type_installed_nowhere_crosses_with_checksum_and_definition(team: tuple[Side, Side]) -> None:
@@ -138,12 +139,12 @@ def test_a_latched_message_waits_for_late_subscribers_and_for_a_bridge_that_star
 ) -> None:
     alice, bob = team
     alice.robot.publish("/alice/mesh_comm/map", "latched map", latch=True)
-    late = Robot(bob.master, "late")
+    late = Ros1Node(bob.master, "late")
     late.subscribe("/alice/mesh_comm/bob/map")
     assert late.expect("data", "latched map")["latching"] == "1"
     bob.bridge.stop()
     bob.bridge.start()
-    later = Robot(bob.master, "later")
+    later = Ros1Node(bob.master, "later")
     later.subscribe("/alice/mesh_comm/bob/map")
     later.expect("data", "latched map")
     late.close()
@@ -171,7 +172,7 @@ def test_a_topic_added_while_everything_runs_is_carried(team: tuple[Side, Side])
         with side.daemon.client() as client:
             client.request("set-topic", topic="new/topic", values={"priority": 3})
     bob.robot.subscribe("/alice/mesh_comm/bob/new/topic")
-    alice.robot.publish_until_heard("/alice/mesh_comm/bob/new/topic", "late news", bob.robot)
+    alice.robot.publish_until_received("/alice/mesh_comm/bob/new/topic", "late news", bob.robot)
 
 
 def test_the_legacy_status_messages_and_service_need_no_package(team: tuple[Side, Side]) -> None:
@@ -216,7 +217,7 @@ def test_the_legacy_settings_message_sets_the_window(team: tuple[Side, Side]) ->
 
 def test_rostopic_knows_what_came(team: tuple[Side, Side]) -> None:
     alice, bob = team
-    alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "for rostopic", bob.robot)
+    alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "for rostopic", bob.robot)
     command = ["/usr/bin/rostopic", "type", "/alice/mesh_comm/bob/status"]
     shown = subprocess.run(command, env=bob.master.environment, capture_output=True, text=True, check=True)
     assert shown.stdout.strip() == "std_msgs/String"
@@ -226,13 +227,13 @@ def test_both_directions_survive_a_restart_of_a_master(team: tuple[Side, Side]) 
     alice, bob = team
     bob.master.stop()
     bob.master.start()
-    fresh = Robot(bob.master, "fresh")
+    fresh = Ros1Node(bob.master, "fresh")
     fresh.subscribe("/alice/mesh_comm/bob/status")
-    alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "after the restart", fresh)
+    alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "after the restart", fresh)
     alice.robot.subscribe("/bob/mesh_comm/alice/status")
-    fresh.publish_until_heard("/bob/mesh_comm/alice/status", "and back", alice.robot)
+    fresh.publish_until_received("/bob/mesh_comm/alice/status", "and back", alice.robot)
     # Who was connected before the restart still is.
-    alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "to the old node", bob.robot)
+    alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "to the old node", bob.robot)
     fresh.close()
 
 
@@ -241,4 +242,4 @@ def test_a_restart_of_the_daemon_is_survived(team: tuple[Side, Side]) -> None:
     alice.daemon.kill()
     alice.daemon.start()
     wait_online(alice.daemon, "bob")
-    alice.robot.publish_until_heard("/alice/mesh_comm/bob/status", "after the daemon's restart", bob.robot)
+    alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "after the daemon's restart", bob.robot)

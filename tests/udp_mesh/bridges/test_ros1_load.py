@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from benchmarks.link.laboratory import Link
-from tests.udp_mesh.bridges.ros_processes import Robot, resident_bytes
+from tests.udp_mesh.bridges.ros1_processes import Ros1Node, resident_bytes
 from tests.udp_mesh.bridges.ros_team import TOPICS, Member, team
 from tests.udp_mesh.daemon.processes import poll, wait_online
 
@@ -34,7 +34,7 @@ def pair() -> Iterator[tuple[Member, Member]]:
 
 
 def flows(alice: Member, bob: Member, text: str) -> None:
-    alice.node.publish_until_heard(STATUS, text, bob.node)
+    alice.node.publish_until_received(STATUS, text, bob.node)
 
 
 def test_urgent_messages_pass_thirty_images_a_second_on_a_link_for_less_than_one() -> None:
@@ -75,7 +75,7 @@ def test_a_subscriber_that_does_not_keep_up_costs_bounded_memory_and_delays_no_o
     pair: tuple[Member, Member],
 ) -> None:
     alice, bob = pair
-    slow = Robot(bob.master, "slow")
+    slow = Ros1Node(bob.master, "slow")
     slow.subscribe(IMAGE, "sensor_msgs/Image", delay_s=1000.0)
     bob.node.subscribe(IMAGE, "sensor_msgs/Image")
     bob.node.subscribe(STATUS)
@@ -151,10 +151,10 @@ def test_a_message_that_is_too_long_is_refused_and_takes_no_other_with_it(pair: 
 def test_ten_thousand_messages_at_once_are_delivered_or_refused_aloud(pair: tuple[Member, Member]) -> None:
     alice, bob = pair
     bob.node.subscribe(MAP)
-    alice.node.publish_until_heard(MAP, "there", bob.node)
+    alice.node.publish_until_received(MAP, "there", bob.node)
     before = len(alice.bridge.log.read_text())
     alice.node.publish(MAP, "flood ", repeat=10_000)
-    alice.node.publish_until_heard(MAP, "after the flood", bob.node)
+    alice.node.publish_until_received(MAP, "after the flood", bob.node)
 
     def flood() -> list[str]:
         return [line["data"] for line in bob.node.received() if str(line.get("data")).startswith("flood ")]
@@ -180,7 +180,7 @@ def test_without_a_master_what_flows_goes_on_and_what_is_new_waits(pair: tuple[M
         poll(lambda: client.next_frame(1.0), "the plan at bob's daemon")
     flows(alice, bob, "without a master")
     bob.master.start()
-    fresh = Robot(bob.master, "fresh")
+    fresh = Ros1Node(bob.master, "fresh")
     fresh.subscribe(PLAN)
     fresh.expect("data", "new")
     fresh.close()

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from tests.udp_mesh.bridges.ros_processes import BridgeProcess, Master, Robot
+from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import poll, two_daemons
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS, Definition, decode, encode
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
@@ -24,10 +24,10 @@ def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and
         master = Master(alice.folder, "alice")
         kept.callback(master.stop)
         master.start_bare()
-        bridge = BridgeProcess(master, alice)
+        bridge = Ros1Bridge(master, alice)
         kept.callback(bridge.stop)
         bridge.start()
-        node = Robot(master, "alice_node")
+        node = Ros1Node(master, "alice_node")
         kept.callback(node.close)
         client = kept.enter_context(bob.client())
         client.subscribe("*")

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from tests.udp_mesh.bridges.ros_processes import Master, Robot, stop
+from tests.udp_mesh.bridges.bridge_processes import stop
+from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Node
 from tests.udp_mesh.bridges.ros_team import Member, team
 from tests.udp_mesh.daemon.processes import poll, wait_online
 
@@ -53,7 +54,7 @@ def test_every_robot_hears_every_other(members: list[Member]) -> None:
         for target in members:
             if source is not target:
                 text = f"{source.name} to {target.name}"
-                heard = source.node.publish_until_heard(to(source, target, "status"), text, target.node)
+                heard = source.node.publish_until_received(to(source, target, "status"), text, target.node)
                 assert heard["name"] == to(source, target, "status")
 
 
@@ -62,13 +63,15 @@ def test_a_broadcast_reaches_the_whole_team(members: list[Member]) -> None:
     for member in others:
         member.node.subscribe(to(base, member, "map"))
     for member in others:
-        base.node.publish_until_heard("/base/mesh_comm/map", f"for all, {member.name} last", member.node)
+        base.node.publish_until_received(
+            "/base/mesh_comm/map", f"for all, {member.name} last", member.node, received_as=to(base, member, "map")
+        )
 
 
 def test_a_burst_arrives_whole_and_once_through_the_losses(members: list[Member]) -> None:
     base, ugv1, *_ = members
     base.node.subscribe(to(ugv1, base, "map"))
-    ugv1.node.publish_until_heard(to(ugv1, base, "map"), "there", base.node)
+    ugv1.node.publish_until_received(to(ugv1, base, "map"), "there", base.node)
     ugv1.node.publish(to(ugv1, base, "map"), "burst ", repeat=500)
 
     def burst() -> list[str]:
@@ -84,7 +87,7 @@ def test_a_robot_that_was_away_gets_what_was_latched_meanwhile(members: list[Mem
     wait_online(base.daemon, "uav1", online=False)
     base.node.publish("/base/mesh_comm/any", "go home", latch=True)
     uav1.daemon.start()
-    late = Robot(uav1.master, "late")
+    late = Ros1Node(uav1.master, "late")
     late.subscribe(to(base, uav1, "any"))
     assert late.expect("data", "go home")["latching"] == "1"
     late.close()
@@ -95,12 +98,12 @@ def test_masters_restart_on_the_senders_and_on_the_receivers_side(members: list[
     for member in (ugv1, base):
         member.master.stop()
         member.master.start()
-    fresh = Robot(base.master, "fresh")
+    fresh = Ros1Node(base.master, "fresh")
     fresh.subscribe(to(ugv1, base, "status"))
-    sender = Robot(ugv1.master, "fresh")
-    sender.publish_until_heard(to(ugv1, base, "status"), "both anew", fresh)
+    sender = Ros1Node(ugv1.master, "fresh")
+    sender.publish_until_received(to(ugv1, base, "status"), "both restarted", fresh)
     fresh.subscribe(to(ugv2, base, "status"))
-    ugv2.node.publish_until_heard(to(ugv2, base, "status"), "and the others", fresh)
+    ugv2.node.publish_until_received(to(ugv2, base, "status"), "and the others", fresh)
     fresh.close()
     sender.close()
 
@@ -125,11 +128,11 @@ def test_what_was_recorded_is_played_through_the_bridge(members: list[Member]) -
         with member.daemon.client() as client:
             client.request("set-topic", topic="bagged", values={"priority": 4})
     base.node.subscribe(name)
-    ugv1.node.publish_until_heard(name, "bag ready", base.node)
+    ugv1.node.publish_until_received(name, "bag ready", base.node)
     record = base.master.spawn("record.log", "/usr/lib/rosbag/record", "--lz4", "-O", str(bag), name)
     poll(lambda: "/record_" in base.master.command("rostopic", "info", name), "the recorder")
     for number in range(10):
-        ugv1.node.publish_until_heard(name, f"for the bag {number}", base.node)
+        ugv1.node.publish_until_received(name, f"for the bag {number}", base.node)
     stop(record, signal.SIGINT)
     about = base.master.command("rosbag", "info", str(bag))
     assert name in about
@@ -168,7 +171,7 @@ def test_a_tool_that_relays_on_the_senders_side_is_carried(members: list[Member]
     name = to(ugv2, base, "status")
     base.node.subscribe(name)
     with program(ugv2.master, "out.log", "/usr/lib/topic_tools/relay", "/local/status", name):
-        ugv2.node.publish_until_heard("/local/status", "by a relay", base.node)
+        ugv2.node.publish_until_received("/local/status", "by a relay", base.node, received_as=name)
 
 
 def test_the_autonomy_sees_every_peer(members: list[Member]) -> None:

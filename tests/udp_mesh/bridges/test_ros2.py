@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from tests.udp_mesh.bridges.ros2_processes import Bridge2, Robot2
+from tests.udp_mesh.bridges.ros2_processes import Ros2Bridge, Ros2Node
 from tests.udp_mesh.daemon.processes import RunningDaemon, poll, two_daemons
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
 
@@ -23,8 +23,8 @@ TO_ALICE = "/bob/mesh_comm/alice/status"
 @dataclass
 class Side:
     daemon: RunningDaemon
-    bridge: Bridge2
-    node: Robot2
+    bridge: Ros2Bridge
+    node: Ros2Node
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +33,10 @@ def team() -> Iterator[tuple[Side, Side]]:
         sides = []
         for daemon in daemons:
             domain = DOMAINS[daemon.name]
-            bridge = Bridge2(daemon, domain)
+            bridge = Ros2Bridge(daemon, domain)
             kept.callback(bridge.stop)
             bridge.start()
-            node = Robot2(daemon.folder, f"{daemon.name}_node", domain)
+            node = Ros2Node(daemon.folder, f"{daemon.name}_node", domain)
             kept.callback(node.close)
             sides.append(Side(daemon, bridge, node))
         yield sides[0], sides[1]
@@ -46,8 +46,8 @@ def test_messages_cross_in_both_directions(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.node.subscribe(TO_BOB)
     alice.node.subscribe(TO_ALICE)
-    alice.node.publish_until(bob.node, TO_BOB, "from alice")
-    bob.node.publish_until(alice.node, TO_ALICE, "from bob")
+    alice.node.publish_until_received(TO_BOB, "from alice", bob.node)
+    bob.node.publish_until_received(TO_ALICE, "from bob", alice.node)
 
 
 def test_a_subscriber_that_comes_late_gets_the_last_transient_local_message(team: tuple[Side, Side]) -> None:
@@ -57,7 +57,7 @@ def test_a_subscriber_that_comes_late_gets_the_last_transient_local_message(team
         alice.node.publish(TO_BOB_MAP, "the map", latched=True)
         poll(lambda: next(iter(client.messages(0.1)), None), "the map at bob's daemon")
     bob.node.subscribe(TO_BOB_MAP, latched=True)
-    bob.node.expect(TO_BOB_MAP, "the map")
+    assert bob.node.expect("data", "the map")["name"] == TO_BOB_MAP
 
 
 def test_a_bridge_that_was_killed_carries_on_after_its_restart(team: tuple[Side, Side]) -> None:
@@ -66,7 +66,7 @@ def test_a_bridge_that_was_killed_carries_on_after_its_restart(team: tuple[Side,
     for side, data in ((alice, "sender restarted"), (bob, "receiver restarted")):
         side.bridge.kill()
         side.bridge.start()
-        alice.node.publish_until(bob.node, TO_BOB, data)
+        alice.node.publish_until_received(TO_BOB, data, bob.node)
 
 
 @pytest.mark.parametrize("name", ["made_up/msg/Thing", "os/path/join", "../msg/String", "std_msgs/msg/Nothing"])
@@ -77,4 +77,4 @@ def test_a_type_that_is_not_installed_is_reported_and_ends_nothing(team: tuple[S
         client.publish("status", b"\0\1\0\0", to="bob", type=kind)
     poll(lambda: f"type-unknown type={name}" in bob.bridge.log.read_text() or None, "the report")
     bob.node.subscribe(TO_BOB)
-    alice.node.publish_until(bob.node, TO_BOB, f"after {name}")
+    alice.node.publish_until_received(TO_BOB, f"after {name}", bob.node)

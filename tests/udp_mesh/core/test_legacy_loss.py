@@ -3,8 +3,9 @@
 import heapq
 import random
 
+from tests.udp_mesh.core.legacy_program import LegacyProgram
 from tests.udp_mesh.core.test_legacy import OldRobot
-from udp_mesh.wire.legacy import LegacyAck, LegacyPayload, decode_mesh_data
+from udp_mesh.wire.legacy import LegacyAck, LegacyPayload
 
 DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
 
@@ -12,7 +13,7 @@ DELAY_S, LOSS, TICK_S = 0.010, 0.2, 0.001
 def play(seed: int, duration_s: float) -> tuple[list[float], int]:
     """Latencies in seconds of urgent messages (ten a second) beside endless bulk, and the bulk fragments that
     arrived."""
-    rng, old = random.Random(seed), OldRobot()
+    rng, old, program = random.Random(seed), OldRobot(), LegacyProgram()
     started = old.now
     back: list[tuple[float, int, int]] = []
     sent_at: dict[bytes, float] = {}
@@ -32,10 +33,10 @@ def play(seed: int, duration_s: float) -> tuple[list[float], int]:
         for fragment in old.hear():
             if not isinstance(fragment, LegacyPayload) or rng.random() < LOSS:
                 continue
-            if fragment.total == 1:
-                name = decode_mesh_data(fragment.data).data
-                took.setdefault(name, old.now + DELAY_S - sent_at[name])
-            else:
+            _, message = program.on_fragment(fragment, old.now)
+            if message is not None and message.topic == "stop":
+                took.setdefault(message.data, old.now + DELAY_S - sent_at[message.data])
+            elif fragment.total > 2:
                 bulk.add((fragment.sequence, fragment.position))
             if rng.random() >= LOSS:
                 heapq.heappush(back, (old.now + 2 * DELAY_S, fragment.sequence, fragment.position))

@@ -8,9 +8,11 @@ the configuration says, and the legacy format is no longer spoken with it. Pendi
 Broadcasts stay encapsulated while the configuration names any legacy peer.
 """
 
+from collections.abc import Mapping
+
 from udp_mesh.core.events import MessageReceived, PeerOffline, PeerOnline
 from udp_mesh.core.interfaces import Datagram, RandomSource
-from udp_mesh.core.legacy.acks import LegacyAcks
+from udp_mesh.core.legacy.acks import LegacyAcks, ReceivePosition
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
@@ -68,16 +70,23 @@ class LegacyPeer:
         "unicasts",
     )
 
-    def __init__(self, neighbour: Neighbour, peer: Peer, settings: Settings, rng: RandomSource) -> None:
+    def __init__(
+        self,
+        neighbour: Neighbour,
+        peer: Peer,
+        settings: Settings,
+        rng: RandomSource,
+        position: ReceivePosition | None,
+    ) -> None:
         self.neighbour = neighbour
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
-        self.sender = LegacySender(peer.sender, settings.name, rng.getrandbits(15))
+        self.sender = LegacySender(peer.open_sender(), settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
-        self.acks = LegacyAcks()
+        self.acks = LegacyAcks(position)
         self.settled_at: float | None = None
         """When outboxes may send; None: they do already."""
         self.topics: set[str] = set()
@@ -96,10 +105,14 @@ class LegacyPeer:
 class LegacyPeers:
     """All legacy peers by host address. `next_at` is when something is due."""
 
-    __slots__ = ("_by_host", "_heartbeat_at", "_state")
+    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state", "accepted")
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: State, positions: Mapping[str, ReceivePosition]) -> None:
+        """`positions` are those of the previous run, by peer."""
         self._state = state
+        self._restored = dict(positions)
+        self.accepted = 0
+        """Datagrams of configured addresses. Nothing authenticates them."""
         self._by_host: dict[str, LegacyPeer] = {}
         self._heartbeat_at = float("-inf")
         self.apply()
@@ -116,7 +129,8 @@ class LegacyPeers:
                 if peer is not None:
                     peer.legacy = True
                     peer.transition(PeerEvent.CONFIGURED)
-                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng)
+                    position = self._restored.pop(neighbour.name, None)
+                    self._by_host[host] = LegacyPeer(neighbour, peer, self._state.settings, self._state.rng, position)
 
     def _drop(self, removed: LegacyPeer) -> None:
         """Remove a peer no longer configured; forget it completely if it was never heard and nothing waits for it."""
@@ -124,12 +138,17 @@ class LegacyPeers:
         peer.legacy = peer.settling = False
         peer.legacy_meters = None
         heard = peer.session is not None or peer.legacy_path is not None
-        if not heard and not peer.sender.pending and not state.outboxes.holds(peer.name):
+        if not heard and not peer.open_sender().pending and not state.outboxes.holds(peer.name):
             state.ready.pop(peer, None)
             del state.peer_table.peers[peer.name]
 
     def __len__(self) -> int:
         return len(self._by_host)
+
+    def positions(self) -> dict[str, ReceivePosition]:
+        """What was received from each peer, for the next run of this node."""
+        known = ((legacy.peer.name, legacy.acks.position()) for legacy in self._active())
+        return {name: position for name, position in known if position is not None}
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process a datagram without our mark: the legacy format from a configured address, or foreign."""
@@ -141,6 +160,7 @@ class LegacyPeers:
             return
         try:
             datagram = decode_legacy(data)
+            self.accepted += 1
             self._on_activity(legacy, link, source, now)
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
@@ -225,7 +245,7 @@ class LegacyPeers:
     def send(self, now: float, out: list[Datagram]) -> None:
         """Send the fragments that may be sent now."""
         for legacy in self._active():
-            if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
+            if legacy.link and (legacy.peer.open_sender().pending or legacy.sender.timer() is not None):
                 legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
@@ -264,7 +284,7 @@ class LegacyPeers:
                 store_in_outbox(state, peer, now)
             if peer.state is PeerState.OFFLINE and silent_s > rates.peer_lost_s:
                 peer.transition(PeerEvent.GIVEN_UP)
-                peer.sender.finish_all(Outcome.PEER_LOST)
+                peer.open_sender().finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)
             legacy.broadcasts.purge(now)
@@ -273,8 +293,8 @@ class LegacyPeers:
                 peer.settling = False
             if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
                 release_outbox(state, peer, now)
-            legacy.meters.sent.feed(peer.sender.sent_bytes, now)
-            legacy.meters.delivered.feed(peer.sender.delivered_bytes, now)
+            legacy.meters.sent.feed(peer.open_sender().sent_bytes, now)
+            legacy.meters.delivered.feed(peer.open_sender().delivered_bytes, now)
             legacy.meters.received.feed(legacy.received_bytes, now)
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))

@@ -3,6 +3,11 @@
 The legacy receiver acknowledges every fragment at once; the legacy sender never retransmits. This sender retransmits a
 fragment when its acknowledgement is overdue by the measured round trip, and probes an unresponsive peer with single
 fragments.
+
+The legacy receiver does not remember finished messages: it delivers a message again once all of its fragments came
+again. So no message is sent as a single fragment: a short one is followed by an empty second fragment, which is
+retransmitted only after the first one is acknowledged. A message then arrives twice only if both acknowledgements are
+lost, or both late.
 """
 
 from collections import OrderedDict
@@ -43,7 +48,7 @@ MIN_TIMEOUT_S = 0.025
 
 MAX_TIMEOUT_S = 0.2
 """Upper bound of that minimum, which grows if both transmissions of a fragment are acknowledged: the second was
-needless, and a one-fragment message was delivered twice, because finished messages are not remembered there."""
+needless."""
 
 RESENT_REMEMBERED = 64
 """Fragments acknowledged after a retransmission that may be acknowledged again."""
@@ -113,19 +118,23 @@ class LegacySender:
         for priority in range(PRIORITY_LEVELS):
             urgent = priority <= sender.rates.urgent_priority
             window = LEGACY_WINDOW + (sender.rates.urgent_excess_packets if urgent else 0)
-            while scheduler.waiting >> priority & 1 and not self.unresponsive and len(self._in_flight) < window:
+            while scheduler.waiting >> priority & 1 and not self.unresponsive and self._window_used() < window:
                 run = scheduler.peek(priority)
                 if run is None:
                     break
                 message = run.message
-                if not message.started and not self._begin(message, now):
-                    sender.finish(message, ExpiryReason.REFUSED)
-                    continue
-                run = scheduler.peek(priority)
-                assert run is not None
-                scheduler.consume(run, 1)
-                self._send(message, run.position, 1, link, address, now, out)
-                if not message.reliable and run.position == message.fragments - 1 and message.missing == 0:
+                if not message.started:
+                    if not self._begin(message, now):
+                        sender.finish(message, ExpiryReason.REFUSED)
+                        continue
+                    run = scheduler.peek(priority)
+                    assert run is not None
+                # The empty fragment goes with its first one: it takes no place in the window.
+                count = run.length if self._has_empty_tail(message) else 1
+                scheduler.consume(run, count)
+                for position in range(run.position, run.position + count):
+                    self._send(message, position, 1, link, address, now, out)
+                if not message.reliable and message.next_position == message.fragments and message.missing == 0:
                     sender.finish(message, Outcome.SENT)
 
     def acknowledge(self, sequence: int, position: int, now: float) -> None:
@@ -165,9 +174,25 @@ class LegacySender:
 
     def timer(self) -> float | None:
         """When the next fragment is overdue."""
-        if not self._in_flight:
-            return None
-        return min(sent.sent_at + self._timeout_s(sent) for sent in self._in_flight.values())
+        overdue_at = (
+            sent.sent_at + self._timeout_s(sent) for sent in self._in_flight.values() if not self._follows_first(sent)
+        )
+        return min(overdue_at, default=None)
+
+    def _window_used(self) -> int:
+        """Fragments in flight that carry data."""
+        return sum(bool(self._fragments[sent.message][1][sent.position]) for sent in self._in_flight.values())
+
+    def _has_empty_tail(self, message: OutgoingMessage) -> bool:
+        """Whether the message is one fragment of data and an empty one."""
+        fragments = self._fragments[message][1]
+        return len(fragments) == 2 and not fragments[1]
+
+    def _follows_first(self, sent: _SentFragment) -> bool:
+        """Whether this empty fragment waits for the acknowledgement of the first one before it is retransmitted."""
+        if not sent.position or not self._has_empty_tail(sent.message):
+            return False
+        return (self._fragments[sent.message][0], 0) in self._in_flight
 
     def _timeout_s(self, sent: _SentFragment) -> float:
         timeout = max(self._min_timeout_s, self.sender.rtt.pto_s(0.0))
@@ -177,7 +202,11 @@ class LegacySender:
         return min(PROBE_INTERVAL_S, timeout * (1 << doublings))
 
     def _resend(self, link: str, address: Address, now: float, out: list[Datagram]) -> None:
-        due = [entry for entry in self._in_flight.values() if now >= entry.sent_at + self._timeout_s(entry)]
+        due = [
+            sent
+            for sent in self._in_flight.values()
+            if now >= sent.sent_at + self._timeout_s(sent) and not self._follows_first(sent)
+        ]
         due.sort(key=lambda sent: sent.message.priority)
         for sent in due:
             if sent.unanswered >= TRIES_BEFORE_UNRESPONSIVE and sent.acks == self._acks:
@@ -212,6 +241,8 @@ class LegacySender:
         )
         body = encode_mesh_data(data)
         fragments = fragment_legacy(body)
+        if len(fragments) == 1:
+            fragments.append(b"")
         sequence = self._next_sequence()
         message.begin(sequence, MAX_LEGACY_FRAGMENT_BYTES, MAX_LEGACY_FRAGMENT_BYTES)
         message.fragments = message.missing = len(fragments)

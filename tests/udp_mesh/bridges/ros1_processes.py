@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import signal
 import socket
 import subprocess
-import threading
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import udp_mesh
+from tests.udp_mesh.bridges.bridge_processes import LOG_FOLDERS, BridgeProcess, NodeProcess, stop
 from tests.udp_mesh.bridges.interpreters import ROS_PYTHON, older_interpreters
 from tests.udp_mesh.daemon.processes import RunningDaemon, poll
 from tests.udp_mesh.links.sockets import WAIT_S
@@ -24,27 +21,12 @@ DEBIAN_PACKAGES = "/usr/lib/python3/dist-packages"
 OLD_PYTHON = next(iter(older_interpreters(8)), ROS_PYTHON)
 """Python 3.8, which ROS Noetic was made for, where there is one: Debian's rospy is pure Python."""
 ROBOT = Path(__file__).with_name("ros_robot.py")
-FOLDERS: set[Path] = set()
-"""Where logs of masters, bridges, daemons and nodes are, for the report of a test that fails."""
-TOLD_LINES = 20
-"""Of what a node said, where it did not say what it should."""
 
 
 def free_tcp_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def stop(process: subprocess.Popen[Any], number: signal.Signals = signal.SIGINT) -> None:
-    """Ends it as a person would; kills it where that does not help."""
-    if process.poll() is None:
-        process.send_signal(number)
-        try:
-            process.wait(WAIT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 class Master:
@@ -54,7 +36,7 @@ class Master:
     def __init__(self, folder: Path, name: str, inside: Sequence[str] = ()) -> None:
         self.name = name
         self.folder = folder
-        FOLDERS.add(folder)
+        LOG_FOLDERS.add(folder)
         self.inside = tuple(inside)
         self.port = free_tcp_port()
         self.log = folder / f"{name}-roscore.log"
@@ -116,60 +98,15 @@ class Master:
             self.process = None
 
 
-class Robot:
-    """A node in a robot's ROS graph; its own words are in a log beside the master's."""
+class Ros1Node(NodeProcess):
+    """A node in a robot's ROS graph."""
 
     def __init__(self, master: Master, name: str) -> None:
-        self.log = master.folder / f"{master.name}-{name}.log"
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [*master.inside, ROS_PYTHON, str(ROBOT), name],
-                env=master.environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-            )
-        self._lines: deque[dict[str, Any]] = deque()
-        self._changing = threading.Lock()
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-        self.expect("ready")
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            if line.startswith("{"):
-                entry = json.loads(line)
-                with self._changing:
-                    self._lines.append(entry)
-
-    def _command(self, **command: object) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(command) + "\n")
-        self.process.stdin.flush()
-
-    def expect(self, field: str, value: object = None) -> dict[str, Any]:
-        """Waits for a line with this field (and value); takes it out."""
-
-        def found() -> dict[str, Any] | None:
-            with self._changing:
-                for line in self._lines:
-                    if field in line and (value is None or line[field] == value):
-                        self._lines.remove(line)
-                        return line
-            assert self.process.poll() is None, f"the node has ended: {self.log.read_text()}"
-            return None
-
-        try:
-            return poll(found, f"{field} = {value!r}")
-        except AssertionError as error:
-            raise AssertionError(f"{error}; so far {list(self._lines)[-TOLD_LINES:]}; {self.log.read_text()}") from None
-
-    def received(self) -> list[dict[str, Any]]:
-        """Messages that came and were not taken."""
-        with self._changing:
-            return [line for line in self._lines if "name" in line]
+        super().__init__(
+            [*master.inside, ROS_PYTHON, str(ROBOT), name],
+            master.environment,
+            master.folder / f"{master.name}-{name}.log",
+        )
 
     def subscribe(self, name: str, type_name: str = "std_msgs/String", **more: object) -> None:
         """Waits until the subscriber is registered."""
@@ -195,37 +132,14 @@ class Robot:
         self._command(publish=name, type=type_name, data=data, **more)
         return int(self.expect("connections")["connections"])
 
-    def publish_until_heard(self, name: str, data: str, hearer: Robot, **more: Any) -> dict[str, Any]:
-        """Publishes again and again until the other robot has it: a new topic's first messages may be lost in ROS."""
 
-        def heard() -> dict[str, Any] | None:
-            self.publish(name, data, **more)
-            return next((line for line in hearer.received() if line.get("data") == data), None)
-
-        return poll(heard, f"{data!r} on {name}")
-
-    def kill(self) -> None:
-        """Ends it at once, whatever it is busy with."""
-        self.process.kill()
-        self.close()
-
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        stop(self.process, signal.SIGTERM)
-        self._reader.join(WAIT_S)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
-
-class BridgeProcess:
+class Ros1Bridge(BridgeProcess):
     """One robot's bridge, started by hand or by a launch file; `python` is its interpreter, where that is not ROS's."""
 
     def __init__(self, master: Master, daemon: RunningDaemon, python: str = ROS_PYTHON) -> None:
+        super().__init__(master.folder / f"{daemon.name}-bridge.log")
         self._master, self._daemon = master, daemon
         self._python = python
-        self.log = master.folder / f"{daemon.name}-bridge.log"
-        self.process: subprocess.Popen[bytes] | None = None
 
     def start(self, *, launch: str = "", arguments: Sequence[str] = ()) -> None:
         """`launch` is a launch file's path; else the module is run."""
@@ -245,29 +159,11 @@ class BridgeProcess:
             path = str(ROOT) if self._python == ROS_PYTHON else f"{ROOT}:{DEBIAN_PACKAGES}"
             environment = {**self._master.environment, "PYTHONPATH": path}
             command = [self._python, "-m", "udp_mesh.bridges.ros1", f"_socket:={self._daemon.socket}"]
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self._master.inside, *command, *arguments],
-                env=environment,
-                cwd=self._master.folder,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
+        self._run([*self._master.inside, *command, *arguments], environment)
 
     def resident_bytes(self) -> int:
         assert self.process is not None
         return resident_bytes(self.process.pid)
-
-    def kill(self) -> None:
-        assert self.process is not None
-        self.process.kill()
-        self.process.wait(WAIT_S)
-        self.process = None
-
-    def stop(self) -> None:
-        if self.process is not None:
-            stop(self.process)
-            self.process = None
 
 
 def resident_bytes(pid: int) -> int:

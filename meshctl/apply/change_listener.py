@@ -1,0 +1,42 @@
+"""The events of a change on one node, for a listener that acts on the node's neighbors (`station_flush`)."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from contextlib import AbstractContextManager
+from typing import Protocol
+
+from meshctl.device.observation import Observation
+from meshctl.device.ssh import SshConnection
+
+
+class ChangeListener(Protocol):
+    """Receives the events of one node's change. No event alters the outcome of the change.
+
+    `armed` comes first, or never in a change of a whole mesh. Then `started`, again for each new attempt; `waiting`,
+    `connecting`, `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
+    """
+
+    def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
+        """The change starts next and ends within `for_s`; the node still forwards its neighbors' frames.
+
+        `connection` is None for a node that loses its processes in the change. Raises Unreachable.
+        """
+
+    def started(self) -> None:
+        """The change starts: from now on the node's radios may restart."""
+
+    def connecting(self) -> AbstractContextManager[None]:
+        """Wraps an attempt to connect to the node."""
+
+    def waiting(self, connection: SshConnection) -> AbstractContextManager[None]:
+        """Wraps a wait for the node's answer over a connection that the change may cut."""
+
+    def unreachable(self, among: Container[str] | None = None) -> None:
+        """The node did not answer. `among`: the only nodes that are reachable now."""
+
+    def observed(self) -> None:
+        """The node answered, and the change is still applied."""
+
+    def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
+        """The change was confirmed, or rolled back (`went_back`). `now` is the latest observation."""

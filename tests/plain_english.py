@@ -1,0 +1,25 @@
+"""Words that read as if translated, or as a private metaphor, and stay out of code, messages, help and docs."""
+
+from __future__ import annotations
+
+import re
+
+_EVERYWHERE = r"told|anew|whoever|somebody|nobody|mend(?:s|ed|ing)?|tells? of|cope[sd]? with|take up what"
+# in code these are also keys, names of functions and parts of sound sentences
+_IN_PAGES = r"tells?|of a node that|takes? up|taken up|carr(?:y|ied) out|neighbours?|behaviours?|colours?"
+# words of the command line and of the lab's protocol, and names of lint rules
+_ALLOWED = re.compile(r"lab mend\b|`mend`|^mend$|([a-z]+-)+nobody|nobody(-[a-z]+)+")
+_WORDS = re.compile(rf"\b(?:{_EVERYWHERE})\b", re.I)
+_PAGE_WORDS = re.compile(rf"\b(?:{_EVERYWHERE}|{_IN_PAGES})\b", re.I)
+# fenced and indented code, code spans, and anchors made of command names
+_CODE_OR_ANCHOR = re.compile(r"```.*?```|^ {4}.*?$|`[^`]*`|\(#[\w-]+\)|\{ #[\w-]+ \}", re.MULTILINE | re.DOTALL)
+
+
+def bad_words(text: str) -> list[str]:
+    """The words of the list in a message, docstring, comment or line of a page."""
+    return [match[0] for match in _WORDS.finditer(_ALLOWED.sub("", text))]
+
+
+def bad_page_words(page: str) -> list[str]:
+    """The words of the longer list in the prose of a Markdown page."""
+    return [match[0] for match in _PAGE_WORDS.finditer(_CODE_OR_ANCHOR.sub("", page))]

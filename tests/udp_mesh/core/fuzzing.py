@@ -1,0 +1,241 @@
+"""Fuzz every decoder of the network: `python -m tests.udp_mesh.core.fuzzing --inputs 100000000`.
+
+Inputs are random bytes, mutations of real datagrams, and sealed frames of a key holder; they come from two IPv4 and
+one IPv6 address. The work is split into chunks of one surface and one seed each. Each finished chunk is a line in the
+record, so the same command continues an interrupted run, and `--part 1/2` and `--part 2/2` share one. An exception or
+an exceeded bound ends the run with the chunk's seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.udp_mesh.core.pair import Pair, pair, settings
+from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
+from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour
+from udp_mesh.crypto import TO_ALL, SendChannel
+from udp_mesh.wire.codec import decode, encode
+from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.legacy import encode_legacy, encode_mesh_data, fragment_legacy
+
+RECORD = Path(__file__).parents[3] / "benchmarks" / "results" / "fuzz.jsonl"
+CHUNK_INPUTS = 250_000
+FRESH_PAIR_EVERY = 20_000
+"""Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
+TIMERS_EVERY = 200
+MAX_PARTIAL_BYTES, MAX_PEERS, MAX_STRANGERS = 2_000_000, 64, 16
+
+LEGACY_ADDRESS = ("10.0.0.9", 8700)
+SOURCES = (("mesh", ("10.0.0.66", 8700)), ("six", ("fe80::66", 8700)), ("mesh", ("10.0.0.1", 8700)))
+_BOUNDARIES = bytes((0, 1, 0x7F, 0x80, 0xFF))
+
+
+class Fuzzer:
+    """One pair of nodes, a dual-stack link each, and a random source."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.inputs = 0
+        self.seeds = [encode(frames) for frames in FRAMES.values()]
+        self.legacy_seeds = [encode_legacy(datagram) for datagram in LEGACY.values()]
+        self.legacy_seeds += fragment_legacy(encode_mesh_data(MESH_DATA))
+        self.pair = self._new_pair()
+
+    def _new_pair(self) -> Pair:
+        limits = Limits(partial_bytes=MAX_PARTIAL_BYTES, peers=MAX_PEERS, strangers=MAX_STRANGERS)
+        both = pair(limits=limits)
+        legacy = Neighbour(LEGACY_ADDRESS, name="old", legacy=True)
+        both.b.apply(settings("b", limits=limits, neighbours=(legacy,)), both.now)
+        both.b.link_up(LinkInfo("six", LinkKind.BROADCAST, ("fe80::2", 8700), ("ff02::1", 8700)), both.now)
+        for node, other in ((both.a, "b"), (both.b, "a")):
+            node.send("any", b"hello", destination=other, now=both.now)
+        both.roundtrip(times=30)
+        peer = both.a._state.peer_table.peers["b"]
+        assert peer.session is not None
+        self.insider, self.sent_packets = peer.session, peer.open_sender().in_flight
+        self.stranger = SendChannel(both.a._state.keys[0], self.rng.randbytes(16), TO_ALL)
+        return both
+
+    def mutated(self, data: bytes) -> bytes:
+        """One to six changes. Each takes its choices from one draw: drawing them singly costs more than decoding."""
+        raw = bytearray(data)
+        draw = self.rng.getrandbits
+        for _ in range(1 + draw(8) % 6):
+            bits = draw(96)
+            kind, value, place, many = bits & 3, bits >> 2 & 0xFFF, bits >> 14 & 0xFFFF, bits >> 30 & 7
+            if not raw or kind == 2:
+                at = place % (len(raw) + 1)
+                raw[at:at] = (bits >> 32).to_bytes(8, "big")[: 1 + many]
+            elif kind == 0:
+                raw[place % len(raw)] = _BOUNDARIES[value % 5] if value & 0x800 else value & 0xFF
+            elif kind == 1:
+                del raw[place % len(raw) :]
+            else:
+                raw += self.seeds[place % len(self.seeds)]
+        return bytes(raw)
+
+    def seed_datagram(self) -> bytes:
+        return self.seeds[self.rng.getrandbits(16) % len(self.seeds)]
+
+    def frames(self) -> bytes:
+        """Frames of a key holder: mutations of real ones, sometimes none at all."""
+        return self.mutated(self.seed_datagram()) if self.rng.getrandbits(7) else b""
+
+    def receive(self, data: bytes) -> None:
+        link, source = SOURCES[self.rng.getrandbits(16) % len(SOURCES)]
+        self.pair.b.receive(data, link, source, self.pair.now)
+
+    def run(self, surface: Callable[[Fuzzer], None], inputs: int) -> None:
+        for _ in range(inputs):
+            surface(self)
+            self.inputs += 1
+            if self.inputs % TIMERS_EVERY == 0:
+                self._let_nodes_work()
+            if self.inputs % FRESH_PAIR_EVERY == 0:
+                self.check_bounds()
+                self.pair = self._new_pair()
+
+    def _let_nodes_work(self) -> None:
+        self.pair.now += 0.05
+        for node in (self.pair.b, self.pair.a):
+            node.handle_timer(self.pair.now)
+            while node.datagrams_to_send(self.pair.now):
+                pass
+            while node.next_event() is not None:
+                pass
+
+    def check_bounds(self) -> None:
+        """Raises AssertionError if the node holds more than its limits allow."""
+        table = self.pair.b._state.peer_table
+        assert table.memory.bytes <= MAX_PARTIAL_BYTES
+        assert len(table.peers) <= MAX_PEERS + 1
+        assert len(table.not_current()) <= MAX_STRANGERS + MAX_PEERS
+
+
+def random_bytes(fuzzer: Fuzzer) -> None:
+    bits = fuzzer.rng.getrandbits(24)
+    first = (0x90, 0x91, 0x92, 0x93, 1, 2, 4, 5)[bits & 7] if bits & 8 else bits >> 4 & 0xFF
+    fuzzer.receive(bytes((first,)) + fuzzer.rng.randbytes((bits >> 12) % 121))
+
+
+def decoder(fuzzer: Fuzzer) -> None:
+    try:
+        decode(fuzzer.frames())
+    except DecodeError:
+        return
+
+
+def sealed_data(fuzzer: Fuzzer) -> None:
+    """A key holder's frames to one boot, under short and long headers."""
+    channel = fuzzer.insider.path.channel
+    seal = channel.seal if fuzzer.rng.getrandbits(2) else channel.seal_long
+    number, data = seal(fuzzer.frames())
+    fuzzer.sent_packets.add(number, None)
+    fuzzer.receive(data)
+
+
+def sealed_to_all(fuzzer: Fuzzer) -> None:
+    bits = fuzzer.rng.getrandbits(3)
+    channel = fuzzer.pair.a._state.broadcast_channel if bits & 3 else fuzzer.stranger
+    seal = channel.seal if bits & 4 else channel.seal_long
+    fuzzer.receive(seal(fuzzer.frames())[1])
+
+
+def mutated_datagrams(fuzzer: Fuzzer) -> None:
+    """Sealed datagrams modified in transit: they cannot be opened."""
+    number, data = fuzzer.insider.path.channel.seal(fuzzer.seed_datagram())
+    fuzzer.sent_packets.add(number, None)
+    fuzzer.receive(fuzzer.mutated(data))
+
+
+def legacy(fuzzer: Fuzzer) -> None:
+    seeds = fuzzer.legacy_seeds
+    data = fuzzer.mutated(seeds[fuzzer.rng.getrandbits(16) % len(seeds)])
+    fuzzer.pair.b.receive(data, "mesh", LEGACY_ADDRESS, fuzzer.pair.now)
+
+
+SURFACES = {
+    surface.__name__: surface
+    for surface in (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy)
+}
+
+
+class Chunk(NamedTuple):
+    """One surface under one seed."""
+
+    surface: str
+    seed: int
+    inputs: int
+
+    def run(self) -> None:
+        """Raises whatever a node raised, with the chunk as a note."""
+        fuzzer = Fuzzer(self.seed)
+        try:
+            fuzzer.run(SURFACES[self.surface], self.inputs)
+            fuzzer.check_bounds()
+        except Exception as error:
+            error.add_note(f"surface {self.surface}, seed {self.seed}, input {fuzzer.inputs}")
+            raise
+
+
+def chunks(inputs: int, chunk_inputs: int = CHUNK_INPUTS) -> Iterator[Chunk]:
+    """An equal part for each surface; the seed is the number of the chunk."""
+    seed = 0
+    while inputs > 0:
+        size = min(inputs, chunk_inputs)
+        yield Chunk(tuple(SURFACES)[seed % len(SURFACES)], seed, size)
+        inputs -= size
+        seed += 1
+
+
+def finished(record: Path) -> list[Chunk]:
+    if not record.exists():
+        return []
+    return [Chunk(**json.loads(line)) for line in record.read_text().splitlines()]
+
+
+def run(inputs: int, record: Path, part: tuple[int, int] = (1, 1), chunk_inputs: int = CHUNK_INPUTS) -> int:
+    """Run every chunk of this part that the record does not hold; returns the inputs it ran."""
+    number, of = part
+    done = set(finished(record))
+    ran = 0
+    for chunk in chunks(inputs, chunk_inputs):
+        if chunk.seed % of != number - 1 or chunk in done:
+            continue
+        chunk.run()
+        with record.open("a") as file:
+            file.write(json.dumps(chunk._asdict()) + "\n")
+        ran += chunk.inputs
+    return ran
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, _, of = text.partition("/")
+    if not (number.isdigit() and of.isdigit() and 1 <= int(number) <= int(of)):
+        raise argparse.ArgumentTypeError(f"expected NUMBER/PARTS, as in 1/2, found {text!r}")
+    return int(number), int(of)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.udp_mesh.core.fuzzing", description=__doc__)
+    parser.add_argument("--inputs", type=int, default=100_000_000, help="inputs in all, including those recorded")
+    parser.add_argument("--part", type=_part, default=(1, 1), metavar="NUMBER/PARTS", help="run only these chunks")
+    parser.add_argument("--record", type=Path, default=RECORD, help="finished chunks, one per line")
+    arguments = parser.parse_args()
+    run(arguments.inputs, arguments.record, arguments.part)
+    by_surface: Counter[str] = Counter()
+    for chunk in finished(arguments.record):
+        by_surface[chunk.surface] += chunk.inputs
+    lines = [*by_surface.items(), ("in all", by_surface.total())]
+    sys.stdout.writelines(f"{name:18} {count:>12,}\n" for name, count in lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""What a daemon received from legacy robots is known to its next run."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.core.test_legacy import fragments
+from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
+from tests.udp_mesh.links.sockets import free_port
+from udp_mesh.core.legacy.acks import ReceivePosition
+from udp_mesh.daemon.legacy_positions import load_positions, save_positions
+from udp_mesh.wire.legacy import Host, LegacyAck, decode_legacy, encode_legacy
+
+SOME = {"old": ReceivePosition(17, ((16, 2, 2), (17, 1, 9))), "older": ReceivePosition(1, ())}
+
+
+def test_what_is_saved_is_loaded_and_a_shorter_state_replaces_a_longer_one(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "positions.json"
+    assert load_positions(path) == {}
+    save_positions(path, SOME)
+    assert load_positions(path) == SOME
+    shorter = {"old": SOME["old"]}
+    save_positions(path, shorter)
+    assert load_positions(path) == shorter
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[", "[1]", '{"old": 3}', '{"old": [0, []]}', '{"old": [1, [[1, 5, 2]]]}', '{"old": ["x", []]}', "[" * 9999],
+)
+def test_a_damaged_file_is_reported_and_ignored(text: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "positions.json"
+    path.write_text(text)
+    assert load_positions(path) == {}
+    assert "legacy-positions-unreadable" in caplog.text
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_a_restarted_daemon_frees_the_slots_of_a_legacy_sender(how: signal.Signals) -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, socket.socket(type=socket.SOCK_DGRAM) as robot:
+        folder, port = Path(path), free_port()
+        robot.bind(("127.0.3.9", port))
+        robot.settimeout(0.2)
+        neighbour = '[[neighbours]]\naddress = "127.0.3.9"\nname = "old"\nlegacy = true\n'
+        text = configuration(folder, "alice", 1, [], port).replace("[topics]", neighbour + "[topics]")
+        daemon = RunningDaemon(folder, "alice", text)
+
+        def tell(datagram: bytes) -> None:
+            robot.sendto(datagram, ("127.0.3.1", port))
+
+        def acknowledged() -> set[tuple[int, int]] | None:
+            """The acknowledgements that answer a heartbeat."""
+            tell(encode_legacy(Host("old", "127.0.3.9")))
+            found = set()
+            try:
+                while True:
+                    datagram = decode_legacy(robot.recv(2048))
+                    if isinstance(datagram, LegacyAck):
+                        found.add((datagram.sequence, datagram.position))
+            except TimeoutError:
+                return found or None
+
+        saved = folder / "alice" / "legacy-positions.json"
+        with daemon:
+            tell(encode_legacy(Host("old", "127.0.3.9")))
+            wait_online(daemon, "old")
+            tell(encode_legacy(fragments(500, b"x")[0]))
+            poll(lambda: saved.exists() and json.loads(saved.read_text())["old"][0] == 500, "the position is saved")
+            daemon.signal(how)
+            assert daemon.process is not None
+            daemon.process.wait()
+            while acknowledged() is not None:
+                pass
+            daemon.start()
+            assert {(501, 0), (502, 0), (503, 0)} <= poll(acknowledged, "acknowledgements")

@@ -1,0 +1,54 @@
+"""What was received from each legacy peer, in a file, for the next run of the daemon.
+
+A legacy sender never retransmits: what was in flight to a daemon that stopped would occupy its slots for 10 s. The file
+is only useful after a restart within that time, so nothing waits until it is on disk, and it is overwritten in place:
+replacing it would make some file systems write it at once.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from udp_mesh.core.legacy.acks import MAX_BEHIND, ReceivePosition
+from udp_mesh.wire.legacy import LAST_SEQUENCE
+from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENTS
+
+log = logging.getLogger(__name__)
+
+MAX_FILE_BYTES = 1 << 20
+
+
+def load_positions(path: Path) -> dict[str, ReceivePosition]:
+    """The positions by peer; none if there is no file, or if it was being written when the computer stopped."""
+    try:
+        with path.open("rb") as file:
+            entries = json.loads(file.read(MAX_FILE_BYTES))
+        return {str(name): _position(*entry) for name, entry in entries.items()}
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        log.warning("legacy-positions-unreadable path=%s error=%s", path, error)
+        return {}
+
+
+def _position(latest: int, recent: list[list[int]]) -> ReceivePosition:
+    entries = tuple([(int(sequence), int(expected), int(total)) for sequence, expected, total in recent[:MAX_BEHIND]])
+    for sequence, expected, total in ((latest, 0, 0), *entries):
+        if not 1 <= sequence <= LAST_SEQUENCE or not 0 <= expected <= total <= MAX_LEGACY_FRAGMENTS:
+            raise ValueError(f"expected a message number of 1-{LAST_SEQUENCE}, found {sequence}: {expected}/{total}")
+    return ReceivePosition(latest, entries)
+
+
+def save_positions(path: Path, positions: Mapping[str, ReceivePosition]) -> None:
+    """Write the file, padded to the length it had. Raises OSError."""
+    data = json.dumps(positions).encode()
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        os.pwrite(descriptor, data.ljust(os.fstat(descriptor).st_size), 0)
+    finally:
+        os.close(descriptor)
