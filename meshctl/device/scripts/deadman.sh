@@ -440,7 +440,7 @@ put_new() {
 	extra do "$CHANGE" || return 1
 	while read -r kind _ _ _ path; do
 		case $kind in
-		file | link) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
+		file | link) { [ -d "${path%/*}" ] || mkdir -p "${path%/*}"; } && mv -f "$CHANGE/new$path" "$path" ;;
 		remove) rm -f "$path" ;;
 		esac || return 1
 	done <"$CHANGE/manifest"
@@ -461,7 +461,8 @@ put_previous() {
 	left=0
 	while read -r kind path; do
 		[ "$kind" = had ] && exists "$CHANGE/prev$path" || continue
-		mkdir -p "${path%/*}" && mv -f "$CHANGE/prev$path" "$path"
+		[ -d "${path%/*}" ] || mkdir -p "${path%/*}"
+		mv -f "$CHANGE/prev$path" "$path"
 		! exists "$CHANGE/prev$path" || left=1
 	done <"$CHANGE/previous"
 	sync
