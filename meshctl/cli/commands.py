@@ -10,12 +10,15 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """`attribute` of `module` is a function or, for a group, a Typer app; without `module` it is an extension."""
+    """`attribute` of `module` is a function or, for a group, a Typer app; without `module` it is an extension.
+
+    `heading` is the section of `meshctl --help`, whose commands follow one another.
+    """
 
     module: str
     attribute: str
     summary: str
-    panel: str = "Commands"
+    heading: str
 
 
 _INVENTORY = "Inventory"

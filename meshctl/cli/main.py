@@ -7,20 +7,21 @@ one by its summary only, and hands over to typer.
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 import os
 import sys
 from collections.abc import Callable, MutableMapping, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import DEFAULT_MARKUP_MODE
+from typer.core import TyperGroup
 
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, ignore_broken_pipe, is_plain, prepare_streams
-from meshctl.cli.verbosity import with_verbosity
+from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
 from meshctl.errors import ExitCode, MeshctlError
 
 if TYPE_CHECKING:
@@ -30,6 +31,11 @@ _EPILOG = """Start with `meshctl init DIR`, or with `meshctl lab up` for a virtu
 
 Exit codes: 0 success, 1 findings, 2 could not run, 3 required nodes unreachable, 130 interrupted."""
 
+# Lines longer than this are hard to read.
+MAX_HELP_COLUMNS = 100
+# Objects created before the youngest are searched for cycles, and collections before the next older generation is.
+GC_THRESHOLD = (50_000, 20, 50)
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run meshctl with `arguments` (default: sys.argv); always raises SystemExit."""
@@ -37,9 +43,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     requested = next((word for word in completing or words if not word.startswith("-")), "")
+    # a fleet's answers are hundreds of thousands of objects without cycles: by default, a quarter of status is spent
+    # looking for some
+    gc.set_threshold(*GC_THRESHOLD)
     try:
         defaults = user_defaults(os.environ)
         command = typer.main.get_command(build(requested))
+        gc.freeze()
         command(args=words, prog_name="meshctl", default_map=default_map(defaults, requested, command))
     except MeshctlError as error:
         _print_error(error)
@@ -83,18 +93,39 @@ def build(requested: str) -> typer.Typer:
         help="Manage a fleet of OpenWrt mesh radios from one inventory.",
         epilog=_EPILOG,
         no_args_is_help=True,
+        cls=_RootGroup,
         pretty_exceptions_enable=False,
-        # None: plain help and usage errors
-        rich_markup_mode=None if is_plain() else DEFAULT_MARKUP_MODE,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        # plain help and usage errors: importing rich for its boxes takes longer than everything else
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MAX_HELP_COLUMNS},
     )
     app.callback()(_root)
     for name, entry in COMMANDS.items():
         if name == requested:
             _register(app, name, entry)
         else:
-            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_placeholder)
+            app.command(name, help=entry.summary)(_placeholder)
     return app
+
+
+class _Group(TyperGroup):
+    """Lists commands with their whole summaries, which click would cut at the end of the line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        summaries = [(name, command.get_short_help_str(sys.maxsize)) for name, command in self.commands.items()]
+        with formatter.section("Commands"):
+            formatter.write_dl(summaries)
+
+
+class _RootGroup(TyperGroup):
+    """Lists the commands under the headings of their table, in its order."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        # one column of names for all sections
+        widest = max(map(len, COMMANDS))
+        for heading, entries in groupby(COMMANDS.items(), lambda item: item[1].heading):
+            with formatter.section(heading):
+                formatter.write_dl([(name.ljust(widest), entry.summary) for name, entry in entries])
 
 
 def _root(
@@ -119,11 +150,11 @@ def _placeholder() -> None:
 def _register(app: typer.Typer, name: str, entry: Entry) -> None:
     target = getattr(importlib.import_module(entry.module), entry.attribute) if entry.module else load(name)
     if isinstance(target, typer.Typer):
-        _guard_group(target)
-        app.add_typer(target, name=name, help=entry.summary, rich_help_panel=entry.panel, no_args_is_help=True)
+        _prepare_group(target)
+        app.add_typer(target, name=name, cls=_Group, help=entry.summary, no_args_is_help=True)
     else:
         # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
-        app.command(name, rich_help_panel=entry.panel)(_guarded(target))
+        app.command(name)(_guarded(target))
 
 
 def _print_error(error: MeshctlError) -> None:
@@ -132,13 +163,14 @@ def _print_error(error: MeshctlError) -> None:
         echo(f"hint: {error.hint}", err=True)
 
 
-def _guard_group(group: typer.Typer) -> None:
+def _prepare_group(group: typer.Typer) -> None:
     for command in group.registered_commands:
         if command.callback is not None:
             command.callback = _guarded(command.callback)
     for inner in group.registered_groups:
+        inner.cls = _Group
         if inner.typer_instance is not None:
-            _guard_group(inner.typer_instance)
+            _prepare_group(inner.typer_instance)
 
 
 def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -146,6 +178,9 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
     if "is_guarded" in vars(command):
         # the commands of a group are guarded in place, and the group may be registered again
         return command
+    # here, because the root command's help does not need it
+    from meshctl.cli.verbosity import with_verbosity
+
     command = with_verbosity(command)
 
     @functools.wraps(command)

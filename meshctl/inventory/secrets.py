@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import assert_never
-
-import pyrage
+from typing import TYPE_CHECKING, assert_never
 
 from meshctl import event_log
 from meshctl.diagnostics import Position
@@ -21,6 +19,9 @@ from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar
 from meshctl.model import Secret, SecretKind, SecretRef
+
+if TYPE_CHECKING:
+    import pyrage
 
 # A key file has a few lines.
 MAX_SECRET_FILE_BYTES = 1024 * 1024
@@ -87,6 +88,9 @@ class SecretStore:
     def _decrypt(self, path: Path, identity: Path) -> bytes:
         known = self._files.get((path, identity))
         if known is None:
+            # few inventories have encrypted files
+            import pyrage
+
             try:
                 known = pyrage.decrypt(_read(path), _identities(identity))
             except pyrage.DecryptError:
@@ -122,6 +126,8 @@ def _read(path: Path) -> bytes:
 
 def _identities(path: Path) -> list[pyrage.x25519.Identity | pyrage.ssh.Identity]:
     """An SSH private key, or the `AGE-SECRET-KEY-1...` lines of age-keygen."""
+    import pyrage
+
     content = _read(path)
     try:
         if content.startswith(b"-----BEGIN"):

@@ -145,6 +145,20 @@ class Node:
         """A snapshot for the autonomy, the status page and the metrics."""
         return _snapshot(self._state, now)
 
+    def peer_addresses(self) -> dict[str, set[Address]]:
+        """Link -> the addresses from which authenticated peers send: a driver reads what comes from elsewhere with less
+        priority. It changes with the events of peers and with links."""
+        addresses: dict[str, set[Address]] = {name: set() for name in self._state.links}
+        for peer in self._state.peer_table.online():
+            if peer.session is not None and peer.session.path.link in addresses:
+                addresses[peer.session.path.link].add(peer.session.path.address)
+        return addresses
+
+    @property
+    def unauthenticated(self) -> int:
+        """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
+        return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
+
     def legacy_positions(self) -> dict[str, ReceivePosition]:
         """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
         return self._legacy.positions()

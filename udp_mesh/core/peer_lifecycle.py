@@ -12,13 +12,13 @@ from udp_mesh.core.broadcast import NackRepair
 from udp_mesh.core.events import (
     Incompatible,
     NameConflict,
-    PathNarrowed,
     PeerAddressChanged,
     PeerOffline,
     PeerOnline,
     PeerRestarted,
     TopicStarved,
 )
+from udp_mesh.core.path_mtu import refragment, update_pmtu
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
@@ -26,10 +26,7 @@ from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
 from udp_mesh.core.peers.session_state import ReceptionEvent
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
-from udp_mesh.core.sender.message import OutgoingMessage
-from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.pmtu import NARROWER_MTUS
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
@@ -246,78 +243,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
     if not first and session.verified and session.peer is not None:
         state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
     if sender is not None and path.fragment_bytes < before:
-        _refragment(sender, path, include_sent=False)
-
-
-def update_mtu(state: State, session: Session, mtu: int) -> None:
-    """The link or the settings changed under a session's path: fit both, and what the path was found to carry."""
-    path = session.path
-    sender = session.peer.sender if session.peer is not None else None
-    if sender is not None and sender.pmtu.narrowed_at is not None:
-        mtu = min(mtu, path.mtu)
-    before = path.mtu
-    path.switch_to(path.link, path.address, mtu, state.settings.fragment_bytes)
-    if sender is not None and mtu < before:
-        _refragment(sender, path, include_sent=False)
-
-
-def _refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
-    """Restart messages whose fragments are larger than the path now carries.
-
-    A message sent completely may have arrived completely, and under a new number it would arrive twice. It is restarted
-    only with `include_sent`, when none of its large fragments get through anyway. Otherwise the kernel fragments what
-    is too large for the link.
-    """
-    for message in list(sender.pending):
-        if not include_sent and message.started and message.next_position >= message.fragments:
-            continue
-        if message.started and any(
-            not there and _fragment_bytes(message, position) > path.fragment_bytes
-            for position, there in enumerate(message.arrived)
-        ):
-            sender.cancel(message)
-            sender.resend_from_start(message)
-
-
-def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
-    start, end = message.span(position)
-    return end - start
-
-
-def _update_pmtu(state: State, peer: Peer, sender: Sender, session: Session, now: float) -> None:
-    """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
-    path, size = session.path, sender.pmtu
-    info = state.links.get(path.link)
-    fragment_bytes = state.settings.fragment_bytes
-    rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
-    narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
-    if size.is_black_hole(now) and narrower:
-        path.switch_to(path.link, path.address, narrower.pop(0), fragment_bytes)
-        size.on_narrowed(now)
-        state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))
-        _refragment(sender, path, include_sent=True)
-        state.ready[peer] = None
-    size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
-    if size.narrowed_at is None or info is None:
-        return
-    if size.probe.confirmed_mtu > path.mtu:
-        path.switch_to(path.link, path.address, min(size.probe.confirmed_mtu, info.mtu), fragment_bytes)
-        size.reset()
-    rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
-    rooms[info.mtu] = datagram_room(path.address, info.mtu, fragment_bytes)
-    larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
-    if not larger:
-        size.narrowed_at = None
-    elif (
-        peer.online
-        and path.confirmed
-        and sender.state is not SendState.UNRESPONSIVE
-        and size.probe.due(now, sender.loss)
-    ):
-        for room, mtu in larger.items():
-            token = state.rng.getrandbits(64)
-            size.probe.on_probe_sent(token, mtu)
-            state.outgoing.append(build_mtu_probe(sender, path, token, room))
+        refragment(sender, path, include_sent=False)
 
 
 def on_bye(state: State, session: Session, now: float) -> None:
@@ -411,7 +337,7 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
     sender = peer.sender
     if sender is not None:
         _report_starved(state, peer.name, sender, now)
-        _update_pmtu(state, peer, sender, session, now)
+        update_pmtu(state, peer, sender, session, now)
         session.meters.sent.feed(sender.sent_bytes, now)
         session.meters.delivered.feed(sender.delivered_bytes, now)
 

@@ -8,7 +8,7 @@ from enum import Enum
 
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import update_mtu
+from udp_mesh.core.path_mtu import update_mtu
 from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
 from udp_mesh.core.sender.message import AcceptedMessage

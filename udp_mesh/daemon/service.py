@@ -8,7 +8,6 @@ single thread.
 from __future__ import annotations
 
 import asyncio
-import fnmatch
 import logging
 import os
 from collections import OrderedDict
@@ -16,7 +15,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 
-from udp_mesh.client.mesh_client import Header, encode_frame
+from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
@@ -29,20 +28,14 @@ from udp_mesh.core.events import (
 from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import (
-    BENCH_TOPIC,
-    CONDITIONS_TOPIC,
-    PING_TOPIC,
-    PONG_TOPIC,
-    RESERVED_PREFIX,
-    Configuration,
-    load,
-)
+from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
+from udp_mesh.daemon.subscriptions import Subscriptions
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +43,6 @@ MAX_OUTCOMES = 65_536
 """Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
-MAX_PATTERNS = 1024
-"""Patterns per client: each is matched against each new topic."""
 TOKEN_BYTES = 8
 
 
@@ -84,9 +75,8 @@ class Service:
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
-        self._subscriptions: dict[Client, list[str]] = {}
+        self.subscriptions = Subscriptions()
         self._watchers: set[Client] = set()
-        self._routes: dict[str, list[Client]] = {}
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
         self._pings: dict[bytes, asyncio.Future[float]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -143,23 +133,8 @@ class Service:
             client.refuse(header.get("id"), error.code, str(error))
 
     def client_gone(self, client: Client) -> None:
-        self._subscriptions.pop(client, None)
+        self.subscriptions.remove_client(client)
         self._watchers.discard(client)
-        self._routes.clear()
-
-    def subscribe(self, client: Client, patterns: list[str]) -> None:
-        wanted = self._subscriptions.setdefault(client, [])
-        # A client may subscribe to the same pattern repeatedly; store it once.
-        new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
-        if len(wanted) + len(new) > MAX_PATTERNS:
-            raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
-        wanted.extend(new)
-        self._routes.clear()
-
-    def unsubscribe(self, client: Client, patterns: list[str]) -> None:
-        kept = [pattern for pattern in self._subscriptions.get(client, ()) if pattern not in patterns]
-        self._subscriptions[client] = kept
-        self._routes.clear()
 
     def subscribe_events(self, client: Client) -> None:
         """Sends all events except messages to this client."""
@@ -330,7 +305,7 @@ class Service:
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self._distribute(
+        self.subscriptions.distribute(
             {
                 "event": "message",
                 "source": event.source,
@@ -350,23 +325,6 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
-    def _distribute(self, header: Header, payload: bytes) -> None:
-        topic = str(header["topic"])
-        clients = self._routes.get(topic)
-        if clients is None:
-            clients = [
-                client
-                for client, patterns in self._subscriptions.items()
-                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
-            ]
-            if len(self._routes) >= MAX_COUNTED_TOPICS:
-                self._routes.clear()
-            self._routes[topic] = clients
-        if clients:
-            frame = encode_frame(header, payload)
-            for client in clients:
-                client.send_encoded(frame)
-
     def _publish_conditions(self) -> None:
         """Once per period: sends the conditions to subscribed clients and to the recording."""
         period_s = self.configuration.daemon.conditions_period_s
@@ -375,22 +333,21 @@ class Service:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
         self._spawn(self._save_positions())
-        wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
-        if not wanted and self.recorder is None:
+        clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
+        if not clients and self.recorder is None:
             return
         conditions = self.driver.conditions()
         if self.recorder is not None:
             self.recorder.conditions(conditions)
-        if wanted:
+        if clients:
             header: Header = {
                 "event": "conditions",
                 "source": self.settings.name,
                 "topic": CONDITIONS_TOPIC,
                 "conditions": conditions_json(conditions),
             }
-            for client, patterns in self._subscriptions.items():
-                if CONDITIONS_TOPIC in patterns:
-                    client.send_event(header)
+            for client in clients:
+                client.send_event(header)
 
     async def _save_positions(self) -> None:
         """Saves what was received from legacy peers, if there are any and it changed."""

@@ -181,6 +181,7 @@ def test_a_datagram_that_came_just_now_is_taken_for_the_last_and_the_next_look_f
     pair: tuple[UdpLink, UdpLink],
 ) -> None:
     alice, bob = pair
+    bob.set_peers(frozenset({alice.attachment.address}))
     for size in (10, 20, 30):
         assert alice.send([Out(bytes(size), bob.attachment.address)]) == 1
     found: list[int] = []

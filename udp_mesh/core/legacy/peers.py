@@ -105,12 +105,14 @@ class LegacyPeer:
 class LegacyPeers:
     """All legacy peers by host address. `next_at` is when something is due."""
 
-    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state")
+    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state", "accepted")
 
     def __init__(self, state: State, positions: Mapping[str, ReceivePosition]) -> None:
         """`positions` are those of the previous run, by peer."""
         self._state = state
         self._restored = dict(positions)
+        self.accepted = 0
+        """Datagrams of configured addresses. Nothing authenticates them."""
         self._by_host: dict[str, LegacyPeer] = {}
         self._heartbeat_at = float("-inf")
         self.apply()
@@ -158,6 +160,7 @@ class LegacyPeers:
             return
         try:
             datagram = decode_legacy(data)
+            self.accepted += 1
             self._on_activity(legacy, link, source, now)
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
