@@ -31,11 +31,6 @@ def set_groups(directory: Path, masks: Mapping[str, int]) -> None:
     request(directory, {"op": "set_groups", "masks": dict(masks)})
 
 
-def set_loss(directory: Path, losses: Mapping[tuple[str, str], float]) -> None:
-    """Set the share (0..1) of frames from the first node of each pair that the second one loses."""
-    request(directory, {"op": "set_loss", "losses": [[a, b, loss] for (a, b), loss in losses.items()]})
-
-
 def radios(directory: Path) -> dict[str, tuple[str, ...]]:
     """The phy names of each node's radios: `{"b01": ("phy1",)}`."""
     return {name: tuple(phys) for name, phys in request(directory, {"op": "radios"})["radios"].items()}

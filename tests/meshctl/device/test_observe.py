@@ -74,7 +74,6 @@ def test_the_facts_a_plan_needs_are_there_for_every_release(release: str) -> Non
     assert "batctl-full" in seen.packages
     assert seen.host_keys
     assert seen.clock_offset_s == 8.0
-    assert seen.uptime_error_s == 2.0
 
 
 def test_an_empty_answer_is_an_empty_observation_with_a_note_for_each_fact() -> None:
