@@ -108,7 +108,11 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
-        Journal(default_path(os.environ), lab=lab_directory) as journal,
+        Journal(
+            default_path(os.environ),
+            lab=lab_directory,
+            pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
+        ) as journal,
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
         journal.move_lab_runs(fleet.name, lab_of)

@@ -158,6 +158,9 @@ def resume(
         if record.command == "restore":
             hint = f"run `meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` to apply the inventory"
             raise InputError(f"run {record.id} restored a backup, which cannot be resumed", hint=hint)
+        if record.command == "rollback":
+            hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
+            raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
         names = _still_managed(opened, left)
         if not names:
             echo(f"run {record.id} is finished: nothing to resume", err=as_json)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,11 @@ from meshctl.fleet.process import owner, process_lives, this_process
 
 # During a run nodes wait to be confirmed, so a locked journal is written later.
 STEP_TIMEOUT_S = 1.0
+# Keys of facts: those that every command stores have the node's name alone, those of `status` a prefix.
+NODE_PREFIX = "status."
+ROBOT_PREFIX = "robot."
+# The fact that tells which device the others are of: the host keys that were pinned for it.
+_HOST_KEYS = "host_keys"
 # separates the name of a fleet and the directory of its lab (ASCII unit separator)
 _LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
@@ -86,10 +91,12 @@ class LastKnown:
 class Journal:
     """The journal file. Safe for several threads and processes; close it, or use a `with` block."""
 
-    def __init__(self, path: Path, *, lab: str = "") -> None:
-        """`lab` is the directory of a virtual fleet, empty for real nodes."""
+    def __init__(self, path: Path, *, lab: str = "", pinned: Callable[[str], Iterable[str]] = lambda node: ()) -> None:
+        """`lab` is the directory of a virtual fleet, empty for real nodes; `pinned` are the fingerprints of the host
+        keys pinned for a node: facts of a device with other keys, which has been replaced since, are left out."""
         self.path = path
         self.lab = lab
+        self._pinned = pinned
         self._file = JournalFile(path)
 
     def __enter__(self) -> Journal:
@@ -193,14 +200,30 @@ class Journal:
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
         with self._file.write() as database:
             database.executemany(
-                _REMEMBER, [_sighting(self._key(fleet), node, known, seen_s) for node, known in facts.items()]
+                _REMEMBER,
+                [_sighting(self._key(fleet), node, self._marked(node, known), seen_s) for node, known in facts.items()],
             )
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
         rows = self._file.read(
             "SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),)
         )
-        return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
+        found: dict[str, LastKnown] = {}
+        for node, seen_s, text in rows:
+            facts = json.loads(text)
+            keys, pinned = set(facts.pop(_HOST_KEYS, "").split()), set(self._keys_of(node))
+            if not (keys and pinned and keys.isdisjoint(pinned)):
+                found[node] = LastKnown(node, seen_s, facts)
+        return found
+
+    def _keys_of(self, node: str) -> tuple[str, ...]:
+        """The host keys pinned for a radio now."""
+        return () if node.startswith(ROBOT_PREFIX) else tuple(self._pinned(node.removeprefix(NODE_PREFIX)))
+
+    def _marked(self, node: str, facts: Mapping[str, str]) -> dict[str, str]:
+        """The facts, with the host keys of the device that they are of."""
+        keys = " ".join(self._keys_of(node))
+        return {**facts, **({_HOST_KEYS: keys} if keys else {})}
 
     def move_lab_runs(self, fleet: str, lab_of: Callable[[str], str]) -> None:
         """Move each lab's runs of `fleet`, which an earlier version stored under the real fleet's name, to the lab.
@@ -257,7 +280,8 @@ class Run:
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Store the facts of a node during this run."""
-        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, facts, seen_s))
+        marked = self._journal._marked(node, facts)
+        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, marked, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:

@@ -272,3 +272,27 @@ def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_the
         assert [run.id for run in lab.runs(fleet="practice")] == [only_virtual.id]
         assert set(field.last_known("f")) == {"a"}, "their origin is unknown: they stay"
         assert (field.last_known("practice"), set(lab.last_known("practice"))) == ({}, {"a"})
+
+
+def test_facts_of_a_device_that_was_replaced_are_left_out(path: Path) -> None:
+    """On any laptop: the pinned host keys come with the inventory, whoever ran `meshctl replace`."""
+    pins = {"b01": ["SHA256:old"], "b02": ["SHA256:b02"]}
+
+    def opened() -> Journal:
+        return Journal(path, pinned=lambda node: pins.get(node, ()))
+
+    with opened() as journal:
+        for key in ("b01", "b02", "status.b01", "robot.b01"):
+            journal.remember("f", key, {"macs": f"02:00:00:00:00:0{len(key) % 10}"}, 100.0)
+    pins["b01"] = ["SHA256:new"]
+    with opened() as journal:
+        known = journal.last_known("f")
+        assert sorted(known) == ["b02", "robot.b01"]
+        assert known["b02"].facts == {"macs": "02:00:00:00:00:03"}
+        run = journal.begin("provision", fleet="f", inventory="", nodes=("b01",))
+        run.remember("f", "b01", {"macs": "02:00:00:00:00:11"}, 200.0)
+        assert journal.last_known("f")["b01"].facts == {"macs": "02:00:00:00:00:11"}
+    # one key of several was rotated, or known_hosts is not at hand: still the same device
+    pins["b01"], pins["b02"] = ["SHA256:new", "SHA256:rsa"], []
+    with opened() as journal:
+        assert {"b01", "b02"} <= set(journal.last_known("f"))
