@@ -1,7 +1,7 @@
-"""Low-level access to a QEMU fleet from the host: run commands in its machine, set radios' groups and losses.
+"""Low-level access to a QEMU fleet from the host: run commands in its machine, set radios' groups.
 
-All functions take the fleet's directory, as `VirtualFleet.attach` does. Prefer `VirtualFleet.link`, which sets groups
-and losses itself and survives reboots; what is set here lasts until the next change of a link.
+All functions take the fleet's directory, as `VirtualFleet.attach` does. Prefer `VirtualFleet.link`, which sets the
+groups itself and survives reboots; what is set here lasts until the next change of a link.
 
 Every function raises LabError when no such fleet runs, InputError for unknown nodes.
 """
