@@ -238,19 +238,9 @@ class SshConnection(Connection):
         return time.monotonic() - self._activity.last_received_s
 
     @property
-    def server_version(self) -> str:
-        """The server's identification: `SSH-2.0-dropbear_2022.83`."""
-        return self._transport.remote_version
-
-    @property
     def host_key(self) -> HostKey:
         key = self._transport.get_remote_server_key()
         return HostKey(key.get_name(), key.asbytes())
-
-    @property
-    def host_key_algorithm(self) -> str:
-        """The server's signature algorithm: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
-        return str(self._transport.host_key_type)
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""
