@@ -404,6 +404,8 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
     if session.received_bytes:
         session.meters.received.feed(session.received_bytes, now)
     if peer.has_sender:
+        if peer.online and peer.sender.unconfirmed and peer.sender.request_confirmations(now):
+            state.ready[peer] = None
         _report_starved(state, peer, now)
         _update_pmtu(state, peer, session, now)
         session.meters.sent.feed(peer.sender.sent_bytes, now)

@@ -25,6 +25,7 @@ class _Record:
     next_wire_id: int
     floors: dict[tuple[bytes, bytes], int]
     finished: tuple[RangeSet, RangeSet]
+    unconfirmed: set[int]
     freshness: Freshness
 
 
@@ -53,6 +54,7 @@ class BootMemory:
             session.next_wire_id,
             session.floors(),
             (receiver.unicasts.finished, receiver.broadcasts.finished),
+            receiver.unconfirmed,
             session.freshness,
         )
         while len(self._records) > MAX_BOOTS:
@@ -70,6 +72,7 @@ class BootMemory:
         session.next_wire_id = record.next_wire_id
         session.restore_floors(record.floors)
         session.receiver.unicasts.finished, session.receiver.broadcasts.finished = record.finished
+        session.receiver.unconfirmed = record.unconfirmed
         session.freshness = record.freshness
         session.restored = True
         session.replaced = record.name == session.name

@@ -336,3 +336,4 @@ class Session:
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
         self.timed = self.path.timed = bool(beat.features & Feature.TIMED)
+        self.path.confirms = bool(beat.features & Feature.CONFIRM)
