@@ -23,6 +23,7 @@ from udp_mesh.core.events import (
     MessageExpired,
     MessagePeerLost,
     MessageReceived,
+    Receipt,
     Rejected,
     RejectReason,
 )
@@ -39,6 +40,7 @@ from udp_mesh.daemon.configuration import (
     load,
 )
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
@@ -80,11 +82,19 @@ class Service:
             legacy_positions=self._positions,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
+        self.inbox = Inbox(
+            DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
+            self._confirm,
+            self._request_again,
+        )
+        self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
         self._subscriptions: dict[Client, list[str]] = {}
+        self._acknowledging: set[Client] = set()
+        """Clients that acknowledge messages with receipts."""
         self._watchers: set[Client] = set()
         self._routes: dict[str, list[Client]] = {}
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
@@ -115,6 +125,7 @@ class Service:
         await self._save_positions()
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
+        await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
 
     # Requests (called by the local API)
 
@@ -142,19 +153,29 @@ class Service:
         except RequestError as error:
             client.refuse(header.get("id"), error.code, str(error))
 
+    def client_read(self) -> None:
+        self.inbox.take_read()
+
     def client_gone(self, client: Client) -> None:
         self._subscriptions.pop(client, None)
         self._watchers.discard(client)
+        self._acknowledging.discard(client)
         self._routes.clear()
+        self.inbox.client_gone(client)
+        self._pass_on_held()
 
-    def subscribe(self, client: Client, patterns: list[str]) -> None:
+    def subscribe(self, client: Client, patterns: list[str], *, acknowledge: bool = False) -> None:
+        """Sends messages of these topics to the client. With `acknowledge` it acknowledges those that have receipts."""
         wanted = self._subscriptions.setdefault(client, [])
         # A client may subscribe to the same pattern repeatedly; store it once.
         new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
         if len(wanted) + len(new) > MAX_PATTERNS:
             raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
         wanted.extend(new)
+        if acknowledge:
+            self._acknowledging.add(client)
         self._routes.clear()
+        self._pass_on_held()
 
     def unsubscribe(self, client: Client, patterns: list[str]) -> None:
         kept = [pattern for pattern in self._subscriptions.get(client, ()) if pattern not in patterns]
@@ -330,17 +351,23 @@ class Service:
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self._distribute(
-            {
-                "event": "message",
-                "source": event.source,
-                "topic": topic,
-                "type": event.type_name,
-                "priority": event.priority,
-                "broadcast": event.broadcast,
-            },
-            event.payload,
-        )
+        header: Header = {
+            "event": "message",
+            "source": event.source,
+            "topic": topic,
+            "type": event.type_name,
+            "priority": event.priority,
+            "broadcast": event.broadcast,
+        }
+        if event.receipt is None:
+            self._distribute(header, event.payload)
+            return
+        key = self.inbox.add(event)
+        for client in self._clients(topic):
+            self._send_held(client, key, header, event.payload)
+        self.inbox.on_distributed(key)
+        if self.inbox.needs_flush:
+            self._spawn(self.inbox.flush())
 
     def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
@@ -350,8 +377,51 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
-    def _distribute(self, header: Header, payload: bytes) -> None:
-        topic = str(header["topic"])
+    # Messages held until a program takes them
+
+    def _confirm(self, receipt: Receipt) -> None:
+        self.driver.node.confirm(receipt)
+        self.driver.send_soon()
+
+    def _request_again(self, receipt: Receipt) -> None:
+        self.driver.node.request_again(receipt)
+        self.driver.send_soon()
+
+    def _send_held(self, client: Client, key: int, header: Header, payload: bytes) -> None:
+        acknowledges = client in self._acknowledging
+        if client.send_encoded(encode_frame({**header, "receipt": key} if acknowledges else header, payload)):
+            self.inbox.on_sent(key, client, acknowledges=acknowledges)
+
+    def _pass_on_held(self) -> None:
+        """Sends messages that no program is reading to the programs subscribed now."""
+        if any(self._clients(topic) for topic in self.inbox.topics()):
+            self._spawn(self._send_from_disk())
+
+    async def _send_from_disk(self) -> None:
+        loop = asyncio.get_running_loop()
+        for key in self.inbox.waiting(lambda topic: bool(self._clients(topic))):
+            message = await loop.run_in_executor(None, self.inbox.read, key)
+            if message is None or not self.inbox.is_waiting(key):
+                continue
+            topic = self.topic(message.topic)
+            header: Header = {
+                "event": "message",
+                "source": message.peer,
+                "topic": message.topic,
+                "type": message.type_name,
+                "priority": 0 if topic is None else topic.priority,
+                "broadcast": False,
+            }
+            for client in self._clients(message.topic):
+                self._send_held(client, key, header, message.payload)
+            self.inbox.on_distributed(key)
+
+    def acknowledge(self, client: Client, receipts: list[int]) -> int:
+        """A client took these messages. Returns how many of them were waiting for that."""
+        return sum([self.inbox.acknowledge(client, receipt) for receipt in receipts])
+
+    def _clients(self, topic: str) -> list[Client]:
+        """The clients subscribed to a topic."""
         clients = self._routes.get(topic)
         if clients is None:
             clients = [
@@ -362,6 +432,10 @@ class Service:
             if len(self._routes) >= MAX_COUNTED_TOPICS:
                 self._routes.clear()
             self._routes[topic] = clients
+        return clients
+
+    def _distribute(self, header: Header, payload: bytes) -> None:
+        clients = self._clients(str(header["topic"]))
         if clients:
             frame = encode_frame(header, payload)
             for client in clients:
@@ -375,6 +449,8 @@ class Service:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
         self._spawn(self._save_positions())
+        self.inbox.take_read()
+        self._pass_on_held()
         wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
         if not wanted and self.recorder is None:
             return

@@ -188,6 +188,9 @@ def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch
         def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
             client.reply(header.get("id"))
 
+        def client_read(self) -> None:
+            pass
+
         def client_gone(self, client: api.Client) -> None: ...
 
     async def work(path: Path) -> None:
