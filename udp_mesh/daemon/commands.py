@@ -115,7 +115,7 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
 
 
 def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscribe(client, _texts(header, "topics"), acknowledge=bool(header.get("acknowledge")))
+    service.subscriptions.add(client, _texts(header, "topics"), acknowledge=bool(header.get("acknowledge")))
     return {}
 
 
@@ -127,7 +127,7 @@ def acknowledge(service: Service, client: Client, header: Header, _: bytes) -> H
 
 
 def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.unsubscribe(client, _texts(header, "topics"))
+    service.subscriptions.remove(client, _texts(header, "topics"))
     return {}
 
 

@@ -8,7 +8,6 @@ single thread.
 from __future__ import annotations
 
 import asyncio
-import fnmatch
 import logging
 import os
 from collections import OrderedDict
@@ -16,7 +15,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 
-from udp_mesh.client.mesh_client import Header, encode_frame
+from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
@@ -45,6 +44,7 @@ from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
+from udp_mesh.daemon.subscriptions import Subscriptions
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +52,6 @@ MAX_OUTCOMES = 65_536
 """Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
-MAX_PATTERNS = 1024
-"""Patterns per client: each is matched against each new topic."""
 TOKEN_BYTES = 8
 
 
@@ -92,11 +90,8 @@ class Service:
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
-        self._subscriptions: dict[Client, list[str]] = {}
-        self._acknowledging: set[Client] = set()
-        """Clients that acknowledge messages with receipts."""
+        self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority)
         self._watchers: set[Client] = set()
-        self._routes: dict[str, list[Client]] = {}
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
         self._pings: dict[bytes, asyncio.Future[float]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -157,30 +152,8 @@ class Service:
         self.inbox.take_read()
 
     def client_gone(self, client: Client) -> None:
-        self._subscriptions.pop(client, None)
         self._watchers.discard(client)
-        self._acknowledging.discard(client)
-        self._routes.clear()
-        self.inbox.client_gone(client)
-        self._pass_on_held()
-
-    def subscribe(self, client: Client, patterns: list[str], *, acknowledge: bool = False) -> None:
-        """Sends messages of these topics to the client. With `acknowledge` it acknowledges those that have receipts."""
-        wanted = self._subscriptions.setdefault(client, [])
-        # A client may subscribe to the same pattern repeatedly; store it once.
-        new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
-        if len(wanted) + len(new) > MAX_PATTERNS:
-            raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
-        wanted.extend(new)
-        if acknowledge:
-            self._acknowledging.add(client)
-        self._routes.clear()
-        self._pass_on_held()
-
-    def unsubscribe(self, client: Client, patterns: list[str]) -> None:
-        kept = [pattern for pattern in self._subscriptions.get(client, ()) if pattern not in patterns]
-        self._subscriptions[client] = kept
-        self._routes.clear()
+        self.subscriptions.client_gone(client)
 
     def subscribe_events(self, client: Client) -> None:
         """Sends all events except messages to this client."""
@@ -351,23 +324,7 @@ class Service:
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        header: Header = {
-            "event": "message",
-            "source": event.source,
-            "topic": topic,
-            "type": event.type_name,
-            "priority": event.priority,
-            "broadcast": event.broadcast,
-        }
-        if event.receipt is None:
-            self._distribute(header, event.payload)
-            return
-        key = self.inbox.add(event)
-        for client in self._clients(topic):
-            self._send_held(client, key, header, event.payload)
-        self.inbox.on_distributed(key)
-        if self.inbox.needs_flush:
-            self._spawn(self.inbox.flush())
+        self.subscriptions.distribute(event)
 
     def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
@@ -387,59 +344,13 @@ class Service:
         self.driver.node.request_again(receipt)
         self.driver.send_soon()
 
-    def _send_held(self, client: Client, key: int, header: Header, payload: bytes) -> None:
-        acknowledges = client in self._acknowledging
-        if client.send_encoded(encode_frame({**header, "receipt": key} if acknowledges else header, payload)):
-            self.inbox.on_sent(key, client, acknowledges=acknowledges)
-
-    def _pass_on_held(self) -> None:
-        """Sends messages that no program is reading to the programs subscribed now."""
-        if any(self._clients(topic) for topic in self.inbox.topics()):
-            self._spawn(self._send_from_disk())
-
-    async def _send_from_disk(self) -> None:
-        loop = asyncio.get_running_loop()
-        for key in self.inbox.waiting(lambda topic: bool(self._clients(topic))):
-            message = await loop.run_in_executor(None, self.inbox.read, key)
-            if message is None or not self.inbox.is_waiting(key):
-                continue
-            topic = self.topic(message.topic)
-            header: Header = {
-                "event": "message",
-                "source": message.peer,
-                "topic": message.topic,
-                "type": message.type_name,
-                "priority": 0 if topic is None else topic.priority,
-                "broadcast": False,
-            }
-            for client in self._clients(message.topic):
-                self._send_held(client, key, header, message.payload)
-            self.inbox.on_distributed(key)
-
     def acknowledge(self, client: Client, receipts: list[int]) -> int:
         """A client took these messages. Returns how many of them were waiting for that."""
         return sum([self.inbox.acknowledge(client, receipt) for receipt in receipts])
 
-    def _clients(self, topic: str) -> list[Client]:
-        """The clients subscribed to a topic."""
-        clients = self._routes.get(topic)
-        if clients is None:
-            clients = [
-                client
-                for client, patterns in self._subscriptions.items()
-                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
-            ]
-            if len(self._routes) >= MAX_COUNTED_TOPICS:
-                self._routes.clear()
-            self._routes[topic] = clients
-        return clients
-
-    def _distribute(self, header: Header, payload: bytes) -> None:
-        clients = self._clients(str(header["topic"]))
-        if clients:
-            frame = encode_frame(header, payload)
-            for client in clients:
-                client.send_encoded(frame)
+    def _priority(self, topic: str) -> int:
+        settings = self.topic(topic)
+        return 0 if settings is None else settings.priority
 
     def _publish_conditions(self) -> None:
         """Once per period: sends the conditions to subscribed clients and to the recording."""
@@ -450,8 +361,8 @@ class Service:
             self._spawn(self._flusher.flush())
         self._spawn(self._save_positions())
         self.inbox.take_read()
-        self._pass_on_held()
-        wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
+        self.subscriptions.pass_on_held()
+        wanted = self.subscriptions.exact(CONDITIONS_TOPIC)
         if not wanted and self.recorder is None:
             return
         conditions = self.driver.conditions()
@@ -464,9 +375,8 @@ class Service:
                 "topic": CONDITIONS_TOPIC,
                 "conditions": conditions_json(conditions),
             }
-            for client, patterns in self._subscriptions.items():
-                if CONDITIONS_TOPIC in patterns:
-                    client.send_event(header)
+            for client in wanted:
+                client.send_event(header)
 
     async def _save_positions(self) -> None:
         """Saves what was received from legacy peers, if there are any and it changed."""
