@@ -6,7 +6,6 @@ observation uses a new one (`connect`, `observe_and_decide`), and `confirm` or `
 
 from __future__ import annotations
 
-import re
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -154,8 +153,7 @@ def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
 def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
     """Install the dead-man's switch unless the node has this version."""
     known = ctx.before.change
-    own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
-    if known is None or not known.installed or own is None or known.version != own[1].decode():
+    if known is None or not known.installed or known.version != deadman.version():
         deadman.install(connection)
 
 

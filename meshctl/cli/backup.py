@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import replace
@@ -12,6 +13,7 @@ import typer
 
 from meshctl.apply.backup import (
     Backup,
+    differing_files,
     fetch,
     incompatibility,
     lockout_by,
@@ -26,6 +28,7 @@ from meshctl.apply.prepare import base_macs
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
+    DryRun,
     InventoryPath,
     KeyFiles,
     Lab,
@@ -40,11 +43,13 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
+from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
@@ -106,6 +111,7 @@ def restore(
     node: Annotated[str, typer.Argument(help="Node to restore.")],
     file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -121,11 +127,41 @@ def restore(
         raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
         there = selected_node(opened.fleet, node)
+        if dry_run:
+            _show_restore(opened, there, saved, as_json=as_json)
+            return
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
         journaled = _restore(opened, there.name, saved, as_json=as_json)
         raise print_totals(opened, journaled, as_json=as_json)
+
+
+def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) -> None:
+    """Print what a restore would change. Raises PlanRefused as the restore would."""
+    with opened.access.borrow(node) as connection:
+        seen = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, seen)
+        paths = differing_files(saved, seen, connection)
+    missing = uninstalled_packages(saved, seen)
+    if as_json:
+        report = {"node": node.name, "files": paths, "uninstalled_packages": missing, "disabled": saved.disabled}
+        echo_json(json.dumps(report, indent=1))
+        return
+    echo(f"{node.name}: {len(paths)} files would change" if paths else f"{node.name}: matches the backup")
+    for path in paths:
+        echo(f"  {path}")
+    for package in missing:
+        echo(f"  package {package} is in the backup but no longer installed")
+
+
+def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observation) -> None:
+    """Raises PlanRefused for a backup of another device, or one that would lock us out."""
+    if problem := incompatibility(saved, node.name, seen):
+        raise PlanRefused(problem)
+    lockout = lockout_by(saved, node, opened.access.own_keys(node))
+    if lockout is not None:
+        raise PlanRefused(lockout.reason, hint=lockout.hint)
 
 
 def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> JournaledRun:
@@ -151,12 +187,7 @@ def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> Jou
             connection = opened.access.open(node)
             try:
                 seen = observe_cleared(connection, (), opened.interrupt)
-                problem = incompatibility(saved, name, seen)
-                if problem:
-                    raise PlanRefused(problem)
-                lockout = lockout_by(saved, node, opened.access.own_keys(node))
-                if lockout is not None:
-                    raise PlanRefused(lockout.reason, hint=lockout.hint)
+                _require_restorable(opened, node, saved, seen)
                 around.update(
                     observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
                 )

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from meshctl.device.connection import Endpoint
 from meshctl.errors import InputError
+
+if TYPE_CHECKING:
+    from meshctl.device.connection import Endpoint
 
 _GROUP = "meshctl.extensions"
 
@@ -40,6 +41,9 @@ def attach_lab(directory: Path) -> LabFleet:
 
 def load(name: str) -> Any:
     """The object of the extension `name`. Raises InputError if it is not installed."""
+    # takes a tenth of the start-up, and few commands use an extension
+    from importlib.metadata import entry_points
+
     for entry in entry_points(group=_GROUP, name=name):
         return entry.load()
     raise InputError(f"meshctl extension {name!r} is not installed", hint="install meshctl from its wheel")

@@ -10,21 +10,29 @@ import functools
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, MutableMapping, Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import DEFAULT_MARKUP_MODE
+from typer.core import TyperGroup
 
 from meshctl import __version__
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, ignore_broken_pipe, is_plain, prepare_streams
+from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
+from meshctl.cli.verbosity import with_verbosity
 from meshctl.errors import ExitCode, MeshctlError
+
+if TYPE_CHECKING:
+    from meshctl.cli.user_config import Defaults
 
 _EPILOG = """Start with `meshctl init DIR`, or with `meshctl lab up` for a virtual fleet.
 
 Exit codes: 0 success, 1 findings, 2 could not run, 3 required nodes unreachable, 130 interrupted."""
+
+# Lines longer than this are hard to read.
+MAX_HELP_COLUMNS = 100
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -34,11 +42,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     requested = next((word for word in completing or words if not word.startswith("-")), "")
     try:
-        build(requested)(args=words, prog_name="meshctl")
+        defaults = user_defaults(os.environ)
+        command = typer.main.get_command(build(requested))
+        command(args=words, prog_name="meshctl", default_map=default_map(defaults, requested, command))
+    except MeshctlError as error:
+        _print_error(error)
+        sys.exit(int(error.exit_code))
     except KeyboardInterrupt:
         # during the import of the command, which takes seconds on a busy machine
         echo("interrupted", err=True)
         sys.exit(int(ExitCode.INTERRUPTED))
+
+
+def user_defaults(environ: MutableMapping[str, str]) -> Defaults | None:
+    """The user's configuration file, if there is one; sets the environment variables it stands for.
+
+    Raises InputError with file and line for an invalid file.
+    """
+    named = environ.get("MESHCTL_CONFIG")
+    root = environ.get("XDG_CONFIG_HOME") or os.path.join(environ.get("HOME", "/"), ".config")
+    path = os.path.join(root, "meshctl", "config.toml") if named is None else os.path.expanduser(named)
+    if named == "" or (named is None and not os.path.exists(path)):
+        return None
+    # imported only for those who have such a file: this is part of every start
+    from meshctl.cli.user_config import load
+
+    defaults = load(path)
+    for name, value in defaults.environment.items():
+        environ.setdefault(name, value)
+    return defaults
+
+
+def default_map(defaults: Defaults | None, requested: str, command: Any) -> dict[str, Any] | None:
+    """What the user's file says about the requested command, for click."""
+    if defaults is None or requested not in COMMANDS:
+        return None
+    return {requested: defaults.for_command(requested, command.commands[requested])}
 
 
 def build(requested: str) -> typer.Typer:
@@ -48,18 +87,39 @@ def build(requested: str) -> typer.Typer:
         help="Manage a fleet of OpenWrt mesh radios from one inventory.",
         epilog=_EPILOG,
         no_args_is_help=True,
+        cls=_RootGroup,
         pretty_exceptions_enable=False,
-        # None: plain help and usage errors
-        rich_markup_mode=None if is_plain() else DEFAULT_MARKUP_MODE,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        # plain help and usage errors: importing rich for its boxes takes longer than everything else
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": MAX_HELP_COLUMNS},
     )
     app.callback()(_root)
     for name, entry in COMMANDS.items():
         if name == requested:
             _register(app, name, entry)
         else:
-            app.command(name, help=entry.summary, rich_help_panel=entry.panel)(_placeholder)
+            app.command(name, help=entry.summary)(_placeholder)
     return app
+
+
+class _Group(TyperGroup):
+    """Lists commands with their whole summaries, which click would cut at the end of the line."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        summaries = [(name, command.get_short_help_str(sys.maxsize)) for name, command in self.commands.items()]
+        with formatter.section("Commands"):
+            formatter.write_dl(summaries)
+
+
+class _RootGroup(TyperGroup):
+    """Lists the commands under the headings of their table, in its order."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        # one column of names for all sections
+        widest = max(map(len, COMMANDS))
+        for heading, entries in groupby(COMMANDS.items(), lambda item: item[1].heading):
+            with formatter.section(heading):
+                formatter.write_dl([(name.ljust(widest), entry.summary) for name, entry in entries])
 
 
 def _root(
@@ -84,33 +144,42 @@ def _placeholder() -> None:
 def _register(app: typer.Typer, name: str, entry: Entry) -> None:
     target = getattr(importlib.import_module(entry.module), entry.attribute) if entry.module else load(name)
     if isinstance(target, typer.Typer):
-        _guard_group(target)
-        app.add_typer(target, name=name, help=entry.summary, rich_help_panel=entry.panel, no_args_is_help=True)
+        _prepare_group(target)
+        app.add_typer(target, name=name, cls=_Group, help=entry.summary, no_args_is_help=True)
     else:
         # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
-        app.command(name, rich_help_panel=entry.panel)(_guarded(target))
+        app.command(name)(_guarded(target))
 
 
-def _guard_group(group: typer.Typer) -> None:
+def _print_error(error: MeshctlError) -> None:
+    echo(f"error: {error}", err=True)
+    if error.hint:
+        echo(f"hint: {error.hint}", err=True)
+
+
+def _prepare_group(group: typer.Typer) -> None:
     for command in group.registered_commands:
         if command.callback is not None:
             command.callback = _guarded(command.callback)
     for inner in group.registered_groups:
+        inner.cls = _Group
         if inner.typer_instance is not None:
-            _guard_group(inner.typer_instance)
+            _prepare_group(inner.typer_instance)
 
 
 def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn meshctl's errors and Ctrl-C into a message and an exit code."""
+    """Turn meshctl's errors and Ctrl-C into a message and an exit code, and add the options that all commands have."""
+    if "is_guarded" in vars(command):
+        # the commands of a group are guarded in place, and the group may be registered again
+        return command
+    command = with_verbosity(command)
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
         try:
             return command(*args, **kwargs)
         except MeshctlError as error:
-            echo(f"error: {error}", err=True)
-            if error.hint:
-                echo(f"hint: {error.hint}", err=True)
+            _print_error(error)
             raise typer.Exit(int(error.exit_code)) from None
         except (KeyboardInterrupt, typer.Abort):
             echo("interrupted", err=True)
@@ -121,4 +190,5 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
                 raise
             raise typer.Exit from None
 
+    vars(run)["is_guarded"] = True
     return run

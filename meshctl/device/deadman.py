@@ -136,6 +136,12 @@ def installed_files() -> dict[str, tuple[int, bytes]]:
     }
 
 
+def version() -> str:
+    """The version of the switch that `install` installs."""
+    found = re.search(r"^VERSION=(\S+)", script("deadman.sh"), re.MULTILINE)
+    return found[1] if found else ""
+
+
 def status(connection: Connection) -> ChangeStatus:
     """The switch's state; `installed=False` if the node has none."""
     done = connection.run(f"[ -x {PROGRAM} ] || {{ echo absent; exit 0; }}; {PROGRAM} status")

@@ -10,9 +10,6 @@ import base64
 import binascii
 from dataclasses import dataclass
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
 _ALGORITHM = b"Ed"
 _NAME_BYTES = 8
 _KEY_BYTES = 32
@@ -39,6 +36,10 @@ def parse_public_key(text: str) -> PublicKey:
 
 def verify(message: bytes, signature: str, key: PublicKey) -> None:
     """Return if `signature`, a `.sig` file's text, is valid for `message` and `key`. Raises BadSignature otherwise."""
+    # only inventories with signed images need it
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
     name, value = _parts(signature, "signature", _SIGNATURE_BYTES)
     if name != key.name:
         raise BadSignature(f"expected a signature by key {key.name.hex()}, found one by {name.hex()}")

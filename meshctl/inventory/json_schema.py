@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 from typing import Any
 
 from pydantic import BaseModel
@@ -27,7 +29,16 @@ def json_schema() -> dict[str, Any]:
 
 
 class _Generator(GenerateJsonSchema):
-    """Omits defaults without information: unset keys, and sections with their own defaults."""
+    """Omits defaults without information: unset keys, and sections with their own defaults. Describes each key by its
+    attribute's docstring."""
+
+    def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
+        described = super().model_schema(schema)
+        model: type[BaseModel] = schema["cls"]
+        docstrings = attribute_docstrings(model)
+        for name, field in model.model_fields.items():
+            described["properties"][field.alias or name]["description"] = docstrings[name]
+        return described
 
     def get_default_value(self, schema: core_schema.WithDefaultSchema) -> Any:
         default = super().get_default_value(schema)
@@ -39,6 +50,22 @@ class _Generator(GenerateJsonSchema):
         if schema["function"]["function"] is empty_mapping:
             return {"anyOf": [inner, {"type": "null"}]}
         return inner
+
+
+def attribute_docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """The string below each attribute, also of the model's bases. pydantic can read them when it creates a model, which
+    takes a sixth of the time to import them all."""
+    found: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        if not issubclass(base, BaseModel) or base is BaseModel:
+            continue
+        (definition,) = ast.parse(inspect.getsource(base)).body
+        assert isinstance(definition, ast.ClassDef)
+        for attribute, below in zip(definition.body, definition.body[1:], strict=False):
+            match attribute, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = inspect.cleandoc(text)
+    return found
 
 
 def _untitled(value: Any) -> Any:

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import assert_never
+from typing import TYPE_CHECKING, assert_never
 
-import pyrage
-
+from meshctl import event_log
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
@@ -20,6 +19,9 @@ from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar
 from meshctl.model import Secret, SecretKind, SecretRef
+
+if TYPE_CHECKING:
+    import pyrage
 
 # A key file has a few lines.
 MAX_SECRET_FILE_BYTES = 1024 * 1024
@@ -38,10 +40,12 @@ class SecretStore:
     def get(self, ref: SecretRef, at: Position | None = None) -> Secret:
         """The secret that `ref` refers to. Raises InputError, with the position `at` if given."""
         try:
-            return Secret(self._value(ref))
+            value = self._value(ref)
         except _NoSecret as reason:
             place = "" if at is None else f"{at}: "
             raise InputError(f"{place}secret {ref}: {reason}", hint=reason.hint) from None
+        event_log.hide(value)
+        return Secret(value)
 
     def _value(self, ref: SecretRef) -> str:
         match ref.kind:
@@ -84,6 +88,9 @@ class SecretStore:
     def _decrypt(self, path: Path, identity: Path) -> bytes:
         known = self._files.get((path, identity))
         if known is None:
+            # few inventories have encrypted files
+            import pyrage
+
             try:
                 known = pyrage.decrypt(_read(path), _identities(identity))
             except pyrage.DecryptError:
@@ -119,6 +126,8 @@ def _read(path: Path) -> bytes:
 
 def _identities(path: Path) -> list[pyrage.x25519.Identity | pyrage.ssh.Identity]:
     """An SSH private key, or the `AGE-SECRET-KEY-1...` lines of age-keygen."""
+    import pyrage
+
     content = _read(path)
     try:
         if content.startswith(b"-----BEGIN"):

@@ -16,7 +16,8 @@ from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
 from meshctl.render.extra import with_extra
 from meshctl.render.facts import NO_FACTS, DeviceFacts, with_board_sections
 from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
-from meshctl.render.templates import NOT_UCI, TemplateFile, Templates
+from meshctl.render.template_files import NOT_UCI, TemplateFile
+from meshctl.render.templates import Templates
 from meshctl.resolve import Intent, resolve
 
 # A WEP key has 5 characters; shorter values, such as the index in wireless' `key '1'`, are not secret.

@@ -17,7 +17,7 @@ from typing import Any
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.render.sandbox import LENGTH_BYTES, OUTPUT_BYTES
-from meshctl.render.templates import TemplateSet
+from meshctl.render.template_set import TemplateSet
 
 
 def main(cpu_s: int, memory_bytes: int) -> None:

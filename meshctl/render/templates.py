@@ -4,63 +4,27 @@ A folder has `common/`, for all back ends, and one folder per back end (`batman-
 template has the path of its file on the device plus `.j2`. Templates that start with `_` are only included by others.
 For each file, the operator's parts of a back end take precedence over the inventory's `templates/`, and these over the
 shipped templates.
+
+`template_set` renders; it is imported with Jinja when the first template is, because commands such as lint rarely need
+it.
 """
 
 from __future__ import annotations
 
 import os
-import traceback
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-
-from jinja2 import (
-    BaseLoader,
-    ChoiceLoader,
-    Environment,
-    FileSystemLoader,
-    PrefixLoader,
-    StrictUndefined,
-    Template,
-    TemplateError,
-    TemplateNotFound,
-    TemplateSyntaxError,
-)
-from jinja2.sandbox import ImmutableSandboxedEnvironment
+from typing import TYPE_CHECKING
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.inventory.file_access import HINT, Boundary
-from meshctl.model import Backend, Fleet, MeshMode, OperatorParts, Release
-from meshctl.render.quoting import quoted, require_quoted, revealed
-from meshctl.render.rendered import CONFIG_FOLDER
+from meshctl.inventory.file_access import Boundary
+from meshctl.model import Backend, Fleet, OperatorParts
 from meshctl.render.sandbox import LimitExceeded, SandboxRenderer
+from meshctl.render.template_files import COMMON, NO_TEMPLATE, TEMPLATE, TemplateFile, refuse_outside
 from meshctl.resources import shipped
 
-# Codes of this module, described in docs/render.md.
-TEMPLATE = "RND010"
-NOT_UCI = "RND011"
-NO_TEMPLATE = "RND012"
-
-COMMON = "common"
-_SUFFIX = ".j2"
-
-
-@dataclass(frozen=True, slots=True)
-class TemplateFile:
-    """A template of a file: `path` on the device, `name` for the loader, `source` on disk."""
-
-    path: str
-    name: str
-    source: Path
-
-    @property
-    def is_uci(self) -> bool:
-        return self.path.startswith(CONFIG_FOLDER)
-
-    @property
-    def is_executable(self) -> bool:
-        """Whether the template file is executable; then the rendered file is, too."""
-        return bool(self.source.stat().st_mode & 0o100)
+if TYPE_CHECKING:
+    from meshctl.render.template_set import TemplateSet
 
 
 class Templates:
@@ -83,7 +47,7 @@ class Templates:
         own = Path(fleet.base) / "templates"
         if not fleet.base or not own.is_dir():
             return cls((shipped("templates"),), boundary)
-        _refuse_outside(own, boundary)
+        refuse_outside(own, boundary)
         _refuse_unknown_folders(own, fleet)
         return cls((own, shipped("templates")), boundary)
 
@@ -110,31 +74,12 @@ class Templates:
         return str(answer["text"])
 
     def _set(self, backend: Backend, parts: OperatorParts) -> TemplateSet:
+        from meshctl.render.template_set import TemplateSet
+
         key = (backend, parts)
         if key not in self._sets:
             self._sets[key] = TemplateSet(self._folders, backend, parts, self._boundary)
         return self._sets[key]
-
-
-def _refuse_outside(path: Path, boundary: Boundary) -> None:
-    """Raises InvalidInput for a template folder or file outside the inventory's boundary."""
-    if refusal := boundary.refusal(path):
-        hint = HINT if refusal.startswith("outside") else ""
-        raise InvalidInput(
-            [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(path)), f"not allowed: {refusal}", hint=hint)]
-        )
-
-
-class _BoundedLoader(FileSystemLoader):
-    """A loader of regular files inside the inventory's boundary."""
-
-    def __init__(self, folder: Path, boundary: Boundary) -> None:
-        super().__init__(folder)
-        self._folder, self._boundary = folder, boundary
-
-    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Callable[[], bool]]:
-        _refuse_outside(self._folder / template, self._boundary)
-        return super().get_source(environment, template)
 
 
 def _refuse_unknown_folders(own: Path, fleet: Fleet) -> None:
@@ -149,89 +94,3 @@ def _refuse_unknown_folders(own: Path, fleet: Fleet) -> None:
     ]
     if strays:
         raise InvalidInput(strays)
-
-
-class TemplateSet:
-    """The templates of one back end with one operator's parts."""
-
-    def __init__(self, folders: tuple[Path, ...], backend: Backend, parts: OperatorParts, boundary: Boundary) -> None:
-        layers: list[tuple[str, Path]] = []
-        loaders: list[BaseLoader] = []
-        if parts.templates:
-            own = Path(parts.base) / parts.templates
-            if not own.is_dir():
-                found = Diagnostic(
-                    NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", "a folder of templates", "none"
-                )
-                raise InvalidInput([found])
-            _refuse_outside(own, boundary)
-            layers.append((backend.value, own))
-            loaders.append(PrefixLoader({backend.value: _BoundedLoader(own, boundary)}))
-        for folder in folders:
-            layers.extend((part, folder / part) for part in (backend.value, COMMON))
-            is_shipped = folder == shipped("templates")
-            loaders.append(FileSystemLoader(folder) if is_shipped else _BoundedLoader(folder, boundary))
-        loader = ChoiceLoader(loaders)
-        self._plain = _environment(loader)
-        self._uci = _environment(loader, is_uci=True)
-        self._compiled: dict[str, Template] = {}
-        self.files = _files(layers, boundary)
-
-    def text(self, file: TemplateFile, context: Mapping[str, object]) -> str:
-        try:
-            if file.name not in self._compiled:
-                self._compiled[file.name] = (self._uci if file.is_uci else self._plain).get_template(file.name)
-            return self._compiled[file.name].render(context)
-        except InvalidInput:
-            raise
-        except Exception as error:
-            # a template can raise any exception; report all of them with the position
-            raise InvalidInput([_diagnostic(file, error)]) from error
-
-
-def _files(layers: list[tuple[str, Path]], boundary: Boundary) -> tuple[TemplateFile, ...]:
-    """One template per path on the device, from the first layer that has it. Raises InvalidInput."""
-    found: dict[str, TemplateFile] = {}
-    for prefix, folder in layers:
-        for source in sorted(folder.rglob(f"*{_SUFFIX}")):
-            inside = source.relative_to(folder).as_posix()
-            if not folder.is_relative_to(shipped("templates")):
-                _refuse_outside(source, boundary)
-            if not source.name.startswith("_") and source.is_file():
-                path = inside.removesuffix(_SUFFIX)
-                found.setdefault(path, TemplateFile(path, f"{prefix}/{inside}", source))
-    return tuple(found[path] for path in sorted(found))
-
-
-def _environment(loader: BaseLoader, *, is_uci: bool = False) -> ImmutableSandboxedEnvironment:
-    environment = ImmutableSandboxedEnvironment(
-        loader=loader,
-        undefined=StrictUndefined,
-        autoescape=False,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        auto_reload=False,
-        finalize=require_quoted if is_uci else None,
-    )
-    environment.filters["uci"] = quoted
-    environment.filters["reveal"] = revealed
-    environment.globals["Release"] = Release
-    environment.globals["MeshMode"] = MeshMode
-    return environment
-
-
-def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
-    """The error, at the innermost template line of its traceback."""
-    place = Position(str(file.source))
-    match error:
-        case TemplateSyntaxError():
-            place = Position(error.filename or str(file.source), error.lineno)
-        case TemplateNotFound():
-            return Diagnostic(TEMPLATE, Severity.ERROR, place, "", expected="a template", found=f"none named {error}")
-        case _:
-            lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(_SUFFIX)]
-            if lines:
-                place = Position(lines[-1].filename, lines[-1].lineno or 0)
-    kind = "" if isinstance(error, TemplateError | ValueError | TypeError) else f"{type(error).__name__}: "
-    return Diagnostic(TEMPLATE, Severity.ERROR, place, f"{kind}{error}")

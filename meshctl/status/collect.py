@@ -20,7 +20,7 @@ from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.observe import observe
 from meshctl.errors import MeshctlError, NodeError
-from meshctl.fleet.journal import Journal
+from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import FleetObservation, facts_of, known_macs
 from meshctl.nodes.connections import ConnectionPool
@@ -31,7 +31,7 @@ from meshctl.robots.connection import RobotConnector
 from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts, expected_release
 from meshctl.robots.host import Host
 from meshctl.status.assess import Snapshot
-from meshctl.status.last_known import ROBOT_PREFIX, merge_by_device
+from meshctl.status.last_known import merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
 from meshctl.status.unreachable import no_answer_of
 from meshctl.status.values import NoAnswer

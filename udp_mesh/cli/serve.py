@@ -1,25 +1,30 @@
-"""`run`, `check` and `keygen`: the commands that need no running daemon."""
+"""`run`, `check` and `keygen`: the commands that need no running daemon.
+
+Each imports what it needs of the transport itself: the other commands start in a third of the time without it.
+"""
 
 from __future__ import annotations
 
 import argparse
-import asyncio
-import logging
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from udp_mesh.cli.output import Exit, print_error, print_json, print_text
-from udp_mesh.crypto import Key
-from udp_mesh.crypto.keys import SECRET_BYTES
-from udp_mesh.daemon.configuration import RESERVED_PREFIX, load
-from udp_mesh.daemon.status import plain
-from udp_mesh.daemon.toml_source import ConfigurationError
+from udp_mesh.daemon.interface import RESERVED_PREFIX
+
+if TYPE_CHECKING:
+    from udp_mesh.daemon.toml_source import ConfigurationError
 
 
 def run_daemon(arguments: argparse.Namespace) -> int:
     """Runs the daemon until it is stopped."""
-    # Imported here: the other commands start in half the time without the transport.
+    import asyncio
+    import logging
+
+    from udp_mesh.daemon.configuration import load
     from udp_mesh.daemon.main import run
+    from udp_mesh.daemon.toml_source import ConfigurationError
 
     logging.basicConfig(level=arguments.log_level.upper(), format="%(levelname)s %(message)s")
     try:
@@ -45,6 +50,10 @@ def _reason(error: OSError) -> str:
 
 def check(arguments: argparse.Namespace) -> int:
     """Checks a configuration and prints its problems, or a summary."""
+    from udp_mesh.daemon.configuration import load
+    from udp_mesh.daemon.status import plain
+    from udp_mesh.daemon.toml_source import ConfigurationError
+
     try:
         configuration = load(arguments.config)
     except ConfigurationError as error:
@@ -89,6 +98,9 @@ def _print_problems(error: ConfigurationError) -> int:
 
 def keygen(arguments: argparse.Namespace) -> int:
     """Creates a fleet key, readable only by its owner; never overwrites a file."""
+    from udp_mesh.crypto import Key
+    from udp_mesh.crypto.keys import SECRET_BYTES
+
     key = Key(os.urandom(SECRET_BYTES))
     line = f"{key.secret.hex()}  # {key.key_id.hex()}\n"
     path: Path = arguments.file

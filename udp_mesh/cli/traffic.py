@@ -24,7 +24,7 @@ from udp_mesh.cli.output import (
 )
 from udp_mesh.cli.views import Json
 from udp_mesh.client.mesh_client import MAX_PAYLOAD_BYTES, MeshClient, MeshError, as_message
-from udp_mesh.daemon.configuration import BENCH_TOPIC, CONDITIONS_TOPIC
+from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC
 
 MAX_BENCH_BACKLOG_BYTES = 16 << 20
 BENCH_BACKLOG_S = 2.0

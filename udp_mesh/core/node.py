@@ -171,7 +171,7 @@ class Node:
 
     @property
     def unauthenticated(self) -> int:
-        """Datagrams so far that nobody has proven to be from a peer: dropped ones, and those in the legacy format."""
+        """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
         return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
 
     def legacy_positions(self) -> dict[str, ReceivePosition]:
@@ -187,10 +187,9 @@ def _snapshot(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
     idle = Sender(state.settings)
     peers = tuple(
-        _peer_conditions(state, peer, peer.sender if peer.has_sender else idle, now)
-        for _, peer in sorted(state.peer_table.peers.items())
+        _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
     )
-    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
+    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.sender is not None]
     counters = state.event_queue.counters
     sent_bits_per_s = _bits_per_s(state.sent, now)
     receivers = [session.receiver for session in state.peer_table.sessions.values()]

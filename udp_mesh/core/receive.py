@@ -140,7 +140,7 @@ def _receive_data(
         and peer.session is session
         and source == path.address
         and link == path.link
-        and peer.sender.state is not _UNRESPONSIVE
+        and (peer.sender is None or peer.sender.state is not _UNRESPONSIVE)
     ):
         session.last_heard = path.heard_at = now
     else:

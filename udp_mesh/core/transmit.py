@@ -77,7 +77,8 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
     while confirmed:
         frames.append(Delivered(tuple(confirmed[:MAX_IDS])))
         del confirmed[:MAX_IDS]
-    cancelled = peer.sender.cancelled
+    sender = peer.open_sender()
+    cancelled = sender.cancelled
     while cancelled:
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
         del cancelled[:MAX_IDS]
@@ -90,7 +91,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
             count = max(1, count * path.room_bytes // len(encoded) - 1)
             encoded = path.encode(frames[:count], now)
         number, data = path.seal(encoded)
-        peer.sender.in_flight.add(number, None)
+        sender.in_flight.add(number, None)
         out.append(Datagram(path.link, path.address, data, True))
         del frames[:count]
     state.arm(peer)
@@ -121,7 +122,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
     peers: list[Peer] = []
     mask = broadcasts.waiting
     for peer in list(state.ready):
-        sender = peer.sender
+        sender = peer.open_sender()
         session = peer.session
         if session is None or not session.path.link:
             del state.ready[peer]
@@ -158,7 +159,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
         for peer in peers:
-            sender = peer.sender
+            sender = peer.open_sender()
             if not sender.scheduler.waiting & bit:
                 continue
             session = peer.session
@@ -172,7 +173,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 state.ready[peer] = state.ready.pop(peer)
                 break
     for peer in peers:
-        sender = peer.sender
+        sender = peer.open_sender()
         if sender.served:
             sender.levels.record_served(sender.served, sender.scheduler.waiting, now)
             sender.served = 0
@@ -192,7 +193,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
 def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    twice = urgent and any(peer.has_sender and peer.sender.send_twice for peer in state.peer_table.online())
+    twice = urgent and any(peer.sender is not None and peer.sender.send_twice for peer in state.peer_table.online())
     paths: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]
@@ -254,7 +255,7 @@ def handle_timer(state: State, now: float) -> None:
         peer.timer_at = peer.due_at = _INFINITY
         due_peers.append(peer)
     for peer in due_peers:
-        sender = peer.sender
+        sender = peer.open_sender()
         sender.handle_timer(now)
         report_ended(state, peer, now)
         session = peer.session
@@ -276,7 +277,7 @@ def handle_timer(state: State, now: float) -> None:
             waiting = {sender for sender, _ in bucket.parked}
             bucket.unpark()
             for peer in state.peer_table.peers.values():
-                if peer.has_sender and peer.sender in waiting:
+                if peer.sender in waiting:
                     state.ready[peer] = None
     broadcasts: list[Datagram] = []
     state.broadcasts.send_copies(now, broadcasts)

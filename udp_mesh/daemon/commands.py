@@ -17,16 +17,9 @@ from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.settings import Settings, is_type_name
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import (
-    CONDITIONS_TOPIC,
-    MAX_PING_S,
-    RESERVED_PREFIX,
-    load,
-    read_keys,
-    read_rates,
-    topic_from_values,
-)
+from udp_mesh.daemon.configuration import load, read_keys, read_rates, topic_from_values
 from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, is_below, off_loop
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC, MAX_PING_S, RESERVED_PREFIX
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -183,7 +176,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
                 "for_s": round(error.last - error.since, 3),
                 "last_ago_s": round(driver.now() - error.last, 3),
             }
-            for error in driver.send_errors.active()
+            for error in driver.output.send_errors.active()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -212,7 +205,7 @@ def render_metrics(service: Service) -> str:
     driver = service.driver
     extra = {
         "wakeups": driver.wakeups,
-        "datagrams_lost_on_full_socket": driver.lost_on_full_socket,
+        "datagrams_lost_on_full_socket": driver.output.lost_on_full_socket,
         "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
         "outbox_messages_refused_by_disk": service.store.refused,
     }

@@ -28,6 +28,7 @@ from udp_mesh.core.settings import (
 )
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.file_access import is_exposed, read_regular
+from udp_mesh.daemon.interface import BENCH_TOPIC, DEFAULT_SOCKET, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -43,17 +44,12 @@ from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
 log = logging.getLogger(__name__)
 
-DEFAULT_PATH = Path("/etc/udp-mesh/udp-mesh.toml")
-DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
 DEFAULT_STATE_DIRECTORY = Path("/var/lib/udp-mesh")
 MAX_SOCKET_PATH_BYTES = 107
 """Maximum length of a Unix socket's path, without the terminating NUL."""
 MAX_FILE_BYTES = 1 << 20
 """A larger configuration file is a mistake, such as a wrong path."""
 
-RESERVED_PREFIX = "~mesh/"
-"""Prefix of the daemon's own topics: ping, pong, benchmark."""
-PING_TOPIC, PONG_TOPIC, BENCH_TOPIC = "~mesh/ping", "~mesh/pong", "~mesh/bench"
 RESERVED_TOPICS = (
     # Reliable: a ping measures whether and how fast an urgent message makes the round trip, not whether one datagram
     # does. The conditions report the share of lost datagrams.
@@ -61,10 +57,6 @@ RESERVED_TOPICS = (
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
     Topic(BENCH_TOPIC, priority=15, reliable=True),
 )
-MAX_PING_S = 60.0
-"""Maximum timeout of a ping."""
-CONDITIONS_TOPIC = "~mesh/conditions"
-"""Topic that carries the network conditions to local subscribers; it never leaves the machine."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,6 @@
 2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
    and one timer for the core's next deadline.
 3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
-
-A full socket never blocks the other links: its datagrams wait in a short queue; beyond that they are dropped.
 """
 
 from __future__ import annotations
@@ -27,11 +25,11 @@ from udp_mesh.core.events import (
     PeerRestarted,
     Rejected,
 )
-from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
+from udp_mesh.daemon.link_output import LinkOutput
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
 from udp_mesh.links.hub import LinkHub
@@ -50,8 +48,6 @@ MAX_DRAIN_S = 0.5
 """Reading a batch takes milliseconds; even on a busy machine it takes no longer than this."""
 MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
-MAX_BLOCKED_DATAGRAMS = 256
-"""Datagrams queued for one full socket; more are dropped."""
 INTERFACE_DEBOUNCE_S = 0.05
 """One kernel notice is followed by others (link, then addresses): one refresh handles them all."""
 RECOVERY_S = 0.1
@@ -85,19 +81,16 @@ class Driver:
         )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
-        self.send_errors = SendErrors()
-        self.lost_on_full_socket = 0
+        self.output = LinkOutput(self._loop, self.hub, self._pump)
         self.wakeups = 0
         self._on_event = on_event
         self._monitor: InterfaceMonitor | None = None
-        self._blocked: dict[str, list[Datagram]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._due = float("-inf")
         """The core's next deadline as last read; the loop may run `_pump` for other reasons than its timer."""
         self._refresh_timer: asyncio.TimerHandle | None = None
         self._interface_error = ""
-        self._send_error_timer: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
         self._wall_offset: float | None = None
@@ -125,7 +118,8 @@ class Driver:
         self._transmit_all()
         self._report_events()
         self.closed = True
-        for handle in (self._timer, self._refresh_timer, self._send_error_timer):
+        self.output.close()
+        for handle in (self._timer, self._refresh_timer):
             if handle is not None:
                 handle.cancel()
         if self._monitor is not None:
@@ -184,8 +178,7 @@ class Driver:
         reopened = {link.attachment.name for link in changes.opened}
         for link in changes.gone:
             name = link.attachment.name
-            self._blocked.pop(name, None)
-            self.send_errors.link_closed(name)
+            self.output.link_closed(name)
             if name not in reopened:
                 log.info("link-down link=%s", name)
                 self.node.link_down(name, now)
@@ -203,8 +196,7 @@ class Driver:
 
     def _watch_all(self) -> None:
         for link in self.hub.links.values():
-            if self._blocked.get(link.attachment.name):
-                self._loop.add_writer(link.fileno(), self._writable, link)
+            self.output.watch(link)
             self._loop.add_reader(link.fileno(), self._readable, link)
             self.strangers.watch(link)
 
@@ -367,54 +359,12 @@ class Driver:
                 end = start + 1
                 while end < len(batch) and batch[end].link == name:
                     end += 1
-                self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
+                self.output.transmit(name, batch[start:end] if end - start < len(batch) else batch)
                 start = end
             sent += sum(len(datagram.data) for datagram in batch)
             if not self.node.has_datagrams:
                 return False
         return True
-
-    def _transmit(self, name: str, datagrams: list[Datagram]) -> None:
-        link = self.hub.links.get(name)
-        if link is None:
-            return
-        waiting = self._blocked.get(name, [])
-        done = 0 if waiting else self._send(link, datagrams)
-        if done == len(datagrams):
-            return
-        if not waiting:
-            self._loop.add_writer(link.fileno(), self._writable, link)
-        # Urgent datagrams first; beyond the limit, the latest of the others are dropped.
-        waiting = sorted([*waiting, *datagrams[done:]], key=lambda datagram: not datagram.urgent)
-        self._blocked[name] = waiting[:MAX_BLOCKED_DATAGRAMS]
-        self.lost_on_full_socket += len(waiting[MAX_BLOCKED_DATAGRAMS:])
-
-    def _writable(self, link: UdpLink) -> None:
-        waiting = self._blocked.get(link.attachment.name, [])
-        del waiting[: self._send(link, waiting)]
-        if not waiting:
-            self._loop.remove_writer(link.fileno())
-            self._pump()
-
-    def _send(self, link: UdpLink, datagrams: Sequence[Datagram]) -> int:
-        """Sends from the front and returns how many are done, those refused by the kernel included."""
-        done = link.send(datagrams)
-        if link.send_errors:
-            self.send_errors.add(link.attachment.name, link.send_errors, self._clock())
-            link.send_errors.clear()
-            if self._send_error_timer is None and not self.closed:
-                self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors)
-        return done
-
-    def _log_send_errors(self) -> None:
-        going_on, over = self.send_errors.review(self._clock())
-        for one in going_on:
-            log.warning(
-                "send-refused link=%s to=%s datagrams=%d reason=%s", one.link, one.to, one.datagrams, one.reason
-            )
-        for one in over:
-            log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
-        self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
 
     def _report_events(self) -> None:
         moved = False

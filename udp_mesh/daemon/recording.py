@@ -18,7 +18,7 @@ from pathlib import Path
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived
-from udp_mesh.daemon.configuration import RESERVED_PREFIX
+from udp_mesh.daemon.interface import RESERVED_PREFIX
 from udp_mesh.daemon.status import Json, conditions_json, event_json
 
 log = logging.getLogger(__name__)

@@ -29,17 +29,10 @@ from udp_mesh.core.events import (
 from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import (
-    BENCH_TOPIC,
-    CONDITIONS_TOPIC,
-    PING_TOPIC,
-    PONG_TOPIC,
-    RESERVED_PREFIX,
-    Configuration,
-    load,
-)
+from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.inbox import Inbox
+from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
@@ -152,8 +145,8 @@ class Service:
         self.inbox.take_read()
 
     def client_gone(self, client: Client) -> None:
+        self.subscriptions.remove_client(client)
         self._watchers.discard(client)
-        self.subscriptions.client_gone(client)
 
     def subscribe_events(self, client: Client) -> None:
         """Sends all events except messages to this client."""
@@ -362,20 +355,20 @@ class Service:
         self._spawn(self._save_positions())
         self.inbox.take_read()
         self.subscriptions.pass_on_held()
-        wanted = self.subscriptions.exact(CONDITIONS_TOPIC)
-        if not wanted and self.recorder is None:
+        clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
+        if not clients and self.recorder is None:
             return
         conditions = self.driver.conditions()
         if self.recorder is not None:
             self.recorder.conditions(conditions)
-        if wanted:
+        if clients:
             header: Header = {
                 "event": "conditions",
                 "source": self.settings.name,
                 "topic": CONDITIONS_TOPIC,
                 "conditions": conditions_json(conditions),
             }
-            for client in wanted:
+            for client in clients:
                 client.send_event(header)
 
     async def _save_positions(self) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from udp_mesh.core.conditions import Conditions, PeerConditions
 from udp_mesh.core.events import Event
 from udp_mesh.core.settings import Address, Settings, Topic
-from udp_mesh.daemon.configuration import RESERVED_PREFIX
+from udp_mesh.daemon.interface import RESERVED_PREFIX
 
 Json = dict[str, object]
 

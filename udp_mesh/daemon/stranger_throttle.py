@@ -1,6 +1,6 @@
 """Reads from strangers at a limited share of the time during a flood.
 
-If most of what a wake-up read from addresses of no known peer proves to be from nobody in particular (forged, replayed,
+If most of what a wake-up read from addresses of no known peer proves to come from no peer (forged, replayed,
 foreign, or in the unauthenticated legacy format), only a few datagrams are read at a time, with pauses in between. The
 kernel drops what its queue cannot hold meanwhile.
 """

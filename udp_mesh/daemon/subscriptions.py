@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import fnmatch
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 
 from udp_mesh.client.mesh_client import Header, encode_frame
 from udp_mesh.core.events import MessageReceived
@@ -53,7 +53,7 @@ class Subscriptions:
         self._patterns[client] = kept
         self._routes.clear()
 
-    def client_gone(self, client: Client) -> None:
+    def remove_client(self, client: Client) -> None:
         self._patterns.pop(client, None)
         self._acknowledging.discard(client)
         self._routes.clear()
@@ -74,9 +74,9 @@ class Subscriptions:
             self._routes[topic] = clients
         return clients
 
-    def exact(self, topic: str) -> list[Client]:
-        """The clients that subscribed to this very name, not to a pattern that matches it."""
-        return [client for client, patterns in self._patterns.items() if topic in patterns]
+    def subscribed_literally(self, topic: str) -> Iterator[Client]:
+        """The clients that named this topic itself: a pattern such as `*` does not match a reserved one."""
+        return (client for client, patterns in self._patterns.items() if topic in patterns)
 
     def distribute(self, message: MessageReceived) -> None:
         """Send a message to the clients subscribed to its topic. One with a receipt goes through the inbox."""

@@ -269,7 +269,7 @@ stage() { # OWNER ID BUNDLE
 		was_as_expected "$expected" "$path" || drop "$w" moved-on "$path is not what the plan saw"
 		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
 	done <"$w/manifest"
-	extra keep "$w" || drop "$w" flash-full "could not keep the packages as they are"
+	extra keep "$w" || drop "$w" flash-full "could not read the new packages, or not keep those that they replace"
 	unchanged_since_kept "$w" || drop "$w" flash-full "what was kept is not what is there"
 	for conf in "$w"/new/etc/config/*; do
 		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
@@ -516,7 +516,7 @@ boot() { # before anything reads the configuration, so nothing is reloaded
 	# for packages.sh
 	export BOOTING=yes
 	put_back=no
-	[ ! -f "$CHANGE/packages.tar" ] || put_back=yes
+	[ ! -s "$CHANGE/packages.begun" ] || put_back=yes
 	case $MARKER in armed | restoring) restore boot ;; *) return 0 ;; esac
 	# services that came back with their packages were not there when the list of what to start was made
 	[ $put_back = no ] || [ -e "$CHANGE" ] || /sbin/reboot

@@ -13,14 +13,15 @@ NOT_WRITTEN: Any = None
 
 
 class Document(BaseModel):
-    """Base of all models: known keys only, attribute docstrings as descriptions, no values in errors."""
+    """Base of all models: known keys only, no values in errors. `json_schema` reads the attributes' docstrings."""
 
     model_config = ConfigDict(
         extra="forbid",
         frozen=True,
         populate_by_name=False,
-        use_attribute_docstrings=True,
         hide_input_in_errors=True,
+        # every command loads an inventory: build the validator of the whole, not one of each part as well
+        defer_build=True,
     )
 
 

@@ -56,7 +56,7 @@ class NodeLayer(Document):
     """OpenWrt release series. Default: the hardware profile's."""
     lan_ports: tuple[Text, ...] = NOT_WRITTEN
     """Ports bridged into the LAN. Default: the hardware profile's."""
-    ssh: SshLayer = SshLayer()
+    ssh: SshLayer = Field(default_factory=SshLayer)
     """SSH login."""
     robot: Name = NOT_WRITTEN
     """The robot that carries the node. Default: the robot that lists it."""

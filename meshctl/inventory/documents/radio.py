@@ -70,7 +70,7 @@ class HardwareDocument(Document):
     """RAM in MiB."""
     flash_mib: Whole = Field(default=8, ge=4, le=1_048_576)
     """Flash in MiB."""
-    firmware: FirmwareDocument = FirmwareDocument()
+    firmware: FirmwareDocument = Field(default_factory=FirmwareDocument)
     """Firmware image of these devices."""
     packages: tuple[Text, ...] = ()
     """Packages in addition to those that the mesh needs."""
@@ -161,7 +161,7 @@ class MeshDocument(Document):
     """Minimum number of beacons, checked by lint."""
     backend: Backend = Backend.BATMAN
     """Routing back end."""
-    batman: BatmanDocument = BatmanDocument()
+    batman: BatmanDocument = Field(default_factory=BatmanDocument)
     """batman-adv's options."""
-    operator_parts: OperatorPartsDocument = OperatorPartsDocument()
+    operator_parts: OperatorPartsDocument = Field(default_factory=OperatorPartsDocument)
     """Parts that the operator supplies for meshmerize."""

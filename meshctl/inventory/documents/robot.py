@@ -15,7 +15,7 @@ class ComputerDocument(Document):
 
     address: Interface
     """Address with prefix length."""
-    ssh: SshLayer = SshLayer()
+    ssh: SshLayer = Field(default_factory=SshLayer)
     """SSH login."""
     python: Text = "python3"
     """Python interpreter for the daemon."""

@@ -39,17 +39,17 @@ class InventoryDocument(Document):
     """Country of the regulatory rules: two capital letters."""
     include: tuple[Text, ...] = ()
     """Additional files of the inventory; relative to this file."""
-    operators: OperatorsDocument = OperatorsDocument()
+    operators: OperatorsDocument = Field(default_factory=OperatorsDocument)
     """Login to the radios."""
-    system: SystemDocument = SystemDocument()
+    system: SystemDocument = Field(default_factory=SystemDocument)
     """OpenWrt system settings."""
-    apply: ApplyDocument = ApplyDocument()
+    apply: ApplyDocument = Field(default_factory=ApplyDocument)
     """Rollout policy of changes."""
     hardware: Section[HardwareDocument] = Field(default_factory=dict)
     """Hardware profiles by name."""
     meshes: Section[MeshDocument] = Field(default_factory=dict)
     """Meshes by name."""
-    defaults: OrEmpty[NodeLayer] = NodeLayer()
+    defaults: OrEmpty[NodeLayer] = Field(default_factory=NodeLayer)
     """Default values of all nodes."""
     groups: Section[OrEmpty[GroupDocument]] = Field(default_factory=dict)
     """Groups of nodes by name."""
@@ -57,7 +57,7 @@ class InventoryDocument(Document):
     """Nodes by name; `b[01-12]` expands to twelve."""
     robots: Section[OrEmpty[RobotDocument]] = Field(default_factory=dict)
     """Robots by name."""
-    udp_mesh: UdpMeshDocument = UdpMeshDocument()
+    udp_mesh: UdpMeshDocument = Field(default_factory=UdpMeshDocument)
     """Transport settings."""
     topics: TopicSection = Field(default_factory=dict)
     """Topics by name."""

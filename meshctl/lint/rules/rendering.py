@@ -12,7 +12,7 @@ from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.render import Rendered, Templates, render
 from meshctl.render.extra import EXTRA
-from meshctl.render.templates import NO_TEMPLATE, NOT_UCI, TEMPLATE
+from meshctl.render.template_files import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 
 # replaces every secret: a valid passphrase that never leaves this module

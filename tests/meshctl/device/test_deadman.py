@@ -483,19 +483,3 @@ def test_a_bundle_is_deterministic_and_invalid_changes_raise_before_upload() -> 
         bundle(Change("c", {"/etc/a/b": NewFile(b"")}, "true", removed=("/etc/a/b",)))
     with pytest.raises(ValueError, match=r"\.\./init\.d"):
         bundle(Change("c", {}, "true", links={"/etc/a/b": "/tmp"}))
-
-
-# Applets that OpenWrt's busybox leaves out (package/utils/busybox/Config-defaults.in).
-ABSENT = """
-    base64 blkid chrt cksum comm diff fold hostname install ionice mountpoint nohup nproc nsenter od paste realpath
-    renice rev setsid sha1sum sha512sum shuf split stat stty tac timeout truncate tty unlink unshare usleep xxd
-"""
-
-
-@pytest.mark.parametrize("name", ["deadman.sh", "observe.sh", "deadman.init", "packages.sh"])
-def test_the_scripts_use_no_tool_that_openwrt_leaves_out(name: str) -> None:
-    code = re.sub(r"^\s*#.*$", "", script(name), flags=re.MULTILINE)
-    called = set(
-        re.findall(r"(?:^\s*|[|;&({`]\s*|\b(?:if|then|do|else|until|while|!)\s+)([a-z][a-z0-9_-]*)", code, re.M)
-    )
-    assert not called & set(ABSENT.split())

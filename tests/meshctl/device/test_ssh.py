@@ -128,7 +128,7 @@ def test_a_command_killed_on_the_node_is_distinguished_from_a_failed_one(connect
 def test_output_that_does_not_fit_is_the_command_s_failure_and_not_the_node_s_silence(
     connection: SshConnection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshctl.device.ssh.MAX_OUTPUT_BYTES", 1 << 20)
+    monkeypatch.setattr("meshctl.device.ssh_channel.MAX_OUTPUT_BYTES", 1 << 20)
     with pytest.raises(OutputTooLarge, match="printed more than 1 MiB") as caught:
         connection.run("head -c 3000000 /dev/zero")
     assert "| tail" in caught.value.hint

@@ -13,7 +13,8 @@ import pytest
 
 from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
-from meshctl.device.ssh import SshConnection, _Feeder
+from meshctl.device.ssh import SshConnection
+from meshctl.device.ssh_channel import _Feeder
 from meshctl.device.upload import CHUNK_BYTES, UploadProgress, upload
 from meshctl.errors import InputError
 from tests.meshctl.device.sandbox import Sandbox

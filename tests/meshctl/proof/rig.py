@@ -37,8 +37,7 @@ country: US
 operators:
   ssh_keys: ["{key}"]
 system: {{log_size_kib: {log_size}}}
-apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, parallel: {parallel},
-        quorum: 0.6}}
+apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, quorum: 0.6{policy}}}
 hardware:
   box:
     board: compex,wpj344-16m
@@ -98,7 +97,8 @@ class Rig:
     count: int
     # a reload alone takes 3 s, and more on a busy machine
     window_s: int = 40
-    parallel: int = 8
+    # of the inventory's `apply`; None: not set
+    parallel: int | None = 8
     # further lines of the hardware profile, by inventory
     firmware: Mapping[str, str] = field(default_factory=dict)
     # what is baked into the images
@@ -125,7 +125,7 @@ class Rig:
                 key=public.decode() + " proof",
                 count=self.count,
                 window_s=self.window_s,
-                parallel=self.parallel,
+                policy="" if self.parallel is None else f", parallel: {self.parallel}",
                 firmware=self.firmware.get(variant, ""),
                 log_size=64 + number,
                 channel=SPLIT_CHANNELS[number] if variant == "split" else 6,

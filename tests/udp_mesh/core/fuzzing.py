@@ -59,7 +59,7 @@ class Fuzzer:
         both.roundtrip(times=30)
         peer = both.a._state.peer_table.peers["b"]
         assert peer.session is not None
-        self.insider, self.sent_packets = peer.session, peer.sender.in_flight
+        self.insider, self.sent_packets = peer.session, peer.open_sender().in_flight
         self.stranger = SendChannel(both.a._state.keys[0], self.rng.randbytes(16), TO_ALL)
         return both
 

@@ -120,6 +120,7 @@ def test_a_message_that_is_not_confirmed_in_its_lifetime_expires() -> None:
     made.run(5.0)
     assert made.events_of("a", MessageDelivered) == []
     sender = made.nodes["a"]._state.peer_table.peers["b"].sender
+    assert sender is not None
     assert sender.unconfirmed == {}
 
 

@@ -112,7 +112,7 @@ def insider(both: Pair, frames: list[Frame]) -> None:
     peer = both.a._state.peer_table.peers["b"]
     assert peer.session is not None
     number, data = peer.session.path.seal(encode(frames))
-    peer.sender.in_flight.add(number, None)
+    peer.open_sender().in_flight.add(number, None)
     both.b.receive(data, "mesh", A, both.now)
 
 

@@ -71,7 +71,7 @@ def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     both = acquainted(topic)
     recorded = overheard(both, topic.name, b"stop")
     # The peers keep hearing each other; the test never retransmits what was lost.
-    both.a._state.peer_table.peers["b"].sender.finish_all(ExpiryReason.DEADLINE)
+    both.a._state.peer_table.peers["b"].open_sender().finish_all(ExpiryReason.DEADLINE)
     both.roundtrip(times=900, step_s=0.1)
     before = both.b.conditions(both.now).counters
     replay(both, recorded)

@@ -20,7 +20,7 @@ from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.client import MeshClient, MeshError, Message, mesh_client
 from udp_mesh.client.mesh_client import encode_frame
 from udp_mesh.core.settings import Limits
-from udp_mesh.daemon.configuration import CONDITIONS_TOPIC
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC
 
 Pair = tuple[RunningDaemon, RunningDaemon]
 

@@ -80,7 +80,7 @@ class HeartbeatScheduler:
         online = [session for session in sessions if session.peer is not None and session.peer.online]
         verified = bool(online) and all(
             session.peer is not None
-            and session.peer.has_sender
+            and session.peer.sender is not None
             and now - session.peer.sender.delivered_at < rates.heartbeat_s
             and session.peer.sender.delivered_packets
             for session in online

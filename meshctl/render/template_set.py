@@ -1,0 +1,120 @@
+"""The templates of one back end, compiled and rendered with Jinja."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from jinja2 import (
+    BaseLoader,
+    ChoiceLoader,
+    Environment,
+    FileSystemLoader,
+    PrefixLoader,
+    StrictUndefined,
+    Template,
+    TemplateError,
+    TemplateNotFound,
+    TemplateSyntaxError,
+)
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.inventory.file_access import Boundary
+from meshctl.model import Backend, MeshMode, OperatorParts, Release
+from meshctl.render.quoting import quoted, require_quoted, revealed
+from meshctl.render.template_files import (
+    COMMON,
+    NO_TEMPLATE,
+    SUFFIX,
+    TEMPLATE,
+    TemplateFile,
+    refuse_outside,
+    template_files,
+)
+from meshctl.resources import shipped
+
+
+class TemplateSet:
+    """The templates of one back end with one operator's parts."""
+
+    def __init__(self, folders: tuple[Path, ...], backend: Backend, parts: OperatorParts, boundary: Boundary) -> None:
+        layers: list[tuple[str, Path]] = []
+        loaders: list[BaseLoader] = []
+        if parts.templates:
+            own = Path(parts.base) / parts.templates
+            if not own.is_dir():
+                found = Diagnostic(
+                    NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", "a folder of templates", "none"
+                )
+                raise InvalidInput([found])
+            refuse_outside(own, boundary)
+            layers.append((backend.value, own))
+            loaders.append(PrefixLoader({backend.value: _BoundedLoader(own, boundary)}))
+        for folder in folders:
+            layers.extend((part, folder / part) for part in (backend.value, COMMON))
+            is_shipped = folder == shipped("templates")
+            loaders.append(FileSystemLoader(folder) if is_shipped else _BoundedLoader(folder, boundary))
+        loader = ChoiceLoader(loaders)
+        self._plain = _environment(loader)
+        self._uci = _environment(loader, is_uci=True)
+        self._compiled: dict[str, Template] = {}
+        self.files = template_files(layers, boundary)
+
+    def text(self, file: TemplateFile, context: Mapping[str, object]) -> str:
+        try:
+            if file.name not in self._compiled:
+                self._compiled[file.name] = (self._uci if file.is_uci else self._plain).get_template(file.name)
+            return self._compiled[file.name].render(context)
+        except InvalidInput:
+            raise
+        except Exception as error:
+            # a template can raise any exception; report all of them with the position
+            raise InvalidInput([_diagnostic(file, error)]) from error
+
+
+class _BoundedLoader(FileSystemLoader):
+    """A loader of regular files inside the inventory's boundary."""
+
+    def __init__(self, folder: Path, boundary: Boundary) -> None:
+        super().__init__(folder)
+        self._folder, self._boundary = folder, boundary
+
+    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Callable[[], bool]]:
+        refuse_outside(self._folder / template, self._boundary)
+        return super().get_source(environment, template)
+
+
+def _environment(loader: BaseLoader, *, is_uci: bool = False) -> ImmutableSandboxedEnvironment:
+    environment = ImmutableSandboxedEnvironment(
+        loader=loader,
+        undefined=StrictUndefined,
+        autoescape=False,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        auto_reload=False,
+        finalize=require_quoted if is_uci else None,
+    )
+    environment.filters["uci"] = quoted
+    environment.filters["reveal"] = revealed
+    environment.globals["Release"] = Release
+    environment.globals["MeshMode"] = MeshMode
+    return environment
+
+
+def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
+    """The error, at the innermost template line of its traceback."""
+    place = Position(str(file.source))
+    match error:
+        case TemplateSyntaxError():
+            place = Position(error.filename or str(file.source), error.lineno)
+        case TemplateNotFound():
+            return Diagnostic(TEMPLATE, Severity.ERROR, place, "", expected="a template", found=f"none named {error}")
+        case _:
+            lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(SUFFIX)]
+            if lines:
+                place = Position(lines[-1].filename, lines[-1].lineno or 0)
+    kind = "" if isinstance(error, TemplateError | ValueError | TypeError) else f"{type(error).__name__}: "
+    return Diagnostic(TEMPLATE, Severity.ERROR, place, f"{kind}{error}")

@@ -1,0 +1,45 @@
+"""Commands start fast because each imports only what it needs. `benchmarks/start_up.py` measures how fast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.start_up import imported_modules, packages
+
+ROOT = Path(__file__).resolve().parents[3]
+MAIN = "meshctl.cli.main"
+# every start of the program
+ENTRANCE = frozenset(
+    {
+        "meshctl",
+        "meshctl.cli",
+        "meshctl.cli.commands",
+        "meshctl.cli.extensions",
+        "meshctl.cli.main",
+        "meshctl.cli.output",
+        "meshctl.errors",
+        "meshctl.report",
+        "meshctl.report.terminal_escapes",
+    }
+)
+# typer and what it imports, one of them only on some of its versions
+TYPER = frozenset({"typer", "annotated_doc", "click", "shellingham", "typing_extensions"})
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"]], ids=" ".join)
+def test_help_and_version_import_typer_and_the_table_of_commands(words: list[str], tmp_path: Path) -> None:
+    imported = imported_modules(MAIN, words, tmp_path)
+    assert {name for name in imported if name.startswith(("meshctl", "meshlab"))} == ENTRANCE
+    assert packages(imported) - {"meshctl"} <= TYPER
+    # each takes milliseconds, and none is needed
+    assert not imported & {"asyncio", "email", "importlib.metadata", "json", "sqlite3", "ssl"}
+
+
+def test_lint_of_shipped_templates_imports_no_ssh_no_cryptography_and_no_jinja(tmp_path: Path) -> None:
+    imported = imported_modules(MAIN, ["lint", str(ROOT / "inventory" / "lab")], tmp_path)
+    assert "meshctl.lint.check_path" in imported
+    heavy = {"bcrypt", "cryptography", "jinja2", "meshlab", "nacl", "paramiko", "pyrage", "rich"}
+    assert packages(imported).isdisjoint(heavy)
+    assert not imported & {"asyncio", "sqlite3", "ssl"}
