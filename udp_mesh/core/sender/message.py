@@ -61,6 +61,7 @@ class OutgoingMessage:
         "fragments",
         "missing",
         "next_position",
+        "overdue",
         "priority",
         "queued_at",
         "reliable",
@@ -79,6 +80,8 @@ class OutgoingMessage:
         self.confirm = False
         """It ends as delivered only when the peer confirms that, not when its fragments are acknowledged."""
         self.ended = False
+        self.overdue = False
+        """Past its deadline: only its acknowledgement is awaited."""
         self.superseded = False
         """Replaced by a newer message: its lost fragments are not retransmitted."""
         self.wire_id: int | None = None

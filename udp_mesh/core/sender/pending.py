@@ -104,10 +104,17 @@ class PendingMessages:
         """When the next message expires (it may have ended meanwhile)."""
         return self._deadlines[0][0] if self._deadlines else None
 
-    def expire(self, now: float) -> None:
-        """End messages whose deadline has passed."""
+    def expire(self, now: float, ack_wait_s: float = 0.0) -> None:
+        """End messages whose deadline has passed. One of which every fragment was sent may have arrived in time: it has
+        `ack_wait_s` more for the acknowledgement to come."""
         while self._deadlines and self._deadlines[0][0] <= now:
-            self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
+            at, serial, message = heappop(self._deadlines)
+            all_sent = message.started and message.next_position >= message.fragments
+            if ack_wait_s and all_sent and not message.overdue and not message.ended:
+                message.overdue = True
+                heappush(self._deadlines, (at + ack_wait_s, serial, message))
+            else:
+                self.finish(message, ExpiryReason.DEADLINE)
 
     def restart_message(self, message: OutgoingMessage) -> OutgoingMessage:
         """Replace the message by a copy of which nothing was sent, placed last on its level."""

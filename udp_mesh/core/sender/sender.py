@@ -44,6 +44,9 @@ the pace of the window: a burst of losses costs little more than its own length.
 MIN_ACK_GAP_S = 0.02
 """Minimum time without acknowledgements before packets time out: twice what the peer holds them back."""
 
+MAX_ACK_WAIT_S = 1.0
+"""How long an acknowledgement is awaited after a message's deadline at most."""
+
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
 
@@ -240,7 +243,7 @@ class Sender(PendingMessages):
             return
         if message.superseded:
             self.finish(message, ExpiryReason.SUPERSEDED)
-        else:
+        elif not message.overdue:
             self.scheduler.push_retransmit(message, position)
 
     def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
@@ -284,7 +287,8 @@ class Sender(PendingMessages):
         return self.rtt.pto_s(self.rates.ack_delay_s, PROBE_INTERVAL_S)
 
     def handle_timer(self, now: float) -> None:
-        self.expire(now)
+        responsive = self.state is not SendState.UNRESPONSIVE
+        self.expire(now, min(self.rtt.pto_s(self.rates.ack_delay_s), MAX_ACK_WAIT_S) if responsive else 0.0)
         if self.wake_at <= now:
             self.wake_at = float("inf")
         if self.state is SendState.UNRESPONSIVE:
