@@ -33,7 +33,7 @@ class _Held:
 
     topic: str
     receipt: Receipt | None
-    """Set until the sender is told that the message is safe."""
+    """Set until the sender is informed that the message is safe."""
     on_disk: bool
     reading: dict[Client, int | None] = field(default_factory=dict)
     """Programs that it was sent to: the position in the client's stream at which it is read, or None if the client is
