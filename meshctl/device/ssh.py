@@ -39,6 +39,8 @@ __all__ = ["SshConnection", "connect"]
 
 # OpenWrt's dropbear closes the connection after three refusals (MaxAuthTries in /etc/init.d/dropbear).
 MAX_LOGINS_PER_CONNECTION = 3
+# Keepalives, which the reading thread sends when it wakes, may be late by this much.
+MAX_POLL_S = 1.0
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
 # Without a handler, paramiko's logger would print every failed connection on stderr, beside our errors.
@@ -142,7 +144,8 @@ def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
 ) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    activity = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    stream = open_socket(endpoint, limits) if via is None else via.tunnel(endpoint)
+    activity = ActivityStream(stream, poll_s=min(MAX_POLL_S, limits.ask_s / 2))
     transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
