@@ -35,11 +35,13 @@ class CongestionController(Protocol):
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:
         """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample. When the
-        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
+        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send.
+        `lost` packets were newly found lost; `loss` is the smoothed loss rate."""
         ...
 
     def capacity_packets_per_s(self) -> float | None:
@@ -76,6 +78,7 @@ class FixedWindow:
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:
