@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from udp_mesh.core.congestion.channel_share import MAX_SHARE, RATE_VALID_S, ChannelShare
-from udp_mesh.core.congestion.delay_based import MIN_QUEUE_PACKETS, UNSHARED_FROM_LOSS, DelayBasedController
+from udp_mesh.core.congestion.delay_based import DelayBasedController
+from udp_mesh.core.congestion.queue_target import MIN_QUEUE_PACKETS, UNSHARED_FROM_LOSS
 from udp_mesh.core.congestion.rtt import RttEstimator
 
 
