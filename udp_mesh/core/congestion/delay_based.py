@@ -14,6 +14,7 @@
 5. The minimum RTT is *verified* if it was seen with next to nothing in flight. Once it differs (the path changed, or no
    drain has seen the empty path for long) the next drain goes down to `MIN_CWND` - 1 packets: otherwise a standing
    queue would be taken for the path, and its losses for radio loss.
+6. While others keep the queue filled, whatever drains find (`competition`), the window is TCP's instead.
 
 Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwidth model (Cardwell et al. 2016).
 """
@@ -21,6 +22,7 @@ Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwid
 from collections import deque
 from enum import Enum
 
+from udp_mesh.core.congestion.competition import Competition
 from udp_mesh.core.congestion.delivery_rate import RATE_WINDOW_S, DeliveryRate
 from udp_mesh.core.congestion.growth import GROWTH_PAUSE_S, FullLink, Growth
 from udp_mesh.core.congestion.queue_target import QUEUE_S, loss_queue_s, queue_packets, target_queue_s
@@ -82,6 +84,9 @@ STARTUP_RATE_BOUND = 2.5
 ACK_BATCH_S = 0.008
 """About how long batched acknowledgements keep packets in the window beyond the round trip."""
 
+COMPETITIVE_DRAIN_INTERVAL_S = 4.0
+"""Minimum time between two drains in competition: each gives the queue to the other flow for a round trip or two."""
+
 SUSPECT_QUEUE_S = 0.015
 """More queueing than our own window explains."""
 
@@ -107,6 +112,7 @@ class DelayBasedController:
     """The controller described in the module's docstring."""
 
     __slots__ = (
+        "_competition",
         "_cwnd_before_drain",
         "_drain_on_suspicion",
         "_drained_at",
@@ -145,6 +151,7 @@ class DelayBasedController:
         self._updated_at = 0.0
         self._drained_at = 0.0
         self._startup = FullLink()
+        self._competition = Competition()
         self._growth = Growth()
         self._loss = 0.0
         self._cwnd_before_drain = INITIAL_CWND
@@ -162,6 +169,10 @@ class DelayBasedController:
         # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
         return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
 
+    @property
+    def undrained_cwnd(self) -> float:
+        return self._cwnd_before_drain if self.phase in (Phase.DRAIN, Phase.HOLD) else self.cwnd
+
     def drain_overdue(self, now: float) -> bool:
         return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._windowed_rtt_before_drain
 
@@ -175,7 +186,7 @@ class DelayBasedController:
         capacity = self.capacity_packets_per_s()
         return (
             rate
-            if capacity is None or self._growth.active
+            if capacity is None or self._growth.active or self._competition.is_on
             else min(rate, max(self._pacing_rate(capacity), MIN_CWND / smoothed_rtt))
         )
 
@@ -193,6 +204,7 @@ class DelayBasedController:
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:
@@ -200,6 +212,8 @@ class DelayBasedController:
         if rtt.latest_rtt is None or rtt.min_rtt is None or rtt.windowed_rtt is None:
             return
         self._loss = loss
+        if lost:
+            self._competition.on_lost(lost)
         if rate is not None:
             self._rate.add(rate, app_limited=app_limited, now=now)
             rtt.packet_s = 1.0 / (self.capacity_packets_per_s() or float("inf"))
@@ -273,18 +287,23 @@ class DelayBasedController:
             if not app_limited:
                 self._grow_startup(min_rtt, windowed_rtt, now)
             return
+        self._competition.on_round(min_rtt, loss=self._loss, now=now)
         since_drain = now - self._drained_at
+        if self._competition.is_on:
+            if since_drain > max(COMPETITIVE_DRAIN_INTERVAL_S, DRAIN_ROUND_TRIPS * windowed_rtt):
+                self._begin_drain(now, suspicion=True)
+            elif not app_limited:
+                self.cwnd = min(MAX_CWND, max(MIN_CWND, self._competition.window(self.cwnd, windowed_rtt)))
+            return
         self._suspect_rounds = self._suspect_rounds + 1 if self._unexplained_queue() else 0
         if self._suspect_rounds >= 2 and since_drain > max(self._suspect_interval_s, 4 * windowed_rtt):
             self._begin_drain(now, suspicion=True)
             return
-        every_round_trips = DRAIN_ROUND_TRIPS if self._min_rtt_is_verified() else UNVERIFIED_DRAIN_ROUND_TRIPS
-        if since_drain > max(DRAIN_INTERVAL_S, every_round_trips * min_rtt):
-            if (
-                not self._suspect_rounds
-                and self._min_rtt_is_verified()
-                and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4)
-            ):
+        is_verified = self._min_rtt_is_verified() and not self._competition.is_suspected
+        every_round_trips = DRAIN_ROUND_TRIPS if is_verified else UNVERIFIED_DRAIN_ROUND_TRIPS
+        interval_s = DRAIN_INTERVAL_S / 2 if self._competition.is_suspected else DRAIN_INTERVAL_S
+        if since_drain > max(interval_s, every_round_trips * min_rtt):
+            if not self._suspect_rounds and is_verified and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4):
                 self._drained_at = now
             else:
                 self._begin_drain(now, suspicion=self._suspect_rounds > 0)
@@ -360,7 +379,7 @@ class DelayBasedController:
         self._windowed_rtt_before_drain = windowed_rtt
         self._hold_min_rtt = float("inf")
         self._updated_at = now
-        self._full_drain = not self._min_rtt_is_verified()
+        self._full_drain = not self._min_rtt_is_verified() or self._competition.is_suspected
         drained = 0.0 if self._full_drain else DRAIN_FRACTION * self.cwnd * min_rtt / windowed_rtt - DRAIN_PACKETS
         self.cwnd = max(MIN_CWND - 1, drained)
 
@@ -378,6 +397,12 @@ class DelayBasedController:
         max_cwnd = STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain)
         if self._full_drain and hold_min_rtt != float("inf"):
             self._verified_min_rtt = hold_min_rtt
+        if hold_min_rtt != float("inf"):
+            self._competition.on_drained(hold_min_rtt, others_send=self.queue_share < 1.0, now=now)
+            if self._competition.is_on:
+                self._rtt.reset_min_rtt(hold_min_rtt, now)
+                self.cwnd = max(self._cwnd_before_drain, INITIAL_CWND)
+                return
         if (
             (self._drain_on_suspicion or self._full_drain)
             and hold_min_rtt > 1.15 * min_rtt + self._jitter_s()

@@ -182,6 +182,7 @@ class Sender(PendingMessages):
                 rate,
                 app_limited=app_limited,
                 ahead=ahead,
+                lost=len(lost),
                 loss=self.loss,
                 now=now,
             )
