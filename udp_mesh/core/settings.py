@@ -227,10 +227,10 @@ class Settings:
     """The complete settings of a node. `keys` holds at most two: the first seals, both open. To run without keys, set
     `unkeyed` explicitly.
 
-    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the paper). `fragment_bytes` is the
-    maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does not
-    list (None: they are refused). With `confirms`, the driver calls `Node.confirm` for each received message that has a
-    receipt, once the message is safe.
+    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes`
+    is the maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does
+    not list (None: they are refused). With `confirms`, the driver calls `Node.confirm` for each received message that
+    has a receipt, once the message is safe.
     """
 
     name: str

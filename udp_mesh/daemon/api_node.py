@@ -72,7 +72,6 @@ class Node:
         self._arrived = asyncio.Event()
         self._happened = asyncio.Event()
         self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
-        self.unread_dropped = 0
 
     async def __aenter__(self) -> Node:
         """Opens the links. Raises OSError if the kernel cannot list its interfaces."""
@@ -156,7 +155,6 @@ class Node:
 
     def _event(self, event: Event) -> None:
         if isinstance(event, MessageReceived):
-            self.unread_dropped += len(self._messages) == MAX_UNREAD
             self._messages.append(event)
             self._arrived.set()
             return

@@ -1,14 +1,14 @@
-"""Foreign flows that keep the bottleneck's queue filled: what drains found -> whether to compete, and with what window.
+"""Foreign flows that fill the bottleneck's queue: what drains found -> whether to compete, and with what window.
 
-A delay-based sender gives way to every queue, so that one TCP flow takes the whole link. The competitive mode is that of
-Copa (Arun and Balakrishnan 2018), with our drains as its evidence:
+A delay-based sender gives way to every queue, so that one TCP flow takes the whole link. The competitive mode is that
+of Copa (Arun and Balakrishnan 2018), with our drains as its evidence:
 
 1. A drain down to a few packets empties our own queue. If the round trip stays long, either the route became longer or
    others fill the queue. A route is as long the next time; a queue of others is not. A long round trip that differs
-   from the one before turns the mode on.
+   from the one that a drain found turns the mode on.
 2. In this mode the window grows and shrinks as TCP's: by `INCREASE` packets per round trip, and to `DECREASE` of it
    after losses while the queue is long. Losses at the rate known from before belong to the radio.
-3. The first drain that finds the queue empty ends it, and so do several that find the same round trip.
+3. The first drain that finds the queue empty ends it, and so do several that find the same round trip: a longer route.
 
 Nodes that report to send on the channel are no foreign flows (see `channel_share`): the mode stays off beside them.
 """
@@ -26,7 +26,11 @@ VARIATION_S = 0.002
 VARIATION = 0.03
 """Two drains on the same route differ by less than both together."""
 
-ROUTE_HOLDS = 3
+SUSPECT_HOLDS = 2
+"""A second drain follows soon after the first that found a long round trip. If it finds the same, a route is likely, and
+each full drain of a long route is expensive: the others come at their usual time."""
+
+ROUTE_HOLDS = 4
 """So many drains in a row that find the same round trip prove a route."""
 
 INCREASE = 1.0
@@ -59,15 +63,15 @@ class Competition:
 
     @property
     def is_suspected(self) -> bool:
-        """A drain found a long round trip: the next one tells more."""
-        return bool(self._holds)
+        """A drain found a long round trip, and the next one is to tell why."""
+        return 0 < len(self._holds) < SUSPECT_HOLDS
 
     def base_rtt(self) -> float:
         return self._bases[0][1]
 
     def on_round(self, min_rtt: float, *, loss: float, now: float) -> None:
         """Record the minimum RTT of a round trip, and the loss rate."""
-        if not self.is_suspected:
+        if not self._holds:
             self._radio_loss += RADIO_LOSS_GAIN * (loss - self._radio_loss)
         bases = self._bases
         while bases and bases[-1][1] >= min_rtt:
@@ -75,8 +79,7 @@ class Competition:
         bases.append((now, min_rtt))
         while bases[0][0] < now - BASE_VALID_S:
             bases.popleft()
-
-        if self.is_suspected and not self.is_on and self._is_long(min_rtt):
+        if self._holds and not self.is_on and self._is_long(min_rtt):
             self._compare(min_rtt, now)
 
     def on_lost(self, count: int) -> None:

@@ -17,6 +17,11 @@ class CongestionController(Protocol):
         """The congestion window in packets."""
         ...
 
+    @property
+    def undrained_cwnd(self) -> float:
+        """The same as it was before a drain: the few urgent packets form no queue, so they need not wait for it."""
+        ...
+
     def drain_overdue(self, now: float) -> bool:
         """Whether a drain takes longer than the packets in flight before it."""
         ...
@@ -61,6 +66,10 @@ class FixedWindow:
     def __init__(self, packets: int) -> None:
         self.cwnd = float(packets)
         self.queue_share = 1.0
+
+    @property
+    def undrained_cwnd(self) -> float:
+        return self.cwnd
 
     def drain_overdue(self, now: float) -> bool:
         return False

@@ -14,6 +14,7 @@
 5. The minimum RTT is *verified* if it was seen with next to nothing in flight. Once it differs (the path changed, or no
    drain has seen the empty path for long) the next drain goes down to `MIN_CWND` - 1 packets: otherwise a standing
    queue would be taken for the path, and its losses for radio loss.
+6. While others keep the queue filled, whatever drains find (`competition`), the window is TCP's instead.
 
 Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwidth model (Cardwell et al. 2016).
 """
@@ -167,6 +168,10 @@ class DelayBasedController:
     def assume_delivery(self) -> bool:
         # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
         return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
+
+    @property
+    def undrained_cwnd(self) -> float:
+        return self._cwnd_before_drain if self.phase in (Phase.DRAIN, Phase.HOLD) else self.cwnd
 
     def drain_overdue(self, now: float) -> bool:
         return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._windowed_rtt_before_drain

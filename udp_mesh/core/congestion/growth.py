@@ -13,7 +13,7 @@ GROWTH_AFTER_ROUNDS = 3
 """Round trips without a queue before growth: two occur by chance near equilibrium."""
 
 FIRST_GROWTH_S = 0.005
-FIRST_GROWTH_ROUND_TRIPS = 1 / 30
+FIRST_GROWTH_ROUND_TRIPS = 1 / 60
 """The first step adds at most this much queue, the longer of both: on a long path each doubling takes long."""
 
 FULL_GROWTH = 1.1

@@ -21,8 +21,8 @@ MAX_JITTER_WINDOW_S = 0.06
 JITTER_WINDOWS = 12.0
 JITTER_PACKETS = 2.0
 JITTER_GAIN = 1 / 64
-"""The window covers so many times the mean deviation beyond the serialization time of a few packets, up to the former. A
-radio that repeats a frame delays everything behind it by 10 to 30 ms, which fills the shorter window and looks like a
+"""The window covers so many times the mean deviation beyond the serialization time of a few packets, up to the former.
+A radio that repeats a frame delays everything behind it by 10 to 30 ms, which fills the shorter window and looks like a
 queue; a queue does not vanish within 60 ms. The mean is a slow one: a queue that builds up must not lengthen the window
 that is to show it."""
 

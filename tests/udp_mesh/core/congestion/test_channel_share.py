@@ -57,7 +57,16 @@ def settled_queue(share: float, loss: float) -> float:
         rtt.sample(max(base, window.cwnd / rate), now)
         in_flight = int(window.cwnd)
         window.on_ack(
-            1, number, number + in_flight, in_flight, rate, app_limited=False, ahead=in_flight, loss=loss, now=now
+            1,
+            number,
+            number + in_flight,
+            in_flight,
+            rate,
+            app_limited=False,
+            ahead=in_flight,
+            lost=0,
+            loss=loss,
+            now=now,
         )
     return window.cwnd - base * rate
 
