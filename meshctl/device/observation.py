@@ -157,7 +157,9 @@ class MeshNeighbour:
 
 @dataclass(frozen=True, slots=True)
 class Originator:
-    """One path of batman-adv (`originators_json` or `batctl o`). `tq` 0..255 (BATMAN_IV), `throughput_kbit_s` (V)."""
+    """One path of batman-adv (`originators_json` or `batctl o`): MACs in lower case, `tq` 0..255 (BATMAN_IV) or
+    `throughput_kbit_s` (V).
+    """
 
     mac: str
     next_hop: str
@@ -257,8 +259,3 @@ class Observation:
         if self.clock_s is None:
             return None
         return self.clock_s - (self.asked_at_s + self.answered_at_s) / 2
-
-    @property
-    def uptime_error_s(self) -> float:
-        """The maximum error of `uptime_s` against the observer's clock: half the round trip."""
-        return (self.answered_at_s - self.asked_at_s) / 2

@@ -39,6 +39,8 @@ __all__ = ["SshConnection", "connect"]
 
 # OpenWrt's dropbear closes the connection after three refusals (MaxAuthTries in /etc/init.d/dropbear).
 MAX_LOGINS_PER_CONNECTION = 3
+# Keepalives, which the reading thread sends when it wakes, may be late by this much.
+MAX_POLL_S = 1.0
 # Preferred for speed: X25519 alone is less work and fewer bytes than with ML-KEM beside it, and far less than a finite
 # field. Every dropbear from OpenWrt 19.07 to 25.12 offers it.
 FAST_KEX = ("curve25519-sha256@libssh.org",)
@@ -145,7 +147,8 @@ def _handshake(
     endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
 ) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
-    activity = ActivityStream(open_socket(endpoint, limits) if via is None else via.tunnel(endpoint))
+    stream = open_socket(endpoint, limits) if via is None else via.tunnel(endpoint)
+    activity = ActivityStream(stream, poll_s=min(MAX_POLL_S, limits.ask_s / 2))
     transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first
@@ -235,19 +238,9 @@ class SshConnection(Connection):
         return time.monotonic() - self._activity.last_received_s
 
     @property
-    def server_version(self) -> str:
-        """The server's identification: `SSH-2.0-dropbear_2022.83`."""
-        return self._transport.remote_version
-
-    @property
     def host_key(self) -> HostKey:
         key = self._transport.get_remote_server_key()
         return HostKey(key.get_name(), key.asbytes())
-
-    @property
-    def host_key_algorithm(self) -> str:
-        """The server's signature algorithm: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
-        return str(self._transport.host_key_type)
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""

@@ -17,6 +17,7 @@ SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2'
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
 EXPIRE_GRACE_CS=1500       # an armed change that was not started ends so long after its owner's lock has
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
+PROOF_S=3                  # what remains of the window when a reload stops waiting
 RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
 RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
@@ -480,10 +481,10 @@ wait_until() {
 	is_armed
 }
 
-reload() { # SCRIPT: in the background, so that no hanging reload holds up the timer
+reload() { # SCRIPT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
 	rm -f "$RUN/reloaded"
 	(
-		sh "$1" >"$RUN/reload.log" 2>&1 &
+		UNTIL_S=$2 sh "$1" >"$RUN/reload.log" 2>&1 &
 		echo $! >"$RUN/reload.pid"
 		wait $!
 		echo $? >"$RUN/reloaded"
@@ -544,7 +545,9 @@ watch() { # ID DUE_CS: detached
 		restore failed
 	else
 		cp "$CHANGE/reload" "$RUN/reload"
-		reload "$RUN/reload"
+		# a reload that is not done by then would run at once with the one of the restore
+		now
+		reload "$RUN/reload" $((NOW / 100 + WINDOW - PROOF_S))
 		applied_at_now
 		wait_until $((NOW + WINDOW * 100)) || exit 0
 		reason=timeout

@@ -60,6 +60,10 @@ def last(node: Sandbox) -> tuple[str, str, str]:
     return status.last_id, status.last_outcome, status.last_reason
 
 
+def uptime_s() -> float:
+    return float(Path("/proc/uptime").read_text().split()[0])
+
+
 def refusal(answer: str) -> str:
     words = answer.split()
     assert words[0] == "refused", answer
@@ -266,7 +270,7 @@ def test_the_switch_waits_for_its_moment_and_can_be_called_off_until_then(node: 
 
 def test_a_moment_is_named_by_the_nodes_own_uptime(node: Sandbox) -> None:
     armed(node)
-    uptime = float((node.run("/bin/busybox", "cat", "/proc/uptime").stdout).split()[0])
+    uptime = uptime_s()
     assert refusal(node.deadman("apply", OWNER, "c1", "at", f"{uptime - 5:.2f}")) == "too-late"
     assert is_before(node.path("/etc"))
     due = f"{uptime + 2.25:.2f}"
@@ -281,6 +285,20 @@ def test_a_reload_that_hangs_does_not_hold_up_the_way_back(node: Sandbox) -> Non
     applied(node, window_s="1", wanted=hangs)
     eventually(lambda: node.text("/harness/running") == "back\n")
     assert is_before(node.path("/etc"))
+
+
+def test_a_reload_learns_when_its_window_ends_and_that_of_the_way_back_has_none(node: Sandbox) -> None:
+    log = 'echo "${UNTIL_S:-none}" >>/harness/log'
+    armed(node, "60", change(reload=log))
+    before_s = uptime_s()
+    node.deadman("apply", OWNER, "c1", "now")
+    eventually(lambda: state(node) == "applied" and bool(node.text("/harness/log")))
+    after_s = uptime_s()
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: len((node.text("/harness/log") or "").split()) == 2)
+    until, back = (node.text("/harness/log") or "").split()
+    assert int(before_s) <= int(until) - 60 + 3 <= after_s
+    assert back == "none"
 
 
 def test_the_way_back_lets_a_reload_under_way_come_to_its_end_first(node: Sandbox) -> None:
