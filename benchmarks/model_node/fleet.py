@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from meshctl.device import deadman
 from meshctl.inventory import load_fleet
-from meshctl.model import Secret, SecretRef
+from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.render import DeviceFacts, render_node
 
 INVENTORY = """\
@@ -79,6 +79,7 @@ class ModelFleet:
         self.names = tuple(f"n{number:03}" for number in range(1, count + 1))
         self.key = directory / "key"
         self.ports = dict(zip(self.names, _free_ports(count), strict=True))
+        self._fleets: dict[str, Fleet] = {}
         self._write_inventories(parallel)
         (directory / "nodes").mkdir()
         self._write_nodes()
@@ -88,7 +89,9 @@ class ModelFleet:
 
     def rendered(self, variant: str, name: str) -> dict[str, bytes]:
         """The files that inventory `variant` wants of a node, without the leading slash."""
-        found = render_node(load_fleet(self.inventory(variant)), name, _no_secret, device_facts=DeviceFacts("1.0"))
+        if variant not in self._fleets:
+            self._fleets[variant] = load_fleet(self.inventory(variant))
+        found = render_node(self._fleets[variant], name, _no_secret, device_facts=DeviceFacts("1.0"))
         return {file.path: file.content for file in found.files}
 
     @property

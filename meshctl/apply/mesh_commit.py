@@ -109,7 +109,7 @@ def commit_mesh(
 
 
 def canceled_because(participants: Iterable[Participant], step: str) -> str:
-    """Why nobody changes: the participants that could not be armed or scheduled, each with its reason."""
+    """Why no node changes: the participants that could not be armed or scheduled, each with its reason."""
     failed = [
         f"{participant.name} could not be {step}: {participant.failure.reason}"
         for participant in participants

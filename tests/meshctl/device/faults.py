@@ -35,10 +35,12 @@ sleep() {
 }
 """ + "".join(f'{name}() {{ tick {name} "$@"; command {name} "$@"; }}\n' for name in COMMANDS)
 
-# The script calls sync by its path, so it is counted there.
+# The script calls sync by its path, so it is counted there, for the verb under control and not for processes that it
+# starts beside itself.
 SYNC = """\
 #!/bin/sh
-[ -z "$COUNTED" ] || { . /harness/wrap.sh; tick sync; }
+read -r front </harness/front
+[ -z "$COUNTED" ] || [ "$PPID" != "$front" ] || { . /harness/wrap.sh; tick sync; }
 """
 
 
@@ -76,7 +78,8 @@ class Faults:
         done = self.node.run(
             "/bin/sh",
             "-c",
-            '. /harness/wrap.sh; [ -z "$STDIN" ] || exec <"$STDIN"; . /usr/sbin/meshctl-deadman',
+            '. /harness/wrap.sh; echo $$ >/harness/front; [ -z "$STDIN" ] || exec <"$STDIN"; '
+            ". /usr/sbin/meshctl-deadman",
             "meshctl-deadman",
             *words,
             COUNTED="yes",

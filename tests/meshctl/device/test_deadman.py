@@ -193,55 +193,6 @@ def test_a_change_belongs_to_its_owner_even_after_the_lock_ran_out(node: Sandbox
     assert node.deadman("abort", OTHER, "c1").startswith("ok")
 
 
-def test_a_started_change_is_never_taken_over(node: Sandbox) -> None:
-    applied(node)
-    node.deadman("unlock", OWNER)
-    assert node.deadman("lock", OTHER, LONG).startswith("ok")
-    assert refusal(node.deadman("stage", OTHER, "c2", BUNDLE)) == "busy"
-
-
-def test_an_armed_change_that_was_never_started_ends_once_its_owner_has_lost_the_lock(node: Sandbox) -> None:
-    armed(node)
-    # what `arm` starts, at the end of its time: the owner still holds the lock and may start it
-    node.deadman("expire", "c1", "0")
-    assert " state=armed " in node.deadman("status")
-    node.deadman("unlock", OWNER)
-    node.deadman("expire", "c1", "0")
-    status = node.deadman("status")
-    assert " state=idle " in status
-    assert " last_outcome=restored last_reason=expired " in status
-    assert is_before(node.path("/etc"))
-
-
-def test_an_armed_change_has_a_process_that_ends_it(node: Sandbox) -> None:
-    armed(node)
-    commands = [Path(f"/proc/{process}/cmdline").read_bytes() for process in node.processes()]
-    assert [command for command in commands if b"\0expire\0c1\0" in command]
-
-
-def test_another_operator_ends_a_change_that_was_armed_and_never_started(node: Sandbox) -> None:
-    armed(node)
-    # its process is gone too: the node ran out of memory
-    node.close_processes()
-    node.deadman("unlock", OWNER)
-    assert node.deadman("lock", OTHER, LONG).startswith("ok")
-    assert node.deadman("stage", OTHER, "c2", BUNDLE) == "ok state=staged id=c2"
-    assert is_before(node.path("/etc"))
-
-
-def test_a_new_lock_removes_the_uploads_that_a_killed_meshctl_left(node: Sandbox) -> None:
-    prepare(node)
-    left = ("/tmp/meshctl/c0123456789.tgz", "/tmp/meshctl/.c0123456789.tgz.0123456789abcdef.part")
-    for path in left:
-        node.put(path, "left behind")
-    assert node.deadman("lock", OWNER, LONG).startswith("ok")
-    assert [path for path in left if node.path(path).exists()] == []
-    # the same owner renews its lock while its upload is under way
-    node.put(left[0], "under way")
-    assert node.deadman("lock", OWNER, LONG).startswith("ok")
-    assert node.path(left[0]).exists()
-
-
 def test_a_lock_runs_out_by_itself_and_with_a_reboot(node: Sandbox) -> None:
     assert node.deadman("lock", OWNER, "1").startswith("ok")
     eventually(lambda: node.deadman("lock", OTHER, LONG).startswith("ok"))
