@@ -51,6 +51,7 @@ from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 
@@ -88,7 +89,11 @@ def backup(
             opened.interrupt.on_signals(progress.stopping),
         ):
             ended = run(
-                selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
+                selected,
+                work,
+                parallel=transfers_at_once(opened.fleet.apply.parallel),
+                interrupt=opened.interrupt,
+                observer=progress,
             )
         raise typer.Exit(exit_for(ended.values(), opened.interrupt))
 

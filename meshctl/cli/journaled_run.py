@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -15,7 +16,9 @@ from meshctl.cli.context import Session, exit_for, progress_for
 from meshctl.cli.output import echo, echo_json, ignore_broken_pipe
 from meshctl.fleet import Outcome, totals
 from meshctl.fleet.journal import Run
-from meshctl.report.progress import RunProgress
+
+if TYPE_CHECKING:
+    from meshctl.report.progress import RunProgress
 
 
 @dataclass(slots=True)

@@ -109,7 +109,8 @@ def confirm_and_execute(
     from meshctl.report.plan_text import question
 
     if dry_run:
-        raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
+        ended = report_plan(opened, prepared, choices, as_json=as_json, brief=brief)
+        raise typer.Exit(ExitCode.FINDINGS if prepared.plan.of(Verdict.REFUSED) else ended)
     if not as_json:
         show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:

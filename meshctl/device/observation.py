@@ -157,7 +157,9 @@ class MeshNeighbour:
 
 @dataclass(frozen=True, slots=True)
 class Originator:
-    """One path of batman-adv (`originators_json` or `batctl o`). `tq` 0..255 (BATMAN_IV), `throughput_kbit_s` (V)."""
+    """One path of batman-adv (`originators_json` or `batctl o`): MACs in lower case, `tq` 0..255 (BATMAN_IV) or
+    `throughput_kbit_s` (V).
+    """
 
     mac: str
     next_hop: str

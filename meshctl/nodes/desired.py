@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.plan import DesiredState
 from meshctl.plan.packages import Needs
 from meshctl.plan.seen import packages_seen
-from meshctl.render import DeviceFacts, Templates, render, with_switch
-from meshctl.resolve import package_needs, resolve
+from meshctl.render import DeviceFacts, Rendered, Templates, render, with_switch
+from meshctl.resolve import Intent, package_needs, resolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +21,10 @@ class Renderer:
     fleet: Fleet
     secrets: Callable[[SecretRef], Secret]
     templates: Templates
+    # node -> its intent and files without facts of the device
+    _plain: dict[str, tuple[Node, Intent, Rendered]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
     def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:
@@ -28,14 +32,22 @@ class Renderer:
 
     def desired(self, node: Node, seen: Observation | None = None) -> DesiredState:
         """One node's files and packages. Raises InvalidInput for values that cannot be rendered."""
-        intent = resolve(self.fleet, node, self.secrets)
-        rendered = render(intent, self.templates, device_facts(node, seen))
+        intent, plain = self._rendered(node)
+        rendered = plain if seen is None else render(intent, self.templates, device_facts(node, seen), plain=plain)
         return DesiredState(
             node,
             rendered.files,
             tuple(secret.reveal() for secret in intent.secrets),
             Needs(_groups(self.fleet, node, rendered.packages), rendered.removed_packages),
         )
+
+    def _rendered(self, node: Node) -> tuple[Intent, Rendered]:
+        """The node's intent and its files without facts of the device, rendered once."""
+        known = self._plain.get(node.name)
+        if known is None or known[0] is not node:
+            intent = resolve(self.fleet, node, self.secrets)
+            known = self._plain[node.name] = (node, intent, render(intent, self.templates))
+        return known[1], known[2]
 
 
 def device_facts(node: Node, seen: Observation | None) -> DeviceFacts:

@@ -80,15 +80,23 @@ def _managed(fleet: Fleet, name: str) -> Node:
     return node
 
 
-def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | None = None) -> Rendered:
+def render(
+    intent: Intent, templates: Templates, device_facts: DeviceFacts | None = None, *, plain: Rendered | None = None
+) -> Rendered:
     """The files of one node, the same bytes for the same intent, facts and templates.
 
-    Raises InvalidInput for a template that fails, or whose output is not UCI.
+    `plain` is the same intent rendered before, without facts: it is not rendered again. Raises InvalidInput for a
+    template that fails, or whose output is not UCI.
     """
     facts = device_facts or NO_FACTS
-    files = list(_files(intent, templates, facts))
+    files = list(_files(intent, templates, NO_FACTS)) if plain is None else list(_without_marker(plain))
     # the hash does not cover board-specific sections
-    config_hash = _config_hash(files if facts == NO_FACTS else list(_files(intent, templates, NO_FACTS)))
+    config_hash = _config_hash(files) if plain is None else plain.config_hash
+    if facts.compat_version or not templates.are_shipped(intent.operator_parts):
+        files = list(_files(intent, templates, facts)) if facts != NO_FACTS else files
+    else:
+        # the shipped templates read nothing else of the device
+        files = [_with_board_sections(file, facts, intent.secrets) for file in files]
     marker = f"fleet={intent.fleet}\nnode={intent.node}\nconfig={config_hash}\n"
     files.append(RenderedFile(MARKER_PATH, 0o644, marker.encode(), marker))
     return Rendered(
@@ -99,6 +107,17 @@ def render(intent: Intent, templates: Templates, device_facts: DeviceFacts | Non
         removed_packages=intent.removed_packages,
         config_hash=config_hash,
     )
+
+
+def _without_marker(rendered: Rendered) -> Iterator[RenderedFile]:
+    return (file for file in rendered.files if file.path != MARKER_PATH)
+
+
+def _with_board_sections(file: RenderedFile, facts: DeviceFacts, secrets: tuple[Secret, ...]) -> RenderedFile:
+    if file.package is None:
+        return file
+    package = with_board_sections(file.package, facts)
+    return file if package == file.package else _file(file.path, uci.dump(package), 0o644, secrets, package)
 
 
 def _files(intent: Intent, templates: Templates, facts: DeviceFacts) -> Iterator[RenderedFile]:

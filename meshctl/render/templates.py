@@ -57,7 +57,7 @@ class Templates:
 
     def text(self, file: TemplateFile, backend: Backend, parts: OperatorParts, context: Mapping[str, object]) -> str:
         """The template's text for one node. Raises InvalidInput naming the template and its line."""
-        if self._folders == (shipped("templates"),) and not parts.templates:
+        if self.are_shipped(parts):
             return self._set(backend, parts).text(file, context)
         try:
             answer = self._bounded.text(self._folders, backend, parts, self._boundary, file, context)
@@ -72,6 +72,10 @@ class Templates:
                 for one in answer["diagnostics"]
             )
         return str(answer["text"])
+
+    def are_shipped(self, parts: OperatorParts) -> bool:
+        """Whether all templates are those shipped with meshctl, none the operator's."""
+        return self._folders == (shipped("templates"),) and not parts.templates
 
     def _set(self, backend: Backend, parts: OperatorParts) -> TemplateSet:
         from meshctl.render.template_set import TemplateSet

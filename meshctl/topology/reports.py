@@ -45,8 +45,8 @@ def _direct_quality(originators: tuple[Originator, ...]) -> dict[str, float]:
     """MAC -> quality of the direct link: the originator entries whose next hop is the originator itself."""
     best: dict[str, float] = {}
     for entry in originators:
-        mac = entry.mac.lower()
-        if entry.next_hop.lower() != mac:
+        mac = entry.mac
+        if entry.next_hop != mac:
             continue
         if entry.tq is not None:
             value = entry.tq / TQ_MAX

@@ -222,9 +222,9 @@ class Settings:
     """The complete settings of a node. `keys` holds at most two: the first seals, both open. To run without keys, set
     `unkeyed` explicitly.
 
-    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes` is the
-    maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does not
-    list (None: they are refused).
+    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes`
+    is the maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics`
+    does not list (None: they are refused).
     """
 
     name: str

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from meshctl.device.observation import MeshInfo, MeshNeighbour, Originator
-from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string, truth
+from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string
 
 _MAC = r"((?:[0-9a-f]{2}:){5}[0-9a-f]{2})"
 _SEEN = r"(\d{1,9})\.(\d{3})s"
@@ -90,23 +90,35 @@ def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
 
 
 def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Originator, ...] | None:
-    """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false."""
+    """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false.
+
+    Each node of a fleet knows several paths to every other one, so this is most of what status parses: values of the
+    usual types are taken as they are.
+    """
     data = parse_json(text)
     if not isinstance(data, list):
         return None
-    return tuple(
-        Originator(
-            mac=string(item.get("orig_address")).lower(),
-            next_hop=string(item.get("neigh_address")).lower(),
-            ifname=_interface(item, names),
-            last_seen_ms=integer(item.get("last_seen_msecs")) or 0,
-            best=truth(item.get("best")),
-            tq=integer(item.get("tq")),
-            throughput_kbit_s=integer(item.get("throughput")),
+    found = []
+    for item in data:
+        if type(item) is not dict:
+            continue
+        get = item.get
+        mac, next_hop, ifname = get("orig_address"), get("neigh_address"), get("hard_ifname")
+        seen, tq, throughput = get("last_seen_msecs"), get("tq"), get("throughput")
+        if not (mac := mac if type(mac) is str else string(mac)):
+            continue
+        found.append(
+            Originator(
+                mac.lower(),
+                (next_hop if type(next_hop) is str else string(next_hop)).lower(),
+                ifname if ifname and type(ifname) is str else _interface(item, names),
+                seen if type(seen) is int else integer(seen) or 0,
+                get("best") is True,
+                tq if type(tq) is int else integer(tq),
+                throughput if type(throughput) is int else integer(throughput),
+            )
         )
-        for item in maps(data)
-        if string(item.get("orig_address"))
-    )
+    return tuple(found)
 
 
 def parse_originators_text(text: str) -> tuple[Originator, ...] | None:
