@@ -17,6 +17,7 @@ import os
 import random
 from collections import deque
 from collections.abc import AsyncIterator, Sequence
+from dataclasses import replace
 from types import TracebackType
 
 from udp_mesh.core.conditions import Conditions
@@ -61,7 +62,7 @@ class Node:
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:
-        self._settings = settings
+        self._settings = replace(settings, confirms=True)
         self._links = tuple(links)
         self._store = store
         self._urgent_dscp = urgent_dscp
@@ -122,10 +123,14 @@ class Node:
             del self._outcomes[outcome, to]
 
     async def messages(self) -> AsyncIterator[MessageReceived]:
-        """Messages in order of completion, until the node is closed."""
+        """Messages in order of completion, until the node is closed. What is yielded is delivered."""
         while True:
             while self._messages:
-                yield self._messages.popleft()
+                message = self._messages.popleft()
+                if message.receipt is not None:
+                    self.driver.node.confirm(message.receipt)
+                    self.driver.send_soon()
+                yield message
             if self.driver.closed:
                 return
             self._arrived.clear()
@@ -143,7 +148,7 @@ class Node:
 
     def apply(self, settings: Settings) -> list[str]:
         """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
-        return self.driver.apply(settings)
+        return self.driver.apply(replace(settings, confirms=True))
 
     def conditions(self) -> Conditions:
         return self.driver.conditions()
