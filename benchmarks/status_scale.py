@@ -1,4 +1,5 @@
-"""Duration of `meshctl status` for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]`.
+"""Duration of `meshctl status` for a fleet: `python -m benchmarks.status_scale [--radios 50,200] [--robots 20]
+[--against DIR]`.
 
 The devices are those of `status_fleet`: a real SSH server in its own network namespace, with prepared answers. The
 command runs in a separate process, over real connections:
@@ -6,6 +7,8 @@ command runs in a separate process, over real connections:
 - once for the radios alone, and once for radios and robots, with new connections to all;
 - the rounds of `--watch` after the first, with established connections;
 - once while half of the radios are off: packets to them are lost, as in the field.
+
+`--against` runs the same, in turns, with the meshctl of another checkout that has its own `.venv`.
 
 Devices and meshctl share this machine's CPUs, so the wall time includes the server's work; the CPU time is meshctl's
 own.
@@ -27,8 +30,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.page import fill
 from benchmarks.status_fleet import Devices, programs_missing
 
+ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
 RUNS = 3
 WATCH_ROUNDS = 4
@@ -82,24 +87,32 @@ def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, flo
     return {"seconds": statistics.median(look["took_s"] for look in looks[1:])}
 
 
-def measure(radios: int, robots: int) -> dict[str, Any]:
-    """All figures for one fleet, whose radios include the base."""
+def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict[str, Any]]:
+    """All figures for one fleet, whose radios include the base, by checkout."""
     with tempfile.TemporaryDirectory(prefix="status-scale-") as directory:
         devices = Devices(Path(directory, "fleet"), radios, robots)
         devices.directory.mkdir()
         ours = {name: value for name, value in os.environ.items() if not name.startswith("MESHCTL_")}
         environ = {**ours, "XDG_STATE_HOME": str(Path(directory, "state")), "SSH_AUTH_SOCK": ""}
-        command = [sys.executable, "-m", "meshctl", "status", "--json", "-i", str(devices.inventory)]
+        commands = {
+            label: [f"{checkout}/.venv/bin/meshctl", "status", "--json", "-i", str(devices.inventory)]
+            for label, checkout in checkouts.items()
+        }
+        results = [{"radios": radios, "robots": robots, "checkout": label} for label in commands]
         devices.start()
         try:
-            alone = repeated([*command, "--no-robots"], environ, radios)
-            both = repeated(command, environ, radios + robots)
-            again = watched(command, environ)
+            for result, command in zip(results, commands.values(), strict=True):
+                result["alone"] = repeated([*command, "--no-robots"], environ, radios)
+            for result, command in zip(results, commands.values(), strict=True):
+                result["both"] = repeated(command, environ, radios + robots)
+            for result, command in zip(results, commands.values(), strict=True):
+                result["again"] = watched(command, environ)
             off = devices.switch_off_half()
-            half = repeated(command, environ, radios + robots - off)
+            for result, command in zip(results, commands.values(), strict=True):
+                result["half"] = repeated(command, environ, radios + robots - off)
         finally:
             devices.stop()
-    return {"radios": radios, "robots": robots, "alone": alone, "both": both, "again": again, "half": half}
+    return results
 
 
 _ROWS = {
@@ -113,23 +126,27 @@ _ROWS = {
 def table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        "| radios | robots | look | seconds | processor seconds of meshctl |",
-        "| ---: | ---: | --- | ---: | ---: |",
+        "| radios | robots | query | revision | seconds | processor seconds of meshctl |",
+        "| ---: | ---: | --- | --- | ---: | ---: |",
     ]
-    for result in results:
+    for radios, robots in dict.fromkeys((result["radios"], result["robots"]) for result in results):
         for key, what in _ROWS.items():
-            took = result[key]
-            processor = f"{took['cpu_s']:.1f}" if "cpu_s" in took else ""
-            lines.append(f"| {result['radios']} | {result['robots']} | {what} | {took['seconds']:.1f} | {processor} |")
+            for result in results:
+                if (result["radios"], result["robots"]) == (radios, robots):
+                    took = result[key]
+                    processor = f"{took['cpu_s']:.1f}" if "cpu_s" in took else ""
+                    cells = (radios, robots, what, result["checkout"], f"{took['seconds']:.1f}", processor)
+                    lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
 
-def in_own_network(radios: int, robots: int) -> dict[str, Any]:
+def in_own_network(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict[str, Any]]:
     """Run `measure` in a separate process, in a network namespace with only the fleet's addresses."""
     inner = 'ip link set lo up && exec "$@"'
     command = ["unshare", "--net", "sh", "-ec", inner, "sh", sys.executable, "-m", "benchmarks.status_scale"]
-    done = subprocess.run([*command, "--inside", f"{radios},{robots}"], stdout=subprocess.PIPE, check=True)
-    found: dict[str, Any] = json.loads(done.stdout)
+    inside = json.dumps([radios, robots, checkouts])
+    done = subprocess.run([*command, "--inside", inside], stdout=subprocess.PIPE, check=True)
+    found: list[dict[str, Any]] = json.loads(done.stdout)
     return found
 
 
@@ -138,29 +155,36 @@ def main() -> None:
     parser.add_argument("--radios", default="50,200")
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--against", type=Path, help="another checkout with its .venv, measured in the same run")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
     parser.add_argument("--inside", default="", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.inside:
-        radios, robots = map(int, arguments.inside.split(","))
-        print(json.dumps(measure(radios, robots)))
+        print(json.dumps(measure(*json.loads(arguments.inside))))
         return
     known = (
         [json.loads(line) for line in arguments.results.read_text().splitlines()] if arguments.results.exists() else []
     )
-    results = {(result["radios"], result["robots"]): result for result in known}
+    results = {(result["radios"], result["robots"], result.get("checkout", "now")): result for result in known}
     if not arguments.tables:
         if missing := programs_missing():
             parser.error(f"it needs {', '.join(missing)}")
         machine = {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
+        before = {"before": str(arguments.against.resolve())} if arguments.against else {}
+        checkouts = {**before, "now": str(ROOT)}
         for radios in map(int, arguments.radios.split(",")):
-            results[radios, arguments.robots] = {**machine, **in_own_network(radios, arguments.robots)}
+            for found in in_own_network(radios, arguments.robots, checkouts):
+                results[radios, arguments.robots, found["checkout"]] = {**machine, **found}
             arguments.results.parent.mkdir(parents=True, exist_ok=True)
             arguments.results.write_text("".join(json.dumps(result) + "\n" for result in results.values()))
     rows = [results[key] for key in sorted(results)]
     first = rows[0]
-    print(f"Python {first['python']}, {first['machine']}, {first['cores']} cores for meshctl and all devices\n")
-    print(table(rows))
+    heading = f"Python {first['python']}, {first['machine']}, {first['cores']} cores for meshctl and all devices"
+    text = f"{heading}\n\n{table(rows)}"
+    print(text)
+    if arguments.fill:
+        fill("status", text)
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ def kind_of(script: str) -> str:
 
 # meshctl sends a long script on standard input, to this one (`meshctl.device.framing`).
 READER = "s=; while IFS= read -r l"
-_WITH_INPUT = ("chunk", "ansible put")
+_WITH_INPUT = ("change", "chunk", "ansible put")
 
 
 def takes_input(command: str) -> bool:
@@ -98,6 +98,7 @@ _KINDS = (
     ("stage", r"^/usr/sbin/meshctl-deadman stage "),
     ("arm", r"^/usr/sbin/meshctl-deadman arm "),
     ("apply", r"^/usr/sbin/meshctl-deadman apply "),
+    ("change", r"^/usr/sbin/meshctl-deadman change "),
     ("status", r"/usr/sbin/meshctl-deadman status$"),
     ("confirm", r"^/usr/sbin/meshctl-deadman confirm "),
     ("ansible raw", r"^(/bin/sh -c )?'?(cat /etc/openwrt_release|test \"\$\(sha256sum)"),
@@ -141,8 +142,9 @@ class Node:
         cost = self.costs.get(kind, Cost())
         self.processes += cost.processes
         self.syncs += cost.syncs
-        output, status = getattr(self, "_" + kind.replace(" ", "_"))(script, stdin, now_s)
-        return Answer(output if isinstance(output, bytes) else output.encode(), status, cost.seconds)
+        output, status = getattr(self, "_" + kind.replace(" ", "_"))(script, stdin, now_s + cost.seconds)
+        not_before_s = self.due_s + RELOAD_S if kind == "change" else 0.0
+        return Answer(output.encode(), status, cost.seconds, not_before_s)
 
     def _advance(self, now_s: float) -> None:
         if self.state == "waiting" and now_s >= self.due_s:
@@ -224,6 +226,13 @@ class Node:
         self._unpack(self.uploads[path])
         return f"ok state=staged id={self.change_id}\n", 0
 
+    def _change(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
+        _, _, self.owner, _, self.change_id, _, window_s, _, _ = script.split()
+        self.lock_owner, self.window_s = self.owner, int(window_s)
+        self._unpack(stdin)
+        self.state, self.due_s = "waiting", now_s
+        return f"ok id={self.change_id} reload_status=0\n", 0
+
     def _unpack(self, bundle: bytes) -> None:
         with tarfile.open(fileobj=io.BytesIO(gzip.decompress(bundle))) as tar:
             files = {member.name: tar.extractfile(member) for member in tar if member.name.startswith("new/")}
@@ -243,6 +252,7 @@ class Node:
 
     def _confirm(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
         ended, self.state, self.change_id = self.change_id, "idle", ""
+        self.lock_owner = ""
         self.last = f"last_id={ended} last_outcome=confirmed last_reason=operator"
         return f"ok state=idle id={ended} outcome=confirmed\n", 0
 

@@ -20,7 +20,7 @@ from benchmarks.provisioning import script
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.device import deadman
 from meshctl.device.connection import Completed, Connection, Credentials, Endpoint
-from meshctl.device.deadman import Change, NewFile
+from meshctl.device.deadman import Change, NewFile, Payload
 from meshctl.device.observe import observation_script
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey
@@ -28,10 +28,7 @@ from meshctl.render import DeviceFacts
 from meshlab.fleet import VirtualNode
 from tests.meshctl.proof.rig import Rig
 
-# The detached process, its reload and everything that procd and netifd do for it have ended by then.
-RELOAD_LIMIT_S = 60.0
-# The change starts once the counters have been read.
-RECORDED_DELAY_S = 2.0
+RELOAD_LIMIT_S = 10
 OWNER = "recorder@bench:1:1"
 
 
@@ -71,17 +68,13 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
         observation = connection.run(observation_script("NONCE")).stdout
-        deadman.lock(connection, OWNER, ttl_s=120)
-        deadman.stage(connection, OWNER, change)
-        deadman.arm(connection, OWNER, change.change_id, nonce=nonce, window_s=60)
-        deadman.apply(connection, OWNER, change.change_id, in_s=RECORDED_DELAY_S)
+        deadman.change(connection, OWNER, Payload.of(change), nonce=nonce, window_s=90, ttl_s=120, await_reload_s=0)
         with counting(node, "reload", costs):
-            time.sleep(RELOAD_LIMIT_S / 2)
+            time.sleep(RELOAD_LIMIT_S)
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
         deadman.status(connection)
-        deadman.confirm(connection, change.change_id, nonce=nonce)
-        deadman.unlock(connection, OWNER)
+        deadman.confirm(connection, change.change_id, nonce=nonce, owner=OWNER)
     return observation
 
 
@@ -102,7 +95,7 @@ def ansible_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:
         connection.run(f"/bin/sh -c ' {place}/{name}.sh && sleep 0'")
         connection.run(f"/bin/sh -c 'rm -f -r {place}/ > /dev/null 2>&1 && sleep 0'")
         with counting(node, "ansible reload", costs):
-            time.sleep(RELOAD_LIMIT_S / 2)
+            time.sleep(RELOAD_LIMIT_S)
 
 
 def main() -> None:
@@ -111,7 +104,7 @@ def main() -> None:
         taken = rig.take_in("a")
         if taken.code:
             raise RuntimeError(f"cannot bootstrap the node:\n{taken.out}{taken.err}")
-        time.sleep(RELOAD_LIMIT_S / 4)
+        time.sleep(RELOAD_LIMIT_S)
         observation = meshctl_change(rig, "n001", costs)
         ansible_change(rig, "n001", costs)
     RECORDED_OBSERVATION.write_text(without_neighbors(observation))

@@ -85,7 +85,7 @@ def irreversible(
     if later_runs:
         return f"run {later_runs[-1]} changed it later: run `meshctl rollback {later_runs[-1]}` first"
     if state is None:
-        return f"what run {run_id} replaced on it is not kept"
+        return f"the files that run {run_id} replaced on it were not recorded"
     if state.lasting:
         return f"run {run_id} {state.lasting}, which no configuration undoes"
     if state.added:

@@ -51,6 +51,7 @@ from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 
@@ -88,7 +89,11 @@ def backup(
             opened.interrupt.on_signals(progress.stopping),
         ):
             ended = run(
-                selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
+                selected,
+                work,
+                parallel=transfers_at_once(opened.fleet.apply.parallel),
+                interrupt=opened.interrupt,
+                observer=progress,
             )
         raise typer.Exit(exit_for(ended.values(), opened.interrupt))
 
@@ -165,45 +170,53 @@ def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observ
 
 
 def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> JournaledRun:
-    node = opened.fleet.nodes[name]
     with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
-        known = opened.journal.last_known(opened.fleet.name)
-        around: dict[str, Observation] = {}
-        flushes = StationFlushes()
-        work = RunContext(
-            opened.fleet,
-            opened.access,
-            journaled.entry,
-            journaled.progress,
-            opened.interrupt,
-            opened.owner,
-            flushes.listener,
-            observations=around,
-            mac_owners=known_macs(opened.fleet, known),
-            base_macs=base_macs(opened.fleet, around, known),
-        )
 
-        def one(only: str) -> Outcome:
-            connection = opened.access.open(node)
-            try:
-                seen = observe_cleared(connection, (), opened.interrupt)
-                _require_restorable(opened, node, saved, seen)
-                around.update(
-                    observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
-                )
-                for package in uninstalled_packages(saved, seen):
-                    work.note(f"package {package} is in the backup but no longer installed", name)
-                if saved.disabled:
-                    work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
-                plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-                job = NodeContext(work, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
-            except BaseException:
-                connection.close()
-                raise
-            return restore_backup(job, connection, saved)
+        def work(_: str) -> Outcome:
+            return _restore_node(opened, journaled, opened.fleet.nodes[name], saved)
 
-        journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
-        for unasked in flushes.retry_unanswered(work).values():
-            journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
+        ended = run([name], work, parallel=1, interrupt=opened.interrupt, observer=journaled.progress)
+        journaled.outcomes.update(ended)
         journaled.entry.finish_node(journaled.outcomes[name])
     return journaled
+
+
+def _restore_node(opened: Session, journaled: JournaledRun, node: Node, saved: Backup) -> Outcome:
+    flushes = StationFlushes()
+    connection = opened.access.open(node)
+    try:
+        seen = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, seen)
+        ctx = _context(opened, journaled, node, seen, flushes)
+        for package in uninstalled_packages(saved, seen):
+            ctx.run.note(f"package {package} is in the backup but no longer installed", node.name)
+        if saved.disabled:
+            ctx.run.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", node.name)
+    except BaseException:
+        connection.close()
+        raise
+    outcome = restore_backup(ctx, connection, saved)
+    unflushed = flushes.retry_unanswered(ctx.run).get(node.name, ())
+    return replace(outcome, facts={UNFLUSHED: " ".join(unflushed)}) if unflushed else outcome
+
+
+def _context(
+    opened: Session, journaled: JournaledRun, node: Node, seen: Observation, flushes: StationFlushes
+) -> NodeContext:
+    """The context of a node to be restored, once its neighbors were observed."""
+    fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
+    observations = observe_neighbors(opened.access, fleet, {node.name: seen}, known, interrupt=opened.interrupt)
+    run_context = RunContext(
+        fleet,
+        opened.access,
+        journaled.entry,
+        journaled.progress,
+        opened.interrupt,
+        opened.owner,
+        flushes.listener,
+        observations=observations,
+        mac_owners=known_macs(fleet, known),
+        base_macs=base_macs(fleet, observations, known),
+    )
+    plan = NodePlan(node.name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
+    return NodeContext(run_context, node, plan, opened.renderer.desired(node, seen), seen, Expectation())

@@ -42,6 +42,7 @@ from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.model import Node, NodeState
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
 
@@ -101,7 +102,7 @@ def bootstrap(
                 opened.access,
                 opened.trust,
                 places,
-                parallel=opened.fleet.apply.parallel,
+                parallel=transfers_at_once(opened.fleet.apply.parallel),
                 replace_keys=replace_key,
                 interrupt=opened.interrupt,
             )

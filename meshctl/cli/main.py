@@ -44,12 +44,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     completing = os.environ.get("COMP_WORDS", "").split()[1:] if "_MESHCTL_COMPLETE" in os.environ else []
     requested = next((word for word in completing or words if not word.startswith("-")), "")
     # a fleet's answers are hundreds of thousands of objects without cycles: by default, a quarter of status is spent
-    # looking for some
-    gc.set_threshold(*GC_THRESHOLD)
+    # looking for some; a caller's process keeps its own thresholds
+    if arguments is None:
+        gc.set_threshold(*GC_THRESHOLD)
     try:
         defaults = user_defaults(os.environ)
         command = typer.main.get_command(build(requested))
-        gc.freeze()
         command(args=words, prog_name="meshctl", default_map=default_map(defaults, requested, command))
     except MeshctlError as error:
         _print_error(error)

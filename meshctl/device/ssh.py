@@ -41,6 +41,9 @@ __all__ = ["SshConnection", "connect"]
 MAX_LOGINS_PER_CONNECTION = 3
 # Keepalives, which the reading thread sends when it wakes, may be late by this much.
 MAX_POLL_S = 1.0
+# Preferred for speed: X25519 alone is less work and fewer bytes than with ML-KEM beside it, and far less than a finite
+# field. Every dropbear from OpenWrt 19.07 to 25.12 offers it.
+FAST_KEX = ("curve25519-sha256@libssh.org",)
 _RSA_SHA2 = ("rsa-sha2-512", "rsa-sha2-256")
 
 # Without a handler, paramiko's logger would print every failed connection on stderr, beside our errors.
@@ -178,6 +181,7 @@ def _prefer(transport: paramiko.Transport, known: tuple[HostKey, ...], *, legacy
     rsa = (*_RSA_SHA2, SSH_RSA) if legacy else _RSA_SHA2
     pinned = [name for key in known for name in (rsa if key.key_type == SSH_RSA else (key.key_type,))]
     options = transport.get_security_options()
+    options.kex = (*(name for name in FAST_KEX if name in options.kex), *(n for n in options.kex if n not in FAST_KEX))
     usual = tuple(options.key_types)
     options.key_types = (
         *(name for name in dict.fromkeys(pinned) if name in usual),
@@ -229,19 +233,14 @@ class SshConnection(Connection):
         return self._transport.is_active()
 
     @property
-    def server_version(self) -> str:
-        """The server's identification: `SSH-2.0-dropbear_2022.83`."""
-        return self._transport.remote_version
+    def silent_s(self) -> float:
+        """How long ago the server's last data arrived."""
+        return time.monotonic() - self._activity.last_received_s
 
     @property
     def host_key(self) -> HostKey:
         key = self._transport.get_remote_server_key()
         return HostKey(key.get_name(), key.asbytes())
-
-    @property
-    def host_key_algorithm(self) -> str:
-        """The server's signature algorithm: `ssh-ed25519`, `rsa-sha2-256`, or `ssh-rsa` for SHA-1."""
-        return str(self._transport.host_key_type)
 
     def tunnel(self, target: Endpoint) -> paramiko.Channel:
         """A TCP stream from this node to `target` (direct-tcpip, RFC 4254 section 7.2)."""

@@ -88,7 +88,7 @@ def collect(
 
     def observe_one(name: str) -> Outcome:
         try:
-            with connections.borrow(wanted[name]) as connection:
+            with connections.slots.use(name), connections.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:

@@ -16,6 +16,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import FleetObservation, collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.slots import nodes_in_work
 from meshctl.report.duration import duration
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
 
@@ -134,7 +135,7 @@ def query_neighbors(
     seen = collect(
         connections,
         [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
-        parallel=max(1, fleet.apply.parallel),
+        parallel=nodes_in_work(fleet.apply.parallel),
         interrupt=interrupt,
     )
     return last_seen_of(fleet, missing, seen.observations, known)

@@ -4,7 +4,7 @@
 """
 
 from udp_mesh.core.broadcast import FIRST_UNREPAIRED_NUMBER
-from udp_mesh.core.events import ExpiryReason, MessageReceived
+from udp_mesh.core.events import ExpiryReason, MessageReceived, Receipt
 from udp_mesh.core.peer_lifecycle import on_bye
 from udp_mesh.core.peers.path_validation import send_on_path
 from udp_mesh.core.peers.session import Session
@@ -102,6 +102,8 @@ def process_frames(
         receiver.on_accepted(number, now, ack_now=ack_now)
         if receiver.acks.send_now:
             state.schedule_control(session)
+    if receiver.confirmed:
+        state.schedule_control(session)
     if receiver.refusals:
         for refusal in receiver.refusals:
             session.queue_control(refusal)
@@ -189,7 +191,13 @@ def deliver(state: State, session: Session, now: float) -> None:
         state.event_queue.counters.messages_received += 1
         state.event_queue.emit(
             MessageReceived(
-                session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
+                session.name,
+                message.topic,
+                message.type_name,
+                message.payload,
+                message.priority,
+                message.to_all,
+                None if message.confirm_id is None else Receipt(session.boot_id, message.confirm_id),
             )
         )
 

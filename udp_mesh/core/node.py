@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from udp_mesh.core import publish, reconfigure, transmit
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
-from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.events import Event, MessageId, Receipt, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
@@ -144,6 +144,21 @@ class Node:
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
         return _snapshot(self._state, now)
+
+    def confirm(self, receipt: Receipt) -> None:
+        """A received message is safe: the application took it, or it is on disk. Its sender reports it as delivered."""
+        session = self._state.peer_table.sessions.get(receipt.boot_id)
+        if session is not None and session.receiver.confirm(receipt.message_id):
+            self._state.schedule_control(session)
+
+    def request_again(self, receipt: Receipt) -> None:
+        """A received message could not be kept: its sender is to send it again."""
+        session = self._state.peer_table.sessions.get(receipt.boot_id)
+        if session is not None and session.receiver.request_again(receipt.message_id):
+            for refusal in session.receiver.refusals:
+                session.queue_control(refusal)
+            session.receiver.refusals.clear()
+            self._state.schedule_control(session)
 
     def peer_addresses(self) -> dict[str, set[Address]]:
         """Link -> the addresses from which authenticated peers send: a driver reads what comes from elsewhere with less

@@ -336,6 +336,8 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         session.meters.received.feed(session.received_bytes, now)
     sender = peer.sender
     if sender is not None:
+        if peer.online and sender.unconfirmed and sender.request_confirmations(now):
+            state.ready[peer] = None
         _report_starved(state, peer.name, sender, now)
         update_pmtu(state, peer, sender, session, now)
         session.meters.sent.feed(sender.sent_bytes, now)

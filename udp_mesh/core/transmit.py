@@ -10,7 +10,7 @@ from heapq import heappop
 from udp_mesh.core.frame_handlers import inflate_step
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import maintain
-from udp_mesh.core.peers.heartbeat import OWN_FEATURES, heartbeat_datagrams
+from udp_mesh.core.peers.heartbeat import heartbeat_datagrams, own_features
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
 from udp_mesh.core.receiver.datagram_age import clock_ms
@@ -18,7 +18,7 @@ from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_leve
 from udp_mesh.core.settings import Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
+from udp_mesh.wire.frames import Cancel, Delivered, Frame, Heartbeat, Ping
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
@@ -73,6 +73,10 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
             state.event_queue.counters.acknowledgements_sent += 1
     frames.extend(session.pending_control)
     session.pending_control.clear()
+    confirmed = session.receiver.confirmed
+    while confirmed:
+        frames.append(Delivered(tuple(confirmed[:MAX_IDS])))
+        del confirmed[:MAX_IDS]
     sender = peer.open_sender()
     cancelled = sender.cancelled
     while cancelled:
@@ -100,7 +104,7 @@ def _introduction(state: State, session: Session, now: float) -> Heartbeat:
         settings.name,
         VERSION,
         VERSION,
-        int(OWN_FEATURES),
+        own_features(settings),
         min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
         0,
         0,

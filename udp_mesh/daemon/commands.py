@@ -108,8 +108,15 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
 
 
 def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscriptions.add(client, _texts(header, "topics"))
+    service.subscriptions.add(client, _texts(header, "topics"), acknowledge=bool(header.get("acknowledge")))
     return {}
+
+
+def acknowledge(service: Service, client: Client, header: Header, _: bytes) -> Header:
+    receipts = header.get("receipts")
+    if not isinstance(receipts, list) or not all(isinstance(item, int) for item in receipts):
+        raise RequestError("bad-request", f"receipts: expected a list of numbers, found {receipts!r}")
+    return {"acknowledged": service.acknowledge(client, receipts)}
 
 
 def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
@@ -331,6 +338,7 @@ async def record_stop(service: Service, _client: Client, _header: Header, _: byt
 COMMANDS = {
     "publish": publish,
     "subscribe": subscribe,
+    "acknowledge": acknowledge,
     "unsubscribe": unsubscribe,
     "events": events,
     "ping": ping,

@@ -293,6 +293,10 @@ class Driver:
 
     # Send
 
+    def send_soon(self) -> None:
+        """Something was added to the node: send it in this loop iteration."""
+        self._schedule_pump()
+
     def _schedule_pump(self) -> None:
         if not self._pump_requested and not self.closed:
             self._pump_requested = True

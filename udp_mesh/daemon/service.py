@@ -22,6 +22,7 @@ from udp_mesh.core.events import (
     MessageExpired,
     MessagePeerLost,
     MessageReceived,
+    Receipt,
     Rejected,
     RejectReason,
 )
@@ -30,6 +31,7 @@ from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
@@ -71,11 +73,17 @@ class Service:
             legacy_positions=self._positions,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
+        self.inbox = Inbox(
+            DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
+            self._confirm,
+            self._request_again,
+        )
+        self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
-        self.subscriptions = Subscriptions()
+        self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority)
         self._watchers: set[Client] = set()
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
         self._pings: dict[bytes, asyncio.Future[float]] = {}
@@ -105,6 +113,7 @@ class Service:
         await self._save_positions()
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
+        await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
 
     # Requests (called by the local API)
 
@@ -131,6 +140,9 @@ class Service:
             client.reply(header.get("id"), **await answer)
         except RequestError as error:
             client.refuse(header.get("id"), error.code, str(error))
+
+    def client_read(self) -> None:
+        self.inbox.take_read()
 
     def client_gone(self, client: Client) -> None:
         self.subscriptions.remove_client(client)
@@ -305,17 +317,7 @@ class Service:
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self.subscriptions.distribute(
-            {
-                "event": "message",
-                "source": event.source,
-                "topic": topic,
-                "type": event.type_name,
-                "priority": event.priority,
-                "broadcast": event.broadcast,
-            },
-            event.payload,
-        )
+        self.subscriptions.distribute(event)
 
     def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
@@ -325,6 +327,24 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
+    # Messages held until a program takes them
+
+    def _confirm(self, receipt: Receipt) -> None:
+        self.driver.node.confirm(receipt)
+        self.driver.send_soon()
+
+    def _request_again(self, receipt: Receipt) -> None:
+        self.driver.node.request_again(receipt)
+        self.driver.send_soon()
+
+    def acknowledge(self, client: Client, receipts: list[int]) -> int:
+        """A client took these messages. Returns how many of them were waiting for that."""
+        return sum([self.inbox.acknowledge(client, receipt) for receipt in receipts])
+
+    def _priority(self, topic: str) -> int:
+        settings = self.topic(topic)
+        return 0 if settings is None else settings.priority
+
     def _publish_conditions(self) -> None:
         """Once per period: sends the conditions to subscribed clients and to the recording."""
         period_s = self.configuration.daemon.conditions_period_s
@@ -333,6 +353,8 @@ class Service:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
         self._spawn(self._save_positions())
+        self.inbox.take_read()
+        self.subscriptions.pass_on_held()
         clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
         if not clients and self.recorder is None:
             return

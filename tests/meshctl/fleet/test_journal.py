@@ -219,17 +219,17 @@ def test_a_locked_journal_can_be_read_and_hints_at_the_process(
     Journal(path).close()
     with held_by_another(path), Journal(path) as journal:
         assert journal.runs() == ()
-        with pytest.raises(MeshctlError, match="locked") as told, journal._file.write(0.0):
+        with pytest.raises(MeshctlError, match="locked") as caught, journal._file.write(0.0):
             pass
-        assert "fuser" in told.value.hint
+        assert "fuser" in caught.value.hint
 
 
 def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> None:
     path.parent.mkdir(parents=True)
     path.mkdir()
-    with pytest.raises(MeshctlError, match="cannot open the journal") as told:
+    with pytest.raises(MeshctlError, match="cannot open the journal") as caught:
         Journal(path)
-    assert "XDG_STATE_HOME" in told.value.hint
+    assert "XDG_STATE_HOME" in caught.value.hint
 
 
 def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
@@ -275,7 +275,7 @@ def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_the
 
 
 def test_facts_of_a_device_that_was_replaced_are_left_out(path: Path) -> None:
-    """On any laptop: the pinned host keys come with the inventory, whoever ran `meshctl replace`."""
+    """On any laptop: the pinned host keys come with the inventory, whichever user ran `meshctl replace`."""
     pins = {"b01": ["SHA256:old"], "b02": ["SHA256:b02"]}
 
     def opened() -> Journal:

@@ -103,8 +103,8 @@ class Rig:
     firmware: Mapping[str, str] = field(default_factory=dict)
     # what is baked into the images
     packages: tuple[str, ...] = MESH_PACKAGES
-    # whether meshctl is told of the virtual fleet; without, it goes by addresses and cables as in the field
-    is_told_of_lab: bool = True
+    # whether meshctl knows that the fleet is virtual; otherwise it uses addresses and cables as in the field
+    knows_lab: bool = True
     release: Release = Release.V23_05
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
@@ -178,7 +178,7 @@ class Rig:
         return {
             **{name: text for name, text in os.environ.items() if not name.startswith("MESHCTL_")},
             "XDG_STATE_HOME": str(self.directory / "state"),
-            **({"MESHCTL_LAB": str(self.fleet.directory)} if self.is_told_of_lab else {}),
+            **({"MESHCTL_LAB": str(self.fleet.directory)} if self.knows_lab else {}),
             "PYTHONPATH": root,
             "SSH_AUTH_SOCK": "",
         }
@@ -237,7 +237,7 @@ class Rig:
                     yield member.name, stream.read()
 
     def settle(self) -> None:
-        """Mended, up and wholly on `current`, whatever was done before or left undone."""
+        """Repaired, up and completely on `current`, whatever was done before."""
         self.fleet.repair()
         self.wait_all_up()
         other = "b" if self.current == "a" else "a"

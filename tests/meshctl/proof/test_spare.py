@@ -47,7 +47,7 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         fleet = load_fleet(inventory)
         assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S2", "retired")
         assert rig.meshctl("provision", "spare", "n001", "--check", "--json").verdicts == {"n001": "same"}
-        # its successor dies, too, and somebody breaks the inventory while the next one takes over
+        # its successor dies, too, and the inventory breaks while the next one takes over
         rig.fleet.inject_fault("n002", "off")
         good = inventory.read_text(encoding="utf-8")
         with rig.start("replace", "spare", "n001", "n003", "--yes", "--json") as process:

@@ -185,7 +185,7 @@ def test_a_selected_device_that_is_not_ready_is_a_no_go(fleet: Fleet) -> None:
     assert "beacons" in [check.name for check in selected(fleet, "base", "b02") if not check.is_go]
 
 
-def test_one_selected_robot_has_nobody_to_send_test_messages_to(fleet: Fleet) -> None:
+def test_one_selected_robot_has_no_peer_for_test_messages(fleet: Fleet) -> None:
     found = {check.name: check for check in selected(fleet, "base", "robot:station")}
     assert found["delivery"].is_go
     assert not found["delivery"].is_checked

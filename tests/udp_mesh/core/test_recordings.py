@@ -62,7 +62,6 @@ def replay(both: Pair, recorded: list[Datagram]) -> None:
 def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both nodes as in the first version: they neither send nor accept timestamps."""
     monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
-    monkeypatch.setattr(transmit, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
     monkeypatch.setattr(transmit, "clock_ms", lambda now: None)
 

@@ -55,7 +55,7 @@ def test_a_peer_and_a_stranger_arrive_at_different_sockets() -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
-def test_ipv6_addresses_are_told_apart_by_all_their_words() -> None:
+def test_ipv6_addresses_are_distinguished_by_all_their_words() -> None:
     port = free_port()
     attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
     with closing(UdpLink(attachment)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:

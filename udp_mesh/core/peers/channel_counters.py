@@ -26,6 +26,7 @@ class _Record:
     next_wire_id: int
     floors: dict[tuple[bytes, bytes], int]
     finished: tuple[RangeSet, RangeSet]
+    unconfirmed: set[int]
     freshness: Freshness
 
 
@@ -54,6 +55,7 @@ class BootMemory:
             session.next_wire_id,
             session.floors(),
             (receiver.unicasts.finished, receiver.broadcasts.finished),
+            receiver.unconfirmed,
             session.freshness,
         )
         while len(self._records) > MAX_BOOTS:
@@ -71,6 +73,7 @@ class BootMemory:
         session.next_wire_id = record.next_wire_id
         session.restore_floors(record.floors)
         session.receiver.unicasts.finished, session.receiver.broadcasts.finished = record.finished
+        session.receiver.unconfirmed = record.unconfirmed
         session.freshness = record.freshness
         session.transition(
             SessionEvent.SAME_NAME_RESTORED if record.name == session.name else SessionEvent.OTHER_NAME_RESTORED

@@ -348,3 +348,4 @@ class Session:
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
         self.path.timed = bool(beat.features & Feature.TIMED)
+        self.path.confirms = bool(beat.features & Feature.CONFIRM)
