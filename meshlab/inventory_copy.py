@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.asymmetric.rsa import generate_private_key
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from meshctl.fleet.lab_directory import INVENTORY, KEY_COMMENT
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, save
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Release
 from meshlab import fleet_directory, propagation_file
 from meshlab.propagation import links_of
 from meshlab.spec import LinkSpec
@@ -27,6 +28,8 @@ from meshlab.spec import LinkSpec
 LINKS_FILE = "links.yaml"
 # beside the copy, whatever file the original uses: host keys of virtual nodes must not mix with real ones
 _KNOWN_HOSTS = "known_hosts"
+# as ssh-keygen makes them
+_RSA_BITS, _RSA_EXPONENT = 3072, 65537
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,8 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     target = directory / INVENTORY
     copied = target if source.is_dir() else target / source.name
     key_file = directory / "keys" / "operator"
-    public = _key_pair(key_file)
+    needs_rsa = any(node.release is Release.V19_07 for node in fleet.nodes.values())
+    public = _key_pair(key_file, needs_rsa=needs_rsa)
     editor = Editor.open(copied, environ=environ)
     editor.set(("operators", "ssh_keys"), list(dict.fromkeys([*fleet.operators.ssh_keys, public])))
     editor.set(("defaults", "ssh", "key_files"), [str(key_file)])
@@ -69,12 +73,15 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept)
 
 
-def _key_pair(path: Path) -> str:
-    """The public key's line; the pair is generated if missing."""
+def _key_pair(path: Path, *, needs_rsa: bool) -> str:
+    """The public key's line; the pair is generated if missing. OpenWrt 19.07 accepts RSA only."""
     public_path = path.with_name(path.name + ".pub")
-    if not (path.exists() and public_path.exists()):
+    is_usable = path.exists() and public_path.exists()
+    if needs_rsa:
+        is_usable = is_usable and public_path.read_text(encoding="ascii").startswith("ssh-rsa ")
+    if not is_usable:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        key = Ed25519PrivateKey.generate()
+        key = generate_private_key(_RSA_EXPONENT, _RSA_BITS) if needs_rsa else Ed25519PrivateKey.generate()
         path.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption()))
         path.chmod(0o600)
         public = key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH).decode()

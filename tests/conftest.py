@@ -44,8 +44,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Nothing is left out or tried again without a word."""
     reports = [report for reports in terminalreporter.stats.values() for report in reports]
-    told = [each for report in reports for each in getattr(report, "user_properties", ())]
-    reasons = dict.fromkeys(str(reason) for name, reason in told if name == TRIED_AGAIN)
+    properties = [each for report in reports for each in getattr(report, "user_properties", ())]
+    reasons = dict.fromkeys(str(reason) for name, reason in properties if name == TRIED_AGAIN)
     if reasons:
         terminalreporter.section("tried again")
         for reason in reasons:

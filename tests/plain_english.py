@@ -8,7 +8,9 @@ _EVERYWHERE = r"told|anew|whoever|somebody|nobody|mend(?:s|ed|ing)?|tells? of|co
 # in code these are also keys, names of functions and parts of sound sentences
 _IN_PAGES = r"tells?|of a node that|takes? up|taken up|carr(?:y|ied) out|neighbours?|behaviours?|colours?"
 # words of the command line and of the lab's protocol, and names of lint rules
-_ALLOWED = re.compile(r"lab mend\b|`mend`|^mend$|([a-z]+-)+nobody|nobody(-[a-z]+)+")
+_ALLOWED = re.compile(
+    r"lab mend\b|`mend`|^mend$|([a-z]+-)+nobody|nobody(-[a-z]+)+|as nobody|^(nobody can log in|carried by nobody)$"
+)
 _WORDS = re.compile(rf"\b(?:{_EVERYWHERE})\b", re.I)
 _PAGE_WORDS = re.compile(rf"\b(?:{_EVERYWHERE}|{_IN_PAGES})\b", re.I)
 # fenced and indented code, code spans, and anchors made of command names

@@ -17,6 +17,28 @@ PACKAGES = ("meshctl", "meshlab", "udp_mesh")
 RECORDS = ("docs/facts/",)
 
 
+TEST_PACKAGES = ("benchmarks", "docgen", "tests")
+
+
+def texts_for_readers(file: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of each docstring, comment and name that a file defines, without other strings."""
+    with file.open("rb") as source:
+        yield from (
+            (token.start[0], token.string)
+            for token in tokenize.tokenize(source.readline)
+            if token.type == tokenize.COMMENT
+        )
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                yield node.lineno, name.replace("_", " ")
+                yield node.lineno, ast.get_docstring(node) or ""
+            case ast.Module():
+                yield 1, ast.get_docstring(node) or ""
+            case ast.Name(id=name, ctx=ast.Store()) | ast.arg(arg=name):
+                yield node.lineno, name.replace("_", " ")
+
+
 def words_of(file: Path) -> Iterator[tuple[int, str]]:
     """Line and text of each string and comment."""
     with file.open("rb") as source:
@@ -36,6 +58,17 @@ def test_messages_docstrings_and_comments(package: str) -> None:
         f"{file.relative_to(ROOT)}:{line}: {word}"
         for file in sorted((ROOT / package).rglob("*.py"))
         for line, text in words_of(file)
+        for word in bad_words(text)
+    ]
+    assert bad == []
+
+
+@pytest.mark.parametrize("package", [*PACKAGES, *TEST_PACKAGES])
+def test_names_docstrings_and_comments_of_all_code(package: str) -> None:
+    bad = [
+        f"{file.relative_to(ROOT)}:{line}: {word}"
+        for file in sorted((ROOT / package).rglob("*.py"))
+        for line, text in texts_for_readers(file)
         for word in bad_words(text)
     ]
     assert bad == []

@@ -27,6 +27,27 @@ def test_a_class_name_is_used_for_one_thing(package: str) -> None:
     assert {name: files for name, files in places.items() if len(files) > 1 and name not in SHARED} == {}
 
 
+# lines; a test file mirrors one module, and may be longer than that
+MAX_LINES, MAX_TEST_LINES = 400, 500
+# the control law and the sender are one state machine each: their parts change the same dozen variables
+LONG = {
+    "udp_mesh/core/congestion/delay_based.py": 460,
+    "udp_mesh/core/sender/packetizer.py": 420,
+    "udp_mesh/core/sender/sender.py": 480,
+}
+
+
+@pytest.mark.parametrize("folder", [*PACKAGES, "docgen", "benchmarks", "tests"])
+def test_a_file_is_short_enough_to_read(folder: str) -> None:
+    limit = MAX_TEST_LINES if folder == "tests" else MAX_LINES
+    lengths = {
+        str(file.relative_to(ROOT)): len(file.read_text(encoding="utf-8").splitlines())
+        for file in sorted((ROOT / folder).rglob("*.py"))
+    }
+    assert lengths
+    assert {name: length for name, length in lengths.items() if length > LONG.get(name, limit)} == {}
+
+
 def test_no_import_circle() -> None:
     """Imports for types alone count, too."""
     graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=False)

@@ -167,8 +167,7 @@ def restore_backup(ctx: NodeContext, connection: SshConnection, backup: Backup) 
 
     Files that the backup lacks stay on the node: `sysupgrade -b` does not list what it left out.
     """
-    live = ctx.before.uci or {}
-    files = {path: new for path, new in backup.files.items() if _differs(path, new, live)}
+    files = files_to_write(backup, ctx.before)
     if not files:
         ctx.run.connections.release(ctx.name, connection)
         return Outcome(ctx.name, Result.UNCHANGED)
@@ -184,6 +183,19 @@ def restore_backup(ctx: NodeContext, connection: SshConnection, backup: Backup) 
         radios=_radios(files, ctx.before),
     )
     return run_change(change, connection)
+
+
+def files_to_write(backup: Backup, seen: Observation) -> dict[str, NewFile]:
+    """The UCI files that differ on the node, and all others."""
+    live = seen.uci or {}
+    return {path: new for path, new in backup.files.items() if _differs(path, new, live)}
+
+
+def differing_files(backup: Backup, seen: Observation, connection: SshConnection) -> tuple[str, ...]:
+    """The paths that a restore would change on the node, all compared with their current content."""
+    files = files_to_write(backup, seen)
+    present = openwrt.fetch_files(connection, files)
+    return tuple(path for path, new in files.items() if path not in present or present[path].content != new.content)
 
 
 def _radios(files: Mapping[str, NewFile], before: Observation) -> Radios:

@@ -6,7 +6,6 @@ observation uses a new one (`connect`, `observe_and_decide`), and `confirm` or `
 
 from __future__ import annotations
 
-import re
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
 from meshctl.device import deadman
 from meshctl.device.connection import Endpoint
-from meshctl.device.deadman import Change
+from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
@@ -27,6 +26,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.model import Secret
 from meshctl.nodes.backoff import Backoff
+from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
@@ -37,6 +37,8 @@ LOCK_SLACK_S = 60
 SETTLE_S = 3.0
 # The change starts after this delay, so that the answer to `apply` arrives before the connection may be cut.
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
+# How long a node that keeps its address is waited for over the connection that sent the change.
+AWAIT_RELOAD_S = 30
 # Erasing 16 MB of NOR takes up to three minutes, more with other work beside it.
 FLASH_READY_TIMEOUT_S = 600.0
 ABSENT = ChangeStatus("absent", installed=False)
@@ -73,9 +75,11 @@ class ChangeInProgress:
     # whether its services have reloaded: only a connection opened after that proves the node reachable
     is_reloaded: bool = False
     listener: ChangeListener = field(init=False, repr=False)
+    sent: Payload = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.listener = self.ctx.run.new_listener(self.ctx, self.radios)
+        self.sent = Payload.of(self.payload)
 
     @property
     def new(self) -> Endpoint:
@@ -154,9 +158,40 @@ def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
 def install_switch(ctx: NodeContext, connection: SshConnection) -> None:
     """Install the dead-man's switch unless the node has this version."""
     known = ctx.before.change
-    own = re.search(rb"^VERSION=(\S+)", deadman.installed_files()[deadman.PROGRAM][1], re.MULTILINE)
-    if known is None or not known.installed or own is None or known.version != own[1].decode():
+    if known is None or not known.installed or known.version != deadman.version():
         deadman.install(connection)
+
+
+def is_one_command(change: ChangeInProgress) -> bool:
+    """Whether the change is sent, armed and started by one command: it is small, and nothing limits its rate."""
+    return change.ctx.run.rate_bytes_per_s is None and not change.extra_s and change.sent.fits_one_command
+
+
+def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> None:
+    """Upload, arm and start the change, and wait on the node until its services have reloaded. Raises NodeRefused,
+    NodeError, and Unreachable if the change cuts the connection.
+
+    The slot is given back as soon as the bundle is sent. A node that changes its address is not waited for.
+    """
+    ctx = change.ctx
+    change.starts += 1
+    await_flash(ctx, connection)
+    with ctx.step("apply"):
+        install_switch(ctx, connection)
+        change.listener.started()
+        await_reload_s = AWAIT_RELOAD_S if connection.endpoint.host == change.new.host else 0
+        with change.listener.waiting(connection):
+            status = deadman.change(
+                connection,
+                ctx.run.owner,
+                change.sent,
+                nonce=change.nonce,
+                window_s=change.window_s,
+                ttl_s=change.window_s + LOCK_SLACK_S,
+                await_reload_s=min(await_reload_s, change.window_s // 2),
+                sent=slot.release,
+            )
+    change.is_reloaded = status is not None
 
 
 def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: float | None = None) -> None:
@@ -166,6 +201,7 @@ def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: f
     NodeRefused, Unreachable.
     """
     change.listener.started()
+    change.is_reloaded = False
     patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
     patience.daemon = True
     patience.start()
@@ -194,12 +230,16 @@ def connect(change: ChangeInProgress) -> SshConnection | None:
     return None
 
 
-def observe_and_decide(change: ChangeInProgress, connection: SshConnection) -> Action:
-    """Observe the node once and return the next action. Raises Unreachable."""
+def observe_and_decide(
+    change: ChangeInProgress, connection: SshConnection, *, is_opened_after_reload: bool = False
+) -> Action:
+    """Observe the node once and return the next action. `is_opened_after_reload`: the services are known to have
+    reloaded before the connection was opened. Raises Unreachable."""
     ctx = change.ctx
-    busy = _while_it_reloads(change, connection)
-    if busy is not None:
-        return busy
+    if not is_opened_after_reload:
+        busy = _while_it_reloads(change, connection)
+        if busy is not None:
+            return busy
     change.last = observe(connection)
     age_s = applied_age_s(change.status)
     if age_s is not None:
@@ -251,23 +291,33 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
     )
 
 
-def confirm(change: ChangeInProgress) -> bool:
-    """Confirm over a new connection: a login after the change is the proof that the node is reachable.
+def confirm(change: ChangeInProgress, proof: SshConnection | None = None) -> bool:
+    """Confirm over a connection that was opened after the services had reloaded: that login is the proof that the node
+    is reachable. `proof` is such a connection; otherwise a new one is opened, and goes to the pool.
 
     False when the window ran out meanwhile. Raises Unreachable.
     """
+    if proof is not None:
+        return _confirm_over(change, proof)
     ctx = change.ctx
     connection = ctx.run.connections.open(ctx.node, endpoint=change.new)
     try:
-        deadman.confirm(connection, change.id, nonce=change.nonce)
-        unlock(change, connection)
-    except NodeRefused:
-        connection.close()
-        return False
+        is_confirmed = _confirm_over(change, connection)
     except BaseException:
         connection.close()
         raise
-    ctx.run.connections.release(ctx.name, connection)
+    if is_confirmed:
+        ctx.run.connections.release(ctx.name, connection)
+    else:
+        connection.close()
+    return is_confirmed
+
+
+def _confirm_over(change: ChangeInProgress, connection: SshConnection) -> bool:
+    try:
+        deadman.confirm(connection, change.id, nonce=change.nonce, owner=change.ctx.run.owner)
+    except NodeRefused:
+        return False
     return True
 
 

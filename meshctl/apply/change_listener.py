@@ -13,8 +13,8 @@ from meshctl.device.ssh import SshConnection
 class ChangeListener(Protocol):
     """Receives the events of one node's change. No event alters the outcome of the change.
 
-    `armed` comes first, or never in a change of a whole mesh. Then `started`, again for each new attempt; `connecting`,
-    `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
+    `armed` comes first, or never in a change of a whole mesh. Then `started`, again for each new attempt; `waiting`,
+    `connecting`, `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
     """
 
     def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
@@ -28,6 +28,9 @@ class ChangeListener(Protocol):
 
     def connecting(self) -> AbstractContextManager[None]:
         """Wraps an attempt to connect to the node."""
+
+    def waiting(self, connection: SshConnection) -> AbstractContextManager[None]:
+        """Wraps a wait for the node's answer over a connection that the change may cut."""
 
     def unreachable(self, among: Container[str] | None = None) -> None:
         """The node did not answer. `among`: the only nodes that are reachable now."""

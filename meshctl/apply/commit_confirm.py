@@ -16,8 +16,10 @@ from meshctl.apply.change_in_progress import (
     arm,
     confirm,
     connect,
+    is_one_command,
     new_change,
     observe_and_decide,
+    send,
     start,
     unlock,
 )
@@ -51,9 +53,14 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
     """
     ctx = change.ctx
     try:
-        arm(change, connection)
-        change.listener.armed(connection, for_s=_limit_s(change))
-        start(change, connection)
+        with ctx.run.connections.slots.use(ctx.name) as slot:
+            if is_one_command(change):
+                change.listener.armed(connection, for_s=_limit_s(change))
+                send(change, connection, slot)
+            else:
+                arm(change, connection)
+                change.listener.armed(connection, for_s=_limit_s(change))
+                start(change, connection)
     except Unreachable as error:
         # the node's status shows how far it got
         change.last_error = str(error)
@@ -70,39 +77,67 @@ def run_change(change: ChangeInProgress, connection: SshConnection) -> Outcome:
 
 
 def poll(change: ChangeInProgress) -> Outcome:
-    """Observe and act until the change has ended."""
+    """Observe and act until the change has ended.
+
+    A connection that was opened after the services had reloaded is kept: another one would prove nothing more.
+    """
     run_context = change.ctx.run
     backoff = Backoff(_limit_s(change), run_context.interrupt)
-    run_context.interrupt.wait(change.settle_s)
-    while not backoff.is_over:
-        with change.listener.connecting():
-            connection = connect(change)
-        if connection is not None:
-            try:
-                outcome = _act(change, connection)
-            except Unreachable as error:
-                change.last_error, outcome = str(error), None
-            finally:
-                connection.close()
-            if change.last is not None:
-                run_context.record(change.ctx.name, change.last)
+    if not change.is_reloaded:
+        run_context.interrupt.wait(change.settle_s)
+    proof: SshConnection | None = None
+    try:
+        while not backoff.is_over:
+            with run_context.connections.slots.use(change.ctx.name):
+                outcome, proof = _observe_once(change, proof)
             if outcome is not None:
                 _notify_end(change, outcome)
                 return outcome
-        else:
-            change.listener.unreachable()
-        if run_context.interrupt.leaving:
-            break
-        backoff.pause()
+            if run_context.interrupt.leaving:
+                break
+            backoff.pause()
+    finally:
+        if proof is not None:
+            proof.close()
     return _uncertain(change)
 
 
-def _act(change: ChangeInProgress, connection: SshConnection) -> Outcome | None:
-    """Observe the node once and take the next action; the outcome once the change has ended."""
+def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tuple[Outcome | None, SshConnection | None]:
+    """The outcome once the change has ended, and the connection to use the next time, if one may be kept."""
+    was_reloaded = change.is_reloaded
+    if proof is not None and proof.is_open:
+        connection: SshConnection | None = proof
+    else:
+        with change.listener.connecting():
+            connection = connect(change)
+    if connection is None:
+        change.listener.unreachable()
+        return None, None
+    try:
+        outcome = _act(change, connection, is_proof=was_reloaded)
+    except Unreachable as error:
+        change.last_error, outcome = str(error), None
+    except BaseException:
+        connection.close()
+        raise
+    if change.last is not None:
+        change.ctx.run.record(change.ctx.name, change.last)
+    if was_reloaded and outcome is None and connection.is_open:
+        return None, connection
+    if outcome is not None and outcome.result is Result.DONE:
+        change.ctx.run.connections.release(change.ctx.name, connection)
+    else:
+        connection.close()
+    return outcome, None
+
+
+def _act(change: ChangeInProgress, connection: SshConnection, *, is_proof: bool) -> Outcome | None:
+    """Observe the node once and take the next action; the outcome once the change has ended. `is_proof`: the connection
+    was opened after the services had reloaded."""
     name = change.ctx.name
-    match observe_and_decide(change, connection):
+    match observe_and_decide(change, connection, is_opened_after_reload=is_proof):
         case Action.CONFIRM:
-            return Outcome(name, Result.DONE) if confirm(change) else None
+            return Outcome(name, Result.DONE) if confirm(change, connection if is_proof else None) else None
         case Action.ABORT:
             abort(change, connection)
         case Action.KEPT:

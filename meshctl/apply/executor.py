@@ -40,6 +40,7 @@ from meshctl.model import Fleet, NodeState
 from meshctl.nodes.collect import facts_of, known_macs
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.last_seen import query_neighbors
+from meshctl.nodes.slots import MESH_SLOTS, nodes_in_work
 from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
 
 
@@ -65,6 +66,7 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
+    _assign_slots(prepared, settings)
     unflushed = _unflushed(prepared, settings)
     flushes = StationFlushes()
     run_context = _run_context(prepared, settings, unflushed, flushes)
@@ -93,6 +95,13 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     outcomes.update(_with_last_seen(prepared, settings, contexts, outcomes))
     outcomes.update(_with_unflushed_neighbors(flushes.retry_unanswered(run_context), run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
+
+
+def _assign_slots(prepared: Prepared, settings: RunSettings) -> None:
+    """Nodes that were observed in a mesh share its channel; the entry node is reached by a cable."""
+    for name, made in prepared.plan.nodes.items():
+        is_behind_mesh = made.is_meshed and bool(prepared.plan.entry) and name != prepared.plan.entry
+        settings.connections.slots.assign(name, made.meshes[0] if is_behind_mesh and made.meshes else "")
 
 
 def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
@@ -217,7 +226,7 @@ def _run_stage(
         stage.nodes,
         lambda name: _change_node(contexts[name], images),
         # the stage limits which nodes may be down together, the policy how many are worked on at once
-        parallel=max(1, run_context.fleet.apply.parallel),
+        parallel=nodes_in_work(run_context.fleet.apply.parallel),
         budget=budget,
         interrupt=settings.interrupt,
         observer=observer,
@@ -277,7 +286,7 @@ def _switch_stage(
             run_context,
             [contexts[name] for name in stage.nodes],
             quorum=run_context.fleet.apply.quorum,
-            parallel=run_context.fleet.apply.parallel,
+            parallel=min(nodes_in_work(run_context.fleet.apply.parallel), MESH_SLOTS[1]),
             entry=plan.entry,
         )
     took_s = round(time.monotonic() - began, 3)

@@ -40,6 +40,8 @@ LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
+# Each of the others has its own reason in its own outcome.
+MAX_NAMED = 3
 # The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
 LEFT_BEHIND = "left_behind"
 
@@ -94,16 +96,29 @@ def commit_mesh(
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
-            return _cancel(commit, "the mesh change was canceled: not every node could be armed")
+            return _cancel(commit, canceled_because(participants, "armed"))
         _schedule(commit)
         if not all(participant.is_scheduled for participant in participants):
-            return _cancel(commit, "the mesh change was canceled: not every node could be scheduled")
+            return _cancel(commit, canceled_because(participants, "scheduled"))
         needed = quorum_of(participants, quorum)
         quorum_text = ", ".join(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
         )
         run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must rejoin")
         return _decide(commit, needed)
+
+
+def canceled_because(participants: Iterable[Participant], step: str) -> str:
+    """Why nobody changes: the participants that could not be armed or scheduled, each with its reason."""
+    failed = [
+        f"{participant.name} could not be {step}: {participant.failure.reason}"
+        for participant in participants
+        if participant.failure is not None
+    ]
+    if not failed:
+        return "the mesh change was canceled: interrupted"
+    more = f"; and {len(failed) - MAX_NAMED} more" if len(failed) > MAX_NAMED else ""
+    return f"the mesh change was canceled: {'; '.join(failed[:MAX_NAMED])}{more}"
 
 
 def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:

@@ -17,6 +17,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.slots import nodes_in_work
 
 # How long an 802.11s mesh keeps a peer it does not hear (IEEE80211_MESH_PEER_INACTIVITY_LIMIT, net/mac80211/mesh.h);
 # an ad-hoc cell drops it within a minute.
@@ -39,7 +40,9 @@ def observe_neighbors(
     names = known_neighbors(fleet, seen, known, now_s=time.time())
     nodes = [fleet.nodes[name] for name in names if name not in observations]
     collected = (
-        collect(connections, nodes, parallel=max(1, fleet.apply.parallel), interrupt=interrupt) if nodes else None
+        collect(connections, nodes, parallel=nodes_in_work(fleet.apply.parallel), interrupt=interrupt)
+        if nodes
+        else None
     )
     return {**observations, **seen, **(collected.observations if collected is not None else {})}
 

@@ -21,6 +21,7 @@ from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_mac
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
+from meshctl.nodes.slots import nodes_in_work
 from meshctl.plan import Cut, DesiredState, NodePlan, Plan, Verdict, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.seen import package_of
@@ -71,7 +72,7 @@ def prepare(
     seen = collect(
         connections,
         chosen,
-        parallel=fleet.apply.parallel,
+        parallel=nodes_in_work(fleet.apply.parallel),
         paths=lambda node: other_paths(rendered[node.name]),
         interrupt=interrupt,
         observer=observer,
@@ -83,7 +84,13 @@ def prepare(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
     if rest and not (interrupt is not None and interrupt.stopping):
-        others = collect(connections, rest, parallel=fleet.apply.parallel, interrupt=interrupt, observer=observer)
+        others = collect(
+            connections,
+            rest,
+            parallel=nodes_in_work(fleet.apply.parallel),
+            interrupt=interrupt,
+            observer=observer,
+        )
         _remember(journal, fleet, others)
         seen = replace(seen, observations={**seen.observations, **others.observations})
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))

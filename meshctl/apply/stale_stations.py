@@ -33,8 +33,9 @@ from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 FIRST_PAUSE_S, MAX_PAUSE_S = 5.0, 60.0
 # More neighbors than any radio here has; bounds the cost of a hostile station table.
 MAX_QUERIED = 16
-# What a holder prints for an entry that is old enough: removed, cannot be removed, not stale, cannot be verified.
-GONE, KEPT, ANSWERS, UNKNOWN = "gone", "kept", "answers", "unknown"
+# What a holder prints for an entry that is old enough: removed, cannot be removed, cannot be verified. It prints
+# `answers` for one that is not stale.
+GONE, KEPT, UNKNOWN = "gone", "kept", "unknown"
 # all wireless interfaces, for sh; Linux allows no blank in an interface name
 _EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')\""
 

@@ -61,6 +61,8 @@ _DEADLINES = Deadlines(
 )
 # A node that takes longer to connect counts as unreachable: an SSH login takes a board two seconds.
 SLOW_CONNECT_S = 5.0
+# A connection that waits for an answer is asked for a sign of life every 5 s; twice that is a node that is unreachable.
+SILENT_S, SILENCE_PAUSE_S = 10.0, 1.0
 # The fact in an outcome: the neighbors that may still hold a stale station entry.
 UNFLUSHED = "not_asked"
 # The consequence, for the operator (docs/provisioning.md).
@@ -157,6 +159,27 @@ class StationFlush:
         finally:
             timer.cancel()
             timer.join()
+
+    @contextmanager
+    def waiting(self, connection: SshConnection) -> Iterator[None]:
+        """Query the neighbors in the background whenever the connection is silent for so long, within the block, that
+        the node must be unreachable. Keepalives make a node that is reachable answer sooner."""
+        ended = threading.Event()
+
+        def watch() -> None:
+            while not ended.wait(SILENCE_PAUSE_S):
+                if connection.silent_s > SILENT_S:
+                    self.unreachable()
+
+        thread = threading.Thread(target=watch, daemon=True)
+        if self._holders:
+            thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            if self._holders:
+                thread.join()
 
     def unreachable(self, among: Container[str] | None = None) -> None:
         """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import replace
@@ -12,6 +13,7 @@ import typer
 
 from meshctl.apply.backup import (
     Backup,
+    differing_files,
     fetch,
     incompatibility,
     lockout_by,
@@ -26,6 +28,7 @@ from meshctl.apply.prepare import base_macs
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
+    DryRun,
     InventoryPath,
     KeyFiles,
     Lab,
@@ -40,12 +43,15 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
 from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
+from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
 
@@ -83,7 +89,11 @@ def backup(
             opened.interrupt.on_signals(progress.stopping),
         ):
             ended = run(
-                selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt, observer=progress
+                selected,
+                work,
+                parallel=transfers_at_once(opened.fleet.apply.parallel),
+                interrupt=opened.interrupt,
+                observer=progress,
             )
         raise typer.Exit(exit_for(ended.values(), opened.interrupt))
 
@@ -106,6 +116,7 @@ def restore(
     node: Annotated[str, typer.Argument(help="Node to restore.")],
     file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -121,6 +132,9 @@ def restore(
         raise InputError(f"cannot read {file}: {error.strerror}") from error
     with session(inventory, key_files=key or (), lab=lab) as opened:
         there = selected_node(opened.fleet, node)
+        if dry_run:
+            _show_restore(opened, there, saved, as_json=as_json)
+            return
         if not yes:
             taken = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(saved.taken_s))
             confirm(f"Restore {there.name} to its state of {taken}?")
@@ -128,51 +142,81 @@ def restore(
         raise print_totals(opened, journaled, as_json=as_json)
 
 
+def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) -> None:
+    """Print what a restore would change. Raises PlanRefused as the restore would."""
+    with opened.access.borrow(node) as connection:
+        seen = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, seen)
+        paths = differing_files(saved, seen, connection)
+    missing = uninstalled_packages(saved, seen)
+    if as_json:
+        report = {"node": node.name, "files": paths, "uninstalled_packages": missing, "disabled": saved.disabled}
+        echo_json(json.dumps(report, indent=1))
+        return
+    echo(f"{node.name}: {len(paths)} files would change" if paths else f"{node.name}: matches the backup")
+    for path in paths:
+        echo(f"  {path}")
+    for package in missing:
+        echo(f"  package {package} is in the backup but no longer installed")
+
+
+def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observation) -> None:
+    """Raises PlanRefused for a backup of another device, or one that would lock us out."""
+    if problem := incompatibility(saved, node.name, seen):
+        raise PlanRefused(problem)
+    lockout = lockout_by(saved, node, opened.access.own_keys(node))
+    if lockout is not None:
+        raise PlanRefused(lockout.reason, hint=lockout.hint)
+
+
 def _restore(opened: Session, name: str, saved: Backup, *, as_json: bool) -> JournaledRun:
-    node = opened.fleet.nodes[name]
     with journaled_run(opened, "restore", [name], as_json=as_json) as journaled:
-        known = opened.journal.last_known(opened.fleet.name)
-        around: dict[str, Observation] = {}
-        flushes = StationFlushes()
-        work = RunContext(
-            opened.fleet,
-            opened.access,
-            journaled.entry,
-            journaled.progress,
-            opened.interrupt,
-            opened.owner,
-            flushes.listener,
-            observations=around,
-            mac_owners=known_macs(opened.fleet, known),
-            base_macs=base_macs(opened.fleet, around, known),
-        )
 
-        def one(only: str) -> Outcome:
-            connection = opened.access.open(node)
-            try:
-                seen = observe_cleared(connection, (), opened.interrupt)
-                problem = incompatibility(saved, name, seen)
-                if problem:
-                    raise PlanRefused(problem)
-                lockout = lockout_by(saved, node, opened.access.own_keys(node))
-                if lockout is not None:
-                    raise PlanRefused(lockout.reason, hint=lockout.hint)
-                around.update(
-                    observe_neighbors(opened.access, opened.fleet, {name: seen}, known, interrupt=opened.interrupt)
-                )
-                for package in uninstalled_packages(saved, seen):
-                    work.note(f"package {package} is in the backup but no longer installed", name)
-                if saved.disabled:
-                    work.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", name)
-                plan = NodePlan(name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-                job = NodeContext(work, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
-            except BaseException:
-                connection.close()
-                raise
-            return restore_backup(job, connection, saved)
+        def work(_: str) -> Outcome:
+            return _restore_node(opened, journaled, opened.fleet.nodes[name], saved)
 
-        journaled.outcomes.update(run([name], one, parallel=1, interrupt=opened.interrupt, observer=journaled.progress))
-        for unasked in flushes.retry_unanswered(work).values():
-            journaled.outcomes[name] = replace(journaled.outcomes[name], facts={UNFLUSHED: " ".join(unasked)})
+        ended = run([name], work, parallel=1, interrupt=opened.interrupt, observer=journaled.progress)
+        journaled.outcomes.update(ended)
         journaled.entry.finish_node(journaled.outcomes[name])
     return journaled
+
+
+def _restore_node(opened: Session, journaled: JournaledRun, node: Node, saved: Backup) -> Outcome:
+    flushes = StationFlushes()
+    connection = opened.access.open(node)
+    try:
+        seen = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, seen)
+        ctx = _context(opened, journaled, node, seen, flushes)
+        for package in uninstalled_packages(saved, seen):
+            ctx.run.note(f"package {package} is in the backup but no longer installed", node.name)
+        if saved.disabled:
+            ctx.run.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", node.name)
+    except BaseException:
+        connection.close()
+        raise
+    outcome = restore_backup(ctx, connection, saved)
+    unflushed = flushes.retry_unanswered(ctx.run).get(node.name, ())
+    return replace(outcome, facts={UNFLUSHED: " ".join(unflushed)}) if unflushed else outcome
+
+
+def _context(
+    opened: Session, journaled: JournaledRun, node: Node, seen: Observation, flushes: StationFlushes
+) -> NodeContext:
+    """The context of a node to be restored, once its neighbors were observed."""
+    fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
+    observations = observe_neighbors(opened.access, fleet, {node.name: seen}, known, interrupt=opened.interrupt)
+    run_context = RunContext(
+        fleet,
+        opened.access,
+        journaled.entry,
+        journaled.progress,
+        opened.interrupt,
+        opened.owner,
+        flushes.listener,
+        observations=observations,
+        mac_owners=known_macs(fleet, known),
+        base_macs=base_macs(fleet, observations, known),
+    )
+    plan = NodePlan(node.name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
+    return NodeContext(run_context, node, plan, opened.renderer.desired(node, seen), seen, Expectation())

@@ -24,6 +24,7 @@ from meshctl.apply.bootstrap import (
 from meshctl.apply.replace import adopt, identity_edits, with_identity
 from meshctl.cli.context import (
     AsJson,
+    DryRun,
     InventoryPath,
     KeyFiles,
     Lab,
@@ -41,6 +42,7 @@ from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.model import Node, NodeState
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
 
@@ -78,6 +80,7 @@ def bootstrap(
     interface: Interfaces = None,
     inventory: InventoryPath = Path(),
     replace_key: Annotated[bool, typer.Option("--replace-key", "--replace", help="Accept a changed host key.")] = False,
+    dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,
@@ -99,7 +102,7 @@ def bootstrap(
                 opened.access,
                 opened.trust,
                 places,
-                parallel=opened.fleet.apply.parallel,
+                parallel=transfers_at_once(opened.fleet.apply.parallel),
                 replace_keys=replace_key,
                 interrupt=opened.interrupt,
             )
@@ -121,10 +124,18 @@ def bootstrap(
             interrupt=opened.interrupt,
         )
         refused = [plan.node for plan in prepared.plan.of(Verdict.REFUSED) if plan.node in arrivals.found]
-        restore_pins(opened.trust, arrivals, refused)
+        restore_pins(opened.trust, arrivals, arrivals.found if dry_run else refused)
         try:
             confirm_and_execute(
-                opened, prepared, "bootstrap", choices, yes=yes, as_json=as_json, brief=brief, rate=rate
+                opened,
+                prepared,
+                "bootstrap",
+                choices,
+                yes=yes,
+                as_json=as_json,
+                brief=brief,
+                rate=rate,
+                dry_run=dry_run,
             )
         except typer.Exit as ended:
             if arrivals.outcomes and ended.exit_code == ExitCode.OK:
@@ -193,6 +204,7 @@ def replace(
         str, typer.Option("--interface", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     rate: Rate = None,
@@ -237,14 +249,25 @@ def replace(
                 choices=choices,
                 interrupt=opened.interrupt,
             )
-            confirm_and_execute(opened, prepared, "replace", choices, yes=yes, as_json=as_json, brief=True, rate=rate)
+            confirm_and_execute(
+                opened,
+                prepared,
+                "replace",
+                choices,
+                yes=yes,
+                as_json=as_json,
+                brief=True,
+                rate=rate,
+                dry_run=dry_run,
+            )
         except typer.Exit as ended:
             status = ended.exit_code
         finally:
-            if status != ExitCode.OK:
+            if status != ExitCode.OK or dry_run:
                 restore_pins(opened.trust, successor.discovered, [node.name])
         if status == ExitCode.OK:
-            changes = _record_identity(opened, inventory, node, spare, successor.discovered.found[node.name])
+            found = successor.discovered.found[node.name]
+            changes = _record_identity(opened, inventory, node, spare, found, dry_run=dry_run)
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
@@ -270,13 +293,18 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
     return spare
 
 
-def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice) -> Changes:
+def _record_identity(
+    opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice, *, dry_run: bool
+) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     mine, theirs = identity_edits(node, spare, found.seen)
+    if dry_run:
+        return _identity_changes(inventory, node, spare, found, mine, theirs)
     if spare is not None:
         opened.trust.forget(spare.name)
     try:
-        return _write_identity(inventory, node, spare, found, mine, theirs)
+        changes = _identity_changes(inventory, node, spare, found, mine, theirs)
+        save(changes)
     except MeshctlError as error:
         both = {node.name: dict(mine), **({spare.name: dict(theirs)} if spare is not None else {})}
         edits = {name: edit for name, edit in both.items() if edit}
@@ -284,9 +312,10 @@ def _record_identity(opened: Session, inventory: Path, node: Node, spare: Node |
             f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
             hint=f"fix the inventory, then add under `nodes`: {json.dumps(edits)}",
         ) from error
+    return changes
 
 
-def _write_identity(
+def _identity_changes(
     inventory: Path,
     node: Node,
     spare: Node | None,
@@ -301,10 +330,12 @@ def _write_identity(
         for word in ("mac", "serial", "label"):
             if editor.has(("nodes", spare.name, word)):
                 editor.remove(("nodes", spare.name, word))
+    # those of the old device: another device may have them one day, and this one's are observed
+    for radio in node.radios:
+        if editor.has(("nodes", node.name, "radios", radio.name, "mac")):
+            editor.remove(("nodes", node.name, "radios", radio.name, "mac"))
     if mine:
         set_node(editor, node.name, dict(mine))
     if node.host_keys:
         set_node(editor, node.name, {"host_keys": [found.key.text]})
-    changes = editor.changes()
-    save(changes)
-    return changes
+    return editor.changes()

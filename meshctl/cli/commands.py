@@ -26,6 +26,7 @@ _CHANGE = "Change the fleet"
 _INSPECT = "Inspect and connect"
 _ROBOTS = "Robots"
 _LAB = "Lab"
+_HELP = "Help"
 
 COMMANDS: dict[str, Entry] = {
     "init": Entry("meshctl.cli.inventory", "init", "Create a commented starter inventory", _INVENTORY),
@@ -39,6 +40,7 @@ COMMANDS: dict[str, Entry] = {
     "apply": Entry("meshctl.cli.plan", "apply", "Apply a saved plan", _CHANGE),
     "provision": Entry("meshctl.cli.plan", "provision", "Plan, confirm and apply changes", _CHANGE),
     "resume": Entry("meshctl.cli.plan", "resume", "Resume an interrupted run", _CHANGE),
+    "rollback": Entry("meshctl.cli.rollback", "rollback", "Return nodes to before a run", _CHANGE),
     "history": Entry("meshctl.cli.history", "history", "Show past runs, their steps and outcomes", _CHANGE),
     "bootstrap": Entry("meshctl.cli.bootstrap", "bootstrap", "Set up factory-default devices", _CHANGE),
     "replace": Entry("meshctl.cli.bootstrap", "replace", "Replace a failed node with a spare", _CHANGE),
@@ -52,4 +54,5 @@ COMMANDS: dict[str, Entry] = {
     "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _INSPECT),
     "robots": Entry("meshctl.cli.robots", "app", "Deploy and manage udp_mesh on robots", _ROBOTS),
     "lab": Entry("", "app", "Run a virtual fleet on this machine", _LAB),
+    "help": Entry("meshctl.cli.help", "help_command", "Show the help of a command", _HELP),
 }

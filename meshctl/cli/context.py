@@ -14,12 +14,13 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from meshctl import event_log
 from meshctl.cli.extensions import LabFleet, attach_lab
 from meshctl.cli.output import console, echo
 from meshctl.errors import ExitCode, InputError
@@ -69,6 +70,8 @@ Limit = Annotated[
     ),
 ]
 
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would change, and change nothing.")]
+
 Options = Mapping[str, tuple[Any, Any]]
 """Type and default of each option, by the opener's parameter name, in the order of the help."""
 
@@ -99,13 +102,17 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     from meshctl.nodes.connections import ConnectionPool
     from meshctl.nodes.desired import Renderer
 
-    fleet = load_fleet(inventory, environ=os.environ)
+    fleet = _with_parallel(load_fleet(inventory, environ=os.environ), os.environ.get("MESHCTL_PARALLEL", ""))
     trust = trust_of(fleet)
     virtual, locate = _lab(lab)
     # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
-        Journal(default_path(os.environ), lab=lab_directory) as journal,
+        Journal(
+            default_path(os.environ),
+            lab=lab_directory,
+            pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
+        ) as journal,
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
         journal.move_lab_runs(fleet.name, lab_of)
@@ -120,6 +127,15 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
             Interrupt(),
             virtual,
         )
+
+
+def _with_parallel(fleet: Fleet, wanted: str) -> Fleet:
+    """The fleet with the operator's number of parallel connections, if given."""
+    if not wanted:
+        return fleet
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise InputError(f"MESHCTL_PARALLEL: expected an integer of 1 or more, found {wanted!r}")
+    return replace(fleet, apply=replace(fleet.apply, parallel=int(wanted)))
 
 
 def trust_of(fleet: Fleet) -> TrustStore:
@@ -171,12 +187,13 @@ def read_selection(path: str) -> str:
 
 
 def progress_for(count: int, *, as_json: bool) -> RunProgress:
-    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere."""
+    """JSON lines with `as_json`, live lines on a terminal, plain lines elsewhere and with `--verbose`."""
     from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress, ThreadedProgress
 
     if as_json:
         return ThreadedProgress(JsonProgress(sys.stdout))
-    if sys.stdout.isatty():
+    # events on the same terminal would be painted over
+    if sys.stdout.isatty() and not event_log.is_verbose():
         return ThreadedProgress(LiveProgress(console(), count))
     return ThreadedProgress(PlainProgress(sys.stdout))
 

@@ -1,4 +1,4 @@
-"""`meshctl inventory export`: the fleet's hosts for ssh and Ansible."""
+"""`meshctl inventory export`: the fleet for ssh, Ansible and spreadsheets."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ import typer
 
 from meshctl.cli.context import InventoryPath
 from meshctl.cli.output import echo, write_file
+from meshctl.inventory import csv_table
 from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.inventory.load import load_fleet
+from meshctl.model import Fleet
 from meshctl.render.host_lists import ansible_inventory, host_entries, ssh_config
 
 
 class ExportFormat(Enum):
     SSH_CONFIG = "ssh-config"
     ANSIBLE = "ansible"
+    CSV = "csv"
 
 
 def export(
@@ -27,17 +30,22 @@ def export(
     format: Annotated[ExportFormat, typer.Option("--format", "-f", help="What to write.")] = ExportFormat.SSH_CONFIG,
     out: Annotated[Path | None, typer.Option("--out", help="Write to this file instead of standard output.")] = None,
 ) -> None:
-    """Export managed nodes and robot computers as an OpenSSH configuration or an Ansible inventory.
+    """Export managed nodes and robot computers as an OpenSSH configuration or an Ansible inventory, or all nodes as the
+    CSV table that `meshctl inventory import` reads.
 
     Example: meshctl inventory export --out fleet.ssh_config && ssh -F fleet.ssh_config b03
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    entries = host_entries(fleet, fleet.managed())
-    write = ssh_config if format is ExportFormat.SSH_CONFIG else ansible_inventory
-    # ssh and Ansible may be started in another directory
-    placed = replace(fleet, base=str(Path(fleet.base).resolve()))
-    text = write(entries, known_hosts_path(placed), lambda name: file_path(placed, name))
+    text = csv_table.write(fleet.nodes.values()) if format is ExportFormat.CSV else _hosts(fleet, format)
     if out is None:
         echo(text, nl=False)
     else:
         write_file(out, text)
+
+
+def _hosts(fleet: Fleet, format: ExportFormat) -> str:
+    entries = host_entries(fleet, fleet.managed())
+    write = ssh_config if format is ExportFormat.SSH_CONFIG else ansible_inventory
+    # ssh and Ansible may be started in another directory
+    placed = replace(fleet, base=str(Path(fleet.base).resolve()))
+    return write(entries, known_hosts_path(placed), lambda name: file_path(placed, name))

@@ -15,6 +15,9 @@ from meshctl.cli.context import AsJson
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord, default_path
+from meshctl.fleet.run_files import CHANGES, RunFiles
+from meshctl.plan.values import FileChange
+from meshctl.report.changed_options import summary
 
 
 def history(
@@ -24,10 +27,11 @@ def history(
     lab: Annotated[
         bool | None, typer.Option("--virtual/--real", help="Only runs in a lab, or only on real nodes.")
     ] = None,
+    diff: Annotated[bool, typer.Option("--diff", help="With a run number: show the differences of its files.")] = False,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number of runs.")] = 20,
     as_json: AsJson = False,
 ) -> None:
-    """Show past runs; with a run number, its nodes, steps, outcomes and durations.
+    """Show past runs; with a run number, its nodes, changed settings, steps, outcomes and durations.
 
     Example: meshctl history 12 --node b03
     """
@@ -35,7 +39,7 @@ def history(
         if run is None:
             _list_runs(journal, _RunFilter(node, fleet, lab), limit, as_json=as_json)
         else:
-            _show_run(journal, run, node, as_json=as_json)
+            _show_run(journal, run, node, as_json=as_json, with_diffs=diff)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +90,7 @@ def _fleet_text(fleet: str, lab: str) -> str:
     return f"{fleet} (lab)" if lab else fleet
 
 
-def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool) -> None:
+def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool, with_diffs: bool) -> None:
     record = journal.run(run_id)
     if record is None:
         raise InputError(f"run {run_id} does not exist", hint="run `meshctl history` to list all runs")
@@ -94,10 +98,16 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
     if not outcomes and node is not None:
         raise InputError(f"{node} was not part of run {run_id}", hint=f"`meshctl history {run_id}` lists its nodes")
     steps = journal.steps(run_id, node)
+    changes = _changes(journal, run_id)
     if as_json:
         document = {
             **_run_object(record),
             "outcomes": [{"node": o.node, "result": o.result.value, "reason": o.reason} for o in outcomes],
+            "changes": [
+                {"node": o.node, "path": f"/{each.path}", "kind": each.kind, "diff": each.diff}
+                for o in outcomes
+                for each in changes.get(o.node, ())
+            ],
             "steps": [
                 {"node": s.node, "step": s.step, "began_s": s.began_s, "duration_s": s.duration_s, "result": s.result}
                 for s in steps
@@ -111,11 +121,25 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool)
     width = max((len(step.step) for step in steps), default=0)
     for outcome in outcomes:
         echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
+        for change in changes.get(outcome.node, ()):
+            echo(f"  {change.kind:<{width}} /{change.path}: {summary(change)}".rstrip(": "))
+            if with_diffs:
+                for line in change.diff.splitlines()[2:]:
+                    echo(f"    {line}")
         for step in steps:
             if step.node == outcome.node:
                 took = "interrupted" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
                 echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
+
+
+def _changes(journal: Journal, run_id: int) -> dict[str, tuple[FileChange, ...]]:
+    """What the run planned to change on each node; empty for runs of other commands and versions."""
+    saved = RunFiles(journal.path).load(run_id, CHANGES) or {}
+    return {
+        node: tuple(FileChange(str(path), str(kind), str(diff)) for path, kind, diff in files)
+        for node, files in saved.items()
+    }
 
 
 def _run_object(record: RunRecord) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`meshctl init`, `meshctl schema`, `meshctl inventory list|show|state`."""
+"""`meshctl init`, `meshctl schema`, `meshctl inventory`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import typer
 
 from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.export import export
+from meshctl.cli.inventory_import import import_nodes
 from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
@@ -24,6 +25,7 @@ from meshctl.model import Fleet, Node, NodeState, Role
 
 app = typer.Typer(help="Show and edit the inventory.", no_args_is_help=True)
 app.command("export")(export)
+app.command("import")(import_nodes)
 
 # ssh-keygen's default files; ed25519 first, which every release but 19.07 supports.
 _PUBLIC_KEYS = ("id_ed25519.pub", "id_ecdsa.pub", "id_rsa.pub")

@@ -11,9 +11,9 @@ import gc
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from itertools import groupby
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -23,6 +23,9 @@ from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
 from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
 from meshctl.errors import ExitCode, MeshctlError
+
+if TYPE_CHECKING:
+    from meshctl.cli.user_config import Defaults
 
 _EPILOG = """Start with `meshctl init DIR`, or with `meshctl lab up` for a virtual fleet.
 
@@ -45,11 +48,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None:
         gc.set_threshold(*GC_THRESHOLD)
     try:
-        build(requested)(args=words, prog_name="meshctl")
+        defaults = user_defaults(os.environ)
+        command = typer.main.get_command(build(requested))
+        command(args=words, prog_name="meshctl", default_map=default_map(defaults, requested, command))
+    except MeshctlError as error:
+        _print_error(error)
+        sys.exit(int(error.exit_code))
     except KeyboardInterrupt:
         # during the import of the command, which takes seconds on a busy machine
         echo("interrupted", err=True)
         sys.exit(int(ExitCode.INTERRUPTED))
+
+
+def user_defaults(environ: MutableMapping[str, str]) -> Defaults | None:
+    """The user's configuration file, if there is one; sets the environment variables it stands for.
+
+    Raises InputError with file and line for an invalid file.
+    """
+    named = environ.get("MESHCTL_CONFIG")
+    root = environ.get("XDG_CONFIG_HOME") or os.path.join(environ.get("HOME", "/"), ".config")
+    path = os.path.join(root, "meshctl", "config.toml") if named is None else os.path.expanduser(named)
+    if named == "" or (named is None and not os.path.exists(path)):
+        return None
+    # imported only for those who have such a file: this is part of every start
+    from meshctl.cli.user_config import load
+
+    defaults = load(path)
+    for name, value in defaults.environment.items():
+        environ.setdefault(name, value)
+    return defaults
+
+
+def default_map(defaults: Defaults | None, requested: str, command: Any) -> dict[str, Any] | None:
+    """What the user's file says about the requested command, for click."""
+    if defaults is None or requested not in COMMANDS:
+        return None
+    return {requested: defaults.for_command(requested, command.commands[requested])}
 
 
 def build(requested: str) -> typer.Typer:
@@ -123,6 +157,12 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
         app.command(name)(_guarded(target))
 
 
+def _print_error(error: MeshctlError) -> None:
+    echo(f"error: {error}", err=True)
+    if error.hint:
+        echo(f"hint: {error.hint}", err=True)
+
+
 def _prepare_group(group: typer.Typer) -> None:
     for command in group.registered_commands:
         if command.callback is not None:
@@ -134,16 +174,21 @@ def _prepare_group(group: typer.Typer) -> None:
 
 
 def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Turn meshctl's errors and Ctrl-C into a message and an exit code."""
+    """Turn meshctl's errors and Ctrl-C into a message and an exit code, and add the options that all commands have."""
+    if "is_guarded" in vars(command):
+        # the commands of a group are guarded in place, and the group may be registered again
+        return command
+    # here, because the root command's help does not need it
+    from meshctl.cli.verbosity import with_verbosity
+
+    command = with_verbosity(command)
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> Any:
         try:
             return command(*args, **kwargs)
         except MeshctlError as error:
-            echo(f"error: {error}", err=True)
-            if error.hint:
-                echo(f"hint: {error.hint}", err=True)
+            _print_error(error)
             raise typer.Exit(int(error.exit_code)) from None
         except (KeyboardInterrupt, typer.Abort):
             echo("interrupted", err=True)
@@ -154,4 +199,5 @@ def _guarded(command: Callable[..., Any]) -> Callable[..., Any]:
                 raise
             raise typer.Exit from None
 
+    vars(run)["is_guarded"] = True
     return run

@@ -13,17 +13,17 @@ import typer
 
 from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.resume import resolutions
-from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab, Limit, Nodes, Session, session
-from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Limit, Nodes, Session, session
+from meshctl.cli.output import echo, write_file
 from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
     execute_plan,
     prepare_plan,
     report_check,
-    show,
+    report_plan,
 )
-from meshctl.errors import ExitCode, InputError
+from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict
 from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
@@ -60,20 +60,15 @@ def plan(
     choices = choices_of(no_firmware, leave_behind, accept_cut)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         prepared = prepare_plan(opened, nodes, choices, limits=limit)
-        saved = SavedPlan(prepared.plan, prepared.salt, str(inventory), choices.with_firmware)
         if out is not None:
-            write_file(out, dump(saved))
-        if as_json:
-            echo_json(dump(saved), nl=False)
-        else:
-            show(prepared.plan, opened.fleet, brief=brief)
-        if prepared.plan.refusal:
-            raise typer.Exit(ExitCode.FINDINGS)
+            write_file(out, dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)))
+        raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
 
 
 def apply(
     plan_file: Annotated[Path, typer.Argument(help="Plan written by `meshctl plan --out`.")],
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     rate: Rate = None,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -96,6 +91,9 @@ def apply(
             )
         fresh = prepare_plan(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
         agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
+        if dry_run:
+            choices = PlanOptions(saved.with_firmware)
+            raise typer.Exit(report_plan(opened, agreed, choices, as_json=as_json, brief=False))
         execute_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
 
 
@@ -104,6 +102,7 @@ def provision(
     limit: Limit = None,
     inventory: InventoryPath = Path(),
     check: Annotated[bool, typer.Option("--check", help="Change nothing; exit with 1 if a node differs.")] = False,
+    dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
     leave_behind: LeaveBehind = "",
@@ -123,12 +122,15 @@ def provision(
         prepared = prepare_plan(opened, nodes, choices, limits=limit)
         if check:
             raise typer.Exit(report_check(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
-        confirm_and_execute(opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+        confirm_and_execute(
+            opened, prepared, "provision", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
+        )
 
 
 def resume(
     run: Annotated[int | None, typer.Argument(help="Run number; default: the last unfinished run.")] = None,
     inventory: InventoryPath = Path(),
+    dry_run: DryRun = False,
     yes: Yes = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
@@ -147,10 +149,18 @@ def resume(
         if record.command.startswith("robots "):
             from meshctl.cli.robots_context import resume_run
 
+            if dry_run:
+                raise InputError(
+                    f"run {record.id} was `{record.command}` of {', '.join(left)}: --dry-run is for runs of radios",
+                    hint="run `meshctl robots diff` to see what a deploy would change",
+                )
             raise resume_run(opened, inventory, record, as_json=as_json)
         if record.command == "restore":
             hint = f"run `meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` to apply the inventory"
             raise InputError(f"run {record.id} restored a backup, which cannot be resumed", hint=hint)
+        if record.command == "rollback":
+            hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
+            raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
         names = _still_managed(opened, left)
         if not names:
             echo(f"run {record.id} is finished: nothing to resume", err=as_json)
@@ -170,7 +180,9 @@ def resume(
         for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
-        confirm_and_execute(opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate)
+        confirm_and_execute(
+            opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
+        )
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:

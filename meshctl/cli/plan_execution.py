@@ -6,14 +6,19 @@ import json
 import secrets
 from dataclasses import asdict
 
+import typer
+
 from meshctl.apply.executor import RunSettings, execute
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
+from meshctl.apply.rollback import before_state
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
-from meshctl.cli.journaled_run import journaled_run, print_totals
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
 from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, MeshctlError
+from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
+from meshctl.plan.saved import SavedPlan, dump
 
 # Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
@@ -67,6 +72,15 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
         out.print(Text(line.text, line.style), soft_wrap=True)
 
 
+def report_plan(opened: Session, prepared: Prepared, choices: PlanOptions, *, as_json: bool, brief: bool) -> ExitCode:
+    """Print the plan; with `as_json`, as a saved plan."""
+    if as_json:
+        echo_json(dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)), nl=False)
+    else:
+        show(prepared.plan, opened.fleet, brief=brief)
+    return ExitCode.FINDINGS if prepared.plan.refusal else ExitCode.OK
+
+
 def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
     if as_json:
         nodes = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
@@ -88,14 +102,38 @@ def confirm_and_execute(
     as_json: bool,
     brief: bool,
     rate: float | None,
+    dry_run: bool = False,
+    undoes: int | None = None,
 ) -> None:
+    """Show the plan, ask, execute it and exit; `undoes` is the run that a rollback takes back."""
     from meshctl.report.plan_text import question
 
+    if dry_run:
+        ended = report_plan(opened, prepared, choices, as_json=as_json, brief=brief)
+        raise typer.Exit(ExitCode.FINDINGS if prepared.plan.of(Verdict.REFUSED) else ended)
     if not as_json:
         show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
         confirm(question(prepared.plan))
-    execute_plan(opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices)
+    execute_plan(
+        opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices, undoes=undoes
+    )
+
+
+def _save_before(opened: Session, run: JournaledRun, prepared: Prepared) -> None:
+    """Save what the run changes, and what it replaces, for `history` and `rollback`."""
+    changing = {node.node: node for node in prepared.plan.of(Verdict.CHANGE)}
+    files = RunFiles(opened.journal.path)
+    changes = {name: [[each.path, each.kind, each.diff] for each in node.files] for name, node in changing.items()}
+    observed = prepared.observed.observations
+    before = {name: before_state(node, prepared.desired[name], observed[name]) for name, node in changing.items()}
+    try:
+        files.discard(run.entry.id)
+        files.save(run.entry.id, CHANGES, changes)
+        files.save(run.entry.id, BEFORE, {name: state.to_json() for name, state in before.items()})
+    except MeshctlError as error:
+        # a full disk must not prevent the run
+        run.progress.stopping(f"{error}: `meshctl rollback {run.entry.id}` will not be possible")
 
 
 def execute_plan(
@@ -107,6 +145,7 @@ def execute_plan(
     as_json: bool,
     rate: float | None,
     choices: PlanOptions | None = None,
+    undoes: int | None = None,
 ) -> None:
     """Execute the plan, journal it, print the totals, exit."""
     plan = prepared.plan
@@ -114,8 +153,11 @@ def execute_plan(
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
     choices = choices or PlanOptions(with_firmware)
     stages = [[stage.kind.value, *stage.nodes] for stage in plan.stages]
-    recorded = json.dumps({"choices": asdict(choices), "stages": stages})
+    recorded = json.dumps(
+        {"choices": asdict(choices), "stages": stages, **({} if undoes is None else {"undoes": undoes})}
+    )
     with journaled_run(opened, command, tuple(plan.nodes), plan=recorded, as_json=as_json) as run:
+        _save_before(opened, run, prepared)
         settings = RunSettings(
             opened.fleet,
             opened.access,

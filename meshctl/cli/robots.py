@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import exit_for, line_width
+from meshctl.cli.context import DryRun, exit_for, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
@@ -31,12 +31,15 @@ app.command("rotate-key")(rotate_key_command)
 
 @app.command("deploy")
 @with_robots_context("robots", "limit", "inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
-def deploy_command(context: RobotsContext) -> None:
+def deploy_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """Install or upgrade udp_mesh with the inventory's configuration; an unhealthy release is rolled back.
 
     Example: meshctl robots deploy 'husky*' --wheels wheels/
     """
     context = context.with_fleet(context.fleet)
+    if dry_run:
+        refused = any(one.result is Result.REFUSED for one in _differences(context).values())
+        raise typer.Exit(ExitCode.FINDINGS if refused else ExitCode.OK)
     raise finish(context, run_command(context, "deploy"))
 
 
@@ -47,7 +50,14 @@ def diff_command(context: RobotsContext) -> None:
 
     Example: meshctl robots diff
     """
-    context = context.with_fleet(context.fleet)
+    outcomes = _differences(context.with_fleet(context.fleet))
+    if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
+        raise typer.Exit(ExitCode.FINDINGS)
+    raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+
+
+def _differences(context: RobotsContext) -> dict[str, Outcome]:
+    """Print what a deploy would change on each robot."""
 
     def work(host: Host, robot: str) -> Outcome:
         plan = plan_deploy(host, robot, context.options)
@@ -66,9 +76,7 @@ def diff_command(context: RobotsContext) -> None:
         for name, one in outcomes.items():
             for line in (one.reason or "no changes").splitlines():
                 echo(f"{name}: {line}")
-    if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
-        raise typer.Exit(ExitCode.FINDINGS)
-    raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
+    return outcomes
 
 
 @app.command("status")

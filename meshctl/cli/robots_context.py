@@ -39,6 +39,7 @@ from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outc
 from meshctl.fleet.journal import RunRecord
 from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
+from meshctl.nodes.slots import transfers_at_once
 from meshctl.render.daemon import daemon_keys
 from meshctl.robots.bundle import configuration
 from meshctl.robots.connection import RobotConnector, selected_robots
@@ -133,7 +134,13 @@ class RobotsContext:
         watchdog.start()
         try:
             with interrupt.on_signals(say):
-                return run(self.robots, one, parallel=self.fleet.apply.parallel, interrupt=interrupt, observer=observer)
+                return run(
+                    self.robots,
+                    one,
+                    parallel=transfers_at_once(self.fleet.apply.parallel),
+                    interrupt=interrupt,
+                    observer=observer,
+                )
         finally:
             ended.set()
             watchdog.join()

@@ -33,6 +33,7 @@ from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
 from meshctl.model import Node
 from meshctl.nodes.host_keys import HostKeyState, fetch_host_keys
+from meshctl.nodes.slots import transfers_at_once
 
 
 def trust(
@@ -54,7 +55,7 @@ def trust(
             opened.access,
             opened.trust,
             selected_nodes(opened.fleet, nodes, limit),
-            parallel=opened.fleet.apply.parallel,
+            parallel=transfers_at_once(opened.fleet.apply.parallel),
         )
         if as_json:
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
@@ -159,7 +160,9 @@ def run(
             )
 
         with opened.interrupt.on_signals(echo_error):
-            ended = run_on_all(selected, work, parallel=opened.fleet.apply.parallel, interrupt=opened.interrupt)
+            ended = run_on_all(
+                selected, work, parallel=transfers_at_once(opened.fleet.apply.parallel), interrupt=opened.interrupt
+            )
         for outcome in ended.values():
             if not outcome.result.is_good and "exit_status" not in outcome.facts:
                 if as_json:

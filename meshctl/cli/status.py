@@ -9,18 +9,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, Limit, line_width, read_selection
+from meshctl.cli.context import AsJson, Limit, confirm, line_width, read_selection
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
 from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
-from meshctl.errors import ExitCode
+from meshctl.errors import ExitCode, InputError
 from meshctl.status import Check, FleetStatus, assess
 from meshctl.status import preflight as checks_of
 from meshctl.status.assess import Snapshot
+from meshctl.status.emergency_stop import StopResult, stop_plan
 from meshctl.status.filters import ROLES, STATES, Filter, select_devices
 from meshctl.status.json_output import as_json as status_json
 from meshctl.status.json_output import preflight_json
@@ -149,8 +151,24 @@ def _watch(query: _StatusQuery, period_s: float) -> None:
 
 
 @with_fleet_view
-def preflight(fleet_view: FleetView, names: Names = None, limit: Limit = None, as_json: AsJson = False) -> None:
+def preflight(
+    fleet_view: FleetView,
+    names: Names = None,
+    limit: Limit = None,
+    send_estop: Annotated[
+        Path | None,
+        typer.Option(
+            "--send-estop",
+            metavar="FILE",
+            help="Also send FILE as a real emergency stop and require every acknowledgment. THE ROBOTS STOP.",
+        ),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Send the emergency stop without confirmation.")] = False,
+    as_json: AsJson = False,
+) -> None:
     """Run the go/no-go checks before a mission, including urgent test messages between all robots.
+
+    Without --send-estop, no message reaches the robots' programs: test messages end at their daemons.
 
     With a selection, only those devices and the base must be ready, and the verdict says that others were not checked.
 
@@ -172,9 +190,26 @@ def preflight(fleet_view: FleetView, names: Names = None, limit: Limit = None, a
         for robot in found.robots
         if is_active(robot.state) and robot.facts is not None and robot.facts.answers
     ]
-    checks = checks_of(fleet, found, fleet_view.collector.ping(answering), unselected)
+    pings = fleet_view.collector.ping(answering)
+    stop = None if send_estop is None else _send_stop(fleet_view, answering, send_estop, yes=yes)
+    checks = checks_of(fleet, found, pings, unselected, stop)
     show_preflight(checks, as_json=as_json)
     raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
+
+
+def _send_stop(fleet_view: FleetView, robots: Sequence[str], file: Path, *, yes: bool) -> StopResult:
+    """Send the emergency stop in `file` to these robots, after confirmation."""
+    plan = stop_plan(fleet_view.fleet, robots)
+    if plan is None:
+        raise InputError("--send-estop: the inventory has no topic of class emergency_stop, or no robot that sends it")
+    try:
+        message = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"--send-estop: cannot read {file}: {error.strerror}") from error
+    if not yes and plan.destinations:
+        names = ", ".join(plan.destinations)
+        confirm(f"Send a real emergency stop ({plan.topic.name}) from {plan.source}? These robots stop: {names}.")
+    return fleet_view.collector.send_stop(plan, message)
 
 
 def show_preflight(checks: Sequence[Check], *, as_json: bool) -> None:

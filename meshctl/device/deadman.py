@@ -11,7 +11,7 @@ import gzip
 import hashlib
 import re
 import shlex
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from meshctl.archive import TarMember, tar_of
@@ -30,6 +30,8 @@ INIT_LINK = "/etc/rc.d/S05meshctl-deadman"
 BUNDLE_DIRECTORY = "/tmp/meshctl"
 # Unpacking, copying and syncing into a jffs2 that has to erase blocks first can take a minute.
 STAGE_TIMEOUT_S = 180.0
+# Sent with one command; configuration and keys of a node are a tenth of it.
+MAX_INLINE_BUNDLE_BYTES = 64 << 10
 
 _PATH = re.compile(r"(?:/[A-Za-z0-9._+@-]+){2,}")
 _LINK_TARGET = re.compile(r"\.\./init\.d/[A-Za-z0-9._+@-]+")
@@ -136,6 +138,12 @@ def installed_files() -> dict[str, tuple[int, bytes]]:
     }
 
 
+def version() -> str:
+    """The version of the switch that `install` installs."""
+    found = re.search(r"^VERSION=(\S+)", script("deadman.sh"), re.MULTILINE)
+    return found[1] if found else ""
+
+
 def status(connection: Connection) -> ChangeStatus:
     """The switch's state; `installed=False` if the node has none."""
     done = connection.run(f"[ -x {PROGRAM} ] || {{ echo absent; exit 0; }}; {PROGRAM} status")
@@ -201,12 +209,59 @@ def apply(
     return float(_verb(connection, "apply", owner, change_id, *when).get("due_uptime_s", "nan"))
 
 
-def confirm(connection: Connection, change_id: str, *, nonce: Secret) -> None:
-    """Make the change permanent; safe to repeat if the answer was lost. Raises NodeRefused (`restored`, ...).
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """A change as it is sent: its bundle, built once."""
+
+    change_id: str
+    content: bytes = field(repr=False)
+
+    @classmethod
+    def of(cls, change: Change) -> Payload:
+        return cls(change.change_id, bundle(change))
+
+    @property
+    def fits_one_command(self) -> bool:
+        """Whether it is sent at once; a larger one is uploaded in pieces, so that a cut link loses only one."""
+        return len(self.content) <= MAX_INLINE_BUNDLE_BYTES
+
+
+def change(
+    connection: Connection,
+    owner: str,
+    payload: Payload,
+    *,
+    nonce: Secret,
+    window_s: int,
+    ttl_s: int,
+    await_reload_s: int,
+    sent: Callable[[], None] = lambda: None,
+) -> int | None:
+    """Lock, stage, arm and start a change with one command; returns the exit status of its reload, or None if that had
+    not ended after `await_reload_s`.
+
+    `sent` is called when the bundle has been sent: from then on the channel is only waited for. A connection that
+    breaks leaves nothing changed, or the change as `apply` does. Raises what `stage` and `arm` raise.
+    """
+    digest = hashlib.sha256(nonce.reveal().encode()).hexdigest()
+    words = [owner, str(ttl_s), payload.change_id, digest, str(window_s), str(await_reload_s)]
+    words.append(hashlib.sha256(payload.content).hexdigest())
+
+    def pieces() -> Iterator[bytes]:
+        yield payload.content
+        sent()
+
+    answer = _verb(connection, "change", *words, stdin=pieces(), timeout_s=STAGE_TIMEOUT_S + await_reload_s)
+    return int(answer["reload_status"]) if answer.get("reload_status") else None
+
+
+def confirm(connection: Connection, change_id: str, *, nonce: Secret, owner: str = "") -> None:
+    """Make the change permanent; safe to repeat if the answer was lost. Raises NodeRefused (`restored`, ...). With
+    `owner`, also release its lock.
 
     The connection must be opened after the change was applied: that proves the node reachable.
     """
-    _verb(connection, "confirm", change_id, nonce.reveal())
+    _verb(connection, "confirm", change_id, nonce.reveal(), *([owner] if owner else []))
 
 
 def abort(connection: Connection, owner: str, change_id: str) -> None:
@@ -214,11 +269,17 @@ def abort(connection: Connection, owner: str, change_id: str) -> None:
     _verb(connection, "abort", owner, change_id)
 
 
-def _verb(connection: Connection, verb: str, *words: str, timeout_s: float | None = None) -> dict[str, str]:
+def _verb(
+    connection: Connection,
+    verb: str,
+    *words: str,
+    stdin: bytes | Iterable[bytes] = b"",
+    timeout_s: float | None = None,
+) -> dict[str, str]:
     for word in words:
         if not _WORD.fullmatch(word) and not word.startswith("/"):
             raise ValueError(f"{verb}: expected letters, digits and @._:+-, found {word!r}")
-    done = connection.run(shlex.join([PROGRAM, verb, *words]), timeout_s=timeout_s)
+    done = connection.run(shlex.join([PROGRAM, verb, *words]), stdin=stdin, timeout_s=timeout_s)
     answer = parse_answer(done.stdout)
     if answer.ok:
         return answer.values

@@ -259,8 +259,3 @@ class Observation:
         if self.clock_s is None:
             return None
         return self.clock_s - (self.asked_at_s + self.answered_at_s) / 2
-
-    @property
-    def uptime_error_s(self) -> float:
-        """The maximum error of `uptime_s` against the observer's clock: half the round trip."""
-        return (self.answered_at_s - self.asked_at_s) / 2

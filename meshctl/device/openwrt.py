@@ -170,16 +170,6 @@ def start_sysupgrade(connection: Connection, image_path: str, config_path: str) 
     _detached(connection, "sysupgrade", act)
 
 
-def reboot(connection: Connection) -> None:
-    """Reboot, detached. The boot rolls back an unconfirmed change."""
-    _detached(connection, "reboot", "/bin/sync; exec /sbin/reboot")
-
-
-def reload_config(connection: Connection) -> None:
-    """Reload every service whose configuration changed. Use `deadman` for a change that may cut the connection."""
-    connection.run("/sbin/reload_config").check(f"{connection.endpoint.label}: reload the configuration")
-
-
 def _detached(connection: Connection, name: str, act: str) -> None:
     # with a fresh pid file, because -x alone would match any running shell and start nothing
     pid_file = f"/tmp/meshctl/{name}.pid"

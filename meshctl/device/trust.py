@@ -1,9 +1,8 @@
 """Host key pinning: the fleet's file of pins, in OpenSSH's known_hosts format.
 
 A `HostKeyPolicy` accepts a server's `HostKey` or raises. `TrustStore` is the file: a pinned key passes, an unknown one
-is `HostKeyUnknown`, a different one `HostKeyChanged`. `FirstContact` asks about unknown keys and pins accepted ones;
-`AfterFlash` accepts one expected change; `AcceptAnyKey` accepts any. Names are those of the inventory, so that
-`ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same keys.
+is `HostKeyUnknown`, a different one `HostKeyChanged`. `AcceptAnyKey` accepts any. Names are those of the inventory, so
+that `ssh -o UserKnownHostsFile=FILE -o HostKeyAlias=b03 root@10.42.0.13` trusts the same keys.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import hashlib
 import hmac
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -254,49 +253,6 @@ def _without(pins: list[Pin], name: str) -> Iterator[Pin]:
             yield pin
         elif others := tuple(other for other in pin.names if other != name and not other.startswith("|1|")):
             yield Pin(others, pin.key)
-
-
-class FirstContact:
-    """Asks `accept` about an unknown key and pins it if accepted; a changed key is still refused."""
-
-    def __init__(self, store: TrustStore, accept: Callable[[Endpoint, HostKey], bool]) -> None:
-        self._store = store
-        self._accept = accept
-
-    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
-        return self._store.known(endpoint)
-
-    def check(self, endpoint: Endpoint, key: HostKey) -> None:
-        try:
-            self._store.check(endpoint, key)
-        except HostKeyUnknown:
-            if not self._accept(endpoint, key):
-                raise
-            self._store.add(endpoint.pin_name, key)
-
-
-class AfterFlash:
-    """Accepts the expected key change after a flash, and nothing else new.
-
-    `expected` are the fingerprints of the keys in the flashed configuration. The pin is replaced when the node has one
-    of them.
-    """
-
-    def __init__(self, store: TrustStore, name: str, expected: tuple[str, ...]) -> None:
-        self._store = store
-        self._name = name
-        self._expected = expected
-
-    def known(self, endpoint: Endpoint) -> tuple[HostKey, ...]:
-        return self._store.known(endpoint)
-
-    def check(self, endpoint: Endpoint, key: HostKey) -> None:
-        try:
-            self._store.check(endpoint, key)
-        except (HostKeyChanged, HostKeyUnknown):
-            if endpoint.pin_name != self._name or key.fingerprint not in self._expected:
-                raise
-            self._store.replace(self._name, key)
 
 
 class AcceptAnyKey:

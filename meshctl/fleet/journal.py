@@ -11,47 +11,31 @@ reads and writes under the fleet's name and the lab's directory.
 from __future__ import annotations
 
 import json
-import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
+from meshctl.fleet.journal_file import BUSY_TIMEOUT_S, JournalFile
 from meshctl.fleet.outcome import Outcome, Result
 from meshctl.fleet.process import owner, process_lives, this_process
 
-SCHEMA_VERSION = 1
-# Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
-BUSY_TIMEOUT_S = 20.0
 # During a run nodes wait to be confirmed, so a locked journal is written later.
 STEP_TIMEOUT_S = 1.0
+# Keys of facts: those that every command stores have the node's name alone, those of `status` a prefix.
+NODE_PREFIX = "status."
+ROBOT_PREFIX = "robot."
+# The fact that tells which device the others are of: the host keys that were pinned for it.
+_HOST_KEYS = "host_keys"
 # separates the name of a fleet and the directory of its lab (ASCII unit separator)
 _LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 # Outcomes that leave the result of an earlier change unknown.
 _END_UNKNOWN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
-_SCHEMA = """
-CREATE TABLE runs (
-    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
-    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE TABLE outcomes (
-    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
-    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
-) STRICT;
-CREATE TABLE steps (
-    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
-    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE INDEX steps_of_run ON steps(run, node);
-CREATE TABLE nodes (
-    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
-) STRICT;
-"""
 _REMEMBER = (
     "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
     " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s"
@@ -107,79 +91,13 @@ class LastKnown:
 class Journal:
     """The journal file. Safe for several threads and processes; close it, or use a `with` block."""
 
-    def __init__(self, path: Path, *, lab: str = "") -> None:
-        """`lab` is the directory of a virtual fleet, empty for real nodes."""
+    def __init__(self, path: Path, *, lab: str = "", pinned: Callable[[str], Iterable[str]] = lambda node: ()) -> None:
+        """`lab` is the directory of a virtual fleet, empty for real nodes; `pinned` are the fingerprints of the host
+        keys pinned for a node: facts of a device with other keys, which has been replaced since, are left out."""
         self.path = path
         self.lab = lab
-        self._lock = threading.Lock()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            self._database = sqlite3.connect(
-                path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
-            )
-        except (OSError, sqlite3.Error) as error:
-            raise MeshctlError(f"{path}: cannot open the journal: {error}", hint=_hint(error)) from error
-        try:
-            self._enter_wal()
-            self._database.execute("PRAGMA synchronous = NORMAL")
-            self._database.execute("PRAGMA foreign_keys = ON")
-            self._create()
-        except (sqlite3.Error, MeshctlError) as error:
-            self._database.close()
-            if isinstance(error, MeshctlError):
-                raise
-            what = "cannot open the journal" if _hint(error) else "not a journal of meshctl"
-            hint = _hint(error) or "move the file away and run again"
-            raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
-
-    def _enter_wal(self) -> None:
-        # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
-        deadline = time.monotonic() + BUSY_TIMEOUT_S
-        while True:
-            try:
-                self._database.execute("PRAGMA journal_mode = WAL")
-            except sqlite3.OperationalError as error:
-                if not _is_locked(error) or time.monotonic() > deadline:
-                    raise
-                time.sleep(0.01)
-            else:
-                return
-
-    def _create(self) -> None:
-        # a reader does not wait for a writer
-        if self._version() == SCHEMA_VERSION:
-            return
-        with self._write() as database:
-            version = self._version()
-            if version == 0:
-                for statement in _SCHEMA.split(";\n"):
-                    if statement.strip():
-                        database.execute(statement)
-                database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            elif version != SCHEMA_VERSION:
-                raise MeshctlError(f"{self.path}: journal of version {version}, expected {SCHEMA_VERSION}")
-
-    def _version(self) -> int:
-        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
-
-    @contextmanager
-    def _write(self, wait_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
-        with self._lock:
-            try:
-                self._database.execute(f"PRAGMA busy_timeout = {round(wait_s * 1000)}")
-                self._database.execute("BEGIN IMMEDIATE")
-                try:
-                    yield self._database
-                except BaseException:
-                    self._database.execute("ROLLBACK")
-                    raise
-                self._database.execute("COMMIT")
-            except sqlite3.Error as error:
-                # a COMMIT on a full disk may leave its transaction open
-                if self._database.in_transaction:
-                    with suppress(sqlite3.Error):
-                        self._database.execute("ROLLBACK")
-                raise MeshctlError(f"{self.path}: cannot write the journal: {error}", hint=_hint(error)) from error
+        self._pinned = pinned
+        self._file = JournalFile(path)
 
     def __enter__(self) -> Journal:
         return self
@@ -188,13 +106,12 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        with self._lock:
-            self._database.close()
+        self._file.close()
 
     def begin(self, command: str, *, fleet: str, inventory: str, nodes: tuple[str, ...], plan: str = "") -> Run:
         """Start a run; each of its nodes is PENDING until it has an outcome."""
         now = time.time()
-        with self._write() as database:
+        with self._file.write() as database:
             cursor = database.execute(
                 "INSERT INTO runs (command, fleet, inventory, owner, process, plan, began_s)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -211,7 +128,7 @@ class Journal:
         self, *, fleet: str | None = None, node: str | None = None, limit: int | None = 20
     ) -> tuple[RunRecord, ...]:
         """The latest runs (of a fleet, with a node), newest first; `limit` None: all."""
-        rows = self._read(
+        rows = self._file.read(
             f"SELECT {_RUN_COLUMNS} FROM runs WHERE (?1 IS NULL OR fleet = ?1)"
             " AND (?2 IS NULL OR EXISTS (SELECT 1 FROM outcomes WHERE run = id AND node = ?2))"
             " ORDER BY id DESC LIMIT ?3",
@@ -220,11 +137,11 @@ class Journal:
         return tuple(_record(row) for row in rows)
 
     def run(self, run_id: int) -> RunRecord | None:
-        rows = self._read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,))
+        rows = self._file.read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,))
         return _record(rows[0]) if rows else None
 
     def outcomes(self, run_id: int) -> tuple[Outcome, ...]:
-        rows = self._read(
+        rows = self._file.read(
             "SELECT node, result, reason, duration_s, facts FROM outcomes WHERE run = ? ORDER BY rowid", (run_id,)
         )
         return tuple(
@@ -233,7 +150,7 @@ class Journal:
         )
 
     def steps(self, run_id: int, node: str | None = None) -> tuple[StepRecord, ...]:
-        rows = self._read(
+        rows = self._file.read(
             "SELECT node, step, began_s, duration_s, result FROM steps WHERE run = ?1 AND (?2 IS NULL OR node = ?2)"
             " ORDER BY id",
             (run_id, node),
@@ -249,7 +166,7 @@ class Journal:
 
         Runs of `robots` and runs of radios are separate.
         """
-        rows = self._read(
+        rows = self._file.read(
             "SELECT run, node, outcomes.result FROM outcomes JOIN runs ON id = run WHERE fleet = ?1 AND NOT EXISTS"
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
             " AND later.node = outcomes.node AND after.id > runs.id"
@@ -266,7 +183,7 @@ class Journal:
     def unfinished_changes(self, fleet: str) -> dict[str, float]:
         """Node -> when its first change started (Unix time) whose end no run has observed."""
         ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)
-        rows = self._read(
+        rows = self._file.read(
             "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
             " AND command NOT LIKE 'robots %' AND step IN ('apply', 'flash') AND NOT EXISTS"
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
@@ -281,14 +198,32 @@ class Journal:
         self.remember_all(fleet, {node: facts}, seen_s)
 
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
-        with self._write() as database:
+        with self._file.write() as database:
             database.executemany(
-                _REMEMBER, [_sighting(self._key(fleet), node, known, seen_s) for node, known in facts.items()]
+                _REMEMBER,
+                [_sighting(self._key(fleet), node, self._marked(node, known), seen_s) for node, known in facts.items()],
             )
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
-        rows = self._read("SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),))
-        return {node: LastKnown(node, seen_s, json.loads(facts)) for node, seen_s, facts in rows}
+        rows = self._file.read(
+            "SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),)
+        )
+        found: dict[str, LastKnown] = {}
+        for node, seen_s, text in rows:
+            facts = json.loads(text)
+            keys, pinned = set(facts.pop(_HOST_KEYS, "").split()), set(self._keys_of(node))
+            if not (keys and pinned and keys.isdisjoint(pinned)):
+                found[node] = LastKnown(node, seen_s, facts)
+        return found
+
+    def _keys_of(self, node: str) -> tuple[str, ...]:
+        """The host keys pinned for a radio now."""
+        return () if node.startswith(ROBOT_PREFIX) else tuple(self._pinned(node.removeprefix(NODE_PREFIX)))
+
+    def _marked(self, node: str, facts: Mapping[str, str]) -> dict[str, str]:
+        """The facts, with the host keys of the device that they are of."""
+        keys = " ".join(self._keys_of(node))
+        return {**facts, **({_HOST_KEYS: keys} if keys else {})}
 
     def move_lab_runs(self, fleet: str, lab_of: Callable[[str], str]) -> None:
         """Move each lab's runs of `fleet`, which an earlier version stored under the real fleet's name, to the lab.
@@ -296,12 +231,12 @@ class Journal:
         `lab_of` maps a run's inventory to the lab's directory, empty for a real fleet. The nodes' facts move only if
         all runs are of one lab; otherwise their origin is unknown.
         """
-        rows = self._read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
+        rows = self._file.read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
         labs = {inventory: lab_of(inventory) for (inventory,) in rows}
         moving = {inventory: lab for inventory, lab in labs.items() if lab}
         if not moving:
             return
-        with self._write() as database:
+        with self._file.write() as database:
             for inventory, lab in moving.items():
                 new = _key_of(fleet, lab)
                 database.execute("UPDATE runs SET fleet = ? WHERE fleet = ? AND inventory = ?", (new, fleet, inventory))
@@ -311,13 +246,6 @@ class Journal:
 
     def _key(self, fleet: str) -> str:
         return _key_of(fleet, self.lab)
-
-    def _read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
-        with self._lock:
-            try:
-                return self._database.execute(query, values).fetchall()
-            except sqlite3.Error as error:
-                raise MeshctlError(f"{self.path}: cannot read the journal: {error}") from error
 
 
 class Run:
@@ -341,7 +269,7 @@ class Run:
             timeout_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
             self._pending.append((statement, values))
             try:
-                with self._journal._write(timeout_s) as database:
+                with self._journal._file.write(timeout_s) as database:
                     for pending in self._pending:
                         database.execute(*pending)
             except MeshctlError as error:
@@ -352,7 +280,8 @@ class Run:
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Store the facts of a node during this run."""
-        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, facts, seen_s))
+        marked = self._journal._marked(node, facts)
+        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, marked, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
@@ -400,32 +329,6 @@ def _record(row: tuple[Any, ...]) -> RunRecord:
 
 def _sighting(fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> tuple[object, ...]:
     return fleet, node, seen_s, json.dumps(dict(facts), sort_keys=True)
-
-
-# SQLite's primary result codes (sqlite.org/rescode.html) are the low eight bits of the extended ones.
-_PRIMARY = 0xFF
-_LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
-_UNWRITABLE = (
-    *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN),
-    *(sqlite3.SQLITE_IOERR, sqlite3.SQLITE_PERM),
-)
-
-
-def _primary(error: Exception) -> int:
-    return int(getattr(error, "sqlite_errorcode", 0)) & _PRIMARY
-
-
-def _is_locked(error: Exception) -> bool:
-    return _primary(error) in _LOCKED
-
-
-def _hint(error: Exception) -> str:
-    """What to do if the file cannot be used; empty if its content is at fault."""
-    if _is_locked(error):
-        return "another process has locked it: run `fuser` with its path to find that process"
-    if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
-        return "set XDG_STATE_HOME to a directory on a writable disk with free space"
-    return ""
 
 
 def default_path(environ: Mapping[str, str]) -> Path:

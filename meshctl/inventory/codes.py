@@ -25,6 +25,7 @@ GROUP_CYCLE = "INV033"
 UNKNOWN_HARDWARE = "INV034"
 UNKNOWN_RADIO = "INV035"
 BAD_ADDRESS = "INV036"
+CSV_TABLE = "INV040"
 TOO_MANY_ERRORS = "INV099"
 
 # Bounds the time that a file that is not an inventory can cost.
@@ -53,6 +54,7 @@ MEANINGS = {
     UNKNOWN_HARDWARE: "A node's hardware is not defined.",
     UNKNOWN_RADIO: "A node sets a radio that its hardware does not have.",
     BAD_ADDRESS: "A node's address cannot be determined.",
+    CSV_TABLE: "A CSV table for `meshctl inventory import` has a wrong heading, value or node.",
     TOO_MANY_ERRORS: "Too many errors: the rest is not reported.",
 }
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, assert_never
 
+from meshctl import event_log
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
 from meshctl.inventory.compose import compose
@@ -39,10 +40,12 @@ class SecretStore:
     def get(self, ref: SecretRef, at: Position | None = None) -> Secret:
         """The secret that `ref` refers to. Raises InputError, with the position `at` if given."""
         try:
-            return Secret(self._value(ref))
+            value = self._value(ref)
         except _NoSecret as reason:
             place = "" if at is None else f"{at}: "
             raise InputError(f"{place}secret {ref}: {reason}", hint=reason.hint) from None
+        event_log.hide(value)
+        return Secret(value)
 
     def _value(self, ref: SecretRef) -> str:
         match ref.kind:

@@ -73,7 +73,7 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
         wrong = str(path[-1])
         hint = did_you_mean(wrong, known) or f"known keys: {', '.join(known)}"
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
-    expected = _expected(error)
+    expected = expected_value(error)
     found = f"'{printable(str(path[-1]))}'" if is_key else _found(root, path, kind)
     hint = _enum_hint(root, path, error) if kind == "enum" else ""
     return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
@@ -97,7 +97,8 @@ def _place(root: MappingNode, path: tuple[int | str, ...], *, is_key: bool) -> P
     return place
 
 
-def _expected(error: ErrorDetails) -> str:
+def expected_value(error: ErrorDetails) -> str:
+    """What one of pydantic's errors expected, for `expected ...` in a message."""
     kind = error["type"]
     context: Mapping[str, Any] = error.get("ctx", {})
     if kind == "model_type" and context.get("class_name") == SecretDocument.__name__:

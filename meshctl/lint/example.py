@@ -17,11 +17,11 @@ from typing import Any
 import yaml
 
 from meshctl.firmware import append_metadata
+from meshctl.inventory.compose import LOADER
 from meshctl.lint.rule import Example
 
 REMOVED = "<removed>"
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 BASE = """\
@@ -158,7 +158,7 @@ def content(text: str) -> bytes:
 
 
 def _read(text: str) -> dict[str, Any]:
-    document: dict[str, Any] = yaml.load(text, Loader=_LOADER)
+    document: dict[str, Any] = yaml.load(text, Loader=LOADER)
     return document
 
 

@@ -37,10 +37,6 @@ class AuthorizedKey:
     comment: str
     text: str
 
-    @property
-    def is_ed25519(self) -> bool:
-        return self.kind in ("ssh-ed25519", "sk-ssh-ed25519@openssh.com")
-
 
 def parse_authorized_key(line: str) -> AuthorizedKey:
     """The key on `line`, which may start with options. Raises BadKey."""

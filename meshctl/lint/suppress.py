@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import yaml
 
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
+from meshctl.inventory.compose import yaml_events
 from meshctl.lint.engine import diagnostic
 from meshctl.lint.rule import CODE, Finding
 from meshctl.lint.rules.housekeeping import NO_REASON, UNKNOWN_CODE, UNUSED
 
 _COMMENT = re.compile(r"#\s*meshctl:\s*ignore\b(?P<codes>.*?)(?:\s--(?P<reason>.*))?$", re.MULTILINE)
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ def _inside_scalars(text: str, offsets: list[int]) -> set[int]:
     """The offsets inside a scalar. Invalid YAML has scalars up to the error."""
     spans = []
     try:
-        for event in yaml.parse(text, Loader=_LOADER):
+        for event in yaml_events(text):
             if isinstance(event, yaml.ScalarEvent) and event.start_mark is not None and event.end_mark is not None:
                 spans.append((event.start_mark.index, event.end_mark.index))
     except yaml.YAMLError:

@@ -186,7 +186,8 @@ class ApplyPolicy:
     canary: bool = True
     stop_after_failures: int = 1
     quorum: float = 0.8
-    parallel: int = 8
+    # None: as many as the meshes and this machine carry
+    parallel: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
-from meshctl.model import Fleet, Node
+from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
@@ -55,12 +55,15 @@ class FleetObservation:
 
 
 def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
-    """MAC -> node: from the inventory, from the journal, and alternate MACs of these radios."""
+    """MAC -> node: from the inventory, from the journal, and alternate MACs of these radios.
+
+    The journal's MACs of a retired node are left out: its device may be another node now.
+    """
     macs = {
         mac.lower(): name
         for name, last in known.items()
         for mac in last.facts.get("macs", "").split()
-        if name in fleet.nodes
+        if name in fleet.nodes and fleet.nodes[name].state is not NodeState.RETIRED
     }
     for node in fleet.nodes.values():
         macs.update({radio.mac.lower(): node.name for radio in node.radios if radio.mac})
@@ -85,7 +88,7 @@ def collect(
 
     def observe_one(name: str) -> Outcome:
         try:
-            with connections.borrow(wanted[name]) as connection:
+            with connections.slots.use(name), connections.borrow(wanted[name]) as connection:
                 seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:

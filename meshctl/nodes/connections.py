@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.inventory.file_paths import file_path
 from meshctl.model import Fleet, Node
+from meshctl.nodes.slots import ChannelSlots
 
 # Closing waits up to two seconds for a connection whose other side is gone, so a fleet's are closed in parallel.
 MAX_PARALLEL_CLOSES = 32
@@ -58,6 +60,7 @@ class ConnectionPool:
     bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
+    slots: ChannelSlots = field(default_factory=ChannelSlots, repr=False)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
     _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
@@ -102,14 +105,18 @@ class ConnectionPool:
         while True:
             where, *places_left = places
             try:
-                return connect(
+                via = self._via(node)
+                began_s = time.monotonic()
+                connection = connect(
                     where,
                     credentials=credentials or self.credentials(node, where),
                     trust=policy or self.policy or self.trust,
                     deadlines=deadlines or self.deadlines,
-                    via=self._via(node),
+                    via=via,
                     release=node.release,
                 )
+                self.slots.login_ended(node.name, time.monotonic() - began_s)
+                return connection
             except Unreachable:
                 if not places_left:
                     raise

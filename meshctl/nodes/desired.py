@@ -22,7 +22,9 @@ class Renderer:
     secrets: Callable[[SecretRef], Secret]
     templates: Templates
     # node -> its intent and files without facts of the device
-    _plain: dict[str, tuple[Node, Intent, Rendered]] = field(default_factory=dict, repr=False, compare=False)
+    _plain: dict[str, tuple[Node, Intent, Rendered]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
     def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:

@@ -16,6 +16,8 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import FleetObservation, collect, known_macs
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.slots import nodes_in_work
+from meshctl.report.duration import duration
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
 
 # batman-adv purges an originator after 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
@@ -47,10 +49,10 @@ class LastSeen:
         age_s = max(0.0, now_s - self.last.seen_s)
         # the time of day alone is ambiguous after half a day
         shown = moment.strftime("%H:%M:%S UTC" if age_s < 12 * 3600 else "%Y-%m-%d %H:%M UTC")
-        parts = [f"last seen {_span(age_s)} ago ({shown})"]
+        parts = [f"last seen {duration(age_s)} ago ({shown})"]
         uptime = self.last.facts.get("uptime_s", "")
         if uptime.isdigit():
-            parts.append(f"up {_span(float(uptime))} then")
+            parts.append(f"up {duration(float(uptime))} then")
         parts += [text for key in ("version", "revision") if (text := self.last.facts.get(key))]
         return ", ".join(parts)
 
@@ -80,14 +82,7 @@ class LastSeen:
 def _sighting(one: Sighting) -> str:
     age_s = one.age_ms / 1000
     signal = f" ({one.signal_dbm} dBm)" if one.signal_dbm is not None else ""
-    return f"{one.by} {age_s:.1f} s ago{signal}" if age_s < 10 else f"{one.by} {_span(age_s)} ago{signal}"
-
-
-def _span(seconds: float) -> str:
-    for unit, length_s in (("d", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length_s:
-            return f"{seconds / length_s:.0f} {unit}"
-    return f"{seconds:.0f} s"
+    return f"{one.by} {age_s:.1f} s ago{signal}" if age_s < 10 else f"{one.by} {duration(age_s)} ago{signal}"
 
 
 def last_seen_of(
@@ -140,7 +135,7 @@ def query_neighbors(
     seen = collect(
         connections,
         [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
-        parallel=max(1, fleet.apply.parallel),
+        parallel=nodes_in_work(fleet.apply.parallel),
         interrupt=interrupt,
     )
     return last_seen_of(fleet, missing, seen.observations, known)

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from meshctl.model import Fleet
 from meshctl.plan.order import MeshContext, stages_of
 from meshctl.plan.switch import MeshSwitches, switches
-from meshctl.plan.values import NodePlan, Plan, StageKind, Verdict
+from meshctl.plan.values import Cut, NodePlan, Plan, StageKind, Verdict
 from meshctl.topology import Graph
 
 
@@ -46,7 +46,8 @@ def fleet_plan(
         and not any(name in nodes for nodes in found.nodes.values())
     ]
     notes += [
-        f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} will be unreachable meanwhile"
+        f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} "
+        f"{'may' if plans[stage.nodes[0]].cut <= Cut.WEAK_LINKS else 'will'} be unreachable meanwhile"
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
     ]

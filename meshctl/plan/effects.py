@@ -62,7 +62,7 @@ def _radio(change: RadioChange) -> Effect:
     if change.restarts:
         return Effect("wifi", Cut.MESH, f"{change.radio} restarts: {options}")
     if change.may_lose_range:
-        return Effect("wifi", Cut.MESH, f"{change.radio}: {options} set without a restart, weak links may break")
+        return Effect("wifi", Cut.WEAK_LINKS, f"{change.radio}: {options} set without a restart")
     return Effect("wifi", Cut.NOTHING, f"{change.radio}: {options} set without a restart")
 
 

@@ -75,6 +75,7 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
     paths = context.graph.paths(context.entry)
     cuts = context.graph.cut_off_by(context.entry)
     waiting = [plan.node for plan in plans if plan.node != context.entry]
+    stays_up = {plan.node for plan in plans if plan.cut <= Cut.WEAK_LINKS}
     stages: list[Stage] = []
     if context.policy.canary and len(waiting) > 1:
         # the farthest node that is not a cut vertex
@@ -86,7 +87,9 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
         batch = _batch(waiting, context, cuts)
         waiting = [name for name in waiting if name not in batch]
         lost = cuts.get(batch[0], ())
-        if lost:
+        if lost and batch[0] in stays_up:
+            reason = f"alone, because it is a cut vertex: {', '.join(lost)} cannot be reached if a weak link breaks"
+        elif lost:
             reason = f"alone, because it is a cut vertex: while it is down {', '.join(lost)} cannot be reached"
         elif len(batch) == 1:
             reason = _distance(batch[0], paths)

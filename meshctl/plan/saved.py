@@ -28,7 +28,7 @@ from meshctl.plan.values import (
 )
 
 FORMAT = "meshctl-plan"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,14 +25,23 @@ class Cut(IntEnum):
     LOGIN = 1
     # the robot's wired LAN behind the node
     LAN = 2
+    # radio links that depend on its current range; all others stay up
+    WEAK_LINKS = 3
     # the node's radio links: it and everything behind it
-    MESH = 3
+    MESH = 4
     # the whole node, for minutes
-    NODE = 4
+    NODE = 5
 
     @property
     def text(self) -> str:
-        return ("nothing", "new logins for a second", "its LAN", "its mesh links", "the whole node, for minutes")[self]
+        return (
+            "nothing",
+            "new logins for a second",
+            "its LAN",
+            "weak mesh links, if any",
+            "its mesh links",
+            "the whole node, for minutes",
+        )[self]
 
 
 @dataclass(frozen=True, slots=True)

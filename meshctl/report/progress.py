@@ -18,6 +18,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from meshctl import event_log
 from meshctl.fleet import Event, EventKind, Outcome, Result
 from meshctl.report.terminal_escapes import clean, json_safe, one_line
 
@@ -237,6 +238,11 @@ class ThreadedProgress(RunProgress):
             self._shown.__exit__(kind, error, trace)
 
     def __call__(self, event: Event) -> None:
+        if event.kind is not EventKind.PROGRESS:
+            outcome = event.outcome
+            result = None if outcome is None else outcome.result.value
+            text = (event.text if outcome is None else outcome.reason) or None
+            event_log.emit(event_log.INFO, event.kind.value, node=event.node or None, result=result, text=text)
         self._events.put(event)
 
     def stopping(self, text: str) -> None:

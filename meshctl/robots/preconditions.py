@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from meshctl.errors import InputError
 from meshctl.model import Computer, Fleet
+from meshctl.report.duration import duration
 from meshctl.robots.wheel_tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
@@ -161,7 +162,7 @@ def clock_warning(facts: HostFacts, now_s: float) -> tuple[str, str]:
         return "", ""
     side = "ahead of" if skew_s > 0 else "behind"
     return (
-        f"its clock is {_days(abs(skew_s))} {side} ours",
+        f"its clock is {duration(abs(skew_s))} {side} ours",
         "set it with `date -s` or NTP; until then log times are wrong",
     )
 
@@ -215,11 +216,6 @@ def unmet_disk_space(facts: HostFacts, needed_bytes: int) -> Iterator[tuple[str,
     if facts.free_kib < needed_kib:
         found = f"found {facts.free_kib >> 10} MiB free"
         yield f"disk full: expected {(needed_kib >> 10) + 1} MiB in /opt, {found}", "free disk space there"
-
-
-def _days(seconds: float) -> str:
-    days = seconds / 86_400
-    return f"{days / 365.25:.1f} years" if days > 365 else f"{days:.1f} days"
 
 
 def changed_files(facts: HostFacts, desired: Iterable[tuple[str, str]]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import sys
 import textwrap
 from collections.abc import Iterable
 
+from meshctl.report.duration import duration
 from meshctl.robots.bundle import UNIT_NAME, Bundle
 from meshctl.robots.facts import RobotFacts
 from meshctl.robots.preconditions import HostFacts, changed_files
@@ -55,7 +56,7 @@ def _row(one: RobotFacts) -> tuple[str, ...]:
         one.service.active or "absent",
         one.release or "-",
         one.version or "-",
-        _duration(one.daemon_uptime_s),
+        "-" if one.daemon_uptime_s is None else duration(one.daemon_uptime_s),
         f"{len(one.online)}/{len(one.peers)}" if one.answers else "-",
         _queued(one) if one.answers else "-",
         _last_message(one),
@@ -75,15 +76,7 @@ def _last_message(one: RobotFacts) -> str:
     if not heard:
         return "-"
     name = min(heard, key=lambda each: heard[each])
-    return f"{name} {_duration(heard[name])} ago"
-
-
-def _duration(seconds: float | None) -> str:
-    if seconds is None:
-        return "-"
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+    return f"{name} {duration(heard[name])} ago"
 
 
 def difference(facts: HostFacts, release: Bundle) -> tuple[str, ...]:

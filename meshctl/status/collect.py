@@ -20,7 +20,7 @@ from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.observe import observe
 from meshctl.errors import MeshctlError, NodeError
-from meshctl.fleet.journal import Journal
+from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import FleetObservation, facts_of, known_macs
 from meshctl.nodes.connections import ConnectionPool
@@ -31,7 +31,8 @@ from meshctl.robots.connection import RobotConnector
 from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts, expected_release
 from meshctl.robots.host import Host
 from meshctl.status.assess import Snapshot
-from meshctl.status.last_known import ROBOT_PREFIX, merge_by_device
+from meshctl.status.emergency_stop import StopPlan, StopResult, send
+from meshctl.status.last_known import merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
 from meshctl.status.unreachable import no_answer_of
 from meshctl.status.values import NoAnswer
@@ -129,6 +130,16 @@ class Collector:
         }
         answers = run_parallel(jobs, MAX_PARALLEL)
         return pings_of({name: answer for name, answer in answers.items() if isinstance(answer, dict)})
+
+    def send_stop(self, plan: StopPlan, message: bytes) -> StopResult:
+        """Send a real emergency stop from its source."""
+        if self.connector is None:
+            return StopResult(problem=self.robots_skipped or "no robot can be queried")
+        try:
+            with self.robot_host(plan.source) as host:
+                return send(host, plan, message)
+        except MeshctlError as error:
+            return StopResult(problem=f"{plan.source} cannot send it: {error}")
 
     def _ping(self, robot: str, peers: Iterable[str]) -> dict[str, float | str]:
         with self.robot_host(robot) as host:

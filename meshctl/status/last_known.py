@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from meshctl.fleet.journal import LastKnown
+from meshctl.fleet.journal import NODE_PREFIX, ROBOT_PREFIX, LastKnown
 from meshctl.status.values import FleetStatus, NodeStatus, RobotStatus
 
-NODE_PREFIX = "status."
-ROBOT_PREFIX = "robot."
 # Enough neighbors to find a node again.
 _MAX_NEIGHBORS = 4
 _INTEGERS = frozenset({"hops", "flash_free_bytes", "restarts", "urgent_bytes", "disk_free_kib"})

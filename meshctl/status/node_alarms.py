@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
+from meshctl.report.duration import duration
 from meshctl.status.values import Alarm, Level, Neighbor
 from meshctl.topology import Path
 
@@ -204,12 +205,3 @@ _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _changes,
     _time,
 )
-
-
-def duration(seconds: float) -> str:
-    """`4 s`, `12 min`, `3.5 h`, `2 d`, `3 years`."""
-    for limit, unit_s, unit in ((120, 1, "s"), (7200, 60, "min"), (172800, 3600, "h"), (63072000, 86400, "d")):
-        if seconds < limit:
-            value = seconds / unit_s
-            return f"{value:.1f} {unit}" if unit == "h" and value < 10 else f"{value:.0f} {unit}"
-    return f"{seconds / 31536000:.0f} years"

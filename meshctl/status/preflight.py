@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from meshctl.model import Fleet, NodeState, Role
+from meshctl.status.emergency_stop import DELIVERED, StopResult
 from meshctl.status.node_alarms import join_limited
 from meshctl.status.pings import Pings
 from meshctl.status.robots import is_active
@@ -38,9 +39,17 @@ class Check:
 
 
 def preflight(
-    fleet: Fleet, status: FleetStatus, pings: Pings | None = None, unselected: Sequence[str] = ()
+    fleet: Fleet,
+    status: FleetStatus,
+    pings: Pings | None = None,
+    unselected: Sequence[str] = (),
+    stop: StopResult | None = None,
 ) -> tuple[Check, ...]:
-    """Run all checks. `pings` None: no test messages were sent; `unselected` are devices left out of `status`."""
+    """Run all checks.
+
+    `pings` None: no test messages were sent; `unselected` are devices left out of `status`; `stop` is the result of a
+    real emergency stop, None if the operator did not ask for one.
+    """
     checks = [check(fleet, status) for check in _CHECKS]
     skipped = _skipped_reason(status)
     if unselected and not skipped and not _active_robots(status):
@@ -55,6 +64,8 @@ def preflight(
             if alone
             else _delivery(fleet, status, pings or Pings())
         )
+    if stop is not None:
+        checks.append(_emergency_stop(stop))
     if unselected:
         checks.append(Check(OTHERS, True, f"not selected: {join_limited(tuple(unselected))}", is_checked=False))
     return tuple(checks)
@@ -260,6 +271,15 @@ def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
     worst = max(pings.round_trips_s.items(), key=lambda pair: pair[1], default=None)
     slowest = "" if worst is None else f", the slowest {worst[0][0]} to {worst[0][1]} in {worst[1] * 1000:.0f} ms"
     return _check("delivery", bad, f"urgent messages delivered between all {_plural(len(pairs), 'pair')}{slowest}")
+
+
+def _emergency_stop(stop: StopResult) -> Check:
+    """A real emergency stop, acknowledged by every robot."""
+    bad = [stop.problem] if stop.problem else []
+    bad += [f"{name}: {outcome}" for name, outcome in stop.outcomes.items() if outcome != DELIVERED]
+    if not bad and not stop.outcomes:
+        bad = ["no robot to send it to"]
+    return _check("emergency stop", bad, f"sent, and acknowledged by {join_limited(tuple(stop.outcomes))}")
 
 
 _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
+from meshctl.report.duration import duration
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.node_alarms import duration
 from meshctl.status.topics import is_urgent, urgent_priorities
 from meshctl.status.values import Alarm, Level, TopicStatus
 

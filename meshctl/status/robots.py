@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from meshctl.fleet.journal import LastKnown
+from meshctl.fleet.journal import ROBOT_PREFIX, LastKnown
 from meshctl.model import Fleet, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
-from meshctl.status.last_known import ROBOT_PREFIX
 from meshctl.status.robot_alarms import RobotAlarmInput, robot_alarms, urgent_bytes
 from meshctl.status.topics import topic_statuses
 from meshctl.status.unreachable import NOT_ASKED, no_answer_alarm

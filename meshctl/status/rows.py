@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from meshctl.inventory.selection import COMPUTER
-from meshctl.status.node_alarms import duration
+from meshctl.report.duration import duration
 from meshctl.status.robot_alarms import size
 from meshctl.status.values import NodeStatus, RobotStatus
 

@@ -11,8 +11,9 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from meshctl.errors import ExitCode
 from meshctl.inventory.selection import COMPUTER
+from meshctl.report.duration import duration
 from meshctl.report.terminal_escapes import one_line
-from meshctl.status.node_alarms import duration, join_limited
+from meshctl.status.node_alarms import join_limited
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import row
 from meshctl.status.table import Paint, plain, table_lines

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 
 from meshctl.model import Fleet, Topic, TopicClass
+from meshctl.report.duration import duration
 from meshctl.robots.facts import RobotFacts, TopicFacts
-from meshctl.status.node_alarms import duration
 from meshctl.status.values import TopicStatus
 
 # Missed periods before a topic counts as silent: a single lost message is no alarm.

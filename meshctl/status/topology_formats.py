@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from meshctl.status.node_alarms import duration
+from meshctl.report.duration import duration
 from meshctl.topology import Graph, Report, neighbours_of
 from meshctl.topology.cells import LinkCell
 

@@ -9,7 +9,8 @@ from meshctl.device.errors import AuthenticationRefused, HostKeyChanged, HostKey
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Node, NodeState, Role
-from meshctl.status.node_alarms import duration, join_limited
+from meshctl.report.duration import duration
+from meshctl.status.node_alarms import join_limited
 from meshctl.status.values import Alarm, Level, NoAnswer
 from meshctl.topology import Sighting
 

@@ -1,7 +1,7 @@
-"""Low-level access to a QEMU fleet from the host: run commands in its machine, set radios' groups and losses.
+"""Low-level access to a QEMU fleet from the host: run commands in its machine, set radios' groups.
 
-All functions take the fleet's directory, as `VirtualFleet.attach` does. Prefer `VirtualFleet.link`, which sets groups
-and losses itself and survives reboots; what is set here lasts until the next change of a link.
+All functions take the fleet's directory, as `VirtualFleet.attach` does. Prefer `VirtualFleet.link`, which sets the
+groups itself and survives reboots; what is set here lasts until the next change of a link.
 
 Every function raises LabError when no such fleet runs, InputError for unknown nodes.
 """
@@ -29,11 +29,6 @@ def run(directory: Path, command: str, *, timeout_s: float = 60.0) -> Completed:
 def set_groups(directory: Path, masks: Mapping[str, int]) -> None:
     """Set the hwsim group mask (64 bits, `hwsim_groups.assign`) of each node's radios, in the mapping's order."""
     request(directory, {"op": "set_groups", "masks": dict(masks)})
-
-
-def set_loss(directory: Path, losses: Mapping[tuple[str, str], float]) -> None:
-    """Set the share (0..1) of frames from the first node of each pair that the second one loses."""
-    request(directory, {"op": "set_loss", "losses": [[a, b, loss] for (a, b), loss in losses.items()]})
 
 
 def radios(directory: Path) -> dict[str, tuple[str, ...]]:

@@ -27,7 +27,6 @@ from meshlab.qemu.guest_agent import GuestAgent
 from meshlab.qemu.guest_protocol import ADDRESS, PORT, READY
 from meshlab.qemu.link_state import QemuLinkState
 from meshlab.qemu.port_forwarder import QemuPortForwarder
-from meshlab.qemu.traffic_control import Impairment
 from meshlab.spec import FleetSpec, load
 from meshlab.state import NodeState
 from meshlab.supervisor import Supervisor, fork_node_runner
@@ -96,14 +95,6 @@ class QemuOperations(Operations):
         for name in masks:
             self._fleet.node(name)
         self._qemu_link_state.set_groups(masks)
-
-    def set_loss(self, losses: list[tuple[str, str, float]]) -> None:
-        impairments: dict[str, dict[str, Impairment]] = {}
-        for sender, receiver, loss in losses:
-            cells = self._fleet.node(sender).effective.interfaces
-            impairments.setdefault(receiver, {}).update({cell.mac: Impairment(loss) for cell in cells})
-        for receiver, heard in impairments.items():
-            self._qemu_link_state.impair(self._fleet.node(receiver), heard)
 
 
 def main(arguments: Sequence[str]) -> int:

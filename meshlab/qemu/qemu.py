@@ -34,6 +34,9 @@ _LAST_LINES = 25
 # emulation these take a good part of a process's start, and nodes start thousands. Address randomization makes TCG
 # translate each program again at every start: without it dash takes 19 ms instead of 99, iw 60 instead of 144
 _KERNEL_OPTIONS = "init_on_alloc=0 apparmor=0 audit=0 cgroup_disable=memory transparent_hugepage=never norandmaps"
+# A CPU that has not scheduled for twice watchdog_thresh seconds never will: the kernel writes every CPU's stack to the
+# console and panics, so that the machine ends with a reason instead of leaving each request to its timeout
+_LOCKUP_OPTIONS = "loglevel=5 watchdog_thresh=30 softlockup_all_cpu_backtrace=1 softlockup_panic=1"
 _STOP_S = 10.0
 
 
@@ -141,8 +144,8 @@ class Machine:
 
     def _command(self, accelerator: Accelerator, monitor: int) -> tuple[str, ...]:
         line = (
-            "console=ttyS0 quiet panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check tsc=reliable "
-            f"{_KERNEL_OPTIONS} lab.radios={self._radios}"
+            "console=ttyS0 panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check tsc=reliable "
+            f"{_KERNEL_OPTIONS} {_LOCKUP_OPTIONS} lab.radios={self._radios}"
         )
         network = f"user,id=host,restrict=on,net={NETWORK},host={GATEWAY},hostfwd=tcp:127.0.0.1:0-{ADDRESS}:{PORT}"
         return (

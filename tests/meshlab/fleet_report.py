@@ -10,7 +10,8 @@ from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.state import Power
 
 _CONSOLE_LINES = 40
-_LOG_LINES = 40
+# the stacks of two CPUs, after a lockup of a machine's kernel
+_LOG_LINES = 160
 # the maximum number of nodes to describe
 _NODES = 12
 _COMMAND_S = 20.0

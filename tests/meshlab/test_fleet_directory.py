@@ -49,6 +49,16 @@ def test_a_directory_with_other_files_is_refused_and_left_as_it_is(mine: Path, m
         copy_inventory(mine / "inventory", mine)
 
 
+def test_a_fleet_with_19_07_gets_an_rsa_key_even_where_an_earlier_one_had_none(tmp_path: Path) -> None:
+    keys = []
+    for example in (EXAMPLE, shipped("inventory") / "community", shipped("inventory") / "community"):
+        copy = copy_inventory(example, tmp_path)
+        keys.append(copy.key_file.with_name("operator.pub").read_text(encoding="ascii"))
+        assert keys[-1].strip() in copy.fleet.operators.ssh_keys
+    assert [key.split()[0] for key in keys] == ["ssh-ed25519", "ssh-rsa", "ssh-rsa"]
+    assert keys[1] == keys[2]
+
+
 def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project)

@@ -328,6 +328,53 @@ def test_packages_are_installed_from_files_and_checked(fleet: VirtualFleet, node
     assert "tool-1.2-r3" not in new.exec("apk list --installed").stdout
 
 
+SERVICE = (
+    "#!/bin/sh /etc/rc.common\nSTART=50\nstart() { echo start >>/tmp/calls; }\nstop() { echo stop >>/tmp/calls; }\n"
+)
+
+
+def test_a_package_comes_and_goes_with_its_files_and_services(fleet: VirtualFleet, node: VirtualNode) -> None:
+    from meshlab.images import apk_package, opkg_package
+
+    files = {"/etc/init.d/tool": SERVICE, "/usr/bin/tool": "#!/bin/sh\n"}
+    listed = "ls /etc/rc.d /usr/bin | grep tool; cat /tmp/calls"
+    here = {"S50tool", "tool", "start"}
+    node.exec("cat >/tmp/p.ipk", stdin=opkg_package("tool", "1", files))
+    node.exec("opkg install /tmp/p.ipk").check("install")
+    assert set(node.exec(listed).stdout.split()) == here
+    assert node.exec("opkg files tool").stdout.splitlines()[1:] == sorted(files)
+    node.exec("opkg remove tool").check("remove")
+    assert node.exec(listed).stdout.split() == ["start", "stop"]
+    new = fleet.node("new")
+    new.exec("cat >/tmp/p.apk", stdin=apk_package("tool", "1-r1", files))
+    new.exec("cat >/tmp/bad.apk", stdin=b"torn")
+    listing = [*(path.lstrip("/") for path in sorted(files)), "lib/apk/packages/tool.list"]
+    manifest = new.exec("apk manifest --allow-untrusted /tmp/p.apk").stdout.splitlines()
+    assert [line.split("  ")[1] for line in manifest] == listing
+    assert new.exec("apk manifest --allow-untrusted /tmp/bad.apk").exit_status == 0
+    new.exec("apk add --allow-untrusted /tmp/p.apk").check("install")
+    assert set(new.exec(listed).stdout.split()) == here
+    assert new.exec("apk info -L tool").stdout.splitlines() == ["tool-1-r1 contains:", *listing]
+    new.exec("apk del tool").check("remove")
+    assert new.exec(listed).stdout.split() == ["start", "stop"]
+
+
+def test_the_database_of_packages_is_written_last(fleet: VirtualFleet, node: VirtualNode) -> None:
+    from meshlab.images import opkg_package
+
+    script = (
+        "#!/bin/sh /etc/rc.common\nSTART=50\nstart() { opkg list-installed >/tmp/seen; ls /usr/bin >/tmp/there; }\n"
+    )
+    files = {"/etc/init.d/second": script, "/usr/bin/second": ""}
+    node.exec("cat >/tmp/p.ipk", stdin=opkg_package("first", "1", {"/usr/bin/first": ""}))
+    node.exec("cat >/tmp/q.ipk", stdin=opkg_package("second", "1", files))
+    node.exec("opkg install /tmp/p.ipk /tmp/q.ipk").check("install")
+    seen, there = (set(node.exec(f"cat /tmp/{name}").stdout.split()) for name in ("seen", "there"))
+    assert {"first", "second"} <= there
+    assert not {"first", "second"} & seen
+    assert {"first", "second"} <= set(node.exec("opkg list-installed").stdout.split())
+
+
 def test_netifd_knows_the_protocols_that_were_there_when_it_started(fleet: VirtualFleet, node: VirtualNode) -> None:
     known = json.loads(node.exec("ubus call network get_proto_handlers").stdout)
     assert set(known) >= {"static", "batadv", "batadv_hardif"}

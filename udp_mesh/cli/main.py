@@ -12,9 +12,10 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, inspect, serve, traffic
+from udp_mesh.cli.argument_types import count, ping_s, positive
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
-from udp_mesh.daemon.interface import CONDITIONS_TOPIC, DEFAULT_PATH, MAX_PING_S
+from udp_mesh.daemon.interface import CONDITIONS_TOPIC, DEFAULT_PATH
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -51,8 +52,6 @@ RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
 
 FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
 """Commands that parse their own arguments: `main(argv)` of the package is called."""
-
-MAX_COUNT = 1_000_000_000
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -216,7 +215,7 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
         parser.add_argument(
             "--watch",
-            type=_positive,
+            type=positive,
             nargs="?",
             const=1.0,
             metavar="SECONDS",
@@ -314,43 +313,43 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     publish.add_argument("--file", type=Path, help="send the contents of a file (- for standard input)")
     publish.add_argument("--to", metavar="PEER", help="send to one peer (default: the topic's destinations, or all)")
     publish.add_argument("--type", default="", help="type name to send with the message")
-    publish.add_argument("--count", type=_count, default=1, help="number of times to send it (default: %(default)s)")
-    publish.add_argument("--rate", type=_positive, default=1.0, metavar="HZ", help="messages per second with --count")
+    publish.add_argument("--count", type=count, default=1, help="number of times to send it (default: %(default)s)")
+    publish.add_argument("--rate", type=positive, default=1.0, metavar="HZ", help="messages per second with --count")
     publish.add_argument(
-        "--wait", type=_positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
+        "--wait", type=positive, nargs="?", const=60.0, metavar="SECONDS", help="wait for the outcome (default: 60 s)"
     )
     echo = _command(commands, "echo", traffic.echo, "print received messages", example="udp-mesh echo 'map/*' status")
     echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"topics or patterns, or {CONDITIONS_TOPIC}")
-    echo.add_argument("--count", type=_count, help="exit after this many messages")
-    echo.add_argument("--timeout", type=_positive, metavar="SECONDS", help="exit after this long without a message")
+    echo.add_argument("--count", type=count, help="exit after this many messages")
+    echo.add_argument("--timeout", type=positive, metavar="SECONDS", help="exit after this long without a message")
     echo.add_argument("--raw", action="store_true", help="write only the payloads' bytes")
     ping = _command(
         commands, "ping", traffic.ping, "measure round-trip times to a peer", example="udp-mesh ping base --count 5"
     )
     ping.add_argument("peer", help="name of the peer, as in `udp-mesh peers`")
-    ping.add_argument("-c", "--count", type=_count, default=4, help="number of pings (default: %(default)s)")
+    ping.add_argument("-c", "--count", type=count, default=4, help="number of pings (default: %(default)s)")
     ping.add_argument(
-        "--interval", type=_positive, default=1.0, metavar="SECONDS", help="time between pings (default: %(default)g)"
+        "--interval", type=positive, default=1.0, metavar="SECONDS", help="time between pings (default: %(default)g)"
     )
     ping.add_argument(
-        "--timeout", type=_ping_s, default=2.0, metavar="SECONDS", help="timeout per ping (default: %(default)g)"
+        "--timeout", type=ping_s, default=2.0, metavar="SECONDS", help="timeout per ping (default: %(default)g)"
     )
     bench = _command(
         commands, "bench", traffic.bench, "measure the throughput to a peer", example="udp-mesh bench base"
     )
     bench.add_argument("peer", help="name of the peer, as in `udp-mesh peers`")
     bench.add_argument(
-        "--size", type=_count, default=200_000, metavar="BYTES", help="size per message (default: %(default)s)"
+        "--size", type=count, default=200_000, metavar="BYTES", help="size per message (default: %(default)s)"
     )
     bench.add_argument(
         "--seconds",
-        type=_positive,
+        type=positive,
         default=5.0,
         help="how long to send (default: %(default)g); exits when everything has been delivered",
     )
     bench.add_argument(
         "--timeout",
-        type=_positive,
+        type=positive,
         default=60.0,
         metavar="SECONDS",
         help="exit after this long without a delivered message (default: %(default)g)",
@@ -371,30 +370,6 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     start.add_argument("file", type=Path, help="file to create, with the daemon's permissions; it must not exist")
     start.add_argument("--payloads", action="store_true", help="include the payloads of received messages")
     _command(recorders, "stop", traffic.record_stop, "stop the recording", example="udp-mesh record stop")
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a positive number, found {text!r}")
-    return value
-
-
-def _ping_s(text: str) -> float:
-    value = _positive(text)
-    if value > MAX_PING_S:
-        raise argparse.ArgumentTypeError(f"expected at most {MAX_PING_S:g} seconds, found {text!r}")
-    return value
-
-
-def _count(text: str) -> int:
-    """A number of repetitions."""
-    if not (text.isascii() and text.isdecimal()) or not 1 <= int(text) <= MAX_COUNT:
-        raise argparse.ArgumentTypeError(f"expected a whole number of at least 1, found {text!r}")
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -54,6 +54,8 @@ class Message(NamedTuple):
     payload: bytes
     priority: int
     broadcast: bool
+    receipt: Optional[int] = None
+    """To pass to `MeshClient.acknowledge` once the message is processed. None: nothing waits for that."""
 
 
 def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
@@ -205,9 +207,20 @@ class MeshClient:
             return None
         return int(self.request("publish", payload, **fields)["message"])
 
-    def subscribe(self, *topics: str) -> None:
-        """Subscribes to topics; patterns such as "map/*" and "*" are allowed."""
-        self.request("subscribe", topics=list(topics))
+    def subscribe(self, *topics: str, acknowledge: bool = False) -> None:
+        """Subscribes to topics; patterns such as "map/*" and "*" are allowed.
+
+        With `acknowledge`, messages of topics whose outboxes are on disk have receipts. The daemon keeps each one,
+        and sends it to the next program, until `acknowledge` is called for it.
+        """
+        if acknowledge:
+            self.request("subscribe", topics=list(topics), acknowledge=True)
+        else:
+            self.request("subscribe", topics=list(topics))
+
+    def acknowledge(self, *receipts: int) -> int:
+        """Tells the daemon that these messages are processed; returns how many it still kept."""
+        return int(self.request("acknowledge", receipts=list(receipts))["acknowledged"])
 
     # Receive
 
@@ -297,4 +310,5 @@ def as_message(frame: Frame) -> Optional[Message]:
         payload,
         int(header["priority"]),
         bool(header["broadcast"]),
+        header.get("receipt"),
     )

@@ -101,6 +101,17 @@ class Counters:
     repairs_asked: int = 0
     repairs_sent: int = 0
 
+    @property
+    def dropped_unverified(self) -> int:
+        """Datagrams of which nothing was believed: forged, damaged, replayed or foreign."""
+        return (
+            self.dropped_malformed
+            + self.dropped_unauthenticated
+            + self.dropped_replayed
+            + self.dropped_unproven
+            + self.dropped_stale
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Conditions:

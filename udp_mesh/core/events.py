@@ -5,7 +5,7 @@ Every reliable message ends, per destination, in exactly one of `MessageDelivere
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import NewType
+from typing import NamedTuple, NewType
 
 from udp_mesh.core.settings import Address
 
@@ -106,9 +106,17 @@ class Incompatible:
     versions: tuple[int, int]
 
 
+class Receipt(NamedTuple):
+    """Identifies a received message whose sender waits until it is confirmed."""
+
+    boot_id: bytes
+    message_id: int
+
+
 @dataclass(frozen=True, slots=True)
 class MessageReceived:
-    """A complete message. `payload` is as passed to the sender's `send`."""
+    """A complete message. `payload` is as passed to the sender's `send`. One with a receipt is delivered only once
+    `Node.confirm` was called for it."""
 
     source: str
     topic: str
@@ -116,11 +124,13 @@ class MessageReceived:
     payload: bytes
     priority: int
     broadcast: bool
+    receipt: Receipt | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MessageDelivered:
-    """The destination has the complete message. `latency_s` is from `send` to its acknowledgement."""
+    """The destination's node has the complete message. If the topic's outbox is on disk, the message is safe there: the
+    receiving program took it, or the node has it on disk. `latency_s` is from `send` to the acknowledgement."""
 
     message_id: MessageId
     peer: str

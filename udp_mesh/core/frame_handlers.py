@@ -4,10 +4,11 @@
 """
 
 from udp_mesh.core.broadcast import FIRST_UNREPAIRED_NUMBER
-from udp_mesh.core.events import ExpiryReason, MessageReceived
+from udp_mesh.core.events import ExpiryReason, MessageReceived, Receipt
 from udp_mesh.core.peer_lifecycle import on_bye
 from udp_mesh.core.peers.path_validation import send_on_path
 from udp_mesh.core.peers.session import Session
+from udp_mesh.core.peers.session_state import Reception, ReceptionEvent
 from udp_mesh.core.publish import report_ended
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
 from udp_mesh.core.settings import Address
@@ -42,7 +43,7 @@ def process_frames(
     receiver = session.receiver
     peer = session.peer
     assert peer is not None
-    sender = peer.sender
+    sender = peer.open_sender()
     wants_ack = ack_now = False
     kept = True
     for frame in frames:
@@ -53,12 +54,14 @@ def process_frames(
                 kept = receiver.receive_fragment(frame, now, broadcast=False, late_s=late_s) and kept
             case Ack():
                 if frame.largest < session.path.channel.next_number:
-                    session.path.confirmed = session.knows_us = True
+                    session.path.confirmed = True
+                    if session.reception is Reception.UNKNOWN:
+                        session.on_reception(ReceptionEvent.ACKNOWLEDGED, now)
                     session.peer_receives = (frame.receive_rate, now)
                     arrived_before = sender.delivered_packets
                     sender.acknowledge(frame, now)
                     if sender.delivered_packets > arrived_before:
-                        session.confirm_two_way()
+                        session.on_reception(ReceptionEvent.CONFIRMED, now)
                     report_ended(state, peer, now)
                     state.ready[peer] = None
                 if frame.waiting:
@@ -99,6 +102,8 @@ def process_frames(
         receiver.on_accepted(number, now, ack_now=ack_now)
         if receiver.acks.send_now:
             state.schedule_control(session)
+    if receiver.confirmed:
+        state.schedule_control(session)
     if receiver.refusals:
         for refusal in receiver.refusals:
             session.queue_control(refusal)
@@ -128,7 +133,7 @@ def _on_cancel(state: State, session: Session, message_ids: tuple[int, ...], *, 
 def _on_refused(state: State, session: Session, refused: Refused) -> None:
     peer = session.peer
     assert peer is not None
-    sender = peer.sender
+    sender = peer.open_sender()
     message = sender.by_wire_id(refused.message_id)
     if message is None:
         return
@@ -151,7 +156,8 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
         session.queue_control(Cancel((number,), broadcast_ids=True))
         state.schedule_control(session)
         return
-    if any(message.accepted.broadcast_number == number for message in peer.sender.pending):
+    sender = peer.open_sender()
+    if any(message.accepted.broadcast_number == number for message in sender.pending):
         return
     state.event_queue.counters.repairs_sent += 1
     copy = AcceptedMessage(
@@ -164,7 +170,7 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
         accepted.deadline,
         number,
     )
-    peer.sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
+    sender.accept(OutgoingMessage(copy, accepted.channel.topic.priority, reliable=True), now)
     state.ready[peer] = None
 
 
@@ -185,7 +191,13 @@ def deliver(state: State, session: Session, now: float) -> None:
         state.event_queue.counters.messages_received += 1
         state.event_queue.emit(
             MessageReceived(
-                session.name, message.topic, message.type_name, message.payload, message.priority, message.to_all
+                session.name,
+                message.topic,
+                message.type_name,
+                message.payload,
+                message.priority,
+                message.to_all,
+                None if message.confirm_id is None else Receipt(session.boot_id, message.confirm_id),
             )
         )
 

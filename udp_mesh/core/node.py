@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from udp_mesh.core import publish, reconfigure, transmit
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
-from udp_mesh.core.events import Event, MessageId, Rejected
+from udp_mesh.core.events import Event, MessageId, Receipt, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
@@ -145,6 +145,35 @@ class Node:
         """A snapshot for the autonomy, the status page and the metrics."""
         return _snapshot(self._state, now)
 
+    def confirm(self, receipt: Receipt) -> None:
+        """A received message is safe: the application took it, or it is on disk. Its sender reports it as delivered."""
+        session = self._state.peer_table.sessions.get(receipt.boot_id)
+        if session is not None and session.receiver.confirm(receipt.message_id):
+            self._state.schedule_control(session)
+
+    def request_again(self, receipt: Receipt) -> None:
+        """A received message could not be kept: its sender is to send it again."""
+        session = self._state.peer_table.sessions.get(receipt.boot_id)
+        if session is not None and session.receiver.request_again(receipt.message_id):
+            for refusal in session.receiver.refusals:
+                session.queue_control(refusal)
+            session.receiver.refusals.clear()
+            self._state.schedule_control(session)
+
+    def peer_addresses(self) -> dict[str, set[Address]]:
+        """Link -> the addresses from which authenticated peers send: a driver reads what comes from elsewhere with less
+        priority. It changes with the events of peers and with links."""
+        addresses: dict[str, set[Address]] = {name: set() for name in self._state.links}
+        for peer in self._state.peer_table.online():
+            if peer.session is not None and peer.session.path.link in addresses:
+                addresses[peer.session.path.link].add(peer.session.path.address)
+        return addresses
+
+    @property
+    def unauthenticated(self) -> int:
+        """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
+        return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
+
     def legacy_positions(self) -> dict[str, ReceivePosition]:
         """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
         return self._legacy.positions()
@@ -158,10 +187,9 @@ def _snapshot(state: State, now: float) -> Conditions:
     """See `Node.conditions`."""
     idle = Sender(state.settings)
     peers = tuple(
-        _peer_conditions(state, peer, peer.sender if peer.has_sender else idle, now)
-        for _, peer in sorted(state.peer_table.peers.items())
+        _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
     )
-    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.has_sender]
+    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.sender is not None]
     counters = state.event_queue.counters
     sent_bits_per_s = _bits_per_s(state.sent, now)
     receivers = [session.receiver for session in state.peer_table.sessions.values()]

@@ -98,7 +98,7 @@ class Outboxes:
     def persist(self, peer: str, accepted: AcceptedMessage, now: float) -> int | None:
         """Write a message to disk if its topic requires that. Returns its key, or None if it is in memory only."""
         topic = accepted.channel.topic
-        if self._store is None or not topic.outbox_on_disk or topic.outbox is Outbox.NONE:
+        if self._store is None or not topic.keeps_on_disk:
             return None
         key = self._next_key
         self._next_key += 1

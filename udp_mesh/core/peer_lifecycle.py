@@ -12,23 +12,21 @@ from udp_mesh.core.broadcast import NackRepair
 from udp_mesh.core.events import (
     Incompatible,
     NameConflict,
-    PathNarrowed,
     PeerAddressChanged,
     PeerOffline,
     PeerOnline,
     PeerRestarted,
     TopicStarved,
 )
+from udp_mesh.core.path_mtu import refragment, update_pmtu
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.peer_table import VerifyResult
 from udp_mesh.core.peers.session import STALE_PATH_S, Challenge, Peer, Session
+from udp_mesh.core.peers.session_state import ReceptionEvent
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
-from udp_mesh.core.sender.message import OutgoingMessage
-from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.pmtu import NARROWER_MTUS
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
@@ -64,7 +62,7 @@ def on_heartbeat(
     if to_all:
         session.on_heard_list(beat.heard, state.boot_id[:HEARD_TAG_BYTES], now)
     elif lists_us:
-        session.confirm_two_way()
+        session.on_reception(ReceptionEvent.CONFIRMED, now)
     if not session.verified:
         if (link, source) == (session.path.link, session.path.address):
             session.path.heard_at = now
@@ -128,9 +126,9 @@ def _replace(state: State, peer: Peer, session: Session, now: float) -> None:
     if old is not None:
         state.repairs.pop(old.boot_id, None)
         state.control_ready.pop(old, None)
-        if peer.has_sender:
+        if peer.sender is not None:
             old.next_wire_id = peer.sender.next_wire_id
-    if peer.has_sender:
+    if peer.sender is not None:
         peer.sender.restart(now)
         # A boot that becomes current again remembers what it had: its numbers continue.
         peer.sender.in_flight.restart(session.path.channel.next_number)
@@ -175,7 +173,7 @@ def on_activity(state: State, session: Session, link: str, source: Address, now:
             validate_path(state, session, link, source, now)
             return
         set_online(state, peer, session, now)
-    if peer.has_sender and peer.sender.state is SendState.UNRESPONSIVE:
+    if peer.sender is not None and peer.sender.state is SendState.UNRESPONSIVE:
         peer.sender.on_activity(now)
         state.ready[peer] = None
 
@@ -205,7 +203,7 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
     if link not in state.links:
         return
     path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    sender = session.peer.sender if session.peer is not None else None
     timing_out = sender is not None and sender.state is not SendState.ACTIVE
     first = not path.link
     quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
@@ -236,7 +234,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
     if info is None:
         return
     path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
+    sender = session.peer.sender if session.peer is not None else None
     first = not path.link
     old = path.address
     before = path.fragment_bytes
@@ -245,78 +243,7 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
     if not first and session.verified and session.peer is not None:
         state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
     if sender is not None and path.fragment_bytes < before:
-        _refragment(sender, path, include_sent=False)
-
-
-def update_mtu(state: State, session: Session, mtu: int) -> None:
-    """The link or the settings changed under a session's path: fit both, and what the path was found to carry."""
-    path = session.path
-    sender = session.peer.sender if session.peer is not None and session.peer.has_sender else None
-    if sender is not None and sender.pmtu.narrowed_at is not None:
-        mtu = min(mtu, path.mtu)
-    before = path.mtu
-    path.switch_to(path.link, path.address, mtu, state.settings.fragment_bytes)
-    if sender is not None and mtu < before:
-        _refragment(sender, path, include_sent=False)
-
-
-def _refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
-    """Restart messages whose fragments are larger than the path now carries.
-
-    A message sent completely may have arrived completely, and under a new number it would arrive twice. It is restarted
-    only with `include_sent`, when none of its large fragments get through anyway. Otherwise the kernel fragments what
-    is too large for the link.
-    """
-    for message in list(sender.pending):
-        if not include_sent and message.started and message.next_position >= message.fragments:
-            continue
-        if message.started and any(
-            not there and _fragment_bytes(message, position) > path.fragment_bytes
-            for position, there in enumerate(message.arrived)
-        ):
-            sender.cancel(message)
-            sender.resend_from_start(message)
-
-
-def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
-    start, end = message.span(position)
-    return end - start
-
-
-def _update_pmtu(state: State, peer: Peer, session: Session, now: float) -> None:
-    """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
-    sender, path = peer.sender, session.path
-    size, info = sender.pmtu, state.links.get(path.link)
-    fragment_bytes = state.settings.fragment_bytes
-    rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
-    narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
-    if size.is_black_hole(now) and narrower:
-        path.switch_to(path.link, path.address, narrower.pop(0), fragment_bytes)
-        size.on_narrowed(now)
-        state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))
-        _refragment(sender, path, include_sent=True)
-        state.ready[peer] = None
-    size.large_bytes = rooms[narrower[0]] if narrower else float("inf")
-    if size.narrowed_at is None or info is None:
-        return
-    if size.probe.confirmed_mtu > path.mtu:
-        path.switch_to(path.link, path.address, min(size.probe.confirmed_mtu, info.mtu), fragment_bytes)
-        size.reset()
-    rooms = {mtu: room for mtu, room in rooms.items() if mtu < info.mtu}
-    rooms[info.mtu] = datagram_room(path.address, info.mtu, fragment_bytes)
-    larger = {room: mtu for mtu, room in rooms.items() if room > path.room_bytes}
-    if not larger:
-        size.narrowed_at = None
-    elif (
-        peer.online
-        and path.confirmed
-        and sender.state is not SendState.UNRESPONSIVE
-        and size.probe.due(now, sender.loss)
-    ):
-        for room, mtu in larger.items():
-            token = state.rng.getrandbits(64)
-            size.probe.on_probe_sent(token, mtu)
-            state.outgoing.append(build_mtu_probe(sender, path, token, room))
+        refragment(sender, path, include_sent=False)
 
 
 def on_bye(state: State, session: Session, now: float) -> None:
@@ -332,7 +259,11 @@ def set_offline(state: State, peer: Peer, now: float, *, left: bool) -> None:
     peer.transition(PeerEvent.SILENT)
     peer.online_since = None
     state.event_queue.emit(PeerOffline(peer.name, left))
-    if peer.has_sender and peer.sender.state is not SendState.UNRESPONSIVE and peer.sender.in_flight.outstanding:
+    if (
+        peer.sender is not None
+        and peer.sender.state is not SendState.UNRESPONSIVE
+        and peer.sender.in_flight.outstanding
+    ):
         peer.sender.become_unresponsive(now)
     store_in_outbox(state, peer, now)
 
@@ -351,12 +282,12 @@ def maintain(state: State, now: float) -> None:
     peers = list(state.peer_table.peers.values())
     start = state.maintain_from if state.maintain_from < len(peers) else 0
     state.maintain_from = start + IDLE_PEERS_PER_ROUND
-    has_sender = [peer for peer in peers if peer.has_sender]
-    for peer in has_sender:
-        peer.sender.congestion.queue_share = queue_share
+    senders = [(peer, peer.sender) for peer in peers if peer.sender is not None]
+    for peer, sender in senders:
+        sender.congestion.queue_share = queue_share
         _maintain_peer(state, peer, now)
     for peer in peers[start : state.maintain_from]:
-        if not peer.has_sender:
+        if peer.sender is None:
             _maintain_peer(state, peer, now)
     for name in state.outboxes.peers():
         peer_with_outbox = state.peer_table.peers.get(name)
@@ -395,7 +326,7 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         set_offline(state, peer, now, left=False)
     if peer.state is PeerState.OFFLINE and max(silent_s, one_way_s) > rates.peer_lost_s:
         peer.transition(PeerEvent.GIVEN_UP)
-        if peer.has_sender:
+        if peer.sender is not None:
             peer.sender.finish_all(Outcome.PEER_LOST)
             report_ended(state, peer, now)
     if session.receiver.fragments:
@@ -403,19 +334,22 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         session.receiver.broadcasts.purge(now)
     if session.received_bytes:
         session.meters.received.feed(session.received_bytes, now)
-    if peer.has_sender:
-        _report_starved(state, peer, now)
-        _update_pmtu(state, peer, session, now)
-        session.meters.sent.feed(peer.sender.sent_bytes, now)
-        session.meters.delivered.feed(peer.sender.delivered_bytes, now)
+    sender = peer.sender
+    if sender is not None:
+        if peer.online and sender.unconfirmed and sender.request_confirmations(now):
+            state.ready[peer] = None
+        _report_starved(state, peer.name, sender, now)
+        update_pmtu(state, peer, sender, session, now)
+        session.meters.sent.feed(sender.sent_bytes, now)
+        session.meters.delivered.feed(sender.delivered_bytes, now)
 
 
-def _report_starved(state: State, peer: Peer, now: float) -> None:
-    for level in peer.sender.levels:
+def _report_starved(state: State, name: str, sender: Sender, now: float) -> None:
+    for level in sender.levels:
         since = level.starved_since
         if since is None or level.starved_reported or now - since < state.settings.rates.starved_s:
             continue
         oldest = level.oldest()
         if oldest is not None:
             level.starved_reported = True
-            state.event_queue.emit(TopicStarved(peer.name, oldest.accepted.channel.name, now - since))
+            state.event_queue.emit(TopicStarved(name, oldest.accepted.channel.name, now - since))

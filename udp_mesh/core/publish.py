@@ -125,9 +125,9 @@ def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: in
             if len(state.peer_table.peers) >= limits.peers:
                 return Rejected(RejectReason.QUEUE_FULL, f"limit of {limits.peers} peers reached")
             continue
-        if not peer.has_sender:
-            continue
         sender = peer.sender
+        if sender is None:
+            continue
         if (
             sender.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
             or len(sender.pending) >= limits.queue_messages_per_peer
@@ -188,7 +188,7 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     topic = accepted.channel.topic
     message = OutgoingMessage(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
-    sender = peer.sender
+    sender = peer.open_sender()
     sender.accept(message, now)
     if peer.state is PeerState.LOST:
         sender.finish(message, Outcome.PEER_LOST)
@@ -248,7 +248,10 @@ def _broadcast_bytes(accepted: AcceptedMessage) -> int:
 
 def store_in_outbox(state: State, peer: Peer, now: float) -> None:
     """Move messages from the queue of a peer that went offline to their outboxes."""
-    everything = list(peer.sender.pending) if peer.has_sender else []
+    sender = peer.sender
+    if sender is None:
+        return
+    everything = list(sender.pending)
     # Newest first: each one goes in front of those already there.
     everything.sort(key=lambda message: message.accepted.message_id, reverse=True)
     for message in everything:
@@ -256,9 +259,9 @@ def store_in_outbox(state: State, peer: Peer, now: float) -> None:
             continue
         # Best effort is not remembered for long by the receiver, and legacy programs do not know our numbers.
         resumable = message.started and message.reliable and not peer.legacy
-        peer.sender.withdraw(message, to_resume=resumable)
+        sender.withdraw(message, to_resume=resumable)
         started = message if resumable else None
-        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, started, peer.sender.epoch), now)
+        _hold(state, peer.name, HeldMessage(message.accepted, message.store_key, started, sender.epoch), now)
 
 
 def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
@@ -269,25 +272,26 @@ def _hold(state: State, name: str, new: HeldMessage, now: float) -> None:
 def _drop_held(state: State, name: str, held: HeldMessage, reason: ExpiryReason) -> None:
     """Drop a message from an outbox; the peer may discard what it has of it."""
     peer = state.peer_table.peers.get(name)
-    if held.started is not None and peer is not None and held.epoch == peer.sender.epoch:
-        peer.sender.cancel(held.started)
+    sender = peer.sender if peer is not None else None
+    if held.started is not None and sender is not None and held.epoch == sender.epoch:
+        sender.cancel(held.started)
     report_expired(state, name, held.accepted, reason)
 
 
 def release_outbox(state: State, peer: Peer, now: float) -> None:
     """The peer is online: queue some of its outbox, most urgent and oldest first; more of it soon."""
     for held in state.outboxes.release(peer.name, RELEASE_BATCH):
-        started, session = held.started, peer.session
-        if started is not None and held.epoch == peer.sender.epoch:
+        started, session, sender = held.started, peer.session, peer.sender
+        if started is not None and sender is not None and held.epoch == sender.epoch:
             # A message sent completely may have arrived completely; under a new number it would arrive twice.
             fully_sent = started.next_position >= started.fragments
             if session is not None and (fully_sent or started.fragment_bytes <= session.path.fragment_bytes):
                 started.store_key = held.store_key
-                peer.sender.resume(started, now)
+                sender.resume(started, now)
                 state.ready[peer] = None
                 state.arm(peer)
                 continue
-            peer.sender.cancel(started)
+            sender.cancel(started)
         accepted = held.accepted if session is None or accepts_compressed(session) else uncompressed(held.accepted)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
@@ -296,10 +300,10 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
 
 def report_ended(state: State, peer: Peer, now: float) -> None:
     """Turn the outcomes of messages to one peer into events."""
-    ended = peer.sender.ended
-    if not ended:
+    sender = peer.sender
+    if sender is None or not sender.ended:
         return
-    peer.sender.ended = []
+    ended, sender.ended = sender.ended, []
     counters = state.event_queue.counters
     for message, outcome in ended:
         accepted = message.accepted

@@ -5,7 +5,6 @@
 3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
 """
 
-from udp_mesh.core.conditions import Counters
 from udp_mesh.core.frame_handlers import ack_mid_batch, deliver, process_frames
 from udp_mesh.core.peer_lifecycle import migrate_path, on_activity, on_bye, on_heartbeat, on_verified
 from udp_mesh.core.peers.peer_state import PeerState
@@ -46,6 +45,7 @@ from udp_mesh.wire.header import (
     parse_header,
 )
 
+_SHORT = (DATA_BYTE, BROADCAST_BYTE)
 _MIN_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 
 # Compared for every datagram: a global costs less than an enum member.
@@ -63,10 +63,12 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
         counters.dropped_malformed += 1
         return
     first = data[0]
-    if first == DATA_BYTE:
+    if first in _SHORT:
+        to_one = first == DATA_BYTE
         replayed = False
         _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.peer_table.data_tags.get(tag, ()):
+        tags = state.peer_table.data_tags if to_one else state.peer_table.broadcast_tags
+        for channel, session in tags.get(tag, ()):
             try:
                 number, frames = channel.open(data, low)
             except ReplayError:
@@ -75,23 +77,15 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
                 continue
             except OpenError:
                 continue
-            _receive_data(state, session, number, frames, link, source, now)
+            if to_one:
+                _receive_data(state, session, number, frames, link, source, now)
+            else:
+                _receive_broadcast(state, session, frames, link, source, now)
             return
-        _count_unopened(counters, replayed=replayed)
-    elif first == BROADCAST_BYTE:
-        replayed = False
-        _, tag, low = SHORT_HEADER.unpack_from(data)
-        for channel, session in state.peer_table.broadcast_tags.get(tag, ()):
-            try:
-                _, frames = channel.open(data, low)
-            except ReplayError:
-                replayed = True
-                continue
-            except OpenError:
-                continue
-            _receive_broadcast(state, session, frames, link, source, now)
-            return
-        _count_unopened(counters, replayed=replayed)
+        if replayed:
+            counters.dropped_replayed += 1
+        else:
+            counters.dropped_unauthenticated += 1
     else:
         try:
             header = parse_header(data)
@@ -110,13 +104,6 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
             counters.dropped_malformed += 1
         except DecodeError:
             counters.dropped_malformed += 1
-
-
-def _count_unopened(counters: Counters, *, replayed: bool) -> None:
-    if replayed:
-        counters.dropped_replayed += 1
-    else:
-        counters.dropped_unauthenticated += 1
 
 
 def _receive_data(
@@ -140,7 +127,7 @@ def _receive_data(
         and peer.session is session
         and source == path.address
         and link == path.link
-        and peer.sender.state is not _UNRESPONSIVE
+        and (peer.sender is None or peer.sender.state is not _UNRESPONSIVE)
     ):
         session.last_heard = path.heard_at = now
     else:

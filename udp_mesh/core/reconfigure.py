@@ -8,7 +8,7 @@ from enum import Enum
 
 from udp_mesh.core.events import ExpiryReason, MessageId
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peer_lifecycle import update_mtu
+from udp_mesh.core.path_mtu import update_mtu
 from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
 from udp_mesh.core.sender.message import AcceptedMessage
@@ -75,7 +75,7 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
         session.receiver.apply(settings.rates, settings.limits)
     for peer in state.peer_table.peers.values():
         peer.apply(settings)
-        if peer.has_sender:
+        if peer.sender is not None:
             state.ready[peer] = None
         state.arm(peer)
     for session in state.peer_table.sessions.values():
@@ -171,7 +171,7 @@ def _retopic(state: State, now: float) -> None:
         if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
             state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     for peer in state.peer_table.peers.values():
-        if peer.has_sender:
+        if peer.sender is not None:
             peer.sender.reprioritize()
     state.broadcasts.reprioritize()
 
@@ -182,13 +182,14 @@ def close(state: State, now: float) -> None:
         return
     flush_compression(state, now)
     for peer in state.peer_table.peers.values():
-        if not peer.has_sender:
+        sender = peer.sender
+        if sender is None:
             continue
-        for message in list(peer.sender.pending):
+        for message in list(sender.pending):
             if state.outboxes.on_disk(message.store_key):
-                peer.sender.withdraw(message)
+                sender.withdraw(message)
             else:
-                peer.sender.finish(message, ExpiryReason.CLOSED)
+                sender.finish(message, ExpiryReason.CLOSED)
         report_ended(state, peer, now)
     for name, held in state.outboxes.drop_all():
         report_expired(state, name, held.accepted, ExpiryReason.CLOSED)

@@ -99,6 +99,11 @@ class Topic:
     outbox_on_disk: bool = False
     repair: bool = False
 
+    @property
+    def keeps_on_disk(self) -> bool:
+        """Whether its outbox is on disk; then its receivers keep messages on disk too, until a program takes them."""
+        return self.outbox_on_disk and self.outbox is not Outbox.NONE
+
     def __post_init__(self) -> None:
         _check_name(self.name, "topic", MAX_TOPIC_BYTES)
         if not 0 <= self.priority < PRIORITY_LEVELS:
@@ -222,9 +227,10 @@ class Settings:
     """The complete settings of a node. `keys` holds at most two: the first seals, both open. To run without keys, set
     `unkeyed` explicitly.
 
-    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the paper). `fragment_bytes` is the
-    maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does not
-    list (None: they are refused).
+    `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes`
+    is the maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does
+    not list (None: they are refused). With `confirms`, the driver calls `Node.confirm` for each received message that
+    has a receipt, once the message is safe.
     """
 
     name: str
@@ -236,6 +242,7 @@ class Settings:
     neighbours: tuple[Neighbour, ...] = ()
     window: Literal["adaptive"] | int = "adaptive"
     fragment_bytes: int = 1400
+    confirms: bool = False
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
 

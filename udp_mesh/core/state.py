@@ -95,7 +95,7 @@ class State:
 
     def arm(self, peer: Peer) -> None:
         """Set the peer's timer to what its sender and receiver need now, even if that is later than before."""
-        at = peer.sender.timer() if peer.has_sender else None
+        at = peer.sender.timer() if peer.sender is not None else None
         session = peer.session
         if session is not None:
             due = session.receiver.acks.due_at
@@ -139,7 +139,7 @@ class State:
     def waiting_senders(self) -> Iterator[Sender]:
         """The senders of online peers with pending messages."""
         for peer in self.peer_table.peers.values():
-            if peer.has_sender and peer.online and peer.sender.pending:
+            if peer.sender is not None and peer.online and peer.sender.pending:
                 yield peer.sender
 
     def can_broadcast(self) -> bool:

@@ -10,7 +10,7 @@ from heapq import heappop
 from udp_mesh.core.frame_handlers import inflate_step
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import maintain
-from udp_mesh.core.peers.heartbeat import OWN_FEATURES, heartbeat_datagrams
+from udp_mesh.core.peers.heartbeat import heartbeat_datagrams, own_features
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
 from udp_mesh.core.receiver.datagram_age import clock_ms
@@ -18,7 +18,7 @@ from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_leve
 from udp_mesh.core.settings import Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Cancel, Frame, Heartbeat, Ping
+from udp_mesh.wire.frames import Cancel, Delivered, Frame, Heartbeat, Ping
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
@@ -73,7 +73,12 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
             state.event_queue.counters.acknowledgements_sent += 1
     frames.extend(session.pending_control)
     session.pending_control.clear()
-    cancelled = peer.sender.cancelled
+    confirmed = session.receiver.confirmed
+    while confirmed:
+        frames.append(Delivered(tuple(confirmed[:MAX_IDS])))
+        del confirmed[:MAX_IDS]
+    sender = peer.open_sender()
+    cancelled = sender.cancelled
     while cancelled:
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
         del cancelled[:MAX_IDS]
@@ -86,7 +91,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
             count = max(1, count * path.room_bytes // len(encoded) - 1)
             encoded = path.encode(frames[:count], now)
         number, data = path.seal(encoded)
-        peer.sender.in_flight.add(number, None)
+        sender.in_flight.add(number, None)
         out.append(Datagram(path.link, path.address, data, True))
         del frames[:count]
     state.arm(peer)
@@ -99,7 +104,7 @@ def _introduction(state: State, session: Session, now: float) -> Heartbeat:
         settings.name,
         VERSION,
         VERSION,
-        int(OWN_FEATURES),
+        own_features(settings),
         min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
         0,
         0,
@@ -117,7 +122,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
     peers: list[Peer] = []
     mask = broadcasts.waiting
     for peer in list(state.ready):
-        sender = peer.sender
+        sender = peer.open_sender()
         session = peer.session
         if session is None or not session.path.link:
             del state.ready[peer]
@@ -154,7 +159,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
         for peer in peers:
-            sender = peer.sender
+            sender = peer.open_sender()
             if not sender.scheduler.waiting & bit:
                 continue
             session = peer.session
@@ -168,7 +173,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 state.ready[peer] = state.ready.pop(peer)
                 break
     for peer in peers:
-        sender = peer.sender
+        sender = peer.open_sender()
         if sender.served:
             sender.levels.record_served(sender.served, sender.scheduler.waiting, now)
             sender.served = 0
@@ -188,7 +193,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
 def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    twice = urgent and any(peer.has_sender and peer.sender.send_twice for peer in state.peer_table.online())
+    twice = urgent and any(peer.sender is not None and peer.sender.send_twice for peer in state.peer_table.online())
     paths: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]
@@ -250,7 +255,7 @@ def handle_timer(state: State, now: float) -> None:
         peer.timer_at = peer.due_at = _INFINITY
         due_peers.append(peer)
     for peer in due_peers:
-        sender = peer.sender
+        sender = peer.open_sender()
         sender.handle_timer(now)
         report_ended(state, peer, now)
         session = peer.session
@@ -272,7 +277,7 @@ def handle_timer(state: State, now: float) -> None:
             waiting = {sender for sender, _ in bucket.parked}
             bucket.unpark()
             for peer in state.peer_table.peers.values():
-                if peer.has_sender and peer.sender in waiting:
+                if peer.sender in waiting:
                     state.ready[peer] = None
     broadcasts: list[Datagram] = []
     state.broadcasts.send_copies(now, broadcasts)

@@ -90,10 +90,6 @@ class Keyring:
         return cls((Key(_UNKEYED_SECRET),))
 
     @property
-    def is_unkeyed(self) -> bool:
-        return any(key.secret == _UNKEYED_SECRET for key in self.keys)
-
-    @property
     def sealing(self) -> Key:
         return self.keys[0]
 

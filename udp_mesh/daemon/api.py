@@ -61,6 +61,10 @@ class RequestHandler(Protocol):
         """Replies now or later through `client`. Raises RequestError to refuse."""
         ...
 
+    def client_read(self) -> None:
+        """A client has read most of what waited for it."""
+        ...
+
     def client_gone(self, client: Client) -> None: ...
 
 
@@ -78,6 +82,9 @@ class Client(asyncio.Protocol):
         self._reader = RequestReader(server.max_payload_bytes)
         self._transport: asyncio.Transport | None = None
         self._dropped = 0
+        self.written_bytes = 0
+        """Bytes written to the connection so far."""
+        self._read_bytes = 0
 
     # Called by the service
 
@@ -98,19 +105,21 @@ class Client(asyncio.Protocol):
         if self._transport is not None:
             self.send_encoded(encode_frame(header, payload))
 
-    def send_encoded(self, frame: bytes) -> None:
-        """Like `send_event`, for a frame that is sent to several clients."""
+    def send_encoded(self, frame: bytes) -> bool:
+        """Like `send_event`, for a frame that is sent to several clients. False if it was dropped."""
         transport = self._transport
-        if transport is None:
-            return
+        if transport is None or transport.is_closing():
+            return False
         waiting = self.backlog_bytes()
         if waiting and (waiting + len(frame) > MAX_CLIENT_BACKLOG_BYTES or self._server.exceeds_backlog_share(waiting)):
             self._dropped += 1
             self._server.dropped_for_slow_clients += 1
-            return
+            return False
         if self._dropped:
             self._report_dropped()
+        self.written_bytes += len(frame)
         transport.write(frame)
+        return True
 
     def partial_request_bytes(self) -> int:
         """Bytes of the incomplete request."""
@@ -119,6 +128,13 @@ class Client(asyncio.Protocol):
     def backlog_bytes(self) -> int:
         """Bytes written and not yet read by the client."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
+
+    @property
+    def read_bytes(self) -> int:
+        """Bytes of the connection that the client's socket has taken, as far as was known before it was closed."""
+        if self._transport is not None and not self._transport.is_closing():
+            self._read_bytes = self.written_bytes - self._transport.get_write_buffer_size()
+        return self._read_bytes
 
     def close(self) -> None:
         if self._transport is not None:
@@ -130,7 +146,9 @@ class Client(asyncio.Protocol):
 
     def _write(self, header: Header, payload: bytes = b"") -> None:
         if self._transport is not None:
-            self._transport.write(encode_frame(header, payload))
+            frame = encode_frame(header, payload)
+            self.written_bytes += len(frame)
+            self._transport.write(frame)
 
     # Called by asyncio
 
@@ -204,6 +222,7 @@ class Client(asyncio.Protocol):
         # All but a few kilobytes have been read.
         if self._transport is not None:
             self._transport.resume_reading()
+        self._server.requests.client_read()
         if self._dropped:
             self._report_dropped()
 

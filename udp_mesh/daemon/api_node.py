@@ -17,6 +17,7 @@ import os
 import random
 from collections import deque
 from collections.abc import AsyncIterator, Sequence
+from dataclasses import replace
 from types import TracebackType
 
 from udp_mesh.core.conditions import Conditions
@@ -61,7 +62,7 @@ class Node:
         store: DirectoryStore | None = None,
         urgent_dscp: int = 46,
     ) -> None:
-        self._settings = settings
+        self._settings = replace(settings, confirms=True)
         self._links = tuple(links)
         self._store = store
         self._urgent_dscp = urgent_dscp
@@ -71,7 +72,6 @@ class Node:
         self._arrived = asyncio.Event()
         self._happened = asyncio.Event()
         self._outcomes: dict[tuple[MessageId, str], asyncio.Future[Outcome]] = {}
-        self.unread_dropped = 0
 
     async def __aenter__(self) -> Node:
         """Opens the links. Raises OSError if the kernel cannot list its interfaces."""
@@ -123,10 +123,14 @@ class Node:
             del self._outcomes[outcome, to]
 
     async def messages(self) -> AsyncIterator[MessageReceived]:
-        """Messages in order of completion, until the node is closed."""
+        """Messages in order of completion, until the node is closed. What is yielded is delivered."""
         while True:
             while self._messages:
-                yield self._messages.popleft()
+                message = self._messages.popleft()
+                if message.receipt is not None:
+                    self.driver.node.confirm(message.receipt)
+                    self.driver.send_soon()
+                yield message
             if self.driver.closed:
                 return
             self._arrived.clear()
@@ -144,14 +148,13 @@ class Node:
 
     def apply(self, settings: Settings) -> list[str]:
         """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
-        return self.driver.apply(settings)
+        return self.driver.apply(replace(settings, confirms=True))
 
     def conditions(self) -> Conditions:
         return self.driver.conditions()
 
     def _event(self, event: Event) -> None:
         if isinstance(event, MessageReceived):
-            self.unread_dropped += len(self._messages) == MAX_UNREAD
             self._messages.append(event)
             self._arrived.set()
             return

@@ -108,12 +108,19 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
 
 
 def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscribe(client, _texts(header, "topics"))
+    service.subscriptions.add(client, _texts(header, "topics"), acknowledge=bool(header.get("acknowledge")))
     return {}
 
 
+def acknowledge(service: Service, client: Client, header: Header, _: bytes) -> Header:
+    receipts = header.get("receipts")
+    if not isinstance(receipts, list) or not all(isinstance(item, int) for item in receipts):
+        raise RequestError("bad-request", f"receipts: expected a list of numbers, found {receipts!r}")
+    return {"acknowledged": service.acknowledge(client, receipts)}
+
+
 def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.unsubscribe(client, _texts(header, "topics"))
+    service.subscriptions.remove(client, _texts(header, "topics"))
     return {}
 
 
@@ -169,7 +176,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
                 "for_s": round(error.last - error.since, 3),
                 "last_ago_s": round(driver.now() - error.last, 3),
             }
-            for error in driver.send_errors.active()
+            for error in driver.output.send_errors.active()
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
@@ -198,7 +205,7 @@ def render_metrics(service: Service) -> str:
     driver = service.driver
     extra = {
         "wakeups": driver.wakeups,
-        "datagrams_lost_on_full_socket": driver.lost_on_full_socket,
+        "datagrams_lost_on_full_socket": driver.output.lost_on_full_socket,
         "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
         "outbox_messages_refused_by_disk": service.store.refused,
     }
@@ -331,6 +338,7 @@ async def record_stop(service: Service, _client: Client, _header: Header, _: byt
 COMMANDS = {
     "publish": publish,
     "subscribe": subscribe,
+    "acknowledge": acknowledge,
     "unsubscribe": unsubscribe,
     "events": events,
     "ping": ping,

@@ -193,6 +193,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
             neighbours=neighbours,
             window=_window(window),
             fragment_bytes=fragment_bytes,
+            confirms=True,
             rates=rates,
             limits=limits,
         )

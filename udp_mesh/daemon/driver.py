@@ -1,11 +1,10 @@
 """Moves datagrams, timers and events between the sockets and the core, on an asyncio loop, in batches.
 
-1. A socket becomes readable: all waiting datagrams go to the core (`_drain`).
+1. A socket becomes readable: all waiting datagrams go to the core (`_drain`). Known peers have a socket of their own;
+   during a flood the other one is read for a fifth of the time at most (`stranger_throttle`).
 2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
    and one timer for the core's next deadline.
 3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
-
-A full socket never blocks the other links: its datagrams wait in a short queue; beyond that they are dropped.
 """
 
 from __future__ import annotations
@@ -17,16 +16,25 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from udp_mesh.core.conditions import Conditions
-from udp_mesh.core.events import Event, MessageId, Rejected
-from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.events import (
+    Event,
+    MessageId,
+    PeerAddressChanged,
+    PeerOffline,
+    PeerOnline,
+    PeerRestarted,
+    Rejected,
+)
+from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
+from udp_mesh.daemon.link_output import LinkOutput
+from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.netlink import InterfaceMonitor
-from udp_mesh.links.udp import UdpLink
+from udp_mesh.links.udp import Deliver, UdpLink
 
 log = logging.getLogger(__name__)
 
@@ -40,14 +48,15 @@ MAX_DRAIN_S = 0.5
 """Reading a batch takes milliseconds; even on a busy machine it takes no longer than this."""
 MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
-MAX_BLOCKED_DATAGRAMS = 256
-"""Datagrams queued for one full socket; more are dropped."""
 INTERFACE_DEBOUNCE_S = 0.05
 """One kernel notice is followed by others (link, then addresses): one refresh handles them all."""
 RECOVERY_S = 0.1
 """Delay before the next attempt after an unexpected exception."""
 RETRY_LINK_S = 2.0
 """Delay before a socket that could not be opened is retried."""
+
+_PATH_EVENTS = (PeerOnline, PeerOffline, PeerAddressChanged, PeerRestarted)
+"""Events after which the addresses of known peers may have changed."""
 
 
 class Driver:
@@ -72,25 +81,25 @@ class Driver:
         )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
-        self.send_errors = SendErrors()
-        self.lost_on_full_socket = 0
+        self.output = LinkOutput(self._loop, self.hub, self._pump)
         self.wakeups = 0
         self._on_event = on_event
         self._monitor: InterfaceMonitor | None = None
-        self._blocked: dict[str, list[Datagram]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = 0.0
         self._due = float("-inf")
         """The core's next deadline as last read; the loop may run `_pump` for other reasons than its timer."""
         self._refresh_timer: asyncio.TimerHandle | None = None
         self._interface_error = ""
-        self._send_error_timer: asyncio.TimerHandle | None = None
         self._pump_requested = False
         self.closed = False
         self._wall_offset: float | None = None
         self._drained_at = 0.0
         self._now = 0.0
         self._link_name = ""
+        self.strangers = StrangerThrottle(
+            self._loop, self._read_strangers, lambda: self.node.unauthenticated, batch=MAX_DRAIN_DATAGRAMS
+        )
 
     # Lifecycle
 
@@ -109,7 +118,8 @@ class Driver:
         self._transmit_all()
         self._report_events()
         self.closed = True
-        for handle in (self._timer, self._refresh_timer, self._send_error_timer):
+        self.output.close()
+        for handle in (self._timer, self._refresh_timer):
             if handle is not None:
                 handle.cancel()
         if self._monitor is not None:
@@ -168,8 +178,7 @@ class Driver:
         reopened = {link.attachment.name for link in changes.opened}
         for link in changes.gone:
             name = link.attachment.name
-            self._blocked.pop(name, None)
-            self.send_errors.link_closed(name)
+            self.output.link_closed(name)
             if name not in reopened:
                 log.info("link-down link=%s", name)
                 self.node.link_down(name, now)
@@ -180,15 +189,23 @@ class Driver:
             if self.link_failures.get(name) != reason:
                 log.error("link-failed link=%s reason=%s", name, reason)
         self.link_failures = changes.failed
+        self._update_known_senders()
         self._watch_all()
         if changes.failed:
             self._refresh_timer = self._loop.call_later(RETRY_LINK_S, self._refresh_and_pump)
 
     def _watch_all(self) -> None:
         for link in self.hub.links.values():
-            if self._blocked.get(link.attachment.name):
-                self._loop.add_writer(link.fileno(), self._writable, link)
+            self.output.watch(link)
             self._loop.add_reader(link.fileno(), self._readable, link)
+            self.strangers.watch(link)
+
+    def _update_known_senders(self) -> None:
+        """Receive from the addresses of online peers at the sockets for them."""
+        known = self.node.peer_addresses()
+        for name, link in self.hub.links.items():
+            if not link.set_peers(frozenset(known.get(name, ()))):
+                log.warning("flood-protection-off link=%s peers=%d", name, len(known[name]))
 
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None
@@ -220,23 +237,34 @@ class Driver:
     def _unwatch(self, link: UdpLink) -> None:
         self._loop.remove_reader(link.fileno())
         self._loop.remove_writer(link.fileno())
+        self.strangers.unwatch(link)
 
     # Receive
 
     def _readable(self, link: UdpLink) -> None:
-        self._drain(link)
+        self._drain(link, link.receive, MAX_DRAIN_DATAGRAMS)
+        self._after_drain()
+
+    def _read_strangers(self, link: UdpLink, limit: int) -> int:
+        count = self._drain(link, link.receive_from_strangers, limit)
+        self._after_drain()
+        return count
+
+    def _after_drain(self) -> None:
         if self.node.is_quiet:
             self._reschedule()
         else:
             self._pump()
 
-    def _drain(self, link: UdpLink) -> None:
-        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading."""
+    def _drain(self, link: UdpLink, receive: Callable[[Deliver, int, float], int], limit: int) -> int:
+        """Passes waiting datagrams to the core, each with its arrival time; then sets `_now` to the time of reading.
+        Returns their number."""
         self._drained_at = self._read_clocks()
         self._link_name = link.attachment.name
         assert self._wall_offset is not None
-        link.receive(self._deliver, MAX_DRAIN_DATAGRAMS, self._drained_at + self._wall_offset - LAST_ARRIVAL_S)
+        count = receive(self._deliver, limit, self._drained_at + self._wall_offset - LAST_ARRIVAL_S)
         self._now = max(self._now, self._drained_at)
+        return count
 
     def _read_clocks(self) -> float:
         """Reads the clock, and updates the offset of the wall clock, which the kernel uses for arrival timestamps.
@@ -264,6 +292,10 @@ class Driver:
         self.node.receive(data, self._link_name, source, at)
 
     # Send
+
+    def send_soon(self) -> None:
+        """Something was added to the node: send it in this loop iteration."""
+        self._schedule_pump()
 
     def _schedule_pump(self) -> None:
         if not self._pump_requested and not self.closed:
@@ -327,58 +359,20 @@ class Driver:
                 end = start + 1
                 while end < len(batch) and batch[end].link == name:
                     end += 1
-                self._transmit(name, batch[start:end] if end - start < len(batch) else batch)
+                self.output.transmit(name, batch[start:end] if end - start < len(batch) else batch)
                 start = end
             sent += sum(len(datagram.data) for datagram in batch)
             if not self.node.has_datagrams:
                 return False
         return True
 
-    def _transmit(self, name: str, datagrams: list[Datagram]) -> None:
-        link = self.hub.links.get(name)
-        if link is None:
-            return
-        waiting = self._blocked.get(name, [])
-        done = 0 if waiting else self._send(link, datagrams)
-        if done == len(datagrams):
-            return
-        if not waiting:
-            self._loop.add_writer(link.fileno(), self._writable, link)
-        # Urgent datagrams first; beyond the limit, the latest of the others are dropped.
-        waiting = sorted([*waiting, *datagrams[done:]], key=lambda datagram: not datagram.urgent)
-        self._blocked[name] = waiting[:MAX_BLOCKED_DATAGRAMS]
-        self.lost_on_full_socket += len(waiting[MAX_BLOCKED_DATAGRAMS:])
-
-    def _writable(self, link: UdpLink) -> None:
-        waiting = self._blocked.get(link.attachment.name, [])
-        del waiting[: self._send(link, waiting)]
-        if not waiting:
-            self._loop.remove_writer(link.fileno())
-            self._pump()
-
-    def _send(self, link: UdpLink, datagrams: Sequence[Datagram]) -> int:
-        """Sends from the front and returns how many are done, those refused by the kernel included."""
-        done = link.send(datagrams)
-        if link.send_errors:
-            self.send_errors.add(link.attachment.name, link.send_errors, self._clock())
-            link.send_errors.clear()
-            if self._send_error_timer is None and not self.closed:
-                self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors)
-        return done
-
-    def _log_send_errors(self) -> None:
-        going_on, over = self.send_errors.review(self._clock())
-        for one in going_on:
-            log.warning(
-                "send-refused link=%s to=%s datagrams=%d reason=%s", one.link, one.to, one.datagrams, one.reason
-            )
-        for one in over:
-            log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
-        self._send_error_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
-
     def _report_events(self) -> None:
+        moved = False
         while (event := self.node.next_event()) is not None:
+            moved = moved or isinstance(event, _PATH_EVENTS)
             self._on_event(event)
+        if moved and not self.closed:
+            self._update_known_senders()
 
 
 def _link_info(link: UdpLink) -> LinkInfo:

@@ -169,6 +169,10 @@ class DirectoryStore:
                 leftover.unlink()
         return messages
 
+    def read(self, key: int) -> StoredMessage | None:
+        """One message from the disk; None if it is not there or damaged. Blocks."""
+        return _read(self._path(key))
+
     @property
     def needs_flush(self) -> bool:
         return self._flushed_puts < self.puts

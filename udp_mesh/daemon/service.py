@@ -8,7 +8,6 @@ single thread.
 from __future__ import annotations
 
 import asyncio
-import fnmatch
 import logging
 import os
 from collections import OrderedDict
@@ -16,13 +15,14 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
 
-from udp_mesh.client.mesh_client import Header, encode_frame
+from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
     MessageExpired,
     MessagePeerLost,
     MessageReceived,
+    Receipt,
     Rejected,
     RejectReason,
 )
@@ -31,11 +31,13 @@ from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.legacy_positions import load_positions, save_positions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
+from udp_mesh.daemon.subscriptions import Subscriptions
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +45,6 @@ MAX_OUTCOMES = 65_536
 """Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
-MAX_PATTERNS = 1024
-"""Patterns per client: each is matched against each new topic."""
 TOKEN_BYTES = 8
 
 
@@ -73,13 +73,18 @@ class Service:
             legacy_positions=self._positions,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
+        self.inbox = Inbox(
+            DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
+            self._confirm,
+            self._request_again,
+        )
+        self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
-        self._subscriptions: dict[Client, list[str]] = {}
+        self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority)
         self._watchers: set[Client] = set()
-        self._routes: dict[str, list[Client]] = {}
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
         self._pings: dict[bytes, asyncio.Future[float]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -108,6 +113,7 @@ class Service:
         await self._save_positions()
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
+        await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
 
     # Requests (called by the local API)
 
@@ -135,24 +141,12 @@ class Service:
         except RequestError as error:
             client.refuse(header.get("id"), error.code, str(error))
 
+    def client_read(self) -> None:
+        self.inbox.take_read()
+
     def client_gone(self, client: Client) -> None:
-        self._subscriptions.pop(client, None)
+        self.subscriptions.remove_client(client)
         self._watchers.discard(client)
-        self._routes.clear()
-
-    def subscribe(self, client: Client, patterns: list[str]) -> None:
-        wanted = self._subscriptions.setdefault(client, [])
-        # A client may subscribe to the same pattern repeatedly; store it once.
-        new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
-        if len(wanted) + len(new) > MAX_PATTERNS:
-            raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
-        wanted.extend(new)
-        self._routes.clear()
-
-    def unsubscribe(self, client: Client, patterns: list[str]) -> None:
-        kept = [pattern for pattern in self._subscriptions.get(client, ()) if pattern not in patterns]
-        self._subscriptions[client] = kept
-        self._routes.clear()
 
     def subscribe_events(self, client: Client) -> None:
         """Sends all events except messages to this client."""
@@ -323,17 +317,7 @@ class Service:
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
-        self._distribute(
-            {
-                "event": "message",
-                "source": event.source,
-                "topic": topic,
-                "type": event.type_name,
-                "priority": event.priority,
-                "broadcast": event.broadcast,
-            },
-            event.payload,
-        )
+        self.subscriptions.distribute(event)
 
     def _on_reserved_message(self, event: MessageReceived) -> None:
         if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
@@ -343,22 +327,23 @@ class Service:
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
 
-    def _distribute(self, header: Header, payload: bytes) -> None:
-        topic = str(header["topic"])
-        clients = self._routes.get(topic)
-        if clients is None:
-            clients = [
-                client
-                for client, patterns in self._subscriptions.items()
-                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
-            ]
-            if len(self._routes) >= MAX_COUNTED_TOPICS:
-                self._routes.clear()
-            self._routes[topic] = clients
-        if clients:
-            frame = encode_frame(header, payload)
-            for client in clients:
-                client.send_encoded(frame)
+    # Messages held until a program takes them
+
+    def _confirm(self, receipt: Receipt) -> None:
+        self.driver.node.confirm(receipt)
+        self.driver.send_soon()
+
+    def _request_again(self, receipt: Receipt) -> None:
+        self.driver.node.request_again(receipt)
+        self.driver.send_soon()
+
+    def acknowledge(self, client: Client, receipts: list[int]) -> int:
+        """A client took these messages. Returns how many of them were waiting for that."""
+        return sum([self.inbox.acknowledge(client, receipt) for receipt in receipts])
+
+    def _priority(self, topic: str) -> int:
+        settings = self.topic(topic)
+        return 0 if settings is None else settings.priority
 
     def _publish_conditions(self) -> None:
         """Once per period: sends the conditions to subscribed clients and to the recording."""
@@ -368,22 +353,23 @@ class Service:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
         self._spawn(self._save_positions())
-        wanted = any(CONDITIONS_TOPIC in patterns for patterns in self._subscriptions.values())
-        if not wanted and self.recorder is None:
+        self.inbox.take_read()
+        self.subscriptions.pass_on_held()
+        clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
+        if not clients and self.recorder is None:
             return
         conditions = self.driver.conditions()
         if self.recorder is not None:
             self.recorder.conditions(conditions)
-        if wanted:
+        if clients:
             header: Header = {
                 "event": "conditions",
                 "source": self.settings.name,
                 "topic": CONDITIONS_TOPIC,
                 "conditions": conditions_json(conditions),
             }
-            for client, patterns in self._subscriptions.items():
-                if CONDITIONS_TOPIC in patterns:
-                    client.send_event(header)
+            for client in clients:
+                client.send_event(header)
 
     async def _save_positions(self) -> None:
         """Saves what was received from legacy peers, if there are any and it changed."""

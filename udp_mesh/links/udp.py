@@ -1,8 +1,11 @@
-"""One UDP socket: sends and receives datagrams in runs (segmentation and receive offload), never blocks.
+"""The UDP sockets of one attachment: send and receive datagrams in runs (segmentation, receive offload), never block.
 
 Send: consecutive datagrams of one size to one destination become one system call with UDP_SEGMENT (linux/udp.h). If the
 kernel or a device refuses that, the socket falls back to one call per datagram for good. Receive: one call may return
 up to 64 datagrams of one sender, split by the size in UDP_GRO. Measurements are in the transport's fact sheet.
+
+Two sockets share the port (SO_REUSEPORT): one receives from known peers, the other from strangers (`source_filter`).
+What strangers send waits in a queue of its own, and can be read less often.
 """
 
 from __future__ import annotations
@@ -15,9 +18,19 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, TypeAlias
 
 from udp_mesh.links.attachments import Address, Attachment
+from udp_mesh.links.source_filter import (
+    ACCEPT,
+    DROP,
+    PEERS,
+    SO_ATTACH_FILTER,
+    SO_ATTACH_REUSEPORT_CBPF,
+    STRANGERS,
+    attach,
+    source_program,
+)
 
 SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
-SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 25, 33, 35
+SO_REUSEPORT, SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 15, 25, 33, 35
 
 MAX_SEGMENTS = 64
 """UDP_MAX_SEGMENTS of older kernels (newer ones allow 128)."""
@@ -25,6 +38,8 @@ MAX_RUN_BYTES = 65_000
 """A run must fit one IP packet of 65,535 B before segmentation."""
 RECEIVE_BUFFER_BYTES = 4 << 20
 """Kernel receive buffer: 30 ms at a gigabit, so that a busy core loses nothing; capped by net.core.rmem_max."""
+STRANGERS_BUFFER_BYTES = 1 << 18
+"""That of the strangers' socket: some hundred datagrams, so that a flood leaves no long queue behind."""
 SEND_BUFFER_BYTES = 1 << 20
 """Kernel send buffer: a few runs. The scheduler cannot reorder what is in it, so it is small."""
 MAX_SEND_ERRORS = 256
@@ -70,21 +85,68 @@ class UdpLink:
             else (socket.IPPROTO_IPV6, socket.IPV6_TCLASS)
         )
         self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
-        self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        self.peers: frozenset[Address] = frozenset()
+        """The senders whose datagrams arrive at the first socket."""
+        # In use by another process? The sockets that share the port would not fail.
+        self._open(family, RECEIVE_BUFFER_BYTES, share=False).close()
+        # Bound in the order of `STRANGERS` and `PEERS`.
+        self._strangers = self._open(family, STRANGERS_BUFFER_BYTES)
         try:
-            self._configure()
+            self._socket = self._open(family, RECEIVE_BUFFER_BYTES)
         except OSError:
-            self._socket.close()
+            self._strangers.close()
+            raise
+        try:
+            self._attach(self.peers)
+        except OSError:
+            self.close()
             raise
 
-    def _configure(self) -> None:
-        own, attachment = self._socket, self.attachment
+    def _open(self, family: int, buffer_bytes: int, *, share: bool = True) -> socket.socket:
+        """A configured and bound socket."""
+        own = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        try:
+            if share:
+                own.setsockopt(socket.SOL_SOCKET, SO_REUSEPORT, 1)
+            self._configure(own, buffer_bytes)
+        except OSError:
+            own.close()
+            raise
+        return own
+
+    def set_peers(self, peers: frozenset[Address]) -> bool:
+        """Receive from these senders at the first socket, from all others at the strangers'. False if the kernel
+        refused the programs: then everything arrives as from strangers."""
+        if peers == self.peers:
+            return True
+        try:
+            self._attach(peers)
+        except OSError:
+            # Too little option memory (net.core.optmem_max).
+            self._attach(frozenset())
+            self.peers = frozenset()
+            return False
+        self.peers = peers
+        return True
+
+    def _attach(self, peers: frozenset[Address]) -> None:
+        """Attach the programs in an order in which no datagram is refused by both sockets."""
+        family = self._socket.family
+        own, strangers = self._socket, self._strangers
+        attach(own, SO_ATTACH_FILTER, source_program(self.peers | peers, family, ACCEPT, DROP))
+        attach(strangers, SO_ATTACH_FILTER, source_program(self.peers & peers, family, DROP, ACCEPT))
+        attach(own, SO_ATTACH_REUSEPORT_CBPF, source_program(peers, family, PEERS, STRANGERS))
+        attach(strangers, SO_ATTACH_FILTER, source_program(peers, family, DROP, ACCEPT))
+        attach(own, SO_ATTACH_FILTER, source_program(peers, family, ACCEPT, DROP))
+
+    def _configure(self, own: socket.socket, buffer_bytes: int) -> None:
+        attachment = self.attachment
         own.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, attachment.device.encode() + b"\0")
-        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
         own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         # Without CAP_NET_ADMIN, net.core.rmem_max limits the buffer.
         with contextlib.suppress(PermissionError):
-            own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
+            own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, buffer_bytes)
         # The arrival time rather than the time of reading: round trips must measure the network, not this machine.
         own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         if own.family == socket.AF_INET6:
@@ -102,9 +164,21 @@ class UdpLink:
             own.bind(attachment.address)
 
     def fileno(self) -> int:
+        """The socket of the known peers; also used to send."""
         return self._socket.fileno()
 
+    def strangers_fileno(self) -> int:
+        return self._strangers.fileno()
+
     def receive(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
+        """`_receive` from known peers."""
+        return self._receive(self._socket, deliver, limit, stop_after)
+
+    def receive_from_strangers(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
+        """`_receive` from all others."""
+        return self._receive(self._strangers, deliver, limit, stop_after)
+
+    def _receive(self, from_socket: socket.socket, deliver: Deliver, limit: int, stop_after: float) -> int:
         """Passes about `limit` waiting datagrams to `deliver`, except our own broadcasts; returns their number.
 
         Stops after a datagram that arrived after `stop_after` (seconds since 1970), which is taken to be the last one:
@@ -112,7 +186,7 @@ class UdpLink:
         must copy what it keeps.
         """
         count, buffer, own = 0, self._buffer, self.attachment.address
-        receive = self._socket.recvmsg_into
+        receive = from_socket.recvmsg_into
         buffers = [buffer]
         while count < limit:
             try:
@@ -213,3 +287,4 @@ class UdpLink:
 
     def close(self) -> None:
         self._socket.close()
+        self._strangers.close()

@@ -29,6 +29,8 @@ class Feature(IntFlag):
     """Requests lost broadcasts with `Nack`, and answers such requests."""
     TIMED = 4
     """Accepts `Sent` and a head's remaining lifetime, timestamps what it sends, and answers a ping to its source."""
+    CONFIRM = 8
+    """Answers messages that have `MessageFlag.CONFIRM` with `Delivered` once they are safe."""
 
 
 class Waiting(NamedTuple):
@@ -80,6 +82,9 @@ class MessageFlag(IntFlag):
     """Addressed to every node, whether this copy was broadcast or not."""
     REPAIR = 8
     """A broadcast that can be requested again with `Nack`."""
+    CONFIRM = 16
+    """The sender waits for a `Delivered`: the receiving program took the message, or the receiver has it on disk.
+    Set only to peers that announce `Feature.CONFIRM`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,15 +68,6 @@ DATA_BYTE = MARK | VERSION << 4 | Kind.DATA
 NUMBER_LOW_MASK = 0xFFFFFFFF
 
 
-def is_ours(data: bytes | bytearray | memoryview) -> bool:
-    """Whether the first byte has the mark of this protocol (any version); otherwise it may be the legacy format."""
-    return len(data) > 0 and data[0] >= MARK
-
-
-def encode_short(kind: Kind, tag: int, number: int) -> bytes:
-    return SHORT_HEADER.pack(MARK | VERSION << 4 | kind, tag, number & NUMBER_LOW_MASK)
-
-
 def encode_long(kind: Kind, key_id: bytes, boot_id: bytes, number: int) -> bytes:
     """The long header without its check, which `Key.check` computes."""
     return _LONG.pack(MARK | VERSION << 4 | kind, key_id, boot_id, number, b"")[:-CHECK_BYTES]

@@ -1,21 +1,23 @@
 #!/bin/sh
 # meshctl-deadman: change a node's files so that every way out but a confirmation leads back to what was before.
 #
-#   lock -> stage -> arm -> apply -> confirm          (docs/device-scripts.md has the verbs and states)
+#   lock -> stage -> arm -> apply -> confirm, or change -> confirm     (docs/device-scripts.md has the verbs and states)
 #
 # The state is the name of a marker file in flash, and every decision is one rename of it, which either happened or
 # did not: `staged.ID` -> `armed.ID` -> `confirmed.ID` or `restoring.ID`. So confirm and the timer cannot both win, and
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=5
+VERSION=6
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
 RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
+EXPIRE_GRACE_CS=1500       # an armed change that was not started ends so long after its owner's lock has
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
+PROOF_S=3                  # what remains of the window when a reload stops waiting
 RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
 RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
@@ -25,11 +27,11 @@ sync() { /bin/sync; }
 
 refuse() { echo "refused $1 $2"; exit 3; }
 
+# answer TEXT: the verb's answer, unless it is a part of another verb
+answer() { [ -n "$part" ] || echo "ok${1:+ $1}"; }
+
 # NOW: centiseconds of uptime. The wall clock may be off by years or jump; this one only counts.
 now() { read -r up _ </proc/uptime; NOW=$((${up%.*} * 100 + 1${up#*.} - 100)); }
-
-# put FILE: stdin becomes its content, all of it or none, also after a power cut
-put() { cat >"${1%/*}/.put" && sync && mv -f "${1%/*}/.put" "$1" && sync; }
 
 exists() { [ -e "$1" ] || [ -L "$1" ]; }
 
@@ -48,7 +50,8 @@ seconds() {
 	CS=$((${1%%.*} * 100 + frac - 100))
 }
 
-as_seconds() { echo "$(($1 / 100)).$(($1 / 10 % 10))$(($1 % 10))"; }
+# as_seconds CS: SECONDS_TEXT
+as_seconds() { SECONDS_TEXT=$(($1 / 100)).$(($1 / 10 % 10))$(($1 % 10)); }
 
 # --- lock: RUN/lock.N, the highest N counts. Each step makes the next N by hard link, which only one process can. ---
 
@@ -103,14 +106,19 @@ lock() { # OWNER TTL_S
 	number "$2"
 	read_lock
 	[ -z "$LOCK_OWNER" ] || need_lock "$1"
+	held_before=$LOCK_OWNER
 	write_lock "$1" $(($2 * 100))
-	echo "ok lock_owner=$1"
+	# what a meshctl that was killed has left of its uploads
+	for f in "$RUN"/c[0-9a-f][0-9a-f]*[0-9a-f].tgz "$RUN"/.c[0-9a-f][0-9a-f]*.tgz.*.part; do
+		[ "$LOCK_OWNER" = "$held_before" ] || [ ! -e "$f" ] || rm -f "$f"
+	done
+	answer "lock_owner=$1"
 }
 
 unlock() { # OWNER
 	read_lock
 	[ "$LOCK_OWNER" != "$1" ] || write_lock "$1" 0
-	echo "ok"
+	answer ''
 }
 
 # --- marker ---------------------------------------------------------------------------------------------------------
@@ -135,11 +143,20 @@ alive() { # PIDFILE: a process of ours still runs under that number
 # finish OUTCOME REASON: remember how it ended, then forget the change; the marker goes first, because a directory
 # without one is rubbish to every verb
 finish() {
-	echo "$ID $1 $2 ${NONCE:--}" | put "$LAST"
+	write_last "$1" "$2"
+	sync
+	forget
+}
+
+# Without room for it in flash the change ends all the same; half a line must not become the last one.
+write_last() { echo "$ID $1 $2 ${NONCE:--}" 2>/dev/null >"$LAST.new" || rm -f "$LAST.new"; }
+
+# forget: `write_last` and what the marker decided are synced. A power cut in here leaves the marker, and the next verb
+# ends the change once more, or only what is rubbish.
+forget() {
+	[ ! -s "$LAST.new" ] || mv -f "$LAST.new" "$LAST"
 	rm -f "$CHANGE"/*."$ID"
-	sync
 	rm -rf "$CHANGE" "$TIMER"
-	sync
 }
 
 # tidy: complete what a killed process had decided, remove what one left half done
@@ -147,10 +164,10 @@ tidy() {
 	read_marker
 	case $MARKER in
 	confirmed) finish confirmed operator && read_marker ;;
-	idle) rm -rf "$CHANGE" ;;
+	idle) [ ! -e "$CHANGE" ] || rm -rf "$CHANGE" ;;
 	esac
 	for d in "$CHANGE".*; do
-		kill -0 "${d##*.}" 2>/dev/null || rm -rf "$d"
+		[ ! -e "$d" ] || kill -0 "${d##*.}" 2>/dev/null || rm -rf "$d"
 	done
 }
 
@@ -165,39 +182,73 @@ no_foreign_changes() {
 	done
 }
 
-# The last line of df, because a long device name breaks its row in two
-kib_free() { df -k "$1" 2>/dev/null | awk 'END { if (NF > 3) print $(NF - 2) }'; }
+# kib_free DIRECTORY: FREE, of the last line of df, because a long device name breaks its row in two
+kib_free() {
+	FREE=''
+	df -k "$1" 2>/dev/null >"$RUN/df.$$"
+	while read -r a b c d e f; do
+		if [ -n "$f" ]; then FREE=$d; elif [ -n "$e" ]; then FREE=$c; fi
+	done <"$RUN/df.$$"
+	rm -f "$RUN/df.$$"
+}
 
-check_space() { # BUNDLE
-	free=$(kib_free "${CHANGE%/*}")
+check_space() { # BUNDLE: its manifest, and that there is room for it and for what it will replace
+	kib_free "${CHANGE%/*}"
 	need=$((SPARE_KIB + $(gzip -dc "$1" | wc -c) / 1024 + 1))
-	# shellcheck disable=SC2013 # words are lines here: paths have no blanks, see check_path
-	for p in $(tar -xzOf "$1" manifest | sed 's/.* //'); do
-		[ -f "$p" ] && need=$((need + $(wc -c <"$p") / 1024 + 1))
-	done
-	[ -z "$free" ] || [ "$free" -ge "$need" ] || refuse flash-full "needs $need KiB of flash, $free KiB are free"
+	tar -xzOf "$1" manifest 2>/dev/null >"$RUN/manifest.$$"
+	old=''
+	while read -r _ _ _ _ path; do
+		check_path "$path" || { rm -f "$RUN/manifest.$$" && refuse bad-path "$BAD_PATH"; }
+		[ ! -f "$path" ] || old="$old $path"
+	done <"$RUN/manifest.$$"
+	rm -f "$RUN/manifest.$$"
+	# shellcheck disable=SC2086 # paths have no blanks, see check_path
+	[ -z "$old" ] || while read -r size _; do need=$((need + size / 1024 + 1)); done <<-END
+		$(wc -c $old | sed '/ total$/d')
+	END
+	case $FREE in '' | *[!0-9]*) return 0 ;; esac
+	[ "$FREE" -ge "$need" ] || refuse flash-full "needs $need KiB of flash, $FREE KiB are free"
 }
 
-check_path() {
+check_path() { # PATH: 1, and why in BAD_PATH, where it cannot be covered
+	BAD_PATH=$1
 	case $1 in
-	*[!A-Za-z0-9._/+@-]* | *//* | */../* | */./* | */. | */.. | */) refuse bad-path "$1" ;;
-	/etc/meshctl/change* | /etc/meshctl/last* | /tmp/* | /var/* | /dev/* | /proc/* | /sys/*) refuse bad-path "$1 is not kept in flash, or is ours" ;;
-	/*/*) [ ! -d "$1" ] || refuse bad-path "$1 is a directory" ;;
-	*) refuse bad-path "$1" ;;
+	*[!A-Za-z0-9._/+@-]* | *//* | */../* | */./* | */. | */.. | */) return 1 ;;
+	/etc/meshctl/change* | /etc/meshctl/last* | /tmp/* | /var/* | /dev/* | /proc/* | /sys/*) BAD_PATH="$1 is not kept in flash, or is ours" && return 1 ;;
+	/*/*) [ ! -d "$1" ] || { BAD_PATH="$1 is a directory" && return 1; } ;;
+	*) return 1 ;;
 	esac
 }
 
-was_as_expected() { # EXPECTED PATH
-	case $1 in
-	-) return 0 ;;
-	absent) ! exists "$2" ;;
-	*) [ -f "$2" ] && [ "$(hash_of "$2")" = "$1" ] ;;
-	esac
+# sums_hold: what is in RUN/sums.PID has these sums; one process for all files
+sums_hold() {
+	[ ! -s "$RUN/sums.$$" ] || sha256sum -c "$RUN/sums.$$" >/dev/null 2>&1
+	held=$?
+	rm -f "$RUN/sums.$$"
+	return $held
+}
+
+was_as_expected() { # DIRECTORY: every live file is what the plan saw; if not, MOVED_ON is one that differs
+	while read -r _ _ _ expected MOVED_ON; do
+		case $expected in
+		-) ;;
+		absent) ! exists "$MOVED_ON" || return 1 ;;
+		*) [ -f "$MOVED_ON" ] && echo "$expected  $MOVED_ON" >&3 || return 1 ;;
+		esac
+	done 3>"$RUN/sums.$$" <"$1/manifest"
+	sums_hold && return 0
+	while read -r _ _ _ expected MOVED_ON; do
+		case $expected in
+		- | absent) ;;
+		*) [ "$(hash_of "$MOVED_ON")" = "$expected" ] || return 1 ;;
+		esac
+	done <"$1/manifest"
 }
 
 keep_previous() { # DIRECTORY PATH
 	if exists "$2"; then
-		mkdir -p "$1/prev${2%/*}" && cp -a "$2" "$1/prev$2" && echo "had $2"
+		[ -d "$1/prev${2%/*}" ] || mkdir -p "$1/prev${2%/*}" || return 1
+		cp -a "$2" "$1/prev$2" && echo "had $2"
 		return
 	fi
 	echo "not $2"
@@ -211,10 +262,11 @@ keep_previous() { # DIRECTORY PATH
 check_new() { # DIRECTORY: every new file is there, whole
 	while read -r kind _ is _ path; do
 		case $kind in
-		file) [ "$(hash_of "$1/new$path" 2>/dev/null)" = "$is" ] ;;
+		file) echo "$is  $1/new$path" >&3 ;;
 		link) [ "$(readlink "$1/new$path")" = "$is" ] ;;
 		esac || return 1
-	done <"$1/manifest"
+	done 3>"$RUN/sums.$$" <"$1/manifest"
+	sums_hold
 }
 
 same() { # PATH PATH: both the same file's content, or the same link
@@ -245,15 +297,23 @@ in_flash() {
 	! grep -q '^overlayfs:/tmp/root / ' /proc/mounts && ! ubus call system board 2>/dev/null | grep -q '"rootfs_type": "initramfs"'
 }
 
-stage() { # OWNER ID BUNDLE
+# An armed change that was not started has changed nothing. It ends once its owner has lost the lock.
+end_abandoned() { # the lock is ours to judge by: whoever has it now, it is not the change's owner
+	[ "$MARKER" = armed ] && [ ! -e "$TIMER/due" ] && [ "$LOCK_OWNER" != "$OWNER" ] || return 0
+	restore expired
+	read_marker
+}
+
+stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_staged` needs no more writing
 	need_lock "$1"
 	word "$2"
 	in_flash || refuse no-flash "/ is in RAM: wait until its flash is ready, some minutes after the first boot; an initramfs image has none"
 	tidy
+	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
 	no_foreign_changes
-	rm -rf "$CHANGE"
+	[ ! -e "$CHANGE" ] || rm -rf "$CHANGE"
 	check_space "$3"
 	w=$CHANGE.$$
 	mkdir -p "$w/new" "$w/prev" || drop "$w" flash-full "cannot make $w"
@@ -261,25 +321,26 @@ stage() { # OWNER ID BUNDLE
 	: >"$w/previous"
 	{ [ -f "$w/manifest" ] && [ -f "$w/reload" ]; } || drop "$w" bad-bundle "no manifest or reload in it"
 	check_new "$w" || drop "$w" flash-full "what was unpacked is not what was sent"
-	while read -r kind mode _ expected path; do
-		(check_path "$path") || { rm -rf "$w" && exit 3; }
+	was_as_expected "$w" || drop "$w" moved-on "$MOVED_ON is not what the plan saw"
+	while read -r kind mode _ _ path; do
 		# a link that led to a directory would let a later mv put its file in there
 		case $kind$path in link/etc/rc.d/* | file/* | remove/* | cover/*) ;; *) drop "$w" bad-path "$kind $path" ;; esac
 		[ "$kind" != file ] || chmod "$mode" "$w/new$path" || drop "$w" bad-bundle "mode $mode of $path"
-		was_as_expected "$expected" "$path" || drop "$w" moved-on "$path is not what the plan saw"
 		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
 	done <"$w/manifest"
-	extra keep "$w" || drop "$w" flash-full "could not keep the packages as they are"
+	extra keep "$w" || drop "$w" flash-full "could not read the new packages, or not keep those that they replace"
 	unchanged_since_kept "$w" || drop "$w" flash-full "what was kept is not what is there"
 	for conf in "$w"/new/etc/config/*; do
 		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
 			drop "$w" bad-uci "uci cannot read the new ${conf##*/}"
 	done
-	echo "$2 $1 - 0" | put "$w/ready" || drop "$w" flash-full "could not write the marker"
-	# only this last rename makes it a stage: where a directory cannot be renamed, mv copies, and may be cut short
-	{ mv "$w" "$CHANGE" && sync && mv "$CHANGE/ready" "$CHANGE/staged.$2" && sync; } ||
+	{ echo "$2 $1 - 0" >"$w/ready" && echo "$2 $1 ${4:--} ${5:-0}" >"$w/arming"; } 2>/dev/null ||
+		drop "$w" flash-full "could not write the marker"
+	# Everything is in flash before the renames that make it count; only the last one makes it a stage: where a directory
+	# cannot be renamed, mv copies, and may be cut short. A stage that a power cut takes is sent again.
+	{ sync && mv "$w" "$CHANGE" && mv "$CHANGE/ready" "$CHANGE/staged.$2"; } ||
 		drop "$w" flash-full "could not put the stage in place"
-	echo "ok state=staged id=$2"
+	answer "state=staged id=$2"
 }
 
 # --- arm, apply, confirm, abort -------------------------------------------------------------------------------------
@@ -293,18 +354,25 @@ arm() { # OWNER ID NONCE_SHA256 WINDOW_S
 		[ "$MARKER $ID" = "staged $2" ] || refuse wrong-state "change ${ID:--} is $MARKER, expected $2 staged"
 		{ [ -L /etc/rc.d/S05meshctl-deadman ] && [ -x /etc/init.d/meshctl-deadman ]; } ||
 			refuse not-enabled "the boot hook is missing: a power cut would not be undone"
-		no_foreign_changes
-		check_new "$CHANGE" || refuse bad-bundle "a staged file is damaged; stage again"
-		unchanged_since_kept "$CHANGE" || refuse moved-on "a file changed since it was staged"
-		echo "$2 $1 $3 $4" | put "$CHANGE/armed.$2" || refuse flash-full "could not write the marker"
+		# `change` has just done all this
+		[ -n "$part" ] || {
+			no_foreign_changes
+			check_new "$CHANGE" || refuse bad-bundle "a staged file is damaged; stage again"
+			unchanged_since_kept "$CHANGE" || refuse moved-on "a file changed since it was staged"
+			{ echo "$2 $1 $3 $4" 2>/dev/null >"$CHANGE/arming" && sync; } || refuse flash-full "could not write the marker"
+		}
+		[ ! -e "$TIMER" ] || rm -rf "$TIMER"
+		mv -f "$CHANGE/arming" "$CHANGE/armed.$2" || refuse flash-full "could not write the marker"
 		rm -f "$CHANGE/staged.$2"
-		rm -rf "$TIMER"
+		sync
+		read_marker
+		detach expire "$2" $((NOW + LOCK_LEFT + EXPIRE_GRACE_CS))
 	fi
-	echo "ok state=armed id=$2"
+	answer "state=armed id=$2"
 }
 
 detach() { # NAME ARGS: a process of its own session, which no closing connection takes along
-	mkdir -p "$TIMER"
+	[ -d "$TIMER" ] || mkdir -p "$TIMER"
 	start-stop-daemon -S -q -b -m -p "$TIMER/$1.pid" -x "$SELF" -- "$@"
 }
 
@@ -328,11 +396,41 @@ apply() { # OWNER ID now | in SECONDS | at UPTIME_SECONDS
 		now && [ $NOW -lt $limit ] || { : >"$TIMER/abort" && refuse no-watcher "the timer did not start in time"; }
 		doze
 	done
-	echo "ok state=waiting id=$ID due_uptime_s=$(as_seconds $due)"
+	as_seconds $due
+	answer "state=waiting id=$ID due_uptime_s=$SECONDS_TEXT"
 }
 
-# where sleep knows no fractions, nap returns at once and its caller spins, which the last stretch of a countdown may
-nap() { sleep 0.05 2>/dev/null || :; }
+# change: all of the above in one process, for one answer when the reload has ended, or LIMIT_S later. A cut connection
+# stops nothing from `arm` on; before it, nothing has changed.
+change() { # OWNER TTL_S ID NONCE_SHA256 WINDOW_S LIMIT_S BUNDLE_SHA256: the bundle on standard input
+	word "$3"
+	word "$4"
+	number "$5"
+	number "$6"
+	part=yes
+	lock "$1" "$2"
+	bundle=$RUN/$3.tgz
+	trap 'rm -f "$bundle"' EXIT
+	cat 2>/dev/null >"$bundle" || refuse tmp-full "no room in $RUN for the bundle"
+	[ "$(hash_of "$bundle")" = "$7" ] || refuse bad-bundle "the bundle was damaged on the way"
+	stage "$1" "$3" "$bundle" "$4" "$5"
+	rm -f "$bundle"
+	arm "$1" "$3" "$4" "$5"
+	apply "$1" "$3" now
+	now
+	limit=$((NOW + $6 * 100))
+	until { [ -e "$TIMER/applied" ] && [ -e "$RUN/reloaded" ]; } || ! is_armed || { now && [ $NOW -ge $limit ]; }; do sleep 1; done
+	reloaded=''
+	[ ! -e "$TIMER/applied" ] || read -r reloaded 2>/dev/null <"$RUN/reloaded"
+	part=''
+	answer "id=$3 reload_status=$reloaded"
+}
+
+# nap CS: the end of a countdown; where sleep knows no fractions it returns at once and its caller spins for a moment
+nap() {
+	as_seconds "$1"
+	sleep "$SECONDS_TEXT" 2>/dev/null || :
+}
 
 doze() { sleep 0.2 2>/dev/null || sleep 1; }
 
@@ -343,7 +441,7 @@ put_new() {
 	extra do "$CHANGE" || return 1
 	while read -r kind _ _ _ path; do
 		case $kind in
-		file | link) mkdir -p "${path%/*}" && mv -f "$CHANGE/new$path" "$path" ;;
+		file | link) { [ -d "${path%/*}" ] || mkdir -p "${path%/*}"; } && mv -f "$CHANGE/new$path" "$path" ;;
 		remove) rm -f "$path" ;;
 		esac || return 1
 	done <"$CHANGE/manifest"
@@ -364,7 +462,8 @@ put_previous() {
 	left=0
 	while read -r kind path; do
 		[ "$kind" = had ] && exists "$CHANGE/prev$path" || continue
-		mkdir -p "${path%/*}" && mv -f "$CHANGE/prev$path" "$path"
+		[ -d "${path%/*}" ] || mkdir -p "${path%/*}"
+		mv -f "$CHANGE/prev$path" "$path"
 		! exists "$CHANGE/prev$path" || left=1
 	done <"$CHANGE/previous"
 	sync
@@ -376,15 +475,16 @@ wait_until() {
 	while now && [ $NOW -lt "$1" ]; do
 		is_armed || return 1
 		[ ! -e "$TIMER/abort" ] || return 0
-		if [ $(($1 - NOW)) -gt 150 ]; then sleep 1; else nap; fi
+		left=$(($1 - NOW))
+		if [ $left -gt 150 ]; then sleep 1; elif [ $left -gt 50 ]; then nap $((left - 40)); else nap $left; fi
 	done
 	is_armed
 }
 
-reload() { # SCRIPT: in the background, so that no hanging reload holds up the timer
+reload() { # SCRIPT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
 	rm -f "$RUN/reloaded"
 	(
-		sh "$1" >"$RUN/reload.log" 2>&1 &
+		UNTIL_S=$2 sh "$1" >"$RUN/reload.log" 2>&1 &
 		echo $! >"$RUN/reload.pid"
 		wait $!
 		echo $? >"$RUN/reloaded"
@@ -445,7 +545,9 @@ watch() { # ID DUE_CS: detached
 		restore failed
 	else
 		cp "$CHANGE/reload" "$RUN/reload"
-		reload "$RUN/reload"
+		# a reload that is not done by then would run at once with the one of the restore
+		now
+		reload "$RUN/reload" $((NOW / 100 + WINDOW - PROOF_S))
 		applied_at_now
 		wait_until $((NOW + WINDOW * 100)) || exit 0
 		reason=timeout
@@ -460,11 +562,32 @@ guard() { # ID DUE_CS: detached; ends the change if `watch` was killed
 	[ "$ID" = "$1" ] || exit 0
 	limit=$(($2 + WINDOW * 100 + GUARD_GRACE_CS))
 	[ ! -f "$CHANGE/extra" ] || limit=$((limit + EXTRA_LIMIT_CS))
-	while now && [ $NOW -lt $limit ] && is_armed; do sleep 1; done
+	while now && [ $NOW -lt $limit ] && is_armed; do
+		if [ $((limit - NOW)) -gt 500 ]; then sleep 4; else sleep 1; fi
+	done
 	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do sleep 1; done
 	{ is_armed || [ -f "$CHANGE/restoring.$ID" ]; } || exit 0
 	applied_at_now
 	restore guard
+}
+
+expire() { # ID DUE_CS: detached; ends a change that its owner armed and never started, once it has lost the lock
+	read_marker
+	[ "$ID" = "$1" ] || exit 0
+	while [ ! -e "$TIMER/due" ]; do
+		is_armed || exit 0
+		now
+		[ $NOW -lt "$2" ] || break
+		if [ $(($2 - NOW)) -gt 500 ]; then sleep 3; else sleep 1; fi
+	done
+	read_lock
+	# started, or its owner has renewed the lock and decides
+	[ ! -e "$TIMER/due" ] && [ "$LOCK_OWNER" != "$OWNER" ] || exit 0
+	# should it be started at this moment, it finds the abort and changes nothing
+	: >"$TIMER/abort"
+	sleep 2
+	[ ! -e "$TIMER/due" ] || exit 0
+	restore expired
 }
 
 orphan() { # ID: detached; takes a change back whose timer is gone
@@ -473,7 +596,7 @@ orphan() { # ID: detached; takes a change back whose timer is gone
 	[ "$ID" = "$1" ] && applied_at_now && restore abort
 }
 
-confirm() { # ID NONCE
+confirm() { # ID NONCE [OWNER]: with OWNER, gives its lock back
 	given=$(printf %s "$2" | sha256sum)
 	tidy
 	read -r last_id last_outcome last_reason last_nonce 2>/dev/null <"$LAST"
@@ -484,11 +607,13 @@ confirm() { # ID NONCE
 		[ "$MARKER $ID" = "armed $1" ] || refuse wrong-state "change ${ID:--} is $MARKER, expected $1 applied"
 		[ "$NONCE" = "${given%% *}" ] || refuse wrong-nonce "this is not the nonce change $1 was armed with"
 		[ -e "$TIMER/applied" ] || refuse not-applied "change $ID is not applied yet"
+		write_last confirmed operator
 		mv "$CHANGE/armed.$ID" "$CHANGE/confirmed.$ID" 2>/dev/null || refuse restored "the window has just run out"
 		sync
-		finish confirmed operator
+		forget
 	fi
-	echo "ok state=idle id=$1 outcome=confirmed"
+	[ -z "$3" ] || { part=yes && unlock "$3" && part=''; }
+	answer "state=idle id=$1 outcome=confirmed"
 }
 
 abort() { # OWNER ID
@@ -516,7 +641,7 @@ boot() { # before anything reads the configuration, so nothing is reloaded
 	# for packages.sh
 	export BOOTING=yes
 	put_back=no
-	[ ! -f "$CHANGE/packages.tar" ] || put_back=yes
+	[ ! -s "$CHANGE/packages.begun" ] || put_back=yes
 	case $MARKER in armed | restoring) restore boot ;; *) return 0 ;; esac
 	# services that came back with their packages were not there when the list of what to start was made
 	[ $put_back = no ] || [ -e "$CHANGE" ] || /sbin/reboot
@@ -531,20 +656,22 @@ status() {
 	state=$MARKER left='' due=''
 	if [ "$MARKER" = armed ] && read -r due 2>/dev/null <"$TIMER/due"; then
 		state=waiting
-		due=$(as_seconds "$due")
+		as_seconds "$due"
+		due=$SECONDS_TEXT
 		read -r applied 2>/dev/null <"$TIMER/applied" && state=applied left=$(((applied - NOW) / 100 + WINDOW))
 		alive "$TIMER/watch.pid" || state=orphaned
 	fi
+	as_seconds $NOW
 	echo "version=$VERSION state=$state id=$ID owner=$OWNER window_s=$WINDOW left_s=$left due_uptime_s=$due" \
 		"reload_status=$reloaded lock_owner=$LOCK_OWNER lock_left_s=$((LOCK_LEFT / 100))" \
-		"last_id=$last_id last_outcome=$last_outcome last_reason=$last_reason uptime_s=$(as_seconds $NOW)"
+		"last_id=$last_id last_outcome=$last_outcome last_reason=$last_reason uptime_s=$SECONDS_TEXT"
 }
 
 umask 022
-mkdir -p -m 700 "$RUN" "${CHANGE%/*}"
+[ -d "$RUN" ] && [ -d "${CHANGE%/*}" ] || mkdir -p -m 700 "$RUN" "${CHANGE%/*}"
 verb=$1
 [ $# -eq 0 ] || shift
 case $verb in
-lock | unlock | stage | arm | apply | watch | guard | orphan | confirm | abort | boot | status) "$verb" "$@" ;;
+lock | unlock | stage | arm | apply | change | watch | guard | expire | orphan | confirm | abort | boot | status) "$verb" "$@" ;;
 *) refuse usage "unknown verb '$verb'" ;;
 esac

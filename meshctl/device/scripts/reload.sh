@@ -31,12 +31,15 @@ fail() {
 	STATUS=1
 }
 
-# until_s SECONDS COMMAND...: runs COMMAND once a second until it succeeds; 1 on timeout
+# is_late: whether the uptime UNTIL_S has come, shortly before the change is rolled back; a rollback's own reload has none
+is_late() { [ -n "$UNTIL_S" ] && read -r uptime _ </proc/uptime && [ "${uptime%.*}" -ge "$UNTIL_S" ]; }
+
+# until_s SECONDS COMMAND...: runs COMMAND once a second until it succeeds; 1 on timeout, or when it is late
 until_s() {
 	seconds=$1
 	shift
 	until "$@"; do
-		[ "$seconds" -gt 0 ] || return 1
+		[ "$seconds" -gt 0 ] && ! is_late || return 1
 		seconds=$((seconds - 1))
 		sleep 1
 	done
@@ -72,7 +75,7 @@ take_up() {
 	for package in $PACKAGES; do
 		ubus call service event "{\"type\":\"config.change\",\"data\":{\"package\":\"$package\"}}"
 	done
-	barrier || fail "procd did not run the reloads within $BARRIER_LIMIT_S s"
+	barrier || fail "procd did not run the reloads in time"
 }
 
 netifd_is_idle() {
@@ -178,7 +181,7 @@ for service in $SERVICES; do
 done
 if changed network; then
 	# interfaces that come up trigger dropbear, and the firewall by hotplug
-	barrier || fail "procd did not run the reloads within $BARRIER_LIMIT_S s"
+	barrier || fail "procd did not run the reloads in time"
 fi
 if changed network firewall; then
 	load_firewall || ! changed firewall || fail "the firewall's new ruleset is not loaded"

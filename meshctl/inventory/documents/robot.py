@@ -79,8 +79,8 @@ class ApplyDocument(Document):
     """Number of failures after which a run stops."""
     quorum: Real = Field(default=0.8, gt=0, le=1)
     """Share of the mesh that must rejoin after a change of the whole cell."""
-    parallel: Whole = Field(default=8, ge=1, le=1024)
-    """Number of concurrent connections."""
+    parallel: Whole | None = Field(default=None, ge=1, le=1024)
+    """Maximum number of nodes in work at the same time; default: as many as their meshes and this machine carry."""
 
 
 class UdpMeshDocument(Document):

@@ -1,25 +1,21 @@
-"""Addresses and networks: unique, inside their network, reachable (MC201 to MC215)."""
+"""Addresses: unique, inside their network, reachable (MC201 to MC214)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_address
+from ipaddress import IPv4Address, IPv4Interface, IPv6Address, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, group_by_key
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import Backend, Fleet, Mesh, Node
+from meshctl.model import Fleet, Mesh, Node
 
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
-# RFC 1918, and RFC 6598 (carrier-grade NAT)
-_PRIVATE = tuple(IPv4Network(text) for text in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10"))
-# 0/8, loopback, link-local, multicast, reserved
-_UNUSABLE = tuple(IPv4Network(text) for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3"))
 
 
-def _meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
+def meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
     return [fleet.meshes[name] for name in node.meshes if name in fleet.meshes]
 
 
@@ -34,13 +30,13 @@ def _meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
     passing="nodes: {b01: {address: 10.42.0.102}}",
 )
 def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for address, owners in duplicates(_stations(fleet)):
+    for address, owners in duplicates(stations(fleet)):
         (_, first), *later = owners
         for path, _ in later:
             yield Finding(path, f"{first} has the same address", "a unique address", str(address))
 
 
-def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
+def stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
     for node in fleet.managed():
         yield node.address.ip, (("nodes", node.name, "address"), node.name)
     for robot in fleet.robots.values():
@@ -62,7 +58,7 @@ def _stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...]
 )
 def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
-        networks = [mesh.network for mesh in _meshes_of(fleet, node)]
+        networks = [mesh.network for mesh in meshes_of(fleet, node)]
         if networks and not any(node.address.ip in network for network in networks):
             expected = f"an address in {' or '.join(str(network) for network in networks)}"
             yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
@@ -114,48 +110,6 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
 
 
 @fleet_rule(
-    "MC205",
-    Severity.ERROR,
-    "The networks of two meshes overlap",
-    why="""A node in both meshes, or a robot that bridges both, has two routes to one address and uses the wrong one
-    half the time.""",
-    fix="Use separate networks, or the same network for both (cells of one network share a routing interface).",
-    failing="""
-    meshes:
-      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
-               encryption: psk2+ccmp, key: {env: MESH_KEY}}
-    nodes:
-      base: {radios: {radio1: {mesh: second}}}
-    """,
-    passing="""
-    meshes:
-      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
-               encryption: psk2+ccmp, key: {env: MESH_KEY}}
-    nodes:
-      base: {radios: {radio1: {mesh: second}}}
-    """,
-)
-def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # sorted by first address: a network overlaps either the widest network before it or none
-    widest: Mesh | None = None
-    for mesh in sorted(fleet.meshes.values(), key=lambda mesh: (mesh.network.network_address, mesh.network.prefixlen)):
-        if widest is not None and mesh.network.overlaps(widest.network) and not _routed_as_one(mesh, widest):
-            message = f"overlaps {widest.network} of mesh {widest.name}"
-            yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(mesh.network))
-        if widest is None or mesh.network.broadcast_address > widest.network.broadcast_address:
-            widest = mesh
-
-
-def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
-    """Two cells that share a routing interface, such as one per band, share a network on purpose."""
-    if mesh.network != other.network or mesh.backend is not other.backend:
-        return False
-    if mesh.backend is Backend.BATMAN:
-        return mesh.batman.routing_algo == other.batman.routing_algo
-    return mesh.operator_parts.interface == other.operator_parts.interface
-
-
-@fleet_rule(
     "MC206",
     Severity.WARNING,
     "The network contains the factory address 192.168.1.1",
@@ -179,53 +133,6 @@ def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 @fleet_rule(
-    "MC207",
-    Severity.WARNING,
-    "The network is not private",
-    why="""Internet hosts with these addresses become unreachable from every robot and laptop, and replies leak through
-    the uplink.""",
-    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
-    failing="""
-    meshes: {main: {network: 11.42.0.0/24}}
-    nodes: {base: {address: 11.42.0.1}, husky1-front: {address: 11.42.0.11}, b01: {address: 11.42.0.101}}
-    robots: {base-station: {computer: {address: 11.42.0.100/24}}, husky1: {computer: {address: 11.42.0.110/24}}}
-    """,
-    passing="meshes: {main: {network: 10.42.0.0/24}}",
-)
-def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        network = mesh.network
-        if not any(network.subnet_of(private) for private in _PRIVATE) and not _unusable(network):
-            yield Finding(
-                ("meshes", mesh.name, "network"), "not a private network", "an RFC 1918 network", str(network)
-            )
-
-
-@fleet_rule(
-    "MC208",
-    Severity.ERROR,
-    "The network is not usable for stations",
-    why="Loopback, link-local, multicast and reserved ranges are not routed or not accepted on an interface.",
-    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
-    failing="""
-    meshes: {main: {network: 127.42.0.0/24}}
-    nodes: {base: {address: 127.42.0.1}, husky1-front: {address: 127.42.0.11}, b01: {address: 127.42.0.101}}
-    robots: {base-station: {computer: {address: 127.42.0.100/24}}, husky1: {computer: {address: 127.42.0.110/24}}}
-    """,
-    passing="meshes: {main: {network: 10.42.0.0/24}}",
-)
-def network_unusable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        if _unusable(mesh.network):
-            path = ("meshes", mesh.name, "network")
-            yield Finding(path, "reserved address range", "an RFC 1918 network", str(mesh.network))
-
-
-def _unusable(network: IPv4Network) -> bool:
-    return any(network.overlaps(unusable) for unusable in _UNUSABLE)
-
-
-@fleet_rule(
     "MC209",
     Severity.ERROR,
     "A robot's computer is in a different network than its radios",
@@ -238,76 +145,13 @@ def _unusable(network: IPv4Network) -> bool:
 def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
-        networks = dict.fromkeys(mesh.network for node in nodes for mesh in _meshes_of(fleet, node))
+        networks = dict.fromkeys(mesh.network for node in nodes for mesh in meshes_of(fleet, node))
         if robot.computer is not None and networks:
             address = robot.computer.address.ip
             if not any(address in network for network in networks):
                 expected = f"an address in {' or '.join(str(network) for network in networks)}"
                 path = ("robots", robot.name, "computer", "address")
                 yield Finding(path, "outside the network of its radios", expected, str(address))
-
-
-@fleet_rule(
-    "MC210",
-    Severity.ERROR,
-    "A computer's prefix length differs from the mesh's",
-    why="""With a longer prefix the computer sends part of the fleet's traffic to a gateway that does not exist; with a
-    shorter one it expects remote stations on its own link.""",
-    fix="Use the prefix length of the mesh's network.",
-    failing="robots: {husky1: {computer: {address: 10.42.0.120/28}}}",
-    passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
-)
-def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for robot in fleet.robots.values():
-        if robot.computer is None:
-            continue
-        for mesh in fleet.meshes.values():
-            address = robot.computer.address
-            if address.ip in mesh.network and address.network != mesh.network:
-                path = ("robots", robot.name, "computer", "address")
-                expected = f"/{mesh.network.prefixlen} as in mesh {mesh.name}"
-                yield Finding(path, "prefix length differs from the mesh's", expected, f"/{address.network.prefixlen}")
-
-
-@fleet_rule(
-    "MC211",
-    Severity.WARNING,
-    "The network has no free addresses for a replacement",
-    why="""When all addresses are used, a spare cannot join next to the node it replaces, and a laptop cannot join for
-    diagnosis.""",
-    fix="Use a larger network; a shorter prefix costs nothing.",
-    failing="""
-    meshes: {main: {network: 10.42.0.0/29}}
-    nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
-    robots: {base-station: {computer: {address: 10.42.0.4/29}}, husky1: {computer: {address: 10.42.0.5/29}}}
-    """,
-    passing="""
-    meshes: {main: {network: 10.42.0.0/28}}
-    nodes: {base: {address: 10.42.0.1}, husky1-front: {address: 10.42.0.2}, b01: {address: 10.42.0.3}}
-    robots: {base-station: {computer: {address: 10.42.0.4/28}}, husky1: {computer: {address: 10.42.0.5/28}}}
-    """,
-)
-def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # a spare and the operator's laptop
-    reserve = 2
-    taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
-    by_network = group_by_key((mesh.network, name) for name, mesh in fleet.meshes.items())
-    # one lookup per prefix length instead of one per network
-    lengths = {network.prefixlen for network in by_network}
-    for address, _ in _stations(fleet):
-        for length in lengths:
-            for name in by_network.get(IPv4Network((address, length), strict=False), ()):
-                taken[name].add(address)
-    for name, mesh in fleet.meshes.items():
-        room = mesh.network.num_addresses - 2 - len(taken[name])
-        if len(taken[name]) > 0 and room < reserve:
-            path = ("meshes", name, "network")
-            yield Finding(
-                path,
-                f"{len(taken[name])} addresses are in use",
-                f"at least {reserve} free addresses",
-                f"{max(room, 0)}",
-            )
 
 
 @fleet_rule(
@@ -384,22 +228,3 @@ def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         for name in names[1:]:
             path = ("nodes", name, "ssh", "host")
             yield Finding(path, f"{names[0]} has the same host and port", "a unique host and port", f"{host}:{port}")
-
-
-@fleet_rule(
-    "MC215",
-    Severity.ERROR,
-    "A node's prefix length differs from its mesh's",
-    why="""With a longer prefix the node sends part of the mesh's traffic to a gateway that does not exist; with a
-    shorter one it expects remote stations on its own link. Some nodes can reach it, others cannot.""",
-    fix="Omit the prefix length: it defaults to that of the mesh's network.",
-    failing="nodes: {b01: {address: 10.42.0.7/16}}",
-    passing="nodes: {b01: {address: 10.42.0.7}}",
-)
-def node_prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node in fleet.managed():
-        holding = [mesh for mesh in _meshes_of(fleet, node) if node.address.ip in mesh.network]
-        if holding and not any(node.address.network == mesh.network for mesh in holding):
-            expected = f"/{holding[0].network.prefixlen} as in mesh {holding[0].name}"
-            path = ("nodes", node.name, "address")
-            yield Finding(path, "prefix length differs from the mesh's", expected, f"/{node.address.network.prefixlen}")

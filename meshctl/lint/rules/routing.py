@@ -1,4 +1,4 @@
-"""batman-adv: options, intervals, airtime of originator messages, MTU budget (MC501 to MC517)."""
+"""batman-adv: options, intervals, airtime of originator messages (MC501 to MC516)."""
 
 from __future__ import annotations
 
@@ -8,19 +8,10 @@ from dataclasses import replace
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, join_limited
-from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, NodeState
 from meshctl.resolve import MEASURED_HEAL_S, UnreachableTarget, batman_intervals, heal_s, originator_airtime
 
-# batman-adv's header on a full Ethernet frame (openwrt-facts: 1500 + 32)
-_BATMAN_BYTES = 32
-# overhead that batman-adv checks the MTU against, network coding's header included: batadv_max_header_len()
-_BATMAN_WARNS_BYTES = 60
-# IEEE 802.11-2020 9.2.4.7.1: the largest MSDU, less the eight bytes of LLC and SNAP
-_MAX_MTU = 2304 - 8
-# headers of IPv4, UDP and udp_mesh, and the AEAD tag
-_DATAGRAM_BYTES = 20 + 8 + 40
 # airtime shares from which MC516, MC502 and MC501 report
 _AIRTIME_NOTE = 0.03
 _AIRTIME_WARNING = 0.10
@@ -34,7 +25,7 @@ meshes: {main: {backend: meshmerize, operator_parts:
 PARTS = {"parts/etc/config/meshmerize.j2": "config meshmerize\n\toption enabled '1'\n"}
 
 
-def _batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
+def batman_meshes(fleet: Fleet) -> Iterator[Mesh]:
     return (mesh for mesh in fleet.meshes.values() if mesh.backend is Backend.BATMAN)
 
 
@@ -86,7 +77,7 @@ def originators_take_much(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 def _airtime_findings(fleet: Fleet, least: float, most: float) -> Iterator[Finding]:
     on_air = (node for node in fleet.managed() if node.state is not NodeState.SPARE)
     members = group_by_key((mesh, node.name) for node in on_air for mesh in node.meshes)
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         nodes = len(members.get(mesh.name, []))
         try:
             interval_ms = batman_intervals(mesh).orig_interval_ms
@@ -115,7 +106,7 @@ def _airtime_findings(fleet: Fleet, least: float, most: float) -> Iterator[Findi
     passing="meshes: {main: {reconnect_s: 2.5}}",
 )
 def reconnect_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         try:
             batman_intervals(mesh)
         except UnreachableTarget as target:
@@ -139,7 +130,7 @@ def reconnect_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 )
 def interval_misses_target(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     fastest = min(MEASURED_HEAL_S.values())
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         written = mesh.batman.orig_interval_ms
         if written is not None and max(mesh.reconnect_s, fastest) < heal_s(written):
             path = ("meshes", mesh.name, "batman", "orig_interval_ms")
@@ -147,81 +138,6 @@ def interval_misses_target(fleet: Fleet, _context: LintContext) -> Iterator[Find
             yield Finding(
                 path, "slower than reconnect_s", expected, f"{written} ms, which heals in {heal_s(written):.2g} s"
             )
-
-
-@fleet_rule(
-    "MC505",
-    Severity.ERROR,
-    "Full frames exceed the MTU, and fragmentation is off",
-    why="""batman-adv adds 32 bytes to each frame. With a smaller MTU on the radio and fragmentation off, small packets
-    pass and large ones are dropped: ping works, video does not.""",
-    fix="Set `mtu: 1560` (minimum 1532), or turn on `fragmentation`.",
-    failing="meshes: {main: {mtu: 1500, batman: {fragmentation: false}}}",
-    passing="meshes: {main: {mtu: 1560, batman: {fragmentation: false}}}",
-)
-def mtu_without_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
-        if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and not mesh.batman.fragmentation:
-            yield _mtu_finding(fleet, mesh, "large frames are dropped")
-
-
-@fleet_rule(
-    "MC506",
-    Severity.WARNING,
-    "Full frames are fragmented",
-    why="Every full frame is sent as two, at twice the cost and twice the chance of loss.",
-    fix="Remove `mtu` (the default is 1560), or set at least 1532.",
-    failing="meshes: {main: {mtu: 1500}}",
-    passing="meshes: {main: {mtu: 1560}}",
-)
-def mtu_with_fragmentation(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
-        if mesh.mtu < mesh.lan_mtu + _BATMAN_BYTES and mesh.batman.fragmentation:
-            yield _mtu_finding(fleet, mesh, "full frames are fragmented")
-
-
-def _mtu_finding(fleet: Fleet, mesh: Mesh, message: str) -> Finding:
-    expected = f"at least {mesh.lan_mtu + _BATMAN_BYTES} ({mesh.lan_mtu} LAN + {_BATMAN_BYTES} batman-adv)"
-    path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
-    return Finding(path, message, expected, str(mesh.mtu))
-
-
-@fleet_rule(
-    "MC507",
-    Severity.ERROR,
-    "The MTU exceeds what a radio can carry",
-    why="""An 802.11 frame carries at most 2304 bytes: the kernel rejects the MTU, and netifd does not bring up the
-    interface.""",
-    fix="Remove `mtu` (the default is 1560), or set 1532 to 2296.",
-    failing="meshes: {main: {mtu: 4000}}",
-    passing="meshes: {main: {mtu: 2000}}",
-)
-def mtu_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        if mesh.mtu > _MAX_MTU:
-            path = ("meshes", mesh.name, "mtu")
-            yield Finding(path, "exceeds an 802.11 frame", f"at most {_MAX_MTU}", str(mesh.mtu))
-
-
-@fleet_rule(
-    "MC508",
-    Severity.ERROR,
-    "A udp_mesh fragment exceeds the LAN's MTU",
-    why="IP splits each datagram again: losing one half loses the whole, and a split broadcast may not arrive at all.",
-    fix="Lower `udp_mesh.fragment_bytes` to 1400, or to the LAN's MTU minus 68.",
-    failing="udp_mesh: {fragment_bytes: 1480}",
-    passing="udp_mesh: {fragment_bytes: 1400}",
-)
-def fragment_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    if not fleet.meshes or not any(robot.computer is not None for robot in fleet.robots.values()):
-        return
-    mesh = min(fleet.meshes.values(), key=lambda mesh: mesh.lan_mtu)
-    room = mesh.lan_mtu - _DATAGRAM_BYTES
-    if fleet.udp_mesh.fragment_bytes > room:
-        message = f"IP would fragment it: the LAN of mesh {mesh.name} has an MTU of {mesh.lan_mtu}"
-        expected = f"at most {room} ({mesh.lan_mtu} - {_DATAGRAM_BYTES} for IP, UDP and udp_mesh headers)"
-        path = first_written(fleet, ("udp_mesh", "fragment_bytes"), ("meshes", mesh.name, "lan_mtu"))
-        yield Finding(path, message, expected, str(fleet.udp_mesh.fragment_bytes))
 
 
 @fleet_rule(
@@ -235,7 +151,7 @@ def fragment_too_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     passing="meshes: {main: {batman: {hop_penalty: 15}}}",
 )
 def hop_penalty_extreme(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         if not 5 <= mesh.batman.hop_penalty <= 100:
             path = ("meshes", mesh.name, "batman", "hop_penalty")
             yield Finding(path, "routes flap or prefer long weak links", "5 to 100", str(mesh.batman.hop_penalty))
@@ -251,7 +167,7 @@ def hop_penalty_extreme(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     passing="meshes: {main: {batman: {aggregated_ogms: true}}}",
 )
 def originators_not_aggregated(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         if not mesh.batman.aggregated_ogms:
             path = ("meshes", mesh.name, "batman", "aggregated_ogms")
             yield Finding(path, "each message takes its own frame", "true", "false")
@@ -268,7 +184,7 @@ def originators_not_aggregated(fleet: Fleet, _context: LintContext) -> Iterator[
     passing="meshes: {main: {batman: {gw_mode: 'off'}}}",
 )
 def all_gateways(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         if mesh.batman.gw_mode == "server":
             path = ("meshes", mesh.name, "batman", "gw_mode")
             yield Finding(path, "applies to every node of the mesh", "off", mesh.batman.gw_mode)
@@ -284,7 +200,7 @@ def all_gateways(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="meshes: {main: {batman: {routing_algo: BATMAN_V, elp_interval_ms: 250}}}",
 )
 def elp_without_batman_v(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
+    for mesh in batman_meshes(fleet):
         if mesh.batman.elp_interval_ms is not None and mesh.batman.routing_algo != "BATMAN_V":
             path = ("meshes", mesh.name, "batman", "elp_interval_ms")
             found = mesh.batman.routing_algo
@@ -312,7 +228,7 @@ def elp_without_batman_v(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     """,
 )
 def options_of_one_interface(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    sharing = group_by_key(((mesh.network, mesh.batman.routing_algo), mesh) for mesh in _batman_meshes(fleet))
+    sharing = group_by_key(((mesh.network, mesh.batman.routing_algo), mesh) for mesh in batman_meshes(fleet))
     for first, *others in sharing.values():
         for mesh in others:
             # intervals follow from reconnect_s; the shortest of the group is used
@@ -402,22 +318,3 @@ def operator_parts_incomplete(fleet: Fleet, _context: LintContext) -> Iterator[F
 )
 def originators_cost(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     yield from _airtime_findings(fleet, _AIRTIME_NOTE, _AIRTIME_WARNING)
-
-
-@fleet_rule(
-    "MC517",
-    Severity.NOTE,
-    "batman-adv warns about the MTU",
-    why="""Full frames fit, but batman-adv also counts the network coding header: below the LAN's MTU + 60 it logs "The
-    MTU of interface mesh0 is too small" at each activation, although nothing is wrong.""",
-    fix="Remove `mtu`: the default is 1560, and mac80211 radios such as ath9k carry up to 2304.",
-    failing="meshes: {main: {mtu: 1536}}",
-    passing="meshes: {main: {mtu: 1560}}",
-)
-def mtu_warned_of(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in _batman_meshes(fleet):
-        least = mesh.lan_mtu + _BATMAN_WARNS_BYTES
-        if mesh.lan_mtu + _BATMAN_BYTES <= mesh.mtu < least:
-            path = first_written(fleet, ("meshes", mesh.name, "mtu"), ("meshes", mesh.name, "lan_mtu"))
-            expected = f"at least {least} ({mesh.lan_mtu} LAN + {_BATMAN_WARNS_BYTES})"
-            yield Finding(path, "works, but batman-adv logs a warning at each activation", expected, str(mesh.mtu))

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 from typing import cast
 
 from meshctl.apply.context import NodeContext
-from meshctl.apply.mesh_commit import Participant, quorum_of, short_of_quorum
+from meshctl.apply.mesh_commit import Participant, canceled_because, quorum_of, short_of_quorum
+from meshctl.fleet import Outcome, Result
 
 
 def participant(*meshes: str) -> Participant:
@@ -29,3 +30,19 @@ def test_the_quorum_of_one_mesh_does_not_count_for_another() -> None:
     assert short_of_quorum((*MAIN, BOTH), needed) == "1 of mesh far rejoined, 2 required"
     assert short_of_quorum(FAR, needed) == "0 of mesh main rejoined, 3 required"
     assert short_of_quorum((*MAIN[:2], BOTH, *FAR[:1]), needed) == ""
+
+
+def not_ready(name: str, reason: str) -> Participant:
+    ctx = cast("NodeContext", SimpleNamespace(name=name))
+    return Participant(ctx, failure=Outcome(name, Result.FAILED, reason) if reason else None)
+
+
+def test_a_canceled_change_names_the_nodes_that_were_not_ready_and_why() -> None:
+    full = "stage: needs 72 KiB of flash, 8 KiB are free"
+    assert (
+        canceled_because([not_ready("b01", ""), not_ready("b07", full)], "armed")
+        == f"the mesh change was canceled: b07 could not be armed: {full}"
+    )
+    many = [not_ready(f"b{number:02}", "it does not answer") for number in range(5)]
+    assert canceled_because(many, "scheduled").endswith("b02 could not be scheduled: it does not answer; and 2 more")
+    assert canceled_because([not_ready("b01", "")], "armed") == "the mesh change was canceled: interrupted"

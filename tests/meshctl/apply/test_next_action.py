@@ -97,12 +97,12 @@ def test_a_person_reads_why_it_went_back() -> None:
 
 def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = rollback_reason(late, ("its LAN is down",), "b01: login refused for root; tried: key a")
-    assert told == "it was not confirmed in time: b01: login refused for root; tried: key a"
+    reason = rollback_reason(late, ("its LAN is down",), "b01: login refused for root; tried: key a")
+    assert reason == "it was not confirmed in time: b01: login refused for root; tried: key a"
 
 
 def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
-    told = rollback_reason(late, (), "", "cannot connect: Connection refused")
-    assert told == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
+    reason = rollback_reason(late, (), "", "cannot connect: Connection refused")
+    assert reason == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
     assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")

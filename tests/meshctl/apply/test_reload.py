@@ -41,7 +41,10 @@ class Node:
             (place / folder).mkdir()
         self.tool("ubus", UBUS)
         self.tool("reload_config", 'echo reload_config >>"$HERE/log"')
-        self.tool("sleep", 'echo "sleep $1" >>"$HERE/log"')
+        # time passes by sleeping
+        passing = 'read -r up _ <"$HERE/uptime"; echo "$((up + $1)) 0" >"$HERE/uptime"'
+        self.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; {passing}')
+        (place / "uptime").write_text("1000 0\n")
         self.tool("uci", 'cat "$HERE/wireless" 2>/dev/null')
         self.tool("fw4", ":")
         self.tool("nft", 'cat "$HERE/rules"')
@@ -64,6 +67,7 @@ class Node:
         text = reload_script({f"etc/config/{package}" for package in packages}, services)
         for path, own in {
             "/etc/config/network": "network",
+            "/proc/uptime": "uptime",
             "/etc/init.d": "init.d",
             "/var/run": "run",
             "/tmp/meshctl": "run/meshctl",
@@ -118,7 +122,20 @@ def test_a_procd_that_never_runs_its_reloads_is_a_failure(node: Node) -> None:
     (node.place / "stuck").touch()
     status, said = node.reload("system")
     assert status == 1
-    assert "procd did not run the reloads within 90 s" in said
+    assert "procd did not run the reloads in time" in said
+    assert node.slept_s() == 90
+
+
+def test_no_wait_outlasts_the_confirm_window(node: Node) -> None:
+    (node.place / "stuck").touch()
+    status, said = node.reload("system", "network", environ={"UNTIL_S": "1017"})
+    assert status == 1
+    assert "procd did not run the reloads in time" in said
+    assert node.slept_s() == 17
+
+
+def test_a_reload_that_is_done_before_the_window_ends_succeeds(node: Node) -> None:
+    assert node.reload("system", environ={"UNTIL_S": "1017"}) == (0, "")
 
 
 def test_where_procd_takes_no_trigger_its_reloads_are_waited_for_blindly(node: Node) -> None:

@@ -33,8 +33,8 @@ def prepared(verdict: Verdict) -> Prepared:
     ],
 )
 def test_each_resolution_of_an_uncertain_node_is_reported(verdict: Verdict, text: str) -> None:
-    told = resolutions(7, [Outcome("b01", Result.UNCERTAIN, "left")], prepared(verdict))
-    assert told == {"b01": f"uncertain after run 7; {text}"}
+    resolved = resolutions(7, [Outcome("b01", Result.UNCERTAIN, "left")], prepared(verdict))
+    assert resolved == {"b01": f"uncertain after run 7; {text}"}
 
 
 def test_a_node_left_in_the_old_cell_is_reported_with_how_to_reach_it() -> None:

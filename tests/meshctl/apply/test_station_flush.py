@@ -314,7 +314,7 @@ class TestOnAVirtualFleet:
             assert process.stdout is not None
             for line in process.stdout:
                 said.append(line)
-                if json.loads(line).get("text") == "stage":
+                if json.loads(line).get("text") == "apply":
                     assert rig.meshctl("trust", new, "base", "--replace", "--yes").code == 0
                     break
             rest, err = process.communicate()

@@ -67,9 +67,9 @@ def test_each_command_has_help_with_an_example(name: str, capsys: pytest.Capture
     assert COMMANDS[name].attribute == "app" or f"meshctl {name}" in shown.split("Usage:", 1)[1].split("\n", 1)[1]
 
 
-# these read no inventory: they make one, describe the format, show the journal, or act on a running virtual fleet
+# these read no inventory: they make one, describe its format, show journal or help, or act on a running virtual fleet
 _IN_THE_LAB = "down status shell break mend plug unplug image link move ground mission"
-WITHOUT_INVENTORY = {"init", "schema", "history", *(f"lab {name}" for name in _IN_THE_LAB.split())}
+WITHOUT_INVENTORY = {"init", "schema", "history", "help", *(f"lab {name}" for name in _IN_THE_LAB.split())}
 
 
 def _leaves(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, Any]]:

@@ -141,7 +141,7 @@ def test_a_layout_that_no_switch_can_have_is_refused(run: Run, inventory: Path, 
 
 
 @pytest.mark.usefixtures("inventory")
-def test_a_node_that_is_not_there_is_told(run: Run) -> None:
+def test_a_node_that_does_not_exist_is_reported(run: Run) -> None:
     ran = run("render", "b9*")
     assert ran.code == 2
     assert ran.err.startswith("error: no node matches 'b9*'")
@@ -235,7 +235,7 @@ class TestRevisions:
             ("HEAD:../../etc/passwd", "no such file or directory in HEAD"),
         ],
     )
-    def test_what_is_not_there_is_told(self, run: Run, argument: str, words: str) -> None:
+    def test_a_missing_inventory_or_node_is_reported(self, run: Run, argument: str, words: str) -> None:
         ran = run("diff", argument, "fleet.yaml")
         assert ran.code == 2
         assert words in ran.err

@@ -59,8 +59,16 @@ class Faults:
         node.put("/harness/wrap.sh", WRAP)
         node.put("/bin/sync", SYNC, 0o755)
 
-    def run(self, *words: str, kill_at: int | None = None, pictures: bool = False, stop_at_sleep: bool = False) -> Run:
-        """`meshctl-deadman WORDS`; `kill_at` counts from 1, `stop_at_sleep` kills it when it begins to wait."""
+    def run(
+        self,
+        *words: str,
+        kill_at: int | None = None,
+        pictures: bool = False,
+        stop_at_sleep: bool = False,
+        stdin: str = "",
+    ) -> Run:
+        """`meshctl-deadman WORDS`; `kill_at` counts from 1, `stop_at_sleep` kills it when it begins to wait, `stdin` is
+        a file on the node."""
         self.node.put("/harness/n", "0\n")
         self.node.put("/harness/commands", "")
         shutil.rmtree(self.pictures, ignore_errors=True)
@@ -68,13 +76,14 @@ class Faults:
         done = self.node.run(
             "/bin/sh",
             "-c",
-            ". /harness/wrap.sh; . /usr/sbin/meshctl-deadman",
+            '. /harness/wrap.sh; [ -z "$STDIN" ] || exec <"$STDIN"; . /usr/sbin/meshctl-deadman',
             "meshctl-deadman",
             *words,
             COUNTED="yes",
             KILL_AT="" if kill_at is None else str(kill_at),
             PICTURES="yes" if pictures else "",
             STOP_AT_SLEEP="yes" if stop_at_sleep else "",
+            STDIN=stdin,
         )
         commands = (self.node.text("/harness/commands") or "").splitlines()
         return Run(done.stdout.strip(), done.returncode < 0, tuple(line.split(" ", 1)[1] for line in commands))

@@ -189,15 +189,7 @@ def test_what_ends_the_connection_is_answered_first(connection: Connection, node
     node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
     openwrt.start_sysupgrade(connection, "/tmp/image.bin", "/tmp/config.tgz")
     eventually(lambda: calls(node) == ["sysupgrade -n -f /tmp/config.tgz /tmp/image.bin"])
-    openwrt.reboot(connection)
-    eventually(lambda: node.text("/harness/reboots") == "reboot\n")
 
 
 def test_a_root_that_is_in_flash_is_not_taken_for_one_in_memory(connection: SshConnection) -> None:
     assert not openwrt.root_in_ram(connection)
-
-
-def test_reload_config_is_called_by_its_path(connection: SshConnection, node: Sandbox) -> None:
-    node.put("/sbin/reload_config", NOTING, 0o755)
-    openwrt.reload_config(connection)
-    assert calls(node) == ["reload_config "]

@@ -81,7 +81,7 @@ def test_a_command_gives_its_output_its_errors_and_its_status(connection: SshCon
 
 
 def test_the_other_side_is_busybox_ash(connection: SshConnection) -> None:
-    assert connection.server_version.startswith("SSH-2.0-dropbear")
+    assert connection._transport.remote_version.startswith("SSH-2.0-dropbear")
     assert "BusyBox" in connection.run("busybox | head -n 1").stdout
 
 
@@ -128,7 +128,7 @@ def test_a_command_killed_on_the_node_is_distinguished_from_a_failed_one(connect
 def test_output_that_does_not_fit_is_the_command_s_failure_and_not_the_node_s_silence(
     connection: SshConnection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("meshctl.device.ssh.MAX_OUTPUT_BYTES", 1 << 20)
+    monkeypatch.setattr("meshctl.device.ssh_channel.MAX_OUTPUT_BYTES", 1 << 20)
     with pytest.raises(OutputTooLarge, match="printed more than 1 MiB") as caught:
         connection.run("head -c 3000000 /dev/zero")
     assert "| tail" in caught.value.hint
@@ -323,7 +323,7 @@ def test_a_19_07_profile_still_takes_the_better_algorithm_where_there_is_one(
                 legacy_rsa_sha1=legacy,
                 deadlines=PATIENT,
             ) as ssh:
-                assert ssh.host_key_algorithm in {"rsa-sha2-512", "rsa-sha2-256"}
+                assert ssh._transport.host_key_type in {"rsa-sha2-512", "rsa-sha2-256"}
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from meshctl.device.connection import Endpoint
 from meshctl.device.errors import HostKeyChanged, HostKeyUnknown
-from meshctl.device.trust import AfterFlash, FirstContact, HostKey, Pin, TrustStore, dump_pins, parse_key, parse_pins
+from meshctl.device.trust import HostKey, Pin, TrustStore, dump_pins, parse_key, parse_pins
 from meshctl.errors import InputError
 
 B03 = Endpoint("10.42.0.13", identity="b03")
@@ -136,41 +136,6 @@ def test_keys_pinned_in_the_inventory_count_as_pins(tmp_path: Path) -> None:
         trust.check(B03, key(2))
     with pytest.raises(InputError, match="host key of b04"):
         TrustStore(tmp_path / "pins", inventory={"b04": ("ssh-ed25519 nonsense",)})
-
-
-def test_first_contact_asks_once_and_pins_what_was_accepted(tmp_path: Path) -> None:
-    trust = store(tmp_path)
-    asked: list[str] = []
-
-    def accept(endpoint: Endpoint, shown: HostKey) -> bool:
-        asked.append(f"{endpoint.identity} {shown.fingerprint}")
-        return True
-
-    policy = FirstContact(trust, accept)
-    policy.check(B03, key(1))
-    policy.check(B03, key(1))
-    assert asked == [f"b03 {key(1).fingerprint}"]
-    with pytest.raises(HostKeyChanged):
-        policy.check(B03, key(2))
-    with pytest.raises(HostKeyUnknown):
-        FirstContact(trust, lambda _endpoint, _key: False).check(Endpoint("x", identity="b09"), key(9))
-    assert trust.pinned("b09") == ()
-
-
-def test_after_a_flash_only_the_announced_key_of_that_node_may_change(tmp_path: Path) -> None:
-    trust = store(tmp_path)
-    trust.add("b03", key(1))
-    trust.add("b04", key(4))
-    policy = AfterFlash(trust, "b03", (key(2).fingerprint,))
-    policy.check(B03, key(1))
-    with pytest.raises(HostKeyChanged):
-        policy.check(B03, key(3))
-    with pytest.raises(HostKeyChanged):
-        policy.check(Endpoint("10.42.0.14", identity="b04"), key(2))
-    policy.check(B03, key(2))
-    assert trust.pinned("b03") == (key(2),)
-    with pytest.raises(HostKeyChanged):
-        trust.check(B03, key(1))
 
 
 def test_the_file_is_parsed_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

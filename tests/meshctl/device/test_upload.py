@@ -13,7 +13,8 @@ import pytest
 
 from meshctl.device.connection import Completed, Connection, Endpoint
 from meshctl.device.errors import ChannelClosed, ConnectionLost, UploadFailed
-from meshctl.device.ssh import SshConnection, _Feeder
+from meshctl.device.ssh import SshConnection
+from meshctl.device.ssh_channel import _Feeder
 from meshctl.device.upload import CHUNK_BYTES, UploadProgress, upload
 from meshctl.errors import InputError
 from tests.meshctl.device.sandbox import Sandbox
@@ -29,13 +30,13 @@ def leftovers(node: Sandbox) -> list[str]:
 @pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES - 1, CHUNK_BYTES, 3 * CHUNK_BYTES + 17])
 def test_what_arrives_is_what_was_sent_with_its_mode(connection: SshConnection, node: Sandbox, size: int) -> None:
     data = os.urandom(size)
-    told: list[UploadProgress] = []
-    done = upload(connection, data, TARGET, mode=0o600, progress=told.append)
+    reported: list[UploadProgress] = []
+    done = upload(connection, data, TARGET, mode=0o600, progress=reported.append)
     assert node.path(TARGET).read_bytes() == data
     assert node.path(TARGET).stat().st_mode & 0o777 == 0o600
     assert (done.sha256, done.sent, done.kept) == (hashlib.sha256(data).hexdigest(), size, 0)
-    assert [step.verified for step in told] == sorted({0, *(step.verified for step in told)})
-    assert told[-1] == UploadProgress(size, size)
+    assert [step.verified for step in reported] == sorted({0, *(step.verified for step in reported)})
+    assert reported[-1] == UploadProgress(size, size)
     assert leftovers(node) == []
 
 
@@ -159,13 +160,13 @@ def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
 
 def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_path: Path) -> None:
     ready(node, tmp_path)
-    told: list[UploadProgress] = []
+    reported: list[UploadProgress] = []
     with dropbear(node, tmp_kib=1024) as server, log_in(server, node, tmp_path) as connected:
         with pytest.raises(UploadFailed, match=r"needs 2049 KiB, 10[0-9][0-9] KiB are free"):
-            upload(connected, os.urandom(2 << 20), TARGET, progress=told.append)
+            upload(connected, os.urandom(2 << 20), TARGET, progress=reported.append)
         upload(connected, os.urandom(700 << 10), TARGET)
         assert connected.run(f"wc -c <{TARGET}").stdout == f"{700 << 10}\n"
-    assert told == []
+    assert reported == []
 
 
 def test_a_rate_is_held_by_pausing_for_what_was_sent(connection: SshConnection, node: Sandbox) -> None:

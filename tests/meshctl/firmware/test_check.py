@@ -1,4 +1,4 @@
-"""An image against its profile: each thing that can be wrong is told apart."""
+"""An image against its profile: each thing that can be wrong is distinguished."""
 
 from __future__ import annotations
 

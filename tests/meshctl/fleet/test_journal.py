@@ -143,7 +143,7 @@ def test_what_is_no_journal_is_refused_with_its_path(path: Path) -> None:
 
 def test_a_journal_of_a_later_version_is_refused(path: Path) -> None:
     with Journal(path) as journal:
-        journal._database.execute("PRAGMA user_version = 7")
+        journal._file._database.execute("PRAGMA user_version = 7")
     with pytest.raises(MeshctlError, match="version 7, expected 1"):
         Journal(path)
 
@@ -165,7 +165,7 @@ def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() ->
 def test_an_unwritable_journal_stops_no_work_and_is_reported(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
-        journal._database.execute("PRAGMA query_only = ON")
+        journal._file._database.execute("PRAGMA query_only = ON")
         with run.step("a", "arm"):
             pass
         run.remember("f", "a", {"boot_id": "1"}, 5.0)
@@ -203,7 +203,7 @@ def test_what_a_held_journal_does_not_take_is_written_as_soon_as_it_is_free(path
 def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
-        database = journal._database
+        database = journal._file._database
         (pages,) = database.execute("PRAGMA page_count").fetchone()
         database.execute(f"PRAGMA max_page_count = {pages}")
         run.finish_node(Outcome("a", Result.FAILED, "x" * 100_000))
@@ -219,17 +219,17 @@ def test_a_locked_journal_can_be_read_and_hints_at_the_process(
     Journal(path).close()
     with held_by_another(path), Journal(path) as journal:
         assert journal.runs() == ()
-        with pytest.raises(MeshctlError, match="locked") as told, journal._write(0.0):
+        with pytest.raises(MeshctlError, match="locked") as caught, journal._file.write(0.0):
             pass
-        assert "fuser" in told.value.hint
+        assert "fuser" in caught.value.hint
 
 
 def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> None:
     path.parent.mkdir(parents=True)
     path.mkdir()
-    with pytest.raises(MeshctlError, match="cannot open the journal") as told:
+    with pytest.raises(MeshctlError, match="cannot open the journal") as caught:
         Journal(path)
-    assert "XDG_STATE_HOME" in told.value.hint
+    assert "XDG_STATE_HOME" in caught.value.hint
 
 
 def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
@@ -272,3 +272,27 @@ def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_the
         assert [run.id for run in lab.runs(fleet="practice")] == [only_virtual.id]
         assert set(field.last_known("f")) == {"a"}, "their origin is unknown: they stay"
         assert (field.last_known("practice"), set(lab.last_known("practice"))) == ({}, {"a"})
+
+
+def test_facts_of_a_device_that_was_replaced_are_left_out(path: Path) -> None:
+    """On any laptop: the pinned host keys come with the inventory, whichever user ran `meshctl replace`."""
+    pins = {"b01": ["SHA256:old"], "b02": ["SHA256:b02"]}
+
+    def opened() -> Journal:
+        return Journal(path, pinned=lambda node: pins.get(node, ()))
+
+    with opened() as journal:
+        for key in ("b01", "b02", "status.b01", "robot.b01"):
+            journal.remember("f", key, {"macs": f"02:00:00:00:00:0{len(key) % 10}"}, 100.0)
+    pins["b01"] = ["SHA256:new"]
+    with opened() as journal:
+        known = journal.last_known("f")
+        assert sorted(known) == ["b02", "robot.b01"]
+        assert known["b02"].facts == {"macs": "02:00:00:00:00:03"}
+        run = journal.begin("provision", fleet="f", inventory="", nodes=("b01",))
+        run.remember("f", "b01", {"macs": "02:00:00:00:00:11"}, 200.0)
+        assert journal.last_known("f")["b01"].facts == {"macs": "02:00:00:00:00:11"}
+    # one key of several was rotated, or known_hosts is not at hand: still the same device
+    pins["b01"], pins["b02"] = ["SHA256:new", "SHA256:rsa"], []
+    with opened() as journal:
+        assert {"b01", "b02"} <= set(journal.last_known("f"))

@@ -40,10 +40,10 @@ def test_json_lines_hold_every_event() -> None:
     with JsonProgress(out) as progress:
         for event in EVENTS:
             progress(event)
-    told = [json.loads(line) for line in out.getvalue().splitlines()]
-    assert [line["event"] for line in told] == ["started", "step", "progress", "note", "finished"]
-    assert told[2]["fraction"] == 0.5
-    assert told[4]["outcome"]["result"] == "rolled back"
+    lines = [json.loads(line) for line in out.getvalue().splitlines()]
+    assert [line["event"] for line in lines] == ["started", "step", "progress", "note", "finished"]
+    assert lines[2]["fraction"] == 0.5
+    assert lines[4]["outcome"]["result"] == "rolled back"
 
 
 def test_live_lines_keep_outcomes_and_count_them() -> None:

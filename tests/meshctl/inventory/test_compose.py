@@ -19,7 +19,7 @@ def test_both_parsers_give_the_same_tree_with_the_same_places(name: str, monkeyp
     source = read_source(SHIPPED / name)
     assert isinstance(source, Source)
     first = compose(source)
-    monkeypatch.setattr(module, "_LOADER", yaml.SafeLoader)
+    monkeypatch.setattr(module, "LOADER", yaml.SafeLoader)
     assert compose(source) == first
     assert first.diagnostics == ()
 
@@ -27,7 +27,7 @@ def test_both_parsers_give_the_same_tree_with_the_same_places(name: str, monkeyp
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: [", "a: *b", "- !x y", "a: @", "{a: 1, a: 2}", "\ufffe", "é: 'ü"])
 def test_both_parsers_refuse_the_same_with_the_same_code(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     first = compose(Source("t.yaml", text))
-    monkeypatch.setattr(module, "_LOADER", yaml.SafeLoader)
+    monkeypatch.setattr(module, "LOADER", yaml.SafeLoader)
     second = compose(Source("t.yaml", text))
     assert [item.code for item in first.diagnostics] == [item.code for item in second.diagnostics]
     assert [item.position.line for item in first.diagnostics] == [item.position.line for item in second.diagnostics]

@@ -88,7 +88,7 @@ def test_why_tells_the_layer_of_every_value(tmp_path: Path) -> None:
     assert whys["extra_uci.wireless.radio0.rts"].origin.position.line == 15
 
 
-def test_a_node_has_no_values_but_its_own_when_nobody_writes_defaults(tmp_path: Path) -> None:
+def test_a_node_has_no_values_but_its_own_without_defaults(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "nodes: {n: {hardware: rocket, address: 10.42.0.1}}\n")
     assert {path for path in fleet.provenance if path[0] == "nodes"} == {
         ("nodes",),

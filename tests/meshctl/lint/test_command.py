@@ -182,7 +182,7 @@ def test_list_names_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert "MC342  error    The conducted power exceeds the FCC limit\n" in capsys.readouterr().out
 
 
-def test_a_machine_without_a_regulatory_database_is_told_so(
+def test_a_machine_without_a_regulatory_database_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("meshctl.regdb.file.SYSTEM", Path("absent.db"))

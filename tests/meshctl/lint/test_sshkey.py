@@ -18,9 +18,9 @@ def _line(key: ed25519.Ed25519PublicKey | rsa.RSAPublicKey | ec.EllipticCurvePub
 
 def test_the_kinds_that_openssh_writes_are_read() -> None:
     key = parse_authorized_key(_line(ed25519.Ed25519PrivateKey.generate().public_key()) + " alice@laptop")
-    assert (key.kind, key.bits, key.comment, key.is_ed25519) == ("ssh-ed25519", 256, "alice@laptop", True)
+    assert (key.kind, key.bits, key.comment) == ("ssh-ed25519", 256, "alice@laptop")
     key = parse_authorized_key(_line(rsa.generate_private_key(65537, 2048).public_key()))
-    assert (key.kind, key.bits, key.is_ed25519) == ("ssh-rsa", 2048, False)
+    assert (key.kind, key.bits) == ("ssh-rsa", 2048)
     for curve, bits in ((ec.SECP256R1(), 256), (ec.SECP384R1(), 384)):
         assert parse_authorized_key(_line(ec.generate_private_key(curve).public_key())).bits == bits
 

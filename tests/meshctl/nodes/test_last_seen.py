@@ -32,7 +32,7 @@ def test_the_last_sighting_and_the_nodes_that_hear_it_are_shown_latest_first() -
     stations = (Station("mesh0", LOST, signal_dbm=-61, inactive_ms=40),)
     place = of(b01=hears("b01", 42_000), b02=hears("b02", 400, stations=stations), b04=running(fleet(), "b04"))
     assert place.text(NOW_S) == (
-        "last seen 95 s ago (02:46:40 UTC), up 2 h then, 23.05.5, r24106-10cc5fcd00; "
+        "last seen 95 s ago (02:46:40 UTC), up 2.0 h then, 23.05.5, r24106-10cc5fcd00; "
         "heard by b02 0.4 s ago (-61 dBm), b01 42 s ago"
     )
     assert place.facts == {"last_seen_s": "10000", "heard_by": "b02:400ms b01:42000ms", "asked": "3"}

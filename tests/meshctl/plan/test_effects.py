@@ -58,10 +58,15 @@ def test_up_to_22_03_every_difference_restarts_the_radio_and_later_some_options_
 @pytest.mark.parametrize(
     ("old", "new"), [("txpower '27'", "txpower '9'"), ("country 'US'", "country 'DE'"), ("option txpower '27'\n", "")]
 )
-def test_less_range_may_cut_the_mesh_links_without_a_restart(old: str, new: str) -> None:
-    effect = cut_by(old, new, Release.V24_10)
-    assert effect.cut is Cut.MESH
-    assert effect.why.endswith("set without a restart, weak links may break")
+@pytest.mark.parametrize("release", RELEASES)
+def test_less_range_cuts_weak_links_where_the_radio_does_not_restart(old: str, new: str, release: Release) -> None:
+    effect = cut_by(old, new, release)
+    if release < Release.V23_05:
+        assert effect.cut is Cut.MESH
+        assert "restarts" in effect.why
+    else:
+        assert effect.cut is Cut.WEAK_LINKS
+        assert effect.why.endswith("set without a restart")
 
 
 def test_wpa_supplicant_names_the_country_and_restarts_for_another() -> None:

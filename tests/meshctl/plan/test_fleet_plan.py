@@ -165,7 +165,7 @@ def test_a_saved_plan_reads_back_equal_and_holds_no_secret() -> None:
     ("damage", "message"),
     [
         (lambda document: document.update(format="other"), "expected a plan written by"),
-        (lambda document: document.update(version=9), "expected a plan of version 2, found 9"),
+        (lambda document: document.update(version=9), "expected a plan of version 3, found 9"),
         (lambda document: document.pop("stages"), "'stages' is missing"),
         (lambda document: document["nodes"][0].update(verdict="maybe"), "'maybe' is not a valid Verdict"),
         (lambda document: document["stages"][0].update(nodes=["b99"]), "stages name b99"),

@@ -68,6 +68,14 @@ def test_a_line_goes_from_its_end_and_names_its_cut_vertices() -> None:
     assert stages[0].reason == "b02 is 3 hops away, quality 73%"
 
 
+def test_a_cut_vertex_whose_radio_stays_up_goes_alone_and_may_cut_off_others() -> None:
+    mesh = graph("base-b00", "b00-b01", "b01-b02")
+    stages = stages_of([changing(name, cut=Cut.WEAK_LINKS) for name in ("b01", "b02")], around(mesh))
+    assert [stage.nodes for stage in stages] == [("b02",), ("b01",)]
+    assert stages[1].reason == "alone, because it is a cut vertex: b02 cannot be reached if a weak link breaks"
+    assert stages[1].cuts_off == ("b02",)
+
+
 def test_the_canary_is_the_farthest_node_that_is_not_a_cut_vertex() -> None:
     mesh = graph("base-b00", "base-b01", "b01-b02")
     stages = stages_of([changing(name) for name in ("b00", "b01", "base")], around(mesh, canary=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -43,6 +44,20 @@ def test_it_shows_what_is_interrupted_and_masked_diffs() -> None:
     brief = read(another_host_name(), with_diffs=False)
     assert "  changed   etc/config/wireless: beacon_int 200 -> 100\n" in brief
     assert "option" not in brief
+
+
+def test_a_lower_power_says_that_its_radio_stays_up() -> None:
+    seen = {name: running(fleet(), name) for name in ("base", "b01", "b02")}
+    old = seen["b01"].uci
+    assert old is not None
+    stronger = re.sub(r"(option txpower) '\d+'", r"\1 '30'", old["wireless"])
+    assert stronger != old["wireless"]
+    seen["b01"] = replace(seen["b01"], uci={**old, "wireless": stronger})
+    text = read(fleet_plan(fleet(), plans(fleet(), seen), LINE, now_s=0.0))
+    assert "b01  cuts weak mesh links, if any\n" in text
+    assert "radio0: txpower set without a restart; cuts weak mesh links, if any" in text
+    assert "b02 cannot be reached if a weak link breaks" in text
+    assert "b01 is a cut vertex: b02 may be unreachable meanwhile" in text
 
 
 def test_a_refusal_stands_at_its_end_with_its_remedy() -> None:

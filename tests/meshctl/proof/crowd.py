@@ -1,4 +1,4 @@
-"""A fleet of many virtual nodes, some of which fail in ways that have to be told apart."""
+"""A fleet of many virtual nodes, some of which fail in ways that have to be distinguished."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RIGHT: Mapping[str, tuple[str, ...]] = {
 
 
 def hurt_and_provision(rig: Rig, *, share: float, old: str, new: str) -> dict[str, Any]:
-    """Hurt `share` of the nodes, each in the next way of `RIGHT`; provision; mend; resume. Returns what came of it."""
+    """Hurt `share` of the nodes, each in the next way of `RIGHT`; provision; repair; resume. Returns the result."""
     count = max(len(RIGHT), round(len(rig.names) * share)) if share else 0
     hurt = dict(zip(rig.names[:: max(1, len(rig.names) // max(1, count))], list(RIGHT) * count, strict=False))
     hurt = dict(list(hurt.items())[:count])

@@ -40,7 +40,7 @@ class Case:
     @property
     def holds(self) -> bool:
         # a board without a second slot does not survive a power cut while its flash is written: nothing could
-        # save it, so it holds when that was told and the recovery recipe brought it back
+        # save it, so it holds once that was reported and the recovery recipe brought it back
         if self.state == "bricked":
             return self.outcome == "uncertain" and self.resumed
         return self.state in ("old", "new") and self.reachable and self.resumed
@@ -57,7 +57,7 @@ def strike_nodes(
         rig.fleet.inject_fault(name, f"{kind}@{step}")
     with rig.start("provision", new, "--yes", "--json") as process, ThreadPoolExecutor(1) as reader:
         talk = reader.submit(process.communicate)
-        _mend_when_undone(rig, set(steps), talk)
+        _repair_when_undone(rig, set(steps), talk)
         out, err = talk.result()
     run = Ended(process.returncode, out, err)
     dead = [name for name in steps if rig.fleet.node(name).power is Power.DEAD]
@@ -74,7 +74,7 @@ def strike_nodes(
     ]
 
 
-def _mend_when_undone(rig: Rig, names: set[str], talk: Future[tuple[str, str]]) -> None:
+def _repair_when_undone(rig: Rig, names: set[str], talk: Future[tuple[str, str]]) -> None:
     """Give severed nodes their links back once their windows have run out, so that meshctl sees what became of them."""
     severed: dict[str, float] = {}
     while not talk.done():
@@ -89,7 +89,7 @@ def _mend_when_undone(rig: Rig, names: set[str], talk: Future[tuple[str, str]]) 
 
 
 def strike_meshctl(rig: Rig, words: int, *, old: str, new: str, verb: str = "apply") -> list[Case]:
-    """Kill meshctl (SIGKILL) once it has told `words` events; fewer events in all mean that it ended by itself."""
+    """Kill meshctl (SIGKILL) once it has printed `words` events; with fewer events in all it ended by itself."""
     said: list[str] = []
     with rig.start("provision", new, "--yes", "--json") as process:
         assert process.stdout is not None
@@ -105,14 +105,14 @@ def strike_meshctl(rig: Rig, words: int, *, old: str, new: str, verb: str = "app
 
 
 def _last_word(run: Ended, name: str) -> str:
-    told = [event for event in run.events if event.get("node") == name and event["event"] != "note"]
-    return str(told[-1].get("text") or told[-1]["event"]) if told else "before it"
+    events = [event for event in run.events if event.get("node") == name and event["event"] != "note"]
+    return str(events[-1].get("text") or events[-1]["event"]) if events else "before it"
 
 
 def _verdicts(rig: Rig, struck: Mapping[str, tuple[str, str]], new: str) -> dict[str, str]:
     """What meshctl sees of the nodes once they have come to rest without anybody's help.
 
-    Whoever is under its dead-man's switch does while meshctl looks (it clears what a dead meshctl left); whoever has
+    A node under its dead-man's switch does while meshctl looks (it clears what a dead meshctl left); one that has
     just begun to be flashed is up for another moment, then gone for a while.
     """
     deadline = time.monotonic() + REST_S

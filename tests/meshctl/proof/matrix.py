@@ -185,13 +185,13 @@ def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
 def filled(page: str, rows: Iterable[str]) -> str:
     """The page with these rows of `table` in place of those about the same work and strike; others stay."""
     new = [row for row in rows if not row.startswith(("| work", "| ---"))]
-    anew = {_subject(row) for row in new}
+    updated = {_subject(row) for row in new}
     lines = page.splitlines(keepends=True)
     head = next(number for number, line in enumerate(lines) if line.startswith("| work |"))
     end = next(number for number, line in enumerate(lines[head:], head) if not line.startswith("|"))
-    kept = [line for line in lines[head + 2 : end] if _subject(line) not in anew]
-    told = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
-    return "".join([*lines[: head + 2], *told, *lines[end:]])
+    kept = [line for line in lines[head + 2 : end] if _subject(line) not in updated]
+    rows = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
+    return "".join([*lines[: head + 2], *rows, *lines[end:]])
 
 
 # flash and power-cut, for instance; in the order of the page

@@ -37,8 +37,7 @@ country: US
 operators:
   ssh_keys: ["{key}"]
 system: {{log_size_kib: {log_size}}}
-apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, parallel: {parallel},
-        quorum: 0.6}}
+apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, quorum: 0.6{policy}}}
 hardware:
   box:
     board: compex,wpj344-16m
@@ -98,13 +97,14 @@ class Rig:
     count: int
     # a reload alone takes 3 s, and more on a busy machine
     window_s: int = 40
-    parallel: int = 8
+    # of the inventory's `apply`; None: not set
+    parallel: int | None = 8
     # further lines of the hardware profile, by inventory
     firmware: Mapping[str, str] = field(default_factory=dict)
     # what is baked into the images
     packages: tuple[str, ...] = MESH_PACKAGES
-    # whether meshctl is told of the virtual fleet; without, it goes by addresses and cables as in the field
-    is_told_of_lab: bool = True
+    # whether meshctl knows that the fleet is virtual; otherwise it uses addresses and cables as in the field
+    knows_lab: bool = True
     release: Release = Release.V23_05
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
@@ -125,7 +125,7 @@ class Rig:
                 key=public.decode() + " proof",
                 count=self.count,
                 window_s=self.window_s,
-                parallel=self.parallel,
+                policy="" if self.parallel is None else f", parallel: {self.parallel}",
                 firmware=self.firmware.get(variant, ""),
                 log_size=64 + number,
                 channel=SPLIT_CHANNELS[number] if variant == "split" else 6,
@@ -178,7 +178,7 @@ class Rig:
         return {
             **{name: text for name, text in os.environ.items() if not name.startswith("MESHCTL_")},
             "XDG_STATE_HOME": str(self.directory / "state"),
-            **({"MESHCTL_LAB": str(self.fleet.directory)} if self.is_told_of_lab else {}),
+            **({"MESHCTL_LAB": str(self.fleet.directory)} if self.knows_lab else {}),
             "PYTHONPATH": root,
             "SSH_AUTH_SOCK": "",
         }
@@ -237,7 +237,7 @@ class Rig:
                     yield member.name, stream.read()
 
     def settle(self) -> None:
-        """Mended, up and wholly on `current`, whatever was done before or left undone."""
+        """Repaired, up and completely on `current`, whatever was done before."""
         self.fleet.repair()
         self.wait_all_up()
         other = "b" if self.current == "a" else "a"

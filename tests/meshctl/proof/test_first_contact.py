@@ -1,4 +1,4 @@
-"""A device fresh from its box, taken in over SSH: nobody is locked out, and what its board wrote stays."""
+"""A device fresh from its box, taken in over SSH: no operator is locked out, and what its board wrote stays."""
 
 from __future__ import annotations
 

@@ -51,5 +51,5 @@ def test_killing_meshctl_at_any_of_its_words_in_a_flash_strands_no_node(
 def test_of_two_hundred_nodes_every_outcome_is_right_and_none_is_lost(tmp_path_factory: pytest.TempPathFactory) -> None:
     with Rig(tmp_path_factory.mktemp("crowd"), 200) as rig:
         assert rig.take_in("a").code == 0
-        told = hurt_and_provision(rig, share=0.05, old="a", new="b")
-    assert (told["wrong"], told["not new"]) == ({}, {})
+        report = hurt_and_provision(rig, share=0.05, old="a", new="b")
+    assert (report["wrong"], report["not new"]) == ({}, {})

@@ -39,7 +39,7 @@ def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_chang
     ended = rig.meshctl("resume", "split", "--yes", "--json")
     assert (ended.code, set(ended.results.values())) == (0, {"done"}), ended.out + ended.err
     assert {rig.state_of(name, rig.current, "split") for name in everybody} == {"new"}
-    # On the way back one node is left behind: it is told as uncertain, and a resume settles it.
+    # On the way back one node is left behind: it is reported as uncertain, and a resume settles it.
     rig.fleet.inject_fault("n001", "sever@mv -f /etc/meshctl/change/new")
     ended = rig.meshctl("provision", "a", "--yes", "--json")
     expected = {name: "uncertain" if name == "n001" else "done" for name in ("base", *rig.names)}

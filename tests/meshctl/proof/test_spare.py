@@ -13,8 +13,18 @@ from tests.meshctl.proof.rig import Rig
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
+def _pins(directory: Path) -> list[str]:
+    return sorted(line for file in directory.glob("known_hosts*") for line in file.read_text().splitlines())
+
+
 def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) -> None:
     with Rig(tmp_path, 3) as rig:
+        shown = rig.meshctl("bootstrap", "a", "n001", "--dry-run")
+        assert (shown.code, "1 to change" in shown.out) == (0, True), shown.err
+        # nothing pinned, nothing changed, nothing in the journal
+        assert _pins(tmp_path) == []
+        assert rig.fleet.node("n001").address == "192.168.1.1"
+        assert json.loads(rig.meshctl("history", "", "--json").out) == []
         taken = rig.take_in("a")
         assert taken.code == 0, taken.out + taken.err
         inventory = rig.inventory("spare")
@@ -24,13 +34,20 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         alive = rig.meshctl("replace", "spare", "n001", "n002", "--yes", "--json")
         assert "still answers" in alive.err
         rig.fleet.inject_fault("n001", "off")
+        pins = _pins(tmp_path)
+        shown = rig.meshctl("replace", "spare", "n001", "n002", "--dry-run")
+        assert (shown.code, "becomes n001" in shown.out) == (0, True), shown.err
+        assert "+  n001: {label: S2}" in shown.out, shown.out
+        assert inventory.read_text(encoding="utf-8") == text + spares
+        assert _pins(tmp_path) == pins
+        assert rig.fleet.node("n002").address == "10.42.1.2"
         replaced = rig.meshctl("replace", "spare", "n001", "n002", "--yes", "--json")
         assert (replaced.code, replaced.results) == (0, {"n001": "done"}), replaced.out + replaced.err
         assert rig.fleet.node("n002").address == "10.42.1.1"
         fleet = load_fleet(inventory)
         assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S2", "retired")
         assert rig.meshctl("provision", "spare", "n001", "--check", "--json").verdicts == {"n001": "same"}
-        # its successor dies, too, and somebody breaks the inventory while the next one takes over
+        # its successor dies, too, and the inventory breaks while the next one takes over
         rig.fleet.inject_fault("n002", "off")
         good = inventory.read_text(encoding="utf-8")
         with rig.start("replace", "spare", "n001", "n003", "--yes", "--json") as process:

@@ -1,4 +1,4 @@
-"""Factory devices that all answer at one address, told apart by the interface they are plugged into."""
+"""Factory devices that all answer at one address, distinguished by the interface they are plugged into."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_two_devices_at_one_address_are_taken_in_at_once_each_through_its_own_in
     root = Path(__file__).resolve().parents[3]
     done = subprocess.run(in_own_network(tmp_path), cwd=root, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert (told["results"], told["check"]) == (dict.fromkeys(WIRES, "done"), 0), told
-    assert told["names"] == {name: name for name in WIRES}
-    assert told["addresses"] == {"n001": "10.42.1.1", "n002": "10.42.1.2"}
+    report = json.loads(done.stdout)
+    assert (report["results"], report["check"]) == (dict.fromkeys(WIRES, "done"), 0), report
+    assert report["names"] == {name: name for name in WIRES}
+    assert report["addresses"] == {"n001": "10.42.1.1", "n002": "10.42.1.2"}

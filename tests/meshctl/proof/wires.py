@@ -1,7 +1,7 @@
 """`python -m tests.meshctl.proof.wires DIRECTORY`: two factory devices, each at 192.168.1.1 behind a cable of its own.
 
 Runs in a network namespace of its own (`in_own_network` gives the command): a virtual fleet whose LAN ports are joined
-to real interfaces w1 and w2 of that namespace, which meshctl is told by `--interface`. Prints what came of it as JSON.
+to real interfaces w1 and w2 of that namespace, which meshctl gets by `--interface`. Prints the result as JSON.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def in_own_network(directory: Path) -> list[str]:
 def main() -> int:
     """Plug both in, bootstrap them at once, and look whether each became the one it was said to be."""
     _ip("link set lo up")
-    with Rig(Path(sys.argv[1]), 2, is_told_of_lab=False) as rig:
+    with Rig(Path(sys.argv[1]), 2, knows_lab=False) as rig:
         rig.wait_all_up()
         for number, (name, wire) in enumerate(WIRES.items(), 1):
             _plug(rig, name, wire)
@@ -39,7 +39,7 @@ def main() -> int:
         for number, wire in enumerate(WIRES.values(), 1):
             _ip(f"route add 10.42.1.{number} dev {wire} src 10.42.255.{number}")
         again = rig.meshctl("provision", "a", *WIRES, "--check", "--json")
-        told = {
+        report = {
             "results": taken.results,
             "names": {
                 name: rig.fleet.node(name).exec("cat /proc/sys/kernel/hostname").stdout.strip() for name in WIRES
@@ -49,7 +49,7 @@ def main() -> int:
             "out": taken.out,
             "check": again.code,
         }
-    sys.stdout.write(json.dumps(told))
+    sys.stdout.write(json.dumps(report))
     return 0
 
 

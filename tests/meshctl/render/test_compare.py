@@ -23,7 +23,7 @@ def test_each_changed_option_is_named_on_each_node() -> None:
     assert (file.path, file.lines) == ("etc/config/wireless", ("~ wireless.radio0.channel: '6' -> '11'",))
 
 
-def test_new_and_lost_nodes_are_told() -> None:
+def test_new_and_lost_nodes_are_reported() -> None:
     after = fleets.fleet(fleets.node(name="a", state=NodeState.LOST), fleets.node(name="b"), fleets.node(name="c"))
     differences = [(item.node, item.change) for item in compare_fleets(FLEET, after)]
     assert differences == [("a", NodeChange.REMOVED), ("c", NodeChange.ADDED)]
@@ -54,7 +54,7 @@ def test_files_that_are_no_uci_are_compared_by_lines() -> None:
     assert file.lines[1:] == (f" {fleets.RSA}", f"-{fleets.ED25519}")
 
 
-def test_new_files_are_told() -> None:
+def test_new_files_are_reported() -> None:
     after = fleets.fleet(fleets.node(extra_uci={"lldpd.config": "lldpd", "lldpd.config.lldp_class": "4"}))
     (difference,) = compare_fleets(fleets.fleet(), after)
     (file,) = difference.files

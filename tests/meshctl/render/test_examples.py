@@ -22,7 +22,7 @@ SECRETS: Callable[[SecretRef], Secret] = placeholder_secret
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_every_node_of_the_examples_renders_once_somebody_may_log_in(name: str) -> None:
+def test_every_node_of_the_examples_renders_once_an_operator_has_a_key(name: str) -> None:
     fleet = load_fleet(shipped("inventory") / name)
     if not fleet.operators.ssh_keys:
         with pytest.raises(InvalidInput, match="RND003"):

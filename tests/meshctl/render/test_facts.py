@@ -187,7 +187,7 @@ def test_a_radio_that_the_inventory_leaves_out_stays_as_wifi_config_made_it() ->
     assert written.sections[-2:] == parse(ADDED, "wireless").sections
 
 
-def test_a_radio_that_somebody_switched_on_is_switched_off_and_loses_its_interface() -> None:
+def test_a_radio_switched_on_by_hand_is_switched_off_and_loses_its_interface() -> None:
     written = package(render(box(), wireless=ADDED.replace("disabled '1'", "disabled '0'")), "wireless")
     radio = written.section("radio2")
     assert radio is not None

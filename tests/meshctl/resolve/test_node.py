@@ -199,7 +199,7 @@ def test_system_settings_of_more_than_a_line_are_refused(system: SystemSettings,
     ("release", "keys"),
     [(Release.V24_10, ()), (Release.V19_07, (fleets.ED25519,))],
 )
-def test_nobody_is_locked_out(release: Release, keys: tuple[str, ...]) -> None:
+def test_every_operator_can_log_in(release: Release, keys: tuple[str, ...]) -> None:
     fleet = fleets.fleet(fleets.node(release), operators=Operators(keys))
     assert refusals(fleet) == ["operators.ssh_keys RND003"]
     assert intent(replace(fleet, operators=Operators(keys, password_login=True))).login.is_password_allowed

@@ -23,6 +23,8 @@ def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: 
     fleet.add("husky1", fresh=True)
     fleet.write()
     assert "not installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
+    assert "not installed" in fleet.deploy("--dry-run")
+    assert "not installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
     assert "husky1: done: runs " in fleet.deploy()
     before = fleet.shell("husky1", _EVERYTHING)
     assert "husky1: unchanged: already runs " in fleet.deploy()

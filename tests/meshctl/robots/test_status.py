@@ -50,6 +50,13 @@ def test_a_deployed_crew_is_well_talks_and_a_daemon_that_stops_is_reported_with_
     names = ("daemons", "one release", "keys", "peers", "urgent topics", "delivery")
     assert {name: found[name]["go"] for name in names} == dict.fromkeys(names, True), found
     assert "all 2 pairs" in found["delivery"]["reason"]
+    assert "emergency stop" not in found
+    message = fleet.file.with_name("stop.bin")
+    message.write_bytes(b"\x01\x00stop")
+    stopped = document(fleet, "preflight", "--send-estop", str(message), "--yes")["checks"]
+    (stop,) = [check for check in stopped if check["check"] == "emergency stop"]
+    assert stop["go"], stop
+    assert stop["reason"].startswith("sent, and acknowledged by "), stop
     fleet.meshctl("stop", "bravo")
     after = document(fleet, "status", "--robot", "bravo", "--role", "computer")
     assert (after["exit"], serious(after["robots"][0])) == (1, ["daemon"])

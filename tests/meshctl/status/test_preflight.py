@@ -11,6 +11,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
+from meshctl.status.emergency_stop import StopResult, parse_outcomes, stop_plan
 from meshctl.status.filters import select_devices
 from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
@@ -184,7 +185,40 @@ def test_a_selected_device_that_is_not_ready_is_a_no_go(fleet: Fleet) -> None:
     assert "beacons" in [check.name for check in selected(fleet, "base", "b02") if not check.is_go]
 
 
-def test_one_selected_robot_has_nobody_to_send_test_messages_to(fleet: Fleet) -> None:
+def test_one_selected_robot_has_no_peer_for_test_messages(fleet: Fleet) -> None:
     found = {check.name: check for check in selected(fleet, "base", "robot:station")}
     assert found["delivery"].is_go
     assert not found["delivery"].is_checked
+
+
+def test_an_emergency_stop_goes_from_its_source_to_the_active_robots(fleet: Fleet) -> None:
+    plan = stop_plan(fleet, ["station", "rover"])
+    assert plan is not None
+    assert (plan.topic.name, plan.source, plan.destinations) == ("estop", "station", ("rover",))
+    assert stop_plan(replace(fleet, topics=()), ["rover"]) is None
+
+
+def test_an_emergency_stop_is_a_go_only_if_every_robot_acknowledges_it(fleet: Fleet) -> None:
+    lines = '{"event": "outcome", "peer": "rover", "outcome": "delivered"}\nnoise\n'
+    lines += '{"event": "outcome", "peer": "spot", "outcome": "expired", "reason": "deadline"}\n'
+    status = status_of(fleet, known=KNOWN)
+    found = {
+        names: {check.name: check for check in preflight(fleet, status, DELIVERED, (), parse_outcomes(lines, names))}
+        for names in (("rover",), ("rover", "spot", "uav"), ())
+    }
+    assert found[("rover",)]["emergency stop"].is_go
+    assert "acknowledged by rover" in found[("rover",)]["emergency stop"].reason
+    reason = found[("rover", "spot", "uav")]["emergency stop"].reason
+    assert reason == "spot: expired (deadline); uav: no acknowledgment"
+    assert not found[()]["emergency stop"].is_go
+    # nobody asked for one
+    assert "emergency stop" not in checks(fleet)
+
+
+def test_an_emergency_stop_that_could_not_be_sent_is_a_no_go(fleet: Fleet) -> None:
+    result = preflight(
+        fleet, status_of(fleet, known=KNOWN), DELIVERED, (), StopResult(problem="station cannot send it")
+    )
+    assert [(check.name, check.reason) for check in result if not check.is_go] == [
+        ("emergency stop", "station cannot send it")
+    ]

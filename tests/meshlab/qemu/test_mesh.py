@@ -102,8 +102,8 @@ def _topology_of_one_moment(lab: Lab) -> Any:
         before = lab.hops()
         drawn = lab.meshctl("topology", "--json").json
         after = lab.hops()
-        told = {node["name"]: node["hops"] for node in drawn["nodes"]}
-        return all(told.get(name) in (before[name], after[name]) for name in NODES)
+        shown_hops = {node["name"]: node["hops"] for node in drawn["nodes"]}
+        return all(shown_hops.get(name) in (before[name], after[name]) for name in NODES)
 
     until(agrees, "the drawn hops to be those of the kernels' routes")
     return drawn

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.reconvergence_fleet import PROGRAMS
+from meshlab.placement import flush_stations
 from meshlab.qemu import control
 from tests.meshlab.qemu.conftest import Lab, until
 
@@ -100,12 +101,6 @@ def arrived(lab: Lab) -> int:
     return int(on_machine(lab, "cat /run/arrivals 2>/dev/null | wc -l"))
 
 
-def have_forgotten(lab: Lab, node: str, other: str) -> None:
-    """Delete the station entry of another node, which is off, on a node."""
-    mac = next(mac for mac, name in lab.names().items() if name == other)
-    lab.on(node, f"iw dev mesh0 station del {mac} || true")
-
-
 def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
     put_programs(lab)
     # a second route for the relay's neighbors, and a worse one
@@ -122,8 +117,7 @@ def test_telemetry_flows_again_when_a_relay_has_died(lab: Lab) -> None:
             assert not lab.node("b01").is_up()
     finally:
         # else they would be half deaf to it: it is back within the minute before Linux drops its entry
-        for name in ("base", "b02"):
-            have_forgotten(lab, name, "b01")
+        flush_stations(lab.fleet, "b01")
         lab.fleet.repair("b01")
         lab.meshctl("lab", "mend", "base-b02")
     until(lambda: "base" not in lab.neighbors("b02"), "the links to be as they were")

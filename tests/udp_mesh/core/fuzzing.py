@@ -25,7 +25,7 @@ from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import encode_legacy, encode_mesh_data, fragment_legacy
 
-RECORD = Path(__file__).parents[3] / "benchmarks" / "results" / "fuzz.jsonl"
+RECORD = Path("build/fuzz.jsonl")
 CHUNK_INPUTS = 250_000
 FRESH_PAIR_EVERY = 20_000
 """Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
@@ -59,7 +59,7 @@ class Fuzzer:
         both.roundtrip(times=30)
         peer = both.a._state.peer_table.peers["b"]
         assert peer.session is not None
-        self.insider, self.sent_packets = peer.session, peer.sender.in_flight
+        self.insider, self.sent_packets = peer.session, peer.open_sender().in_flight
         self.stranger = SendChannel(both.a._state.keys[0], self.rng.randbytes(16), TO_ALL)
         return both
 
@@ -228,11 +228,16 @@ def main() -> None:
     parser.add_argument("--inputs", type=int, default=100_000_000, help="inputs in all, including those recorded")
     parser.add_argument("--part", type=_part, default=(1, 1), metavar="NUMBER/PARTS", help="run only these chunks")
     parser.add_argument("--record", type=Path, default=RECORD, help="finished chunks, one per line")
+    parser.add_argument("--totals", type=Path, help="also write the inputs per surface to this file")
     arguments = parser.parse_args()
+    arguments.record.parent.mkdir(parents=True, exist_ok=True)
     run(arguments.inputs, arguments.record, arguments.part)
     by_surface: Counter[str] = Counter()
     for chunk in finished(arguments.record):
         by_surface[chunk.surface] += chunk.inputs
+    if arguments.totals is not None:
+        totals = [json.dumps({"surface": name, "inputs": count}) for name, count in by_surface.items()]
+        arguments.totals.write_text("\n".join(totals) + "\n")
     lines = [*by_surface.items(), ("in all", by_surface.total())]
     sys.stdout.writelines(f"{name:18} {count:>12,}\n" for name, count in lines)
 

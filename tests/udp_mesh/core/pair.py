@@ -76,7 +76,7 @@ class World:
         self.on_event: Callable[[str, Event, float], None] | None = None
         self.tap: Callable[[str, Datagram, float], None] | None = None
         self._queue: list[tuple[float, int, str, str, bytes]] = []
-        self._calls: list[tuple[float, int, Callable[[], None]]] = []
+        self._calls: list[tuple[float, int, Callable[[], object]]] = []
         self._serial = 0
 
     def add(self, config: Settings, *, address: str | None = None, store: Store | None = None) -> Node:
@@ -94,7 +94,7 @@ class World:
                 self.pipes.setdefault((other, name), Pipe())
         return node
 
-    def at(self, when: float, call: Callable[[], None]) -> None:
+    def at(self, when: float, call: Callable[[], object]) -> None:
         """Call a function at a virtual time."""
         self._serial += 1
         heapq.heappush(self._calls, (when, self._serial, call))

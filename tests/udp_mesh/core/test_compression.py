@@ -94,7 +94,7 @@ def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compres
     for payload in (MAP, b"second", bytes(3 * STEP_BYTES), b"fourth"):
         made.nodes["a"].send("map", payload, destination="b", now=made.now)
     made.nodes["a"].send("tiles", b"more urgent", destination="b", now=made.now)
-    sender = made.nodes["a"]._state.peer_table.peers["b"].sender
+    sender = made.nodes["a"]._state.peer_table.peers["b"].open_sender()
     while made.nodes["a"]._state.compression_queue:
         made.nodes["a"].handle_timer(made.now)
     assert [len(message.accepted.payload) for message in sender.pending] == [11, len(MAP), 6, 3 * STEP_BYTES, 6]

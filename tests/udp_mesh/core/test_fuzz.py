@@ -1,7 +1,7 @@
 """Any bytes at every decoder of the network: frames within their caps, or a counted drop, never an exception.
 
 `make test` runs 4,000 inputs per surface. The proof runs `UDP_MESH_FUZZ_INPUTS` inputs over all surfaces, 10^8 by
-default. `benchmarks/results/fuzz.jsonl` records what was run, chunk by chunk.
+default. `benchmarks/results/fuzz.jsonl` has the totals of the largest run.
 """
 
 from __future__ import annotations

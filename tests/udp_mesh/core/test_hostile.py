@@ -112,7 +112,7 @@ def insider(both: Pair, frames: list[Frame]) -> None:
     peer = both.a._state.peer_table.peers["b"]
     assert peer.session is not None
     number, data = peer.session.path.seal(encode(frames))
-    peer.sender.in_flight.add(number, None)
+    peer.open_sender().in_flight.add(number, None)
     both.b.receive(data, "mesh", A, both.now)
 
 
@@ -166,11 +166,11 @@ def test_whatever_an_insider_says_nothing_crashes_and_little_is_owed(datagrams: 
     both.b.send("any", bytes(5000), destination="a", now=both.now)
     both.drop(both.b)
     for datagram in datagrams:
-        mended = [
+        adapted = [
             ack._replace(received=ack.received & ((1 << min(ack.largest, 256)) - 1)) if isinstance(ack, Ack) else ack
             for ack in datagram
         ]
-        insider(both, mended)
+        insider(both, adapted)
     session = both.b._state.peer_table.peers["a"].session
     assert session is not None
     assert len(session.pending_control) <= MAX_PENDING_CONTROL

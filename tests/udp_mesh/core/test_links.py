@@ -76,7 +76,7 @@ class Run:
     def measure(self, seconds: float) -> Figures:
         """Run on and measure."""
         world = self.world
-        sender = world.nodes["a"]._state.peer_table.peers["b"].sender
+        sender = world.nodes["a"]._state.peer_table.peers["b"].open_sender()
         pipe = world.pipes[("a", "b")]
         start, delivered, carried = world.now, sender.delivered_bytes, pipe.carried_bytes
         world.run(seconds)

@@ -107,13 +107,41 @@ def test_what_is_delivered_arrived_once_and_whole() -> None:
 def test_a_message_past_its_deadline_expires_and_says_so() -> None:
     both = pair(Topic("t", deadline_s=0.1))
     both.a.send("t", b"late", destination="b", now=both.now)
-    for _ in range(30):
+    for _ in range(150):
         both.drop(both.a)
         both.now += 0.01
     ends = [event for event in both.events(both.a) if isinstance(event, MessageExpired)]
     assert [end.reason for end in ends] == [ExpiryReason.DEADLINE]
     both.roundtrip(times=20)
     assert not any(isinstance(event, MessageReceived) for event in both.events(both.b))
+
+
+def test_a_message_that_arrived_in_time_is_delivered_although_its_acknowledgement_is_late() -> None:
+    world = World()
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("order", deadline_s=0.3)))
+    for pipe in world.pipes.values():
+        pipe.delay_s = 0.2
+    world.run(10.0)
+    for number in range(20):
+        world.send("a", "order", b"%d" % number, destination="b")
+        world.run(1.0)
+    assert len(world.events_of("b", MessageReceived)) == 20
+    assert len(world.events_of("a", MessageDelivered)) == 20
+    assert world.events_of("a", MessageExpired) == []
+
+
+def test_a_message_that_did_not_arrive_expires_soon_after_its_deadline() -> None:
+    world = World()
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("order", deadline_s=0.3)))
+    world.run(10.0)
+    world.pipes["a", "b"].up = False
+    world.send("a", "order", b"lost", destination="b")
+    sent_at = world.now
+    world.run(5.0)
+    ((expired_at, _),) = [entry for entry in world.events["a"] if isinstance(entry[1], MessageExpired)]
+    assert 0.299 <= expired_at - sent_at <= 1.31
 
 
 def test_of_a_topic_that_keeps_the_last_only_the_newest_waits() -> None:

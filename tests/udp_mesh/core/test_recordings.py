@@ -62,7 +62,6 @@ def replay(both: Pair, recorded: list[Datagram]) -> None:
 def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both nodes as in the first version: they neither send nor accept timestamps."""
     monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
-    monkeypatch.setattr(transmit, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
     monkeypatch.setattr(transmit, "clock_ms", lambda now: None)
 
@@ -72,7 +71,7 @@ def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     both = acquainted(topic)
     recorded = overheard(both, topic.name, b"stop")
     # The peers keep hearing each other; the test never retransmits what was lost.
-    both.a._state.peer_table.peers["b"].sender.finish_all(ExpiryReason.DEADLINE)
+    both.a._state.peer_table.peers["b"].open_sender().finish_all(ExpiryReason.DEADLINE)
     both.roundtrip(times=900, step_s=0.1)
     before = both.b.conditions(both.now).counters
     replay(both, recorded)

@@ -75,7 +75,7 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
     world.run(2.0)
     for path in world.pipes.values():
         path.rate_bits_per_s = 200e3
-    sender = world.nodes["a"]._state.peer_table.peers["b"].sender
+    sender = world.nodes["a"]._state.peer_table.peers["b"].open_sender()
     for number in range(200):
         world.send("a", "status", b"%d" % number, "b")
         world.run(MAX_URGENT_WAIT_S + 0.001)
@@ -92,6 +92,6 @@ def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_pat
     world.run(3.0)
     world.send("a", "map", bytes(50_000), "b")
     world.run(3.0)
-    world.nodes["a"]._state.peer_table.peers["b"].sender.pacer.on_sent(100, world.now, 1.0)
+    world.nodes["a"]._state.peer_table.peers["b"].open_sender().pacer.on_sent(100, world.now, 1.0)
     world.send("a", "map", bytes(50_000), "b")
     assert world.run(2.0, until=lambda: len(world.events_of("a", MessageDelivered)) == 2)

@@ -146,11 +146,6 @@ def test_a_keyring_opens_with_both_live_keys_and_names_an_unknown_one() -> None:
         Keyring((old, new, foreign))
 
 
-def test_an_unkeyed_ring_says_so() -> None:
-    assert Keyring.unkeyed().is_unkeyed
-    assert not Keyring((KEY,)).is_unkeyed
-
-
 def test_a_key_is_read_from_hexadecimal_and_base64_and_never_shown() -> None:
     import base64
 

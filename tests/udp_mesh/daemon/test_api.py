@@ -24,6 +24,9 @@ class Answers:
     def request(self, client: Client, header: Header, payload: bytes) -> None:
         client.reply(header.get("id"), payload)
 
+    def client_read(self) -> None:
+        pass
+
     def client_gone(self, client: Client) -> None:
         pass
 

@@ -7,6 +7,8 @@ import json
 import logging
 import os
 import socket
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -14,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, two_daemons
+from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, configuration, two_daemons
 from tests.udp_mesh.links.sockets import free_port
 from udp_mesh.client import MeshClient, MeshError
 from udp_mesh.client.mesh_client import encode_frame
@@ -188,6 +190,9 @@ def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch
         def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
             client.reply(header.get("id"))
 
+        def client_read(self) -> None:
+            pass
+
         def client_gone(self, client: api.Client) -> None: ...
 
     async def work(path: Path) -> None:
@@ -208,3 +213,45 @@ def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch
 
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
         asyncio.run(work(Path(folder) / "s"))
+
+
+RECORD_AS_ANOTHER_USER = """
+import os, sys
+from udp_mesh.client import MeshClient, MeshError
+socket, path = sys.argv[1:]
+os.setuid(65534)
+client = MeshClient(socket)
+try:
+    client.request("record-start", path=path)
+    print(client.request("record-stop")["path"])
+except MeshError as error:
+    print(error.code)
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root to act as another user")
+def test_another_user_makes_the_daemon_record_below_its_state_directory_only() -> None:
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
+        folder = Path(path)
+        folder.chmod(0o755)
+        text = configuration(folder, "alice", 1, [], free_port(), more='socket_mode = "0666"')
+        with RunningDaemon(folder, "alice", text) as daemon:
+            (folder / "alice").mkdir(exist_ok=True)
+
+            def record(where: Path) -> str:
+                done = subprocess.run(
+                    [sys.executable, "-c", RECORD_AS_ANOTHER_USER, str(daemon.socket), str(where)],
+                    capture_output=True, text=True, check=True, timeout=60,
+                )  # fmt: skip
+                return done.stdout.strip()
+
+            outside, inside = folder / "outside.jsonl", folder / "alice" / "inside.jsonl"
+            assert record(outside) == "cannot-record"
+            assert record(folder / "alice" / ".." / "outside.jsonl") == "cannot-record"
+            assert not outside.exists()
+            assert record(inside) == str(inside)
+            assert inside.exists()
+            with daemon.client() as own:
+                own.request("record-start", path=str(outside))
+                own.request("record-stop")
+            assert outside.exists()

@@ -17,7 +17,7 @@ import pytest
 
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, outcomes, poll, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from udp_mesh.client import MeshClient, MeshError, mesh_client
+from udp_mesh.client import MeshClient, MeshError, Message, mesh_client
 from udp_mesh.client.mesh_client import encode_frame
 from udp_mesh.core.settings import Limits
 from udp_mesh.daemon.interface import CONDITIONS_TOPIC
@@ -46,7 +46,7 @@ def test_messages_arrive_as_they_were_sent_and_their_outcome_is_reported(pair: P
         found = sorted(collect(receiver, 3), key=lambda message: len(message.payload))
         ends = outcomes(sender, 3)
     assert [message.payload for message in found] == [b"", b"ready", big]
-    assert found[1]._replace(payload=b"") == ("alice", "status", "std_msgs/String", b"", 0, False)
+    assert found[1] == Message("alice", "status", "std_msgs/String", b"ready", 0, False)
     assert ends == dict.fromkeys(numbers, "delivered")
 
 
@@ -298,7 +298,8 @@ def test_any_bytes_on_the_udp_port_neither_stop_the_daemon_nor_its_urgent_messag
         assert len(collect(receiver, 10)) == 10
         after = receiver.request("status")["conditions"]["counters"]
     dropped = ("dropped_malformed", "dropped_unauthenticated", "dropped_unproven", "dropped_over_limit")
-    assert sum(after[name] - before[name] for name in dropped) > 1000
+    # The kernel drops what the queue for strangers cannot hold.
+    assert sum(after[name] - before[name] for name in dropped) > 300
     assert "Traceback" not in bob.log.read_text()
 
 

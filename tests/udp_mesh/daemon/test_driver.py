@@ -11,7 +11,7 @@ from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh import Node
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.daemon.driver import MAX_BLOCKED_DATAGRAMS
+from udp_mesh.daemon.link_output import MAX_BLOCKED_DATAGRAMS
 from udp_mesh.links.attachments import Address
 from udp_mesh.links.netlink import NetlinkError
 from udp_mesh.links.udp import Deliver, OutgoingDatagram, UdpLink
@@ -45,12 +45,12 @@ def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses
         monkeypatch.setattr(UdpLink, "send", lambda _self, _datagrams: 0)
         (name,) = alice.driver.hub.links
         address = bob.driver.hub.links["127.0.4.2"].attachment.address
-        alice.driver._transmit(name, [Datagram(name, address, b"x", urgent=False)] * (3 * MAX_BLOCKED_DATAGRAMS))
-        assert len(alice.driver._blocked[name]) == MAX_BLOCKED_DATAGRAMS
-        assert alice.driver.lost_on_full_socket == 2 * MAX_BLOCKED_DATAGRAMS
+        alice.driver.output.transmit(name, [Datagram(name, address, b"x", urgent=False)] * (3 * MAX_BLOCKED_DATAGRAMS))
+        assert alice.driver.output.waiting(name) == MAX_BLOCKED_DATAGRAMS
+        assert alice.driver.output.lost_on_full_socket == 2 * MAX_BLOCKED_DATAGRAMS
         monkeypatch.undo()
         assert isinstance(await alice.deliver("status", b"now there is room", to="bob"), MessageDelivered)
-        assert not alice.driver._blocked[name]
+        assert alice.driver.output.waiting(name) == 0
 
     run(body)
 
@@ -70,12 +70,12 @@ def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_
         (name,) = driver.hub.links
         address = bob.driver.hub.links["127.0.4.2"].attachment.address
         monkeypatch.setattr(UdpLink, "send", send)
-        driver._transmit(name, [Datagram(name, address, b"bulk", urgent=False)] * MAX_BLOCKED_DATAGRAMS)
-        driver._transmit(name, [Datagram(name, address, b"urgent %d" % n, urgent=True) for n in range(3)])
+        driver.output.transmit(name, [Datagram(name, address, b"bulk", urgent=False)] * MAX_BLOCKED_DATAGRAMS)
+        driver.output.transmit(name, [Datagram(name, address, b"urgent %d" % n, urgent=True) for n in range(3)])
         room = 4
-        driver._writable(driver.hub.links[name])
+        driver.output._writable(driver.hub.links[name])
         assert sent == [b"urgent 0", b"urgent 1", b"urgent 2", b"bulk"]
-        assert driver.lost_on_full_socket == 3
+        assert driver.output.lost_on_full_socket == 3
         monkeypatch.undo()
 
     run(body)

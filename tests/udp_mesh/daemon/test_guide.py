@@ -40,3 +40,12 @@ def test_the_guides_examples_of_configuration_load(tmp_path: Path) -> None:
     assert {topic.name for topic in configuration.settings.topics} >= {"status", "artifacts", "map/diff", "video"}
     assert len(configuration.links) == 2
     assert configuration.settings.neighbours[0].legacy
+
+
+def test_every_test_and_benchmark_that_the_threat_model_names_exists() -> None:
+    page = (DOCS / "threat-model.md").read_text()
+    tests = set(re.findall(r"`(\w+/(?:\w+/)*test_\w+\.py)`", page))
+    assert len(tests) >= 15
+    assert [name for name in sorted(tests) if not (DOCS.parent / "tests" / "udp_mesh" / name).exists()] == []
+    figures = set(re.findall(r"`(benchmarks/[\w/.]+)`", page))
+    assert [name for name in sorted(figures) if not (DOCS.parent / name).exists()] == []

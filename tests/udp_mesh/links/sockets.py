@@ -42,6 +42,7 @@ def receive(link: UdpLink, count: int) -> list[tuple[bytes, Address]]:
 
     deadline = time.monotonic() + WAIT_S
     while len(found) < count and time.monotonic() < deadline:
-        select.select([link], [], [], 1.0)
+        select.select([link.fileno(), link.strangers_fileno()], [], [], 1.0)
         link.receive(deliver, 1000)
+        link.receive_from_strangers(deliver, 1000)
     return found

@@ -103,10 +103,21 @@ heard, echoed = [], []
 deadline = time.monotonic() + 60
 while not heard and time.monotonic() < deadline:
     hub.links["mesh0"].send([Out()])
-    select.select([far.links["far0"]], [], [], 0.2)
-    far.links["far0"].receive(lambda data, source, arrived: heard.append((bytes(data), source)), 10)
-    hub.links["mesh0"].receive(lambda data, source, arrived: echoed.append(bytes(data)), 10)
+    select.select([far.links["far0"].strangers_fileno()], [], [], 0.2)
+    far.links["far0"].receive_from_strangers(lambda data, source, arrived: heard.append((bytes(data), source)), 10)
+    hub.links["mesh0"].receive_from_strangers(lambda data, source, arrived: echoed.append(bytes(data)), 10)
 assert heard[0] == (b"to all", ("10.7.20.6", 8700)), heard
+
+# A known peer's broadcast arrives at the socket of the peers, and only there.
+far.links["far0"].set_peers(frozenset({("10.7.20.6", 8700)}))
+at_peers, at_strangers = [], []
+while not at_peers and time.monotonic() < deadline:
+    hub.links["mesh0"].send([Out()])
+    select.select([far.links["far0"]], [], [], 0.2)
+    far.links["far0"].receive(lambda data, source, arrived: at_peers.append(bytes(data)), 10)
+    far.links["far0"].receive_from_strangers(lambda data, source, arrived: at_strangers.append(bytes(data)), 10)
+assert at_peers
+assert at_strangers == []
 assert not echoed
 far.close(); hub.close(); monitor.close()
 """

@@ -17,6 +17,11 @@ class CongestionController(Protocol):
         """The congestion window in packets."""
         ...
 
+    @property
+    def undrained_cwnd(self) -> float:
+        """The same as it was before a drain: the few urgent packets form no queue, so they need not wait for it."""
+        ...
+
     def drain_overdue(self, now: float) -> bool:
         """Whether a drain takes longer than the packets in flight before it."""
         ...
@@ -35,11 +40,13 @@ class CongestionController(Protocol):
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:
         """`count` packets were newly acknowledged, up to number `largest`; `rate` is a delivery rate sample. When the
-        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send."""
+        newest of them was sent, `ahead` others were in flight; `app_limited`: there was no more to send.
+        `lost` packets were newly found lost; `loss` is the smoothed loss rate."""
         ...
 
     def capacity_packets_per_s(self) -> float | None:
@@ -60,6 +67,10 @@ class FixedWindow:
         self.cwnd = float(packets)
         self.queue_share = 1.0
 
+    @property
+    def undrained_cwnd(self) -> float:
+        return self.cwnd
+
     def drain_overdue(self, now: float) -> bool:
         return False
 
@@ -76,6 +87,7 @@ class FixedWindow:
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:

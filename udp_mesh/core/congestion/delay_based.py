@@ -1,18 +1,20 @@
 """Delay-based congestion control: round trip times decide, loss does not (radio loss is not congestion).
 
-1. Startup doubles the window once per round trip until the round trip has grown by `STARTUP_QUEUE_S`.
+1. Startup doubles the window once per round trip until the round trip has grown by `STARTUP_QUEUE_S`, or by
+   an eighth on a long path.
 2. Then, once per round trip: w <- w/2 + (w * min_rtt / windowed_rtt + a) / 2, where a is `QUEUE_S` worth of packets
    (less on a short path, more on a lossy one). The window settles where the sender keeps exactly that much queue at the
    bottleneck.
 3. w never exceeds what the measured delivery rate needs, plus a, by much, and growth that delivers nothing more stops:
-   a queue too short to show as delay is not overrun.
+   a queue too short to show as delay is not overrun. A window that is used up without a queue grows (`growth`).
 4. A *drain* empties the queue for one round trip, so that the minimum RTT is seen again: after `DRAIN_INTERVAL_S`
    without seeing it, and as soon as the round trip is longer than our own queue explains. If it stays long with an
-   empty queue, the route has changed: the window moves at once to the new round trip times the delivery rate, by no
-   more than startup would. On a route too long for that rate to be its own, startup begins again.
+   empty queue, the route has changed: the window moves at once to the new round trip times the delivery rate, however
+   far. On a route too long for that rate to be its own, startup begins again.
 5. The minimum RTT is *verified* if it was seen with next to nothing in flight. Once it differs (the path changed, or no
    drain has seen the empty path for long) the next drain goes down to `MIN_CWND` - 1 packets: otherwise a standing
    queue would be taken for the path, and its losses for radio loss.
+6. While others keep the queue filled, whatever drains find (`competition`), the window is TCP's instead.
 
 Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwidth model (Cardwell et al. 2016).
 """
@@ -20,31 +22,18 @@ Step 2 is based on FAST TCP (Jin, Wei, Low 2004), steps 3 and 4 on BBR's bandwid
 from collections import deque
 from enum import Enum
 
+from udp_mesh.core.congestion.competition import Competition
+from udp_mesh.core.congestion.delivery_rate import RATE_WINDOW_S, DeliveryRate
+from udp_mesh.core.congestion.growth import GROWTH_PAUSE_S, FullLink, Growth
+from udp_mesh.core.congestion.queue_target import QUEUE_S, loss_queue_s, queue_packets, target_queue_s
 from udp_mesh.core.congestion.rtt import MIN_WINDOWED_RTT_S, RttEstimator
 
-QUEUE_S = 0.003
-"""Target queue at the bottleneck: covers batched acknowledgements and pacing, and adds this much to urgent latency."""
-
-MIN_QUEUE_S = 0.002
-QUEUE_PER_ROUND_TRIP = 0.3
-"""On a short path the window is small and acknowledged every few packets, so less queue suffices."""
-
-LOSS_QUEUE_S = 0.002
-FULL_LOSS_QUEUE_AT = 0.05
-"""Losses leave holes in the queue: this much more keeps the link busy, limited by what urgent messages tolerate."""
-
 STARTUP_QUEUE_S = 0.006
-"""RTT growth that ends startup: more than a radio's jitter, less than the slack of an urgent message."""
-
-MIN_QUEUE_PACKETS = 2.0
-"""The same at low rates: fewer packets leave the link idle between acknowledgements."""
-
-MIN_SHARED_QUEUE_PACKETS = 1.0
-"""The same if other nodes send on the channel too and keep it busy."""
-
-UNSHARED_FROM_LOSS = 0.2
-"""With more loss all nodes wait at once more often, and urgent messages may take longer: from this loss rate on, the
-queue is that of a single sender."""
+STARTUP_QUEUE_PER_ROUND_TRIP = 0.125
+MAX_STARTUP_QUEUE_S = 0.030
+"""RTT growth that ends startup: more than a radio's jitter, less than the slack of an urgent message. On a long path a
+doubled window leaves in bursts that are themselves such a queue, and ending too early costs seconds; an eighth of the
+round trip was measured."""
 
 MIN_CWND = 4.0
 """Packets: below this, a lost packet has too few successors to be detected without a timeout."""
@@ -74,9 +63,6 @@ window."""
 MIN_STARTUP_UPDATE_S = 0.004
 """The same during startup, when only growth counts."""
 
-RATE_WINDOW_S = 2.0
-"""How long a delivery rate sample is valid."""
-
 DRAIN_INTERVAL_S = 2.0
 DRAIN_ROUND_TRIPS = 15.0
 """Minimum time between two drains: each costs about a quarter of a round trip of throughput."""
@@ -88,18 +74,8 @@ DRAIN_FRACTION = 0.95
 DRAIN_PACKETS = 3
 """Fraction of the pipe kept full during a drain, less these packets: on a short path a burst of them is the queue."""
 
-GROWTH = 1.25
-"""Growth per round trip while the window is used up without any queue: the link has become faster."""
-
-GROWTH_AFTER_ROUNDS = 3
-"""Round trips without a queue before growth: two occur by chance near equilibrium."""
-
-FULL_GROWTH = 1.1
-FULL_ROUNDS = 3
-"""A link that delivers less than a tenth more after so many rounds of growth is full, whatever its delay."""
-
-GROWTH_PAUSE_S = 2.0
-"""How long to wait after that before growing again."""
+SERIALIZED_MIN_RTT_S = 0.04
+"""From this minimum RTT on, a packet's own serialization time counts as no queue."""
 
 RATE_BOUND = 1.2
 STARTUP_RATE_BOUND = 2.5
@@ -108,12 +84,19 @@ STARTUP_RATE_BOUND = 2.5
 ACK_BATCH_S = 0.008
 """About how long batched acknowledgements keep packets in the window beyond the round trip."""
 
+COMPETITIVE_DRAIN_INTERVAL_S = 4.0
+"""Minimum time between two drains in competition: each gives the queue to the other flow for a round trip or two."""
+
 SUSPECT_QUEUE_S = 0.015
 """More queueing than our own window explains."""
 
 SUSPECT_DRAIN_INTERVAL_S = 0.3
 MAX_SUSPECT_DRAIN_INTERVAL_S = 4.0
 """Minimum time between two drains on suspicion, doubled each time one finds nothing."""
+
+
+def _startup_queue_s(min_rtt: float) -> float:
+    return max(STARTUP_QUEUE_S, min(MAX_STARTUP_QUEUE_S, STARTUP_QUEUE_PER_ROUND_TRIP * min_rtt))
 
 
 class Phase(Enum):
@@ -129,22 +112,20 @@ class DelayBasedController:
     """The controller described in the module's docstring."""
 
     __slots__ = (
+        "_competition",
         "_cwnd_before_drain",
         "_drain_on_suspicion",
         "_drained_at",
-        "_empty_rounds",
-        "_full_capacity",
         "_full_drain",
-        "_full_rounds",
-        "_grow_after",
-        "_growing",
+        "_growth",
         "_hold_from_number",
         "_hold_min_rtt",
         "_last_rtts",
         "_loss",
-        "_rates",
+        "_rate",
         "_round_ends_at",
         "_rtt",
+        "_startup",
         "_suspect_interval_s",
         "_suspect_rounds",
         "_uncontended_acks",
@@ -162,18 +143,16 @@ class DelayBasedController:
         self.cwnd = INITIAL_CWND
         self.phase = Phase.STARTUP
         self._last_rtts: deque[float] = deque(maxlen=4)
-        self._rates: deque[tuple[float, float]] = deque()
+        self._rate = DeliveryRate()
         self._uncontended_acks = 0
         self._verified_min_rtt = 0.0
         self._full_drain = False
         self._round_ends_at = 0
         self._updated_at = 0.0
         self._drained_at = 0.0
-        self._empty_rounds = 0
-        self._full_capacity = 0.0
-        self._full_rounds = 0
-        self._grow_after = 0.0
-        self._growing = False
+        self._startup = FullLink()
+        self._competition = Competition()
+        self._growth = Growth()
         self._loss = 0.0
         self._cwnd_before_drain = INITIAL_CWND
         self._windowed_rtt_before_drain = 0.0
@@ -184,11 +163,15 @@ class DelayBasedController:
         self._suspect_interval_s = SUSPECT_DRAIN_INTERVAL_S
 
     def capacity_packets_per_s(self) -> float | None:
-        return self._rates[0][1] if self._rates else None
+        return self._rate.maximum()
 
     def assume_delivery(self) -> bool:
         # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
-        return bool(self._rates) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
+        return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()
+
+    @property
+    def undrained_cwnd(self) -> float:
+        return self._cwnd_before_drain if self.phase in (Phase.DRAIN, Phase.HOLD) else self.cwnd
 
     def drain_overdue(self, now: float) -> bool:
         return self.phase in (Phase.DRAIN, Phase.HOLD) and now - self._updated_at > self._windowed_rtt_before_drain
@@ -203,7 +186,7 @@ class DelayBasedController:
         capacity = self.capacity_packets_per_s()
         return (
             rate
-            if capacity is None or self._growing
+            if capacity is None or self._growth.active or self._competition.is_on
             else min(rate, max(self._pacing_rate(capacity), MIN_CWND / smoothed_rtt))
         )
 
@@ -221,6 +204,7 @@ class DelayBasedController:
         *,
         app_limited: bool,
         ahead: int,
+        lost: int,
         loss: float,
         now: float,
     ) -> None:
@@ -228,8 +212,11 @@ class DelayBasedController:
         if rtt.latest_rtt is None or rtt.min_rtt is None or rtt.windowed_rtt is None:
             return
         self._loss = loss
+        if lost:
+            self._competition.on_lost(lost)
         if rate is not None:
-            self._add_rate_sample(rate, app_limited=app_limited, now=now)
+            self._rate.add(rate, app_limited=app_limited, now=now)
+            rtt.packet_s = 1.0 / (self.capacity_packets_per_s() or float("inf"))
         self._last_rtts.append(rtt.latest_rtt)
         self._uncontended_acks = self._uncontended_acks + 1 if ahead < MIN_CWND - 1 else 0
         if app_limited and self._uncontended_acks >= 4 and min(self._last_rtts) > 1.15 * rtt.min_rtt + STARTUP_QUEUE_S:
@@ -252,7 +239,8 @@ class DelayBasedController:
                 self._end_drain(now)
                 self._round_ends_at = next_number
             return
-        if self.phase is Phase.STARTUP and not app_limited and min(self._last_rtts) - rtt.min_rtt > STARTUP_QUEUE_S:
+        growth_s = min(self._last_rtts) - rtt.min_rtt
+        if self.phase is Phase.STARTUP and not app_limited and growth_s > _startup_queue_s(rtt.min_rtt):
             self.phase = Phase.CRUISE
             self._drained_at = now
             self.cwnd = max(MIN_CWND, self.cwnd * rtt.min_rtt / rtt.windowed_rtt)
@@ -299,39 +287,34 @@ class DelayBasedController:
             if not app_limited:
                 self._grow_startup(min_rtt, windowed_rtt, now)
             return
+        self._competition.on_round(min_rtt, loss=self._loss, now=now)
         since_drain = now - self._drained_at
+        if self._competition.is_on:
+            if since_drain > max(COMPETITIVE_DRAIN_INTERVAL_S, DRAIN_ROUND_TRIPS * windowed_rtt):
+                self._begin_drain(now, suspicion=True)
+            elif not app_limited:
+                self.cwnd = min(MAX_CWND, max(MIN_CWND, self._competition.window(self.cwnd, windowed_rtt)))
+            return
         self._suspect_rounds = self._suspect_rounds + 1 if self._unexplained_queue() else 0
         if self._suspect_rounds >= 2 and since_drain > max(self._suspect_interval_s, 4 * windowed_rtt):
             self._begin_drain(now, suspicion=True)
             return
-        every_round_trips = DRAIN_ROUND_TRIPS if self._min_rtt_is_verified() else UNVERIFIED_DRAIN_ROUND_TRIPS
-        if since_drain > max(DRAIN_INTERVAL_S, every_round_trips * min_rtt):
-            if (
-                not self._suspect_rounds
-                and self._min_rtt_is_verified()
-                and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4)
-            ):
+        is_verified = self._min_rtt_is_verified() and not self._competition.is_suspected
+        every_round_trips = DRAIN_ROUND_TRIPS if is_verified else UNVERIFIED_DRAIN_ROUND_TRIPS
+        interval_s = DRAIN_INTERVAL_S / 2 if self._competition.is_suspected else DRAIN_INTERVAL_S
+        if since_drain > max(interval_s, every_round_trips * min_rtt):
+            if not self._suspect_rounds and is_verified and (app_limited or windowed_rtt - min_rtt < QUEUE_S / 4):
                 self._drained_at = now
             else:
                 self._begin_drain(now, suspicion=self._suspect_rounds > 0)
                 return
-        empty = windowed_rtt - min_rtt < QUEUE_S / 4 and not app_limited and now >= self._grow_after
-        self._empty_rounds = self._empty_rounds + 1 if empty else 0
-        if self._empty_rounds >= GROWTH_AFTER_ROUNDS:
-            capacity = self.capacity_packets_per_s() or 0.0
-            if not self._growing or capacity > FULL_GROWTH * self._full_capacity:
-                self._full_capacity, self._full_rounds = capacity, 0
-            else:
-                self._full_rounds += 1
-            if self._full_rounds >= FULL_ROUNDS:
-                self._growing = False
-                self._empty_rounds = 0
-                self._grow_after = now + GROWTH_PAUSE_S
-                return
-            self.cwnd = self._bounded(GROWTH * self.cwnd, min_rtt, windowed_rtt)
-            self._growing = True
+        is_empty = windowed_rtt - min_rtt < self._empty_slack_s() and not app_limited
+        capacity = self.capacity_packets_per_s() or 0.0
+        packets = self._growth.packets(self.cwnd, capacity, min_rtt, is_empty=is_empty, now=now)
+        if packets is not None:
+            if packets:
+                self.cwnd = self._bounded(self.cwnd + packets, min_rtt, windowed_rtt)
             return
-        self._growing = False
         target = 0.5 * self.cwnd + 0.5 * (self.cwnd * min_rtt / windowed_rtt + self._queue_packets(windowed_rtt))
         if target < self.cwnd or not app_limited:
             self.cwnd = self._bounded(min(target, 2 * self.cwnd), min_rtt, windowed_rtt)
@@ -340,50 +323,47 @@ class DelayBasedController:
         """Start up again on a route so much longer that the measured rate says nothing about its capacity."""
         self.phase = Phase.STARTUP
         self.cwnd = min(MAX_CWND, max(INITIAL_CWND, packets))
-        self._rates.clear()
-        self._full_capacity, self._full_rounds = 0.0, 0
+        self._rate.clear()
+        self._startup.restart(0.0)
 
     def _grow_startup(self, min_rtt: float, windowed_rtt: float, now: float) -> None:
         """Double the window, unless that has not made the link faster for some round trips (its queue is too short to
         see)."""
-        capacity = self.capacity_packets_per_s() or 0.0
-        if capacity > FULL_GROWTH * self._full_capacity:
-            self._full_capacity = capacity
-            self._full_rounds = 0
-        else:
-            self._full_rounds += 1
-        if self._full_rounds >= FULL_ROUNDS:
+        if self._startup.is_full(self.capacity_packets_per_s() or 0.0):
             self.phase = Phase.CRUISE
             self._drained_at = now
-            self._grow_after = now + GROWTH_PAUSE_S
+            self._growth.pause(now + GROWTH_PAUSE_S)
             self.cwnd = self._bounded(self.cwnd, min_rtt, windowed_rtt)
         else:
             self.cwnd = max(self.cwnd, self._bounded(2 * self.cwnd, min_rtt, windowed_rtt))
 
+    def _empty_slack_s(self) -> float:
+        """Round trips this much above the minimum show no queue.
+
+        On a longer path the minimum of a small packet stays valid for many seconds; those that follow take the
+        serialization time of a full one more without any queue.
+        """
+        min_rtt = self._rtt.min_rtt
+        assert min_rtt is not None
+        if min_rtt < SERIALIZED_MIN_RTT_S:
+            return QUEUE_S / 4
+        return min(STARTUP_QUEUE_S, QUEUE_S / 4 + 1.0 / (self.capacity_packets_per_s() or float("inf")))
+
     def _queue_packets(self, windowed_rtt: float) -> float:
-        # Losses leave holes in the queue as well as in what arrives.
-        lost_s = LOSS_QUEUE_S * min(1.0, self._loss / FULL_LOSS_QUEUE_AT)
-        return self._shared_queue(self._target_queue_s() + lost_s, self.cwnd / windowed_rtt)
+        return self._shared_queue(self._target_queue_s() + loss_queue_s(self._loss), self.cwnd / windowed_rtt)
 
     def _target_queue_s(self) -> float:
         min_rtt = self._rtt.min_rtt
         assert min_rtt is not None
-        return min(QUEUE_S, max(MIN_QUEUE_S, QUEUE_PER_ROUND_TRIP * min_rtt))
+        return target_queue_s(min_rtt)
 
     def _shared_queue(self, queue_s: float, packets_per_s: float) -> float:
-        """Queue in packets: `queue_s` at this rate, with a minimum; less of both if other nodes send too."""
-        if self.queue_share == 1.0:
-            return max(MIN_QUEUE_PACKETS, queue_s * packets_per_s)
-        relief = min(1.0, self._loss / UNSHARED_FROM_LOSS)
-        share = self.queue_share + (1.0 - self.queue_share) * relief
-        min_packets = MIN_SHARED_QUEUE_PACKETS * self.queue_share
-        min_packets += (MIN_QUEUE_PACKETS - min_packets) * relief
-        return max(min_packets, queue_s * share * packets_per_s)
+        return queue_packets(queue_s, packets_per_s, queue_share=self.queue_share, loss=self._loss)
 
     def _bounded(self, packets: float, min_rtt: float, windowed_rtt: float) -> float:
         capacity = self.capacity_packets_per_s()
         if capacity is not None:
-            factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growing else STARTUP_RATE_BOUND
+            factor = RATE_BOUND if self.phase is Phase.CRUISE and not self._growth.active else STARTUP_RATE_BOUND
             # Packets waiting for a batched acknowledgement are in flight too, and lost ones occupy the window.
             pipe = capacity * (min_rtt + ACK_BATCH_S) / (1 - min(self._loss, MAX_LOSS))
             packets = min(packets, max(INITIAL_CWND, factor * pipe + self._queue_packets(windowed_rtt)))
@@ -399,7 +379,7 @@ class DelayBasedController:
         self._windowed_rtt_before_drain = windowed_rtt
         self._hold_min_rtt = float("inf")
         self._updated_at = now
-        self._full_drain = not self._min_rtt_is_verified()
+        self._full_drain = not self._min_rtt_is_verified() or self._competition.is_suspected
         drained = 0.0 if self._full_drain else DRAIN_FRACTION * self.cwnd * min_rtt / windowed_rtt - DRAIN_PACKETS
         self.cwnd = max(MIN_CWND - 1, drained)
 
@@ -410,11 +390,19 @@ class DelayBasedController:
         self.phase = Phase.CRUISE
         self._drained_at = self._updated_at = now
         # The drain emptied the queue: no reason to grow for the next round trips.
-        self._grow_after = now + 3 * self._windowed_rtt_before_drain
+        self._growth.pause(now + 3 * self._windowed_rtt_before_drain)
         self._suspect_rounds = 0
         throughput = self._cwnd_before_drain / self._windowed_rtt_before_drain
+        # The rate may have changed with the route: stay within the bound of startup.
+        max_cwnd = STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain)
         if self._full_drain and hold_min_rtt != float("inf"):
             self._verified_min_rtt = hold_min_rtt
+        if hold_min_rtt != float("inf"):
+            self._competition.on_drained(hold_min_rtt, others_send=self.queue_share < 1.0, now=now)
+            if self._competition.is_on:
+                self._rtt.reset_min_rtt(hold_min_rtt, now)
+                self.cwnd = max(self._cwnd_before_drain, INITIAL_CWND)
+                return
         if (
             (self._drain_on_suspicion or self._full_drain)
             and hold_min_rtt > 1.15 * min_rtt + self._jitter_s()
@@ -423,8 +411,10 @@ class DelayBasedController:
             self._rtt.reset_min_rtt(hold_min_rtt, now)
             self._suspect_interval_s = SUSPECT_DRAIN_INTERVAL_S
             if hold_min_rtt > (min_rtt + self._windowed_rtt_before_drain) / 2:
-                # Still long although our queue is gone: the route, not the queue, is longer.
+                # Still long although our queue is gone: the route, not the queue, is longer. The rate was measured
+                # within the last seconds, mostly on the shorter route, so it is known however much the window grows.
                 throughput = max(throughput, self.capacity_packets_per_s() or 0.0)
+                max_cwnd = MAX_CWND
                 if hold_min_rtt > RATE_WINDOW_S / 3:
                     self._restart(2 * self._cwnd_before_drain)
                     return
@@ -435,17 +425,4 @@ class DelayBasedController:
             return
         base = min(hold_min_rtt, self._windowed_rtt_before_drain) if hold_min_rtt != float("inf") else min_rtt
         queue = self._shared_queue(self._target_queue_s(), throughput)
-        # The rate may have changed with the route: stay within the bound of startup.
-        max_cwnd = min(MAX_CWND, STARTUP_RATE_BOUND * max(INITIAL_CWND, self._cwnd_before_drain))
-        self.cwnd = min(max_cwnd, max(MIN_CWND, throughput * base + queue))
-
-    def _add_rate_sample(self, rate: float, *, app_limited: bool, now: float) -> None:
-        """Add to the windowed maximum; an application-limited sample counts only if it is larger."""
-        rates = self._rates
-        while rates and rates[0][0] < now - RATE_WINDOW_S and not (app_limited and len(rates) == 1):
-            rates.popleft()
-        if app_limited and (not rates or rate < rates[0][1]):
-            return
-        while rates and rates[-1][1] <= rate:
-            rates.pop()
-        rates.append((now, rate))
+        self.cwnd = min(max_cwnd, MAX_CWND, max(MIN_CWND, throughput * base + queue))

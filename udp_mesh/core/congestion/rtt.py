@@ -1,7 +1,8 @@
 """Round-trip time to one peer: a sample per acknowledgement -> smoothed, minimum and windowed RTT.
 
 *Minimum* is the path without queues (over about 5 s). *Windowed* is the current round trip without single late
-acknowledgements (minimum over half a round trip, at least 20 ms). Smoothed RTT and variation follow RFC 6298.
+acknowledgements (minimum over half a round trip, at least 20 ms; longer on a path with jitter). Smoothed RTT and
+variation follow RFC 6298.
 """
 
 from collections import deque
@@ -15,6 +16,15 @@ MIN_RTT_WINDOW_ROUND_TRIPS = 37.5
 
 MIN_WINDOWED_RTT_S = 0.020
 """Lower bound of the window: fast links acknowledge in bursts of a scheduler tick."""
+
+MAX_JITTER_WINDOW_S = 0.06
+JITTER_WINDOWS = 12.0
+JITTER_PACKETS = 2.0
+JITTER_GAIN = 1 / 64
+"""The window covers so many times the mean deviation beyond the serialization time of a few packets, up to the former.
+A radio that repeats a frame delays everything behind it by 10 to 30 ms, which fills the shorter window and looks like a
+queue; a queue does not vanish within 60 ms. The mean is a slow one: a queue that builds up must not lengthen the window
+that is to show it."""
 
 INITIAL_PTO_S = 0.25
 """Until the first sample: the longest probe interval."""
@@ -34,11 +44,24 @@ TIMER_GRANULARITY_S = 0.005
 class RttEstimator:
     """All times in seconds; None before the first sample."""
 
-    __slots__ = ("_min_samples", "_windowed_samples", "latest_rtt", "min_rtt", "rttvar", "smoothed_rtt", "windowed_rtt")
+    __slots__ = (
+        "_jitter_s",
+        "_min_samples",
+        "_windowed_samples",
+        "latest_rtt",
+        "min_rtt",
+        "packet_s",
+        "rttvar",
+        "smoothed_rtt",
+        "windowed_rtt",
+    )
 
     def __init__(self) -> None:
         self.smoothed_rtt: float | None = None
         self.rttvar = 0.0
+        self._jitter_s = 0.0
+        self.packet_s = 0.0
+        """Serialization time of a packet, as far as known."""
         self.latest_rtt: float | None = None
         self.min_rtt: float | None = None
         self.windowed_rtt: float | None = None
@@ -53,13 +76,16 @@ class RttEstimator:
             self.smoothed_rtt = round_trip_s
             self.rttvar = round_trip_s / 2
         else:
-            self.rttvar += (abs(self.smoothed_rtt - round_trip_s) - self.rttvar) / 4
+            deviation_s = abs(self.smoothed_rtt - round_trip_s)
+            self.rttvar += (deviation_s - self.rttvar) / 4
+            self._jitter_s += JITTER_GAIN * (deviation_s - self._jitter_s)
             self.smoothed_rtt += (round_trip_s - self.smoothed_rtt) / 8
         min_window_s = max(MIN_RTT_WINDOW_S, MIN_RTT_WINDOW_ROUND_TRIPS * (self.min_rtt or 0.0))
         self.min_rtt = _minimum(self._min_samples, round_trip_s, now, min_window_s)
-        self.windowed_rtt = _minimum(
-            self._windowed_samples, round_trip_s, now, max(MIN_WINDOWED_RTT_S, self.smoothed_rtt / 2)
-        )
+        jitter_s = self._jitter_s - JITTER_PACKETS * self.packet_s
+        jitter_window_s = min(MAX_JITTER_WINDOW_S, JITTER_WINDOWS * jitter_s)
+        window_s = max(MIN_WINDOWED_RTT_S, self.smoothed_rtt / 2, jitter_window_s)
+        self.windowed_rtt = _minimum(self._windowed_samples, round_trip_s, now, window_s)
 
     def reset_min_rtt(self, round_trip_s: float, now: float) -> None:
         """Replace the minimum RTT: the path changed."""

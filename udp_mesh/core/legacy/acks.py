@@ -47,9 +47,10 @@ MAX_REPEATS = 4096
 """Scheduled repetitions: those of one second at 40 Mbit/s."""
 
 
-RESTORED_AHEAD = 40
-"""Messages, and fragments of each incomplete one, that may have been sent after the position was saved: what a link of
-1 Mbit/s carries in a quarter of a second. Their acknowledgements fit into a default receive buffer."""
+RESTORED_STEP, RESTORED_STEPS = 40, 16
+"""Messages, and fragments of each incomplete one, that may have been sent after the position was saved: acknowledged
+step by step, so that a default receive buffer holds the acknowledgements of a step. All steps reach as far as a sender
+of 600 messages a second comes in one second."""
 
 
 class ReceivePosition(NamedTuple):
@@ -64,7 +65,16 @@ class ReceivePosition(NamedTuple):
 class LegacyAcks:
     """`on_fragment` returns what to acknowledge in addition to the fragment; `next_at` is when `due` returns more."""
 
-    __slots__ = ("_incomplete", "_latest", "_lossy_until", "_payload_at", "_predicted_at", "_repeats", "_restored")
+    __slots__ = (
+        "_incomplete",
+        "_latest",
+        "_lossy_until",
+        "_payload_at",
+        "_predicted_at",
+        "_repeats",
+        "_restored",
+        "_restored_step",
+    )
 
     def __init__(self, position: ReceivePosition | None = None) -> None:
         """`position` is that of the previous run, if it is known."""
@@ -76,6 +86,7 @@ class LegacyAcks:
             self._incomplete[sequence] = (expected, total)
         self._restored = position is not None
         """Nothing has arrived in this run yet."""
+        self._restored_step = RESTORED_STEPS
         self._repeats: deque[tuple[float, LegacyAck, bool]] = deque()
         self._payload_at = float("-inf")
         self._predicted_at = float("-inf")
@@ -113,10 +124,11 @@ class LegacyAcks:
         """The peer sent a heartbeat: release what may be stuck."""
         if not self._restored:
             return self._predicted()
+        self._restored_step = 0
+        self._predicted_at = float("-inf")
         # Less urgent messages have lower numbers than the latest one: look behind each that was seen.
         following = {_before(sequence, -ahead) for sequence in self._incomplete for ahead in range(1, WINDOW + 1)}
-        behind = [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
-        return self._predicted(RESTORED_AHEAD) + behind
+        return [ack for sequence in following - self._incomplete.keys() for ack in _first(sequence)]
 
     def position(self) -> ReceivePosition | None:
         """What the next run of this node needs to know (None: nothing was received)."""
@@ -146,25 +158,35 @@ class LegacyAcks:
             acks.append(ack)
             if again and now < self._lossy_until:
                 self._schedule(at + REPEAT_LOSSY_S, ack, again=False)
-        if now < self._payload_at + PREDICT_FOR_S and now >= self._predicted_at + PREDICT_INTERVAL_S:
+        if self._predicts(now) and now >= self._predicted_at + PREDICT_INTERVAL_S:
             self._predicted_at = now
-            acks += self._predicted()
+            if self._restored:
+                acks += self._predicted(self._restored_step * RESTORED_STEP, RESTORED_STEP)
+                self._restored_step += 1
+            else:
+                acks += self._predicted()
         return acks
+
+    def _predicts(self, now: float) -> bool:
+        """Whether predicted acknowledgements are sent without a heartbeat."""
+        return self._restored_step < RESTORED_STEPS if self._restored else now < self._payload_at + PREDICT_FOR_S
 
     def next_at(self) -> float:
         at = self._repeats[0][0] if self._repeats else float("inf")
         predict_at = self._predicted_at + PREDICT_INTERVAL_S
-        return min(at, predict_at) if predict_at < self._payload_at + PREDICT_FOR_S else at
+        return min(at, predict_at) if self._predicts(predict_at) else at
 
-    def _predicted(self, reach: int = WINDOW) -> list[LegacyAck]:
-        """The fragments expected next, of each incomplete message and of those after the latest: `reach` of each."""
+    def _predicted(self, skip: int = 0, reach: int = WINDOW) -> list[LegacyAck]:
+        """The fragments expected next, of each incomplete message and of those after the latest: `reach` of each, after
+        the first `skip`."""
         if self._latest is None:
             return []
         acks: list[LegacyAck] = []
         for sequence, (expected, total) in self._incomplete.items():
-            acks += [LegacyAck(sequence, position) for position in range(expected, min(total, expected + reach))]
+            first = expected + skip
+            acks += [LegacyAck(sequence, position) for position in range(first, min(total, first + reach))]
         for ahead in range(1, reach + 1):
-            acks += _first(_before(self._latest, -ahead))[: reach + 1 - ahead]
+            acks += _first(_before(self._latest, -skip - ahead))[: reach + 1 - ahead]
         return acks
 
     def _repeat(self, ack: LegacyAck, now: float) -> None:

@@ -82,7 +82,7 @@ class LegacyPeer:
         self.peer = peer
         self.address = neighbour.address
         self.link = neighbour.link or ""
-        self.sender = LegacySender(peer.sender, settings.name, rng.getrandbits(15))
+        self.sender = LegacySender(peer.open_sender(), settings.name, rng.getrandbits(15))
         self.unicasts = LegacyReassembly(settings.limits)
         self.broadcasts = LegacyReassembly(settings.limits)
         self.last_heard = float("-inf")
@@ -105,12 +105,14 @@ class LegacyPeer:
 class LegacyPeers:
     """All legacy peers by host address. `next_at` is when something is due."""
 
-    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state")
+    __slots__ = ("_by_host", "_heartbeat_at", "_restored", "_state", "accepted")
 
     def __init__(self, state: State, positions: Mapping[str, ReceivePosition]) -> None:
         """`positions` are those of the previous run, by peer."""
         self._state = state
         self._restored = dict(positions)
+        self.accepted = 0
+        """Datagrams of configured addresses. Nothing authenticates them."""
         self._by_host: dict[str, LegacyPeer] = {}
         self._heartbeat_at = float("-inf")
         self.apply()
@@ -136,7 +138,7 @@ class LegacyPeers:
         peer.legacy = peer.settling = False
         peer.legacy_meters = None
         heard = peer.session is not None or peer.legacy_path is not None
-        if not heard and not peer.sender.pending and not state.outboxes.holds(peer.name):
+        if not heard and not peer.open_sender().pending and not state.outboxes.holds(peer.name):
             state.ready.pop(peer, None)
             del state.peer_table.peers[peer.name]
 
@@ -158,6 +160,7 @@ class LegacyPeers:
             return
         try:
             datagram = decode_legacy(data)
+            self.accepted += 1
             self._on_activity(legacy, link, source, now)
             legacy.received_bytes += len(data) + IP_UDP_BYTES
             match datagram:
@@ -242,7 +245,7 @@ class LegacyPeers:
     def send(self, now: float, out: list[Datagram]) -> None:
         """Send the fragments that may be sent now."""
         for legacy in self._active():
-            if legacy.link and (legacy.peer.sender.pending or legacy.sender.timer() is not None):
+            if legacy.link and (legacy.peer.open_sender().pending or legacy.sender.timer() is not None):
                 legacy.sender.send(legacy.link, legacy.address, now, out)
                 report_ended(self._state, legacy.peer, now)
 
@@ -281,7 +284,7 @@ class LegacyPeers:
                 store_in_outbox(state, peer, now)
             if peer.state is PeerState.OFFLINE and silent_s > rates.peer_lost_s:
                 peer.transition(PeerEvent.GIVEN_UP)
-                peer.sender.finish_all(Outcome.PEER_LOST)
+                peer.open_sender().finish_all(Outcome.PEER_LOST)
                 report_ended(state, peer, now)
             legacy.unicasts.purge(now)
             legacy.broadcasts.purge(now)
@@ -290,8 +293,8 @@ class LegacyPeers:
                 peer.settling = False
             if peer.online and legacy.settled_at is None and state.outboxes.holds(peer.name):
                 release_outbox(state, peer, now)
-            legacy.meters.sent.feed(peer.sender.sent_bytes, now)
-            legacy.meters.delivered.feed(peer.sender.delivered_bytes, now)
+            legacy.meters.sent.feed(peer.open_sender().sent_bytes, now)
+            legacy.meters.delivered.feed(peer.open_sender().delivered_bytes, now)
             legacy.meters.received.feed(legacy.received_bytes, now)
             for link in self._links(legacy):
                 host = encode_legacy(Host(state.settings.name, link.address[0]))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from udp_mesh.core.peers.session import Session
+from udp_mesh.core.peers.session_state import SessionEvent, SessionState
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.datagram_age import Freshness
 
@@ -25,6 +26,7 @@ class _Record:
     next_wire_id: int
     floors: dict[tuple[bytes, bytes], int]
     finished: tuple[RangeSet, RangeSet]
+    unconfirmed: set[int]
     freshness: Freshness
 
 
@@ -43,7 +45,7 @@ class BootMemory:
     def save(self, session: Session) -> None:
         """Save the counters of a session being dropped, unless it was never verified and nothing was sent to it."""
         number = session.path.channel.next_number
-        if not (session.verified or session.restored or number):
+        if session.state is SessionState.NEW and not number:
             return
         receiver = session.receiver
         self._records.pop(session.boot_id, None)
@@ -53,6 +55,7 @@ class BootMemory:
             session.next_wire_id,
             session.floors(),
             (receiver.unicasts.finished, receiver.broadcasts.finished),
+            receiver.unconfirmed,
             session.freshness,
         )
         while len(self._records) > MAX_BOOTS:
@@ -70,6 +73,8 @@ class BootMemory:
         session.next_wire_id = record.next_wire_id
         session.restore_floors(record.floors)
         session.receiver.unicasts.finished, session.receiver.broadcasts.finished = record.finished
+        session.receiver.unconfirmed = record.unconfirmed
         session.freshness = record.freshness
-        session.restored = True
-        session.replaced = record.name == session.name
+        session.transition(
+            SessionEvent.SAME_NAME_RESTORED if record.name == session.name else SessionEvent.OTHER_NAME_RESTORED
+        )

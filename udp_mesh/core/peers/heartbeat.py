@@ -20,6 +20,12 @@ from udp_mesh.wire.limits import MAX_HEARD
 
 OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
 
+
+def own_features(settings: Settings) -> int:
+    """What this node announces."""
+    return int(OWN_FEATURES | Feature.CONFIRM if settings.confirms else OWN_FEATURES)
+
+
 REPLY_WITHIN_S = 0.1
 """A new node is answered within this time, after a random part of it, so that a team does not answer all at once."""
 
@@ -74,7 +80,7 @@ class HeartbeatScheduler:
         online = [session for session in sessions if session.peer is not None and session.peer.online]
         verified = bool(online) and all(
             session.peer is not None
-            and session.peer.has_sender
+            and session.peer.sender is not None
             and now - session.peer.sender.delivered_at < rates.heartbeat_s
             and session.peer.sender.delivered_packets
             for session in online
@@ -104,7 +110,7 @@ class HeartbeatScheduler:
             settings.name,
             VERSION,
             VERSION,
-            int(OWN_FEATURES),
+            own_features(settings),
             min(65_535, int(self._interval_s * 1000)),
             min(65_535, sum(1 for session in sessions if session.peer is not None and session.peer.online)),
             min(0xFFFFFFFF, int(sent_bytes_per_s)),

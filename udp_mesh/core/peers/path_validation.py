@@ -45,7 +45,7 @@ def send_on_path(state: State, session: Session, frame: Frame, link: str, addres
     """Send one small frame to this address, regardless of the current path."""
     number, data = session.path.seal(encode(session.path.with_timestamp([frame], now)))
     if session.is_current and session.peer is not None:
-        session.peer.sender.in_flight.add(number, None)
+        session.peer.open_sender().in_flight.add(number, None)
     state.outgoing.append(Datagram(link, address, data, True))
 
 

@@ -8,6 +8,7 @@ from enum import Enum
 
 from udp_mesh.core.peers.channel_counters import BootMemory
 from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.peers.session_state import SessionEvent, SessionState
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.settings import Settings
 from udp_mesh.crypto import Key, ReceiveChannel
@@ -83,7 +84,8 @@ class PeerTable:
     def verify(self, session: Session, settings: Settings) -> tuple[VerifyResult, Peer | None]:
         """Mark the session as verified. After NEW and RESTARTED the caller makes it its peer's session; `Peer.session`
         still is the old one."""
-        session.verified = True
+        had_name_before = session.state is SessionState.RETURNED
+        session.transition(SessionEvent.VERIFIED)
         if session.name == self.own_name:
             # It stays among the unverified sessions, which are few: a key holder could invent such boots without end.
             return VerifyResult.OWN_NAME, None
@@ -92,7 +94,7 @@ class PeerTable:
         if peer is None:
             self.forget(session)
             return VerifyResult.FULL, None
-        if session.replaced and peer.session is not None:
+        if had_name_before and peer.session is not None:
             session.peer = peer
             return VerifyResult.RETIRED, peer
         return (VerifyResult.NEW if peer.session is None else VerifyResult.RESTARTED), peer
@@ -102,7 +104,6 @@ class PeerTable:
         old = peer.session
         if old is not None:
             peer.retired[old.boot_id] = None
-            old.replaced = True
             if len(peer.retired) > MAX_RETIRED:
                 oldest = next(iter(peer.retired))
                 del peer.retired[oldest]

@@ -8,6 +8,14 @@ from typing import NamedTuple
 
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.peer_state import TRANSITIONS, PeerEvent, PeerState
+from udp_mesh.core.peers.session_state import (
+    RECEPTION_TRANSITIONS,
+    SESSION_TRANSITIONS,
+    Reception,
+    ReceptionEvent,
+    SessionEvent,
+    SessionState,
+)
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.receiver.receiver import Receiver
@@ -44,6 +52,8 @@ MAX_PENDING_CONTROL = 64
 
 # Compared for every peer of a large team: a global costs less than an enum member.
 _ONLINE = PeerState.ONLINE
+_VERIFIED = SessionState.VERIFIED
+_UNKNOWN = Reception.UNKNOWN
 
 
 class Meters:
@@ -60,14 +70,13 @@ class Meters:
 class Peer:
     """A name: what is being sent to it, whichever of its boots receives.
 
-    `sender` is created on first access, and `has_sender` is True from then on: in a large team most nodes send to few.
+    `sender` is None until `open_sender`: in a large team most nodes send to few.
     """
 
     __slots__ = (
         "_settings",
         "conflict_reported_at",
         "due_at",
-        "has_sender",
         "held_until",
         "legacy",
         "legacy_meters",
@@ -82,12 +91,10 @@ class Peer:
         "timer_at",
     )
 
-    sender: Sender
-
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self._settings = settings
-        self.has_sender = False
+        self.sender: Sender | None = None
         self.session: Session | None = None
         self.state = PeerState.LOST
         self.legacy = False
@@ -108,12 +115,10 @@ class Peer:
         self.held_until: dict[int, float] = {}
         """Priority -> until when its hold-back for other robots is already counted."""
 
-    def __getattr__(self, name: str) -> Sender:
-        # Only called while the slot is unset, so access costs nothing once the sender exists.
-        if name != "sender":
-            raise AttributeError(name)
-        self.has_sender = True
-        self.sender = Sender(self._settings)
+    def open_sender(self) -> Sender:
+        """The sender, created if there is none yet."""
+        if self.sender is None:
+            self.sender = Sender(self._settings)
         return self.sender
 
     @property
@@ -125,7 +130,7 @@ class Peer:
 
     def record_held(self, levels: int, now: float, until: float) -> None:
         """Count how long the waiting levels of the mask are held back for other robots' urgent messages."""
-        for priority, level in enumerate(self.sender.levels):
+        for priority, level in enumerate(self.open_sender().levels):
             if levels >> priority & 1:
                 level.held_s += max(0.0, until - max(now, self.held_until.get(priority, now)))
                 self.held_until[priority] = until
@@ -133,7 +138,7 @@ class Peer:
     def apply(self, settings: Settings) -> None:
         """Apply new settings; nothing in flight is touched."""
         self._settings = settings
-        if self.has_sender:
+        if self.sender is not None:
             self.sender.apply(settings)
 
 
@@ -152,9 +157,7 @@ class Session:
         "freshness",
         "interval_s",
         "introduced_at",
-        "knows_us",
         "last_heard",
-        "lists_us",
         "met_at",
         "meters",
         "name",
@@ -168,10 +171,8 @@ class Session:
         "pending_control",
         "received_bytes",
         "receiver",
-        "replaced",
-        "restored",
-        "timed",
-        "verified",
+        "reception",
+        "state",
         "versions",
     )
 
@@ -188,15 +189,12 @@ class Session:
         self.name = name
         self.boot_id = boot_id
         self.peer: Peer | None = None
-        self.verified = False
-        self.knows_us = False
-        """It listed us as heard, or answered us: introductions need no name any more."""
+        self.state = SessionState.NEW
+        self.reception = Reception.UNKNOWN
         self.met_at: float | None = None
         """When its first heartbeat was heard."""
-        self.lists_us = False
-        """Its broadcast heartbeats have listed us, so one that no longer does is significant."""
         self.one_way_since: float | None = None
-        """Since when its heartbeats no longer list us and it acknowledges nothing: only its direction to us works."""
+        """Since when `reception` is ONE_WAY; None in other states."""
         self.name_conflict = False
         """Still heard after another boot took its name: two nodes share the name."""
         self.next_wire_id = 0
@@ -216,15 +214,9 @@ class Session:
         self.path = Path(SendChannel(keys[0], own_boot, boot_id))
         self.pending_control: list[Frame] = []
         self.freshness = Freshness()
-        self.timed = False
-        """It timestamps what it sends."""
         self.challenges: dict[int, Challenge] = {}
         """Path challenges without an answer yet, by token (see `path_validation`)."""
         self.challenged_at = float("-inf")
-        self.replaced = False
-        """Another boot has taken its name since."""
-        self.restored = False
-        """An earlier session for the same boot was dropped and its counters were restored."""
         self._key_floors: dict[tuple[bytes, bytes], int] = {}
         """(key id, receiver) of removed keys -> the number from which on datagrams are new."""
         self._forgotten_floor = 0
@@ -299,18 +291,38 @@ class Session:
         """Whether it is the current session of its name."""
         return self.peer is not None and self.peer.session is self
 
-    def confirm_two_way(self) -> None:
-        """It listed us, or acknowledged something recent."""
-        self.knows_us = True
-        self.one_way_since = None
+    @property
+    def verified(self) -> bool:
+        """It proved that it hears our current boot."""
+        return self.state is _VERIFIED
+
+    @property
+    def knows_us(self) -> bool:
+        """Introductions to it need no name any more."""
+        return self.reception is not _UNKNOWN
+
+    @property
+    def timed(self) -> bool:
+        """It timestamps what it sends."""
+        return self.path.timed
+
+    def transition(self, event: SessionEvent) -> None:
+        self.state = SESSION_TRANSITIONS[self.state, event]
+
+    def on_reception(self, event: ReceptionEvent, now: float) -> None:
+        """The peer showed whether it hears us."""
+        self.reception = RECEPTION_TRANSITIONS[self.reception, event]
+        if self.reception is not Reception.ONE_WAY:
+            self.one_way_since = None
+        elif self.one_way_since is None:
+            self.one_way_since = now
 
     def on_heard_list(self, heard: tuple[bytes, ...], own_tag: bytes, now: float) -> None:
         """Process the list of a broadcast heartbeat. A full list may have had no room for us."""
         if own_tag in heard:
-            self.lists_us = True
-            self.confirm_two_way()
-        elif self.lists_us and self.one_way_since is None and len(heard) < MAX_HEARD:
-            self.one_way_since = now
+            self.on_reception(ReceptionEvent.LISTED, now)
+        elif len(heard) < MAX_HEARD:
+            self.on_reception(ReceptionEvent.NOT_LISTED, now)
 
     def queue_control(self, frame: Frame) -> None:
         """Queue a small frame for the next datagrams."""
@@ -335,4 +347,5 @@ class Session:
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
-        self.timed = self.path.timed = bool(beat.features & Feature.TIMED)
+        self.path.timed = bool(beat.features & Feature.TIMED)
+        self.path.confirms = bool(beat.features & Feature.CONFIRM)

@@ -27,6 +27,9 @@ from udp_mesh.wire.frames import Fragment, MessageFlag, Refused, RefuseReason, T
 
 _PLAIN_MASK = 0xFF & ~FRAGMENT_ACK_NOW
 
+MAX_UNCONFIRMED = 4096
+"""Messages of one peer that the application has not confirmed yet; the next ones are not acknowledged."""
+
 MAX_REFUSED_REMEMBERED = 256
 """Refused messages of one peer remembered, so that each of their fragments is refused again."""
 
@@ -41,6 +44,13 @@ class ReceivedMessage(NamedTuple):
     to_all: bool
     from_broadcast: int | None
     """Its broadcast number, if it has one."""
+    confirm_id: int | None = None
+    """Its message id, if its sender waits for a confirmation."""
+
+
+def _asks_to_confirm(fragment: Fragment) -> bool:
+    head = fragment.head
+    return head is not None and head.flags & MessageFlag.CONFIRM != 0 and not fragment.broadcast_id
 
 
 def _topic_bytes(names: tuple[str, str]) -> int:
@@ -59,6 +69,7 @@ class Receiver:
         "acks",
         "broadcasts",
         "completed",
+        "confirmed",
         "duplicates",
         "expired",
         "fragments",
@@ -66,6 +77,7 @@ class Receiver:
         "over_limit",
         "refusals",
         "topics",
+        "unconfirmed",
         "unicasts",
     )
 
@@ -86,6 +98,10 @@ class Receiver:
         """Fragments of messages that their senders have given up by now."""
         self.fragments = 0
         self.over_limit = 0
+        self.unconfirmed: set[int] = set()
+        """Delivered messages whose senders wait for a confirmation."""
+        self.confirmed: list[int] = []
+        """Confirmations to send."""
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
         self._gap_ack_at: int | None = None
 
@@ -148,6 +164,9 @@ class Receiver:
         if self._refused and key in self._refused:
             self._refuse(key, self._refused[key])
             return False
+        if len(self.unconfirmed) >= MAX_UNCONFIRMED and _asks_to_confirm(fragment):
+            self.over_limit += 1
+            return False
         reassembly = self.broadcasts if by_broadcast else self.unicasts
         result = reassembly.add(fragment, now, late_s)
         if isinstance(result, CompleteMessage):
@@ -157,6 +176,9 @@ class Receiver:
                 return True
             case FragmentStatus.DUPLICATE:
                 self.duplicates += 1
+                if _asks_to_confirm(fragment) and self._is_confirmed(fragment.message_id):
+                    # The confirmation was lost.
+                    self.confirmed.append(fragment.message_id)
                 return True
             case FragmentStatus.FULL:
                 self.over_limit += 1
@@ -174,6 +196,25 @@ class Receiver:
             case FragmentStatus.CORRUPT:
                 self._refuse_for_good(key, RefuseReason.CORRUPT)
                 return False
+
+    def confirm(self, message_id: int) -> bool:
+        """The message is safe. False if that is not awaited."""
+        if message_id not in self.unconfirmed:
+            return False
+        self.unconfirmed.remove(message_id)
+        self.confirmed.append(message_id)
+        return True
+
+    def request_again(self, message_id: int) -> bool:
+        """The message could not be kept: its sender is to restart it. False if that is not awaited."""
+        if message_id not in self.unconfirmed:
+            return False
+        self.unconfirmed.remove(message_id)
+        self._refuse((False, message_id), RefuseReason.FORGOTTEN)
+        return True
+
+    def _is_confirmed(self, message_id: int) -> bool:
+        return message_id in self.unicasts.finished and message_id not in self.unconfirmed
 
     def on_accepted(self, number: int, now: float, *, ack_now: bool) -> None:
         """Record that a datagram that requests an acknowledgement was accepted."""
@@ -206,7 +247,10 @@ class Receiver:
             return False
         number = complete.message_id if by_broadcast else None
         to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
-        received = ReceivedMessage(*topic, complete.body, head.priority, to_all, number)
+        confirm_id = complete.message_id if head.flags & MessageFlag.CONFIRM and not by_broadcast else None
+        received = ReceivedMessage(*topic, complete.body, head.priority, to_all, number, confirm_id)
+        if confirm_id is not None:
+            self.unconfirmed.add(confirm_id)
         if not head.flags & MessageFlag.COMPRESSED:
             self.completed.append(received)
             return True

@@ -54,12 +54,14 @@ class OutgoingMessage:
         "accepted",
         "arrived",
         "body",
+        "confirm",
         "ended",
         "first_bytes",
         "fragment_bytes",
         "fragments",
         "missing",
         "next_position",
+        "overdue",
         "priority",
         "queued_at",
         "reliable",
@@ -75,7 +77,11 @@ class OutgoingMessage:
         self.reliable = reliable
         self.queued_at = accepted.accepted_at
         self.store_key: int | None = None
+        self.confirm = False
+        """It ends as delivered only when the peer confirms that, not when its fragments are acknowledged."""
         self.ended = False
+        self.overdue = False
+        """Past its deadline: only its acknowledgement is awaited."""
         self.superseded = False
         """Replaced by a newer message: its lost fragments are not retransmitted."""
         self.wire_id: int | None = None
@@ -116,6 +122,7 @@ class OutgoingMessage:
         copy.store_key = self.store_key
         assert self.wire_id is not None
         copy.begin(self.wire_id, self.fragment_bytes, self.first_bytes)
+        copy.confirm = self.confirm
         copy.arrived, copy.missing, copy.next_position = self.arrived, self.missing, self.next_position
         return copy
 

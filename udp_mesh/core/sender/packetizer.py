@@ -33,7 +33,7 @@ from udp_mesh.wire.fragment import (
     WIDE_FROM,
     WIDE_HEADER,
 )
-from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageHead, Ping, Sent, TopicAnnounce
+from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageFlag, MessageHead, Ping, Sent, TopicAnnounce
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 IP_UDP_BYTES = 28
@@ -67,7 +67,18 @@ def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
 class Path:
     """The path to the peer: link, address, sealing and sizes."""
 
-    __slots__ = ("address", "channel", "confirmed", "fragment_bytes", "heard_at", "link", "mtu", "room_bytes", "timed")
+    __slots__ = (
+        "address",
+        "channel",
+        "confirmed",
+        "confirms",
+        "fragment_bytes",
+        "heard_at",
+        "link",
+        "mtu",
+        "room_bytes",
+        "timed",
+    )
 
     def __init__(self, channel: SendChannel) -> None:
         self.channel = channel
@@ -85,6 +96,8 @@ class Path:
         self.fragment_bytes = 0
         """Payload of a full fragment."""
         self.timed = False
+        self.confirms = False
+        """The peer confirms messages that ask for it."""
         """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
 
     def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
@@ -225,6 +238,7 @@ def _begin(sender: Sender, path: Path, message: OutgoingMessage) -> None:
         message.begin(broadcast_number, path.fragment_bytes, max(1, first))
         return
     message.begin(sender.next_wire_id, path.fragment_bytes, max(1, first))
+    message.confirm = path.confirms and message.reliable and message.accepted.channel.topic.keeps_on_disk
     sender.next_wire_id += 1
 
 
@@ -375,7 +389,7 @@ def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) 
         message.fragments,
         accepted.channel.number,
         message.priority,
-        accepted.flags,
+        accepted.flags | MessageFlag.CONFIRM if message.confirm else accepted.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
         accepted.life_ms(now) if _sends_life(path, message) else None,
     )

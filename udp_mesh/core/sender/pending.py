@@ -27,6 +27,31 @@ class Ended(NamedTuple):
     outcome: Outcome | ExpiryReason
 
 
+CONFIRM_INTERVAL_S, MAX_CONFIRM_INTERVAL_S = 1.0, 60.0
+"""How long a confirmation is awaited before it is asked for, the first time and at most: a disk may be slow."""
+
+
+class Unconfirmed:
+    """A message that arrived completely."""
+
+    __slots__ = ("_at", "_interval_s", "message")
+
+    def __init__(self, message: OutgoingMessage) -> None:
+        self.message = message
+        self._at: float | None = None
+        self._interval_s = CONFIRM_INTERVAL_S
+
+    def is_due(self, now: float) -> bool:
+        """Whether to ask now. Asks at growing intervals from the first call on."""
+        if self._at is None:
+            self._at = now + self._interval_s
+        if now < self._at:
+            return False
+        self._interval_s = min(2 * self._interval_s, MAX_CONFIRM_INTERVAL_S)
+        self._at = now + self._interval_s
+        return True
+
+
 class PendingMessages:
     """The session fetches and clears `ended` and `cancelled`."""
 
@@ -39,6 +64,8 @@ class PendingMessages:
         """Wire ids abandoned after their first fragment was sent: the peer may discard them."""
         self._deadlines: list[tuple[float, int, OutgoingMessage]] = []
         self._deadline_serial = 0
+        self.unconfirmed: dict[int, Unconfirmed] = {}
+        """By wire id: messages that arrived completely, until the peer confirms that they are safe."""
         self._kept: dict[str, list[OutgoingMessage]] = {}
         """Pending messages of topics with `keep_last`."""
 
@@ -77,10 +104,17 @@ class PendingMessages:
         """When the next message expires (it may have ended meanwhile)."""
         return self._deadlines[0][0] if self._deadlines else None
 
-    def expire(self, now: float) -> None:
-        """End messages whose deadline has passed."""
+    def expire(self, now: float, ack_wait_s: float = 0.0) -> None:
+        """End messages whose deadline has passed. One of which every fragment was sent may have arrived in time: it has
+        `ack_wait_s` more for the acknowledgement to come."""
         while self._deadlines and self._deadlines[0][0] <= now:
-            self.finish(heappop(self._deadlines)[2], ExpiryReason.DEADLINE)
+            at, serial, message = heappop(self._deadlines)
+            all_sent = message.started and message.next_position >= message.fragments
+            if ack_wait_s and all_sent and not message.overdue and not message.ended:
+                message.overdue = True
+                heappush(self._deadlines, (at + ack_wait_s, serial, message))
+            else:
+                self.finish(message, ExpiryReason.DEADLINE)
 
     def restart_message(self, message: OutgoingMessage) -> OutgoingMessage:
         """Replace the message by a copy of which nothing was sent, placed last on its level."""
@@ -125,6 +159,23 @@ class PendingMessages:
         if message.wire_id is not None and message.accepted.broadcast_number is None:
             self.cancelled.append(message.wire_id)
 
+    def on_arrived(self, message: OutgoingMessage) -> None:
+        """All of the message's fragments are acknowledged."""
+        if message.confirm and message.wire_id is not None:
+            self.unconfirmed.setdefault(message.wire_id, Unconfirmed(message))
+        else:
+            self.finish(message, Outcome.DELIVERED)
+
+    def confirmations_due(self, now: float) -> list[OutgoingMessage]:
+        """Messages of which a fragment is to be sent again, so that the peer repeats a confirmation that was lost."""
+        due = []
+        for wire_id, entry in list(self.unconfirmed.items()):
+            if entry.message.ended:
+                del self.unconfirmed[wire_id]
+            elif entry.is_due(now):
+                due.append(entry.message)
+        return due
+
     def by_wire_id(self, wire_id: int) -> OutgoingMessage | None:
         """The pending message with this wire id (broadcast repairs are numbered separately). A linear search, for rare
         frames."""
@@ -135,6 +186,11 @@ class PendingMessages:
         """The peer reports these messages as complete, whatever it acknowledged. A linear search, for other
         implementations."""
         known = set(wire_ids)
+        for wire_id in known & self.unconfirmed.keys():
+            self.finish(self.unconfirmed.pop(wire_id).message, Outcome.DELIVERED)
+            known.discard(wire_id)
+        if not known:
+            return
         for message in list(self.pending):
             if message.wire_id in known and message.accepted.broadcast_number is None:
                 self.finish(message, Outcome.DELIVERED)

@@ -2,8 +2,8 @@
 
 1. `cwnd_room`: the room in the congestion window, plus what the link should have delivered while acknowledgements are
    late.
-2. `send_quota`: that plus the excess for urgent fragments; for others at most what pacing allows. An unresponsive peer
-   gets only probes.
+2. `send_quota`: that plus the excess for urgent fragments, which no drain holds back; for others at most what pacing
+   allows. An unresponsive peer gets only probes.
 3. `next_send_at`: when nothing may be sent, the time at which pacing or a late acknowledgement changes that.
 4. `ack_spacing`: how often packets request an acknowledgement, which determines when one is late.
 
@@ -62,6 +62,7 @@ def send_quota(sender: Sender, room: int, now: float, packets_per_s: float | Non
     packets = room
     if urgent:
         packets += sender.rates.urgent_excess_packets
+        packets += int(sender.congestion.undrained_cwnd) - int(sender.congestion.cwnd)
         if packets <= 0 and now >= urgent_wait_until(sender):
             packets = 1
     else:

@@ -18,7 +18,7 @@ from udp_mesh.core.congestion.pacer import Pacer
 from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.message import OutgoingMessage
-from udp_mesh.core.sender.pending import Outcome, PendingMessages
+from udp_mesh.core.sender.pending import PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
 from udp_mesh.core.sender.resume_backoff import RESUME_BURST_PACKETS, ResumeBackoff
@@ -43,6 +43,9 @@ the pace of the window: a burst of losses costs little more than its own length.
 
 MIN_ACK_GAP_S = 0.02
 """Minimum time without acknowledgements before packets time out: twice what the peer holds them back."""
+
+MAX_ACK_WAIT_S = 1.0
+"""How long an acknowledgement is awaited after a message's deadline at most."""
 
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
@@ -182,6 +185,7 @@ class Sender(PendingMessages):
                 rate,
                 app_limited=app_limited,
                 ahead=ahead,
+                lost=len(lost),
                 loss=self.loss,
                 now=now,
             )
@@ -218,14 +222,14 @@ class Sender(PendingMessages):
                 message.missing -= 1
                 self.delivered_bytes += message.fragment_bytes if position else message.first_bytes
                 if not message.missing:
-                    self.finish(message, Outcome.DELIVERED)
+                    self.on_arrived(message)
             for message, position in more:
                 if not position:
                     self.announced.add(message.accepted.channel.number)
                 if not message.ended and message.mark_arrived(position):
                     self.delivered_bytes += len(message.body)
                     if not message.missing:
-                        self.finish(message, Outcome.DELIVERED)
+                        self.on_arrived(message)
 
     def _requeue(self, packets: Iterable[Packet]) -> None:
         """Requeue the lost fragments of reliable messages on their level."""
@@ -239,7 +243,7 @@ class Sender(PendingMessages):
             return
         if message.superseded:
             self.finish(message, ExpiryReason.SUPERSEDED)
-        else:
+        elif not message.overdue:
             self.scheduler.push_retransmit(message, position)
 
     def schedule_copies(self, message: OutgoingMessage, position: int, now: float) -> None:
@@ -283,7 +287,8 @@ class Sender(PendingMessages):
         return self.rtt.pto_s(self.rates.ack_delay_s, PROBE_INTERVAL_S)
 
     def handle_timer(self, now: float) -> None:
-        self.expire(now)
+        responsive = self.state is not SendState.UNRESPONSIVE
+        self.expire(now, min(self.rtt.pto_s(self.rates.ack_delay_s), MAX_ACK_WAIT_S) if responsive else 0.0)
         if self.wake_at <= now:
             self.wake_at = float("inf")
         if self.state is SendState.UNRESPONSIVE:
@@ -400,6 +405,7 @@ class Sender(PendingMessages):
         self.announced.clear()
         self.copies.clear()
         self.cancelled.clear()
+        self.unconfirmed.clear()
         self.next_wire_id = 0
         self.epoch += 1
         self._transition(SendEvent.RESTARTED)
@@ -411,6 +417,16 @@ class Sender(PendingMessages):
             self.restart_message(message)
         self.scheduler.rebuild(list(self.pending), keep_fragments=False)
 
+    def request_confirmations(self, now: float) -> bool:
+        """Send fragments of unconfirmed messages again if their confirmations are overdue. False if none is."""
+        due = self.confirmations_due(now)
+        for message in due:
+            if message.arrived[0]:
+                message.arrived[0] = 0
+                message.missing += 1
+                self.scheduler.push_retransmit(message, 0)
+        return bool(due)
+
     def resend_from_start(self, message: OutgoingMessage) -> None:
         """Restart a message whose fragments the peer discarded."""
         self.announced.discard(message.accepted.channel.number)
@@ -420,6 +436,8 @@ class Sender(PendingMessages):
         """Resume a withdrawn message where it stopped."""
         copy = message.resumed()
         self.accept(copy, now)
+        if not copy.missing:
+            self.on_arrived(copy)
         for position in range(copy.next_position):
             if not copy.arrived[position]:
                 self.scheduler.push_retransmit(copy, position)

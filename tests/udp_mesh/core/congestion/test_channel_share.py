@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from udp_mesh.core.congestion.channel_share import MAX_SHARE, RATE_VALID_S, ChannelShare
-from udp_mesh.core.congestion.delay_based import MIN_QUEUE_PACKETS, UNSHARED_FROM_LOSS, DelayBasedController
+from udp_mesh.core.congestion.delay_based import DelayBasedController
+from udp_mesh.core.congestion.queue_target import MIN_QUEUE_PACKETS, UNSHARED_FROM_LOSS
 from udp_mesh.core.congestion.rtt import RttEstimator
 
 
@@ -56,7 +57,16 @@ def settled_queue(share: float, loss: float) -> float:
         rtt.sample(max(base, window.cwnd / rate), now)
         in_flight = int(window.cwnd)
         window.on_ack(
-            1, number, number + in_flight, in_flight, rate, app_limited=False, ahead=in_flight, loss=loss, now=now
+            1,
+            number,
+            number + in_flight,
+            in_flight,
+            rate,
+            app_limited=False,
+            ahead=in_flight,
+            lost=0,
+            loss=loss,
+            now=now,
         )
     return window.cwnd - base * rate
 

@@ -57,14 +57,14 @@ def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
         world.add(settings(name, Topic("map")))
     assert world.run(5.0, until=lambda: all(len(world.events_of(name, PeerOnline)) == 2 for name in world.nodes))
     world.run(3.0)
-    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.has_sender] == []
+    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.sender is not None] == []
     conditions = world.nodes["a"].conditions(world.now)
     assert [(peer.name, peer.online, peer.round_trip_s) for peer in conditions.peers] == [
         ("b", True, None),
         ("c", True, None),
     ]
     world.send("a", "map", bytes(1000), "b")
-    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.has_sender] == ["b"]
+    assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.sender is not None] == ["b"]
 
 
 def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later() -> None:

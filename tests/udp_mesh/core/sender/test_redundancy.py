@@ -67,7 +67,7 @@ def test_the_window_does_not_go_by_urgent_packets_that_pass_the_others() -> None
     run = Run(urgent=True)
     run.start()
     run.world.run(3.0)
-    sender = run.world.nodes["a"]._state.peer_table.peers["b"].sender
+    sender = run.world.nodes["a"]._state.peer_table.peers["b"].open_sender()
     smoothed = sender.rtt.smoothed_rtt
     assert not sender._sample(0.001, run.world.now, urgent=True)
     assert sender.rtt.smoothed_rtt == smoothed

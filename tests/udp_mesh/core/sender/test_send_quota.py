@@ -17,7 +17,7 @@ def busy_outbound(**link: object) -> tuple[Sender, float]:
     run.link(**link)
     run.start()
     run.world.run(3.0)
-    sender = run.world.nodes["a"]._state.peer_table.peers["b"].sender
+    sender = run.world.nodes["a"]._state.peer_table.peers["b"].open_sender()
     return sender, sender.last_progress
 
 

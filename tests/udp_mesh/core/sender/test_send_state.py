@@ -28,7 +28,7 @@ def test_a_sender_times_out_becomes_unresponsive_and_active_again() -> None:
     both = pair(Topic("map"))
     both.a.send("map", b"before", destination="b", now=both.now)
     both.roundtrip(times=10)
-    sender = both.a._state.peer_table.peers["b"].sender
+    sender = both.a._state.peer_table.peers["b"].open_sender()
     assert sender.state is SendState.ACTIVE
     both.a.send("map", b"lost", destination="b", now=both.now)
     seen: list[SendState] = []

@@ -1,0 +1,100 @@
+"""Links that the transport was not tuned to, in virtual time: `python -m benchmarks.unfamiliar_links [--fill]`.
+
+Each link of `udp_mesh.sim.links.cells` under the standard load, several seeds; beside it one TCP flow alone on the same
+link with the same losses (models of CUBIC and BBR). Shares are payload of what the link can carry; urgent latencies
+leave out the fades. Prints the mean of the seeds and the worst.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from statistics import fmean
+
+from benchmarks.page import fill
+from benchmarks.tables import row
+from udp_mesh.sim.links.bbr import Bbr
+from udp_mesh.sim.links.cells import CELLS
+from udp_mesh.sim.links.cubic import Cubic
+from udp_mesh.sim.links.tcp import TcpController
+from udp_mesh.sim.links.trial import Trial, percentile
+
+COLUMNS = (
+    "link", "of the link", "worst seed", "foreign flow", "urgent p50, ms", "urgent p99, ms", "worst seed, ms",
+    "wire bytes per byte", "TCP cubic alone", "TCP BBR alone",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """One seed of one link."""
+
+    share: float
+    foreign_share: float
+    urgent_p50_ms: float
+    urgent_p99_ms: float
+    wire_ratio: float
+    cubic_share: float
+    bbr_share: float
+
+
+def measure(name: str, seed: int) -> Figures:
+    result = Trial(CELLS[name], seed).run()
+    return Figures(
+        result.share,
+        result.foreign_share,
+        1e3 * percentile(result.urgent_s, 0.5),
+        1e3 * percentile(result.urgent_s, 0.99),
+        result.wire_ratio,
+        _alone(name, seed, lambda seed: Cubic()),
+        _alone(name, seed, lambda seed: Bbr(random.Random(seed))),
+    )
+
+
+def _alone(name: str, seed: int, controller: Callable[[int], TcpController]) -> float:
+    """The share of a TCP flow that has the link for itself."""
+    return Trial(replace(CELLS[name], senders=0, foreign=controller), seed).run().foreign_share
+
+
+def line(name: str, seeds: list[Figures]) -> str:
+    def mean(figure: str) -> float:
+        return fmean(getattr(one, figure) for one in seeds)
+
+    beside = CELLS[name].foreign is not None
+    return row(
+        [
+            name,
+            f"{mean('share'):.3f}",
+            f"{min(one.share for one in seeds):.3f}",
+            f"{mean('foreign_share'):.3f}" if beside else "",
+            f"{mean('urgent_p50_ms'):.0f}",
+            f"{mean('urgent_p99_ms'):.0f}",
+            f"{max(one.urgent_p99_ms for one in seeds):.0f}",
+            f"{mean('wire_ratio'):.3f}",
+            f"{mean('cubic_share'):.3f}",
+            f"{mean('bbr_share'):.3f}",
+        ]
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.unfamiliar_links", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
+    arguments = parser.parse_args()
+    seeds = range(1, arguments.seeds + 1)
+    lines = [row(COLUMNS), row(["---"] * len(COLUMNS))]
+    with ProcessPoolExecutor() as pool:
+        for name in CELLS:
+            lines.append(line(name, list(pool.map(partial(measure, name), seeds))))
+            print(lines[-1], flush=True)
+    if arguments.fill:
+        fill("unfamiliar links", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

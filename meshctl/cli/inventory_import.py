@@ -1,0 +1,99 @@
+"""`meshctl inventory import`: node attributes from a CSV table into the inventory."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl.cli.context import AsJson, InventoryPath
+from meshctl.cli.output import echo, echo_json
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
+from meshctl.inventory.csv_table import COLUMNS, NodeEdit, edits, read
+from meshctl.inventory.edit import Editor, FileEdit, save, set_node
+from meshctl.inventory.load import load_fleet
+from meshctl.inventory.suggest import did_you_mean
+
+MAX_BYTES = 16 << 20
+
+
+def import_nodes(
+    table: Annotated[str, typer.Argument(metavar="FILE", help="CSV file with a header; - for standard input.")],
+    inventory: InventoryPath = Path(),
+    add: Annotated[bool, typer.Option("--add", help="Add nodes that the inventory does not have.")] = False,
+    column: Annotated[
+        list[str] | None,
+        typer.Option("--column", metavar="COLUMN=HEADING", help="Read a column under another heading."),
+    ] = None,
+    ignore: Annotated[
+        list[str] | None, typer.Option("--ignore", metavar="HEADING", help="Skip the column with this heading.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Set labels, serial numbers, MAC addresses and other values of nodes from a CSV table.
+
+    Columns: node, label, serial, mac, role, state, hardware, release, address, robot. A row names its node in `node`,
+    or else by its label. Empty cells change nothing; the inventory's comments and layout stay.
+
+    Example: meshctl inventory import boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
+    """
+    fleet = load_fleet(inventory, environ=os.environ)
+    file = "standard input" if table == "-" else table
+    rows = read(_text(table), file, headings=_headings(column or ()), ignored=ignore or ())
+    found = edits(rows, fleet, file, add=add)
+    changes = _changes(inventory, found, file)
+    if as_json:
+        nodes = [{"node": each.node, "line": each.line, "new": each.is_new, "values": each.values} for each in found]
+        echo_json(json.dumps({"fleet": fleet.name, "rows": len(rows), "nodes": nodes}, indent=2))
+    else:
+        for change in changes:
+            echo(change.diff(), nl=False)
+        new = sum(each.is_new for each in found)
+        echo(f"{len(rows)} rows: {len(found) - new} nodes to change, {new} to add", err=True)
+    if not dry_run:
+        save(changes)
+
+
+def _changes(inventory: Path, found: tuple[NodeEdit, ...], file: str) -> tuple[FileEdit, ...]:
+    editor = Editor.open(inventory, environ=os.environ)
+    for each in found:
+        set_node(editor, each.node, dict(each.values))
+    try:
+        return editor.changes()
+    except InvalidInput as reason:
+        raise InputError(f"{file}: the inventory would have errors, so nothing was written:\n{reason}") from reason
+
+
+def _text(table: str) -> str:
+    try:
+        with sys.stdin.buffer if table == "-" else Path(table).open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)
+    except OSError as reason:
+        raise InputError(f"{table}: cannot be read: {reason.strerror}") from reason
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{table}: larger than {MAX_BYTES >> 20} MiB", hint="is it a CSV file?")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as reason:
+        line = data[: reason.start].count(b"\n") + 1
+        raise InputError(f"{table}:{line}: not UTF-8 text", hint="save it as CSV UTF-8") from reason
+
+
+def _headings(words: list[str] | tuple[str, ...]) -> dict[str, str]:
+    """Heading -> column, from words such as `mac=MAC address`."""
+    headings: dict[str, str] = {}
+    for word in words:
+        name, separator, heading = word.partition("=")
+        if not separator or not heading.strip():
+            raise InputError(f"--column {word}: expected COLUMN=HEADING, found {word}")
+        if name not in COLUMNS:
+            hint = did_you_mean(name, COLUMNS) or f"columns: {', '.join(COLUMNS)}"
+            raise InputError(f"--column {word}: there is no column '{name}'", hint=hint)
+        headings[heading] = name
+    return headings

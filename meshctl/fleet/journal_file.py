@@ -1,0 +1,155 @@
+"""The journal's SQLite file: how it is opened, locked, read and written, and what its errors mean.
+
+WAL, so that two meshctl processes can write and a killed one leaves it readable.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from meshctl.errors import MeshctlError
+
+SCHEMA_VERSION = 1
+# Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
+BUSY_TIMEOUT_S = 20.0
+_SCHEMA = """
+CREATE TABLE runs (
+    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
+    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE TABLE outcomes (
+    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
+    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
+) STRICT;
+CREATE TABLE steps (
+    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
+    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE INDEX steps_of_run ON steps(run, node);
+CREATE TABLE nodes (
+    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
+) STRICT;
+"""
+
+
+class JournalFile:
+    """The open file. Safe for several threads and processes."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, or create it. Raises MeshctlError."""
+        self.path = path
+        self._lock = threading.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._database = sqlite3.connect(
+                path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
+            )
+        except (OSError, sqlite3.Error) as error:
+            raise MeshctlError(f"{path}: cannot open the journal: {error}", hint=_hint(error)) from error
+        try:
+            self._enter_wal()
+            self._database.execute("PRAGMA synchronous = NORMAL")
+            self._database.execute("PRAGMA foreign_keys = ON")
+            self._create()
+        except (sqlite3.Error, MeshctlError) as error:
+            self._database.close()
+            if isinstance(error, MeshctlError):
+                raise
+            what = "cannot open the journal" if _hint(error) else "not a journal of meshctl"
+            hint = _hint(error) or "move the file away and run again"
+            raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
+
+    def _enter_wal(self) -> None:
+        # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
+        deadline = time.monotonic() + BUSY_TIMEOUT_S
+        while True:
+            try:
+                self._database.execute("PRAGMA journal_mode = WAL")
+            except sqlite3.OperationalError as error:
+                if not _is_locked(error) or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.01)
+            else:
+                return
+
+    def _create(self) -> None:
+        # a reader does not wait for a writer
+        if self._version() == SCHEMA_VERSION:
+            return
+        with self.write() as database:
+            version = self._version()
+            if version == 0:
+                for statement in _SCHEMA.split(";\n"):
+                    if statement.strip():
+                        database.execute(statement)
+                database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            elif version != SCHEMA_VERSION:
+                raise MeshctlError(f"{self.path}: journal of version {version}, expected {SCHEMA_VERSION}")
+
+    def _version(self) -> int:
+        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
+
+    @contextmanager
+    def write(self, wait_s: float = BUSY_TIMEOUT_S) -> Iterator[sqlite3.Connection]:
+        """One transaction, rolled back if the block raises. Raises MeshctlError if the file cannot be written, or is
+        locked for longer than `wait_s`."""
+        with self._lock:
+            try:
+                self._database.execute(f"PRAGMA busy_timeout = {round(wait_s * 1000)}")
+                self._database.execute("BEGIN IMMEDIATE")
+                try:
+                    yield self._database
+                except BaseException:
+                    self._database.execute("ROLLBACK")
+                    raise
+                self._database.execute("COMMIT")
+            except sqlite3.Error as error:
+                # a COMMIT on a full disk may leave its transaction open
+                if self._database.in_transaction:
+                    with suppress(sqlite3.Error):
+                        self._database.execute("ROLLBACK")
+                raise MeshctlError(f"{self.path}: cannot write the journal: {error}", hint=_hint(error)) from error
+
+    def read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
+        """The rows of a query. Raises MeshctlError."""
+        with self._lock:
+            try:
+                return self._database.execute(query, values).fetchall()
+            except sqlite3.Error as error:
+                raise MeshctlError(f"{self.path}: cannot read the journal: {error}") from error
+
+    def close(self) -> None:
+        with self._lock:
+            self._database.close()
+
+
+# SQLite's primary result codes (sqlite.org/rescode.html) are the low eight bits of the extended ones.
+_PRIMARY = 0xFF
+_LOCKED = (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+_UNWRITABLE = (
+    *(sqlite3.SQLITE_FULL, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN),
+    *(sqlite3.SQLITE_IOERR, sqlite3.SQLITE_PERM),
+)
+
+
+def _primary(error: Exception) -> int:
+    return int(getattr(error, "sqlite_errorcode", 0)) & _PRIMARY
+
+
+def _is_locked(error: Exception) -> bool:
+    return _primary(error) in _LOCKED
+
+
+def _hint(error: Exception) -> str:
+    """What to do if the file cannot be used; empty if its content is at fault."""
+    if _is_locked(error):
+        return "another process has locked it: run `fuser` with its path to find that process"
+    if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
+        return "set XDG_STATE_HOME to a directory on a writable disk with free space"
+    return ""

@@ -1,0 +1,73 @@
+"""A real emergency stop, sent from its source to robots, each acknowledging: `send` runs it.
+
+It proves the whole path up to the robots' daemons, with the topic, priority and message of the mission. The robots act
+on it, so only the operator may ask for it (`meshctl preflight --send-estop FILE`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from meshctl.model import Fleet, Topic, TopicClass
+from meshctl.robots.host import Host
+
+DELIVERED = "delivered"
+# the script waits 10 s for each outcome, all at once
+SEND_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class StopPlan:
+    """Which topic, from which robot, to which ones."""
+
+    topic: Topic
+    source: str
+    destinations: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StopResult:
+    """`outcomes`: robot -> `delivered`, or why there was no acknowledgment; `problem`: why nothing was sent."""
+
+    outcomes: Mapping[str, str] = field(default_factory=dict)
+    problem: str = ""
+
+
+def stop_plan(fleet: Fleet, active: Iterable[str]) -> StopPlan | None:
+    """The first emergency stop of the inventory, from its first source, to its destinations among the `active` robots.
+
+    Where every robot may send it, the base does. None if the inventory has no such topic, or no robot that sends it.
+    """
+    names = tuple(active)
+    topic = next((each for each in fleet.topics if each.topic_class is TopicClass.EMERGENCY_STOP), None)
+    base = (robot.name for robot in fleet.robots.values() if robot.is_base)
+    if topic is None:
+        return None
+    source = next((name for name in topic.sources or (*base, *names) if name in fleet.robots), None)
+    if source is None:
+        return None
+    reached = [name for name in names if "all" in topic.destinations or name in topic.destinations]
+    return StopPlan(topic, source, tuple(name for name in reached if name != source))
+
+
+def send(host: Host, plan: StopPlan, message: bytes) -> StopResult:
+    """Send the message from `host`, the source. Raises what `Host.run` raises."""
+    words = (plan.topic.name, plan.topic.type_name, *plan.destinations)
+    return parse_outcomes(host.run("estop", *words, stdin=message, timeout_s=SEND_TIMEOUT_S), plan.destinations)
+
+
+def parse_outcomes(text: str, destinations: Iterable[str]) -> StopResult:
+    """The lines of `scripts/estop.sh`; a robot without a line did not acknowledge."""
+    found: dict[str, str] = {}
+    for line in text.splitlines():
+        try:
+            reply = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(reply, dict) and isinstance(reply.get("peer"), str):
+            outcome = str(reply.get("outcome", ""))
+            reason = reply.get("reason")
+            found[reply["peer"]] = f"{outcome} ({reason})" if reason and outcome != DELIVERED else outcome
+    return StopResult({name: found.get(name) or "no acknowledgment" for name in destinations})

@@ -1,0 +1,149 @@
+"""`meshctl inventory import` and `export --format csv`: a table out, a table in, and every error at its line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from meshctl.cli.main import build
+from meshctl.diagnostics import InvalidInput
+from meshctl.inventory import load_fleet
+from meshctl.inventory.csv_table import edits, read, write
+from tests.meshctl.inventory.inventories import SHIPPED
+
+EXAMPLE = SHIPPED / "subt-final"
+
+
+@pytest.fixture
+def inventory(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "fleet"))
+
+
+def run(inventory: Path, table: str, *options: str) -> Result:
+    words = ["inventory", "import", "-", "-i", str(inventory), *options]
+    return CliRunner().invoke(build("inventory"), words, input=table)
+
+
+def errors_of(text: str) -> list[tuple[int, str]]:
+    with pytest.raises(InvalidInput) as raised:
+        edits(read(text, "boxes.csv"), load_fleet(EXAMPLE), "boxes.csv")
+    return [(item.position.line, item.text) for item in raised.value.diagnostics]
+
+
+def test_what_is_exported_changes_nothing() -> None:
+    fleet = load_fleet(EXAMPLE)
+    rows = read(write(fleet.nodes.values()), "boxes.csv")
+    assert len(rows) == len(fleet.nodes)
+    assert edits(rows, fleet, "boxes.csv") == ()
+
+
+def test_values_are_set_and_comments_stay(inventory: Path) -> None:
+    before = (inventory / "fleet.yaml").read_text(encoding="utf-8")
+    done = run(inventory, "node,serial,mac\nhusky1-b01,SN-0017,02-00-5E-00-00-01\nbase,,02:00:5e:00:00:02\n")
+    assert done.exit_code == 0, done.output
+    fleet = load_fleet(inventory)
+    assert (fleet.nodes["husky1-b01"].serial, fleet.nodes["husky1-b01"].mac) == ("SN-0017", "02:00:5e:00:00:01")
+    assert (fleet.nodes["base"].serial, fleet.nodes["base"].mac) == ("", "02:00:5e:00:00:02")
+    after = (inventory / "fleet.yaml").read_text(encoding="utf-8")
+    assert [line for line in before.splitlines() if "#" in line] == [line for line in after.splitlines() if "#" in line]
+    assert (fleet.nodes["husky1-b02"].serial, fleet.nodes["husky1-b02"].mac) == ("", "")
+
+
+def test_a_row_without_a_name_is_found_by_its_label(inventory: Path) -> None:
+    done = run(
+        inventory,
+        "\ufeffLabel;Serial number;Owner\r\nh1f;SN-1;lab\r\n",
+        "--column",
+        "serial=Serial number",
+        "--ignore",
+        "owner",
+    )
+    assert done.exit_code == 0, done.output
+    node = load_fleet(inventory).nodes["husky1-front"]
+    # the inventory writes it in capitals, the table does not
+    assert (node.serial, node.label) == ("SN-1", "h1f")
+
+
+def test_nodes_are_added_only_on_request(inventory: Path) -> None:
+    table = "node\thardware\taddress\nextra1\tbeacon\t10.42.0.250\n"
+    refused = run(inventory, table)
+    assert refused.exit_code == 2
+    assert "standard input:2: node: expected a node of the inventory, found 'extra1'" in refused.stderr
+    assert "extra1" not in load_fleet(inventory).nodes
+    assert run(inventory, table, "--add").exit_code == 0
+    assert str(load_fleet(inventory).nodes["extra1"].address.ip) == "10.42.0.250"
+
+
+def test_a_new_node_that_the_inventory_does_not_allow_is_not_written(inventory: Path) -> None:
+    before = (inventory / "fleet.yaml").read_bytes()
+    done = run(inventory, "node,label\nextra1,X1\n", "--add")
+    assert done.exit_code == 2
+    assert "nothing was written" in done.stderr
+    assert "the node has no hardware" in done.stderr
+    assert (inventory / "fleet.yaml").read_bytes() == before
+
+
+def test_a_dry_run_shows_the_change_and_writes_nothing(inventory: Path) -> None:
+    before = (inventory / "fleet.yaml").read_bytes()
+    done = run(inventory, "node,serial\nbase,SN-1\n", "--dry-run")
+    assert "serial: SN-1" in done.stdout
+    assert "1 rows: 1 nodes to change, 0 to add" in done.stderr
+    assert (inventory / "fleet.yaml").read_bytes() == before
+
+
+def test_json_lists_what_is_set_on_each_node(inventory: Path) -> None:
+    done = run(inventory, "node,serial\nbase,SN-1\nhusky1-b01,\n", "--json", "--dry-run")
+    assert json.loads(done.stdout)["nodes"] == [{"node": "base", "line": 2, "new": False, "values": {"serial": "SN-1"}}]
+
+
+def test_all_wrong_values_are_reported_at_their_lines() -> None:
+    found = errors_of(
+        "node,mac,state,address\n"
+        "base,02:00:5e:00:00:01,,\n"
+        '"husky1-b01",02:00:5e:00:00:01,deploid,10.42.0\n'
+        "husky1-b01,nonsense,,\n"
+        "base2 x,,,,beyond\n"
+    )
+    assert [line for line, _ in found] == [3, 3, 3, 4, 4, 5]
+    assert "address: expected" in "\n".join(text for _, text in found)
+    assert (3, "mac: expected a value of one device, found '02:00:5e:00:00:01', which line 2 has too") in found
+    assert (4, "node: expected a value of one device, found 'husky1-b01', which line 3 has too") in found
+    assert (5, "expected 4 cells, as in the header, found 'beyond' beyond") in found
+
+
+@pytest.mark.parametrize(
+    ("table", "line", "text"),
+    [
+        ("", 1, "expected a header with a column 'node' or 'label', found none"),
+        ("serial,mac\nSN-1,\n", 1, "expected a header with a column 'node' or 'label', found none"),
+        ("node,seral\nbase,1\n", 1, "expected a column of node, label, serial"),
+        ("node,serial,Serial\nbase,1,2\n", 1, "serial: expected one column, found two"),
+        ('node,serial\n"base,1\n', 2, "expected CSV, found"),
+        ('node,label\n\n"base\n",\nbose,\n', 5, "node: expected a node of the inventory, found 'bose'"),
+        ("node,label,serial\n,,SN-1\n", 2, "node: expected a name or a label, found neither"),
+        ("label\nZZ\n", 2, "label: expected a node of the inventory, found 'ZZ'"),
+    ],
+)
+def test_a_table_that_is_none_is_an_error(table: str, line: int, text: str) -> None:
+    ((at, found), *_) = errors_of(table)
+    assert at == line
+    assert text in found
+
+
+def test_a_table_in_another_encoding_names_the_line(inventory: Path, tmp_path: Path) -> None:
+    (tmp_path / "boxes.csv").write_bytes("node,label\nbase,B\nhusky1-b01,Käfer\n".encode("latin-1"))
+    words = ["inventory", "import", str(tmp_path / "boxes.csv"), "-i", str(inventory)]
+    done = CliRunner().invoke(build("inventory"), words)
+    assert done.exit_code == 2
+    assert "boxes.csv:3: not UTF-8 text" in done.stderr
+
+
+@pytest.mark.parametrize("option", ["serial", "serial=", "seral=Serial number"])
+def test_a_wrong_column_option_is_an_error(inventory: Path, option: str) -> None:
+    done = run(inventory, "node\nbase\n", "--column", option)
+    assert done.exit_code == 2
+    assert f"--column {option}" in done.stderr

@@ -1,0 +1,39 @@
+"""The windowed round trip: stalls of a radio that repeats a frame are no queue, a queue still shows at once."""
+
+from udp_mesh.core.congestion.rtt import MAX_JITTER_WINDOW_S, MIN_WINDOWED_RTT_S, RttEstimator
+
+BASE_S = 0.010
+
+
+def estimator(stall_every: int, packet_s: float = 0.001) -> RttEstimator:
+    """After ten seconds of samples, one each millisecond; a stall holds 25 of them back until it ends."""
+    rtt = RttEstimator()
+    rtt.packet_s = packet_s
+    for number in range(10_000):
+        left = 25 - number % stall_every if stall_every and number < 9_990 else 0
+        rtt.sample(BASE_S + max(0, left) * 0.001, number * 0.001)
+    return rtt
+
+
+def stalled(rtt: RttEstimator, seconds: float) -> float:
+    """The windowed RTT at the end of samples that are all long."""
+    for number in range(int(seconds * 1000)):
+        rtt.sample(BASE_S + 0.03, 10.0 + number * 0.001)
+    assert rtt.windowed_rtt is not None
+    return rtt.windowed_rtt
+
+
+def test_without_jitter_the_shortest_window_shows_a_queue() -> None:
+    assert stalled(estimator(0), MIN_WINDOWED_RTT_S + 0.003) > BASE_S + 0.02
+
+
+def test_on_a_path_with_stalls_another_stall_is_no_queue() -> None:
+    assert stalled(estimator(50), 0.030) < BASE_S + 0.005
+
+
+def test_a_queue_that_stays_shows_all_the_same() -> None:
+    assert stalled(estimator(50), MAX_JITTER_WINDOW_S + 0.005) > BASE_S + 0.02
+
+
+def test_the_serialization_of_a_few_packets_is_no_jitter() -> None:
+    assert stalled(estimator(50, packet_s=0.02), MIN_WINDOWED_RTT_S + 0.003) > BASE_S + 0.02

@@ -1,0 +1,137 @@
+"""A message of a topic with an outbox on disk is delivered once the receiving application has confirmed it."""
+
+from __future__ import annotations
+
+import random
+from functools import partial
+
+import pytest
+
+from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived, Receipt
+from udp_mesh.core.receiver import receiver
+from udp_mesh.core.settings import Outbox, Topic
+
+KEPT = Topic("kept", outbox=Outbox.ALL, outbox_on_disk=True)
+
+
+def world(*, confirms: bool = True, topic: Topic = KEPT, loss: float = 0.0) -> World:
+    made = World(seed=3)
+    made.add(settings("a", topic))
+    made.add(settings("b", confirms=confirms))
+    for pipe in made.pipes.values():
+        pipe.loss = loss
+    made.run(5.0)
+    return made
+
+
+def receipts(made: World) -> list[Receipt]:
+    found = [event.receipt for event in made.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
+    return [receipt for receipt in found if receipt is not None]
+
+
+@pytest.mark.parametrize("size", [10, 50_000])
+def test_a_message_is_delivered_when_it_is_confirmed_and_not_before(size: int) -> None:
+    made = world()
+    made.send("a", "kept", bytes(size), destination="b")
+    made.run(20.0)
+    (receipt,) = receipts(made)
+    assert made.events_of("a", MessageDelivered) == []
+    made.nodes["b"].confirm(receipt)
+    made.run(1.0)
+    assert len(made.events_of("a", MessageDelivered)) == 1
+    made.nodes["b"].confirm(receipt)
+    made.run(5.0)
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_other_topics_and_peers_that_do_not_confirm_are_served_as_before() -> None:
+    for made, topic in ((world(), "any"), (world(confirms=False), "kept")):
+        made.send("a", topic, b"x", destination="b")
+        made.run(2.0)
+        assert receipts(made) == []
+        assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_a_lost_confirmation_is_repeated_and_nothing_arrives_twice() -> None:
+    made = world(loss=0.3)
+    rng = random.Random(5)
+    for number in range(200):
+        made.at(made.now + number * 0.05, partial(made.send, "a", "kept", b"%d" % number, "b"))
+
+    def confirm() -> None:
+        for receipt in receipts(made):
+            if rng.random() < 0.5:
+                made.nodes["b"].confirm(receipt)
+        made.at(made.now + 0.2, confirm)
+
+    confirm()
+    made.run(120.0)
+    assert len(made.events_of("b", MessageReceived)) == 200
+    assert len(made.events_of("a", MessageDelivered)) == 200
+
+
+def test_a_receiver_killed_before_it_kept_a_message_gets_it_again() -> None:
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(1.0)
+    made.add(settings("b", confirms=True))
+    made.run(30.0)
+    assert len(made.events_of("b", MessageReceived)) == 2
+    assert made.events_of("a", MessageDelivered) == []
+    made.nodes["b"].confirm(receipts(made)[1])
+    made.run(1.0)
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_an_unconfirmed_message_outlives_an_absence_and_arrives_once() -> None:
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(1.0)
+    for pipe in made.pipes.values():
+        pipe.up = False
+    made.run(60.0)
+    made.nodes["b"].confirm(receipts(made)[0])
+    for pipe in made.pipes.values():
+        pipe.up = True
+    made.run(30.0)
+    assert len(made.events_of("b", MessageReceived)) == 1
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_what_the_receiver_could_not_keep_comes_again() -> None:
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(1.0)
+    made.nodes["b"].request_again(receipts(made)[0])
+    made.run(5.0)
+    assert len(receipts(made)) == 2
+    made.nodes["b"].confirm(receipts(made)[1])
+    made.run(1.0)
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_a_message_that_is_not_confirmed_in_its_lifetime_expires() -> None:
+    made = world(topic=Topic("kept", outbox=Outbox.ALL, outbox_on_disk=True, deadline_s=3.0))
+    made.send("a", "kept", b"x", destination="b")
+    made.run(10.0)
+    assert len(made.events_of("a", MessageExpired)) == 1
+    made.nodes["b"].confirm(receipts(made)[0])
+    made.run(5.0)
+    assert made.events_of("a", MessageDelivered) == []
+    sender = made.nodes["a"]._state.peer_table.peers["b"].sender
+    assert sender is not None
+    assert sender.unconfirmed == {}
+
+
+def test_an_application_that_confirms_nothing_holds_a_bounded_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(receiver, "MAX_UNCONFIRMED", 10)
+    made = world()
+    for _ in range(30):
+        made.send("a", "kept", b"x", destination="b")
+    made.run(20.0)
+    assert len(made.events_of("b", MessageReceived)) == 10
+    while len(made.events_of("a", MessageDelivered)) < 30:
+        for receipt in receipts(made):
+            made.nodes["b"].confirm(receipt)
+        made.run(5.0)

@@ -1,0 +1,97 @@
+"""Datagrams of known peers and of strangers arrive at sockets of their own."""
+
+from __future__ import annotations
+
+import select
+import socket
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.links.sockets import Out, free_port, open_link
+from udp_mesh.links import source_filter
+from udp_mesh.links.attachments import Address, Attachment
+from udp_mesh.links.source_filter import ACCEPT, DROP, MAX_INSTRUCTIONS, source_program
+from udp_mesh.links.udp import UdpLink
+
+ALICE, BOB, EVE = "127.0.1.2", "127.0.1.3", "127.0.1.4"
+INSTRUCTION_BYTES = 8
+
+
+def arrivals(link: UdpLink, count: int) -> tuple[list[bytes], list[bytes]]:
+    """What arrived from (peers, strangers), `count` datagrams in all."""
+    found: tuple[list[bytes], list[bytes]] = ([], [])
+    while len(found[0]) + len(found[1]) < count:
+        assert select.select([link.fileno(), link.strangers_fileno()], [], [], 60.0)[0]
+        link.receive(lambda data, _source, _at: found[0].append(bytes(data)), 100)
+        link.receive_from_strangers(lambda data, _source, _at: found[1].append(bytes(data)), 100)
+    return found
+
+
+def test_a_peer_and_a_stranger_arrive_at_different_sockets() -> None:
+    port = free_port()
+    with (
+        closing(open_link(ALICE, port)) as alice,
+        closing(open_link(BOB, port)) as bob,
+        closing(open_link(EVE, port)) as eve,
+        socket.socket(type=socket.SOCK_DGRAM) as other_port,
+    ):
+        other_port.bind((BOB, 0))
+
+        def from_each() -> tuple[list[bytes], list[bytes]]:
+            bob.send([Out(b"bob", (ALICE, port))])
+            eve.send([Out(b"eve", (ALICE, port))])
+            other_port.sendto(b"other port", (ALICE, port))
+            return arrivals(alice, 3)
+
+        assert from_each() == ([], [b"bob", b"eve", b"other port"])
+        assert alice.set_peers(frozenset({(BOB, port)}))
+        assert from_each() == ([b"bob"], [b"eve", b"other port"])
+        assert alice.set_peers(frozenset({(EVE, port), ("10.9.9.9", 1)}))
+        assert from_each() == ([b"eve"], [b"bob", b"other port"])
+        assert alice.set_peers(frozenset())
+        assert from_each() == ([], [b"bob", b"eve", b"other port"])
+
+
+@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
+def test_ipv6_addresses_are_distinguished_by_all_their_words() -> None:
+    port = free_port()
+    attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
+    with closing(UdpLink(attachment)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
+        far.bind(("::1", 0))
+        own: Address = ("::1", far.getsockname()[1])
+        for peers, place in ((frozenset({own}), 0), (frozenset({("1::1", own[1]), ("::2", own[1])}), 1)):
+            assert link.set_peers(peers)
+            far.sendto(b"x", ("::1", port))
+            assert arrivals(link, 1)[place] == [b"x"]
+
+
+def test_a_large_team_fits_as_far_as_the_kernel_takes_a_program() -> None:
+    port = free_port()
+    team = frozenset((f"10.0.{number // 250}.{number % 250 + 1}", 8700) for number in range(1000))
+    program = source_program(team, socket.AF_INET, ACCEPT, DROP)
+    assert len(program) <= MAX_INSTRUCTIONS * INSTRUCTION_BYTES
+    with closing(open_link(ALICE, port)) as alice:
+        assert alice.set_peers(team)
+
+
+def test_where_the_kernel_refuses_the_program_everything_still_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+    port = free_port()
+    with closing(open_link(ALICE, port)) as alice, closing(open_link(BOB, port)) as bob:
+
+        def attach(own: socket.socket, option: int, program: bytes) -> None:
+            if len(program) > INSTRUCTION_BYTES and own is alice._strangers:
+                raise OSError(12, "Cannot allocate memory")
+            source_filter.attach(own, option, program)
+
+        monkeypatch.setattr("udp_mesh.links.udp.attach", attach)
+        assert not alice.set_peers(frozenset({(BOB, port)}))
+        bob.send([Out(b"bob", (ALICE, port))])
+        assert arrivals(alice, 1) == ([], [b"bob"])
+
+
+def test_a_port_in_use_is_refused_although_sockets_may_share_it() -> None:
+    port = free_port()
+    with closing(open_link(ALICE, port)), pytest.raises(OSError, match="in use"):
+        open_link(ALICE, port)

@@ -1,0 +1,36 @@
+"""The capacity of the path: delivery rate samples in -> their windowed maximum out."""
+
+from collections import deque
+
+RATE_WINDOW_S = 2.0
+"""How long a delivery rate sample is valid."""
+
+
+class DeliveryRate:
+    """Packets per second."""
+
+    __slots__ = ("_samples",)
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[float, float]] = deque()
+
+    def __bool__(self) -> bool:
+        return bool(self._samples)
+
+    def maximum(self) -> float | None:
+        """The capacity of the path; None before the first sample."""
+        return self._samples[0][1] if self._samples else None
+
+    def add(self, rate: float, *, app_limited: bool, now: float) -> None:
+        """Add a sample; an application-limited one counts only if it is larger."""
+        samples = self._samples
+        while samples and samples[0][0] < now - RATE_WINDOW_S and not (app_limited and len(samples) == 1):
+            samples.popleft()
+        if app_limited and (not samples or rate < samples[0][1]):
+            return
+        while samples and samples[-1][1] <= rate:
+            samples.pop()
+        samples.append((now, rate))
+
+    def clear(self) -> None:
+        self._samples.clear()

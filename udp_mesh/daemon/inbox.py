@@ -1,0 +1,165 @@
+"""Received messages whose senders keep them on disk: held on disk here too, until a local program takes them.
+
+1. `add` writes a message to the disk. Once it is safe there, its sender is informed (`confirm`).
+2. It goes to the subscribed programs at once, or to the first program that subscribes. A program that asked for
+   receipts takes it by acknowledging the receipt; any other one takes it as soon as its socket has it completely.
+3. What was taken is removed from the disk, or never written. After a restart, the rest goes to the next program that
+   subscribes.
+
+A message that the disk does not take is confirmed when a program took it; without one, its sender sends it again later.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from udp_mesh.core.events import MessageReceived, Receipt
+from udp_mesh.core.interfaces import StoredMessage
+from udp_mesh.daemon.api import Client
+from udp_mesh.daemon.outbox import DirectoryStore, Flusher
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 5.0
+"""Until a message that neither the disk nor a program took is requested from its sender again."""
+
+
+@dataclass(slots=True)
+class _Held:
+    """A message that no program has taken yet."""
+
+    topic: str
+    receipt: Receipt | None
+    """Set until the sender is informed that the message is safe."""
+    on_disk: bool
+    reading: dict[Client, int | None] = field(default_factory=dict)
+    """Programs that it was sent to: the position in the client's stream at which it is read, or None if the client is
+    to acknowledge it."""
+
+
+class Inbox:
+    """`confirm` and `request_again` are those of the node."""
+
+    def __init__(
+        self,
+        store: DirectoryStore,
+        confirm: Callable[[Receipt], None],
+        request_again: Callable[[Receipt], None],
+    ) -> None:
+        self._store = store
+        self._flusher = Flusher(store)
+        self._confirm = confirm
+        self._request_again = request_again
+        self._held: dict[int, _Held] = {}
+        self._next_key = 0
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    @property
+    def needs_flush(self) -> bool:
+        return self._store.needs_flush
+
+    def load(self) -> None:
+        """Hold what the last run left on disk."""
+        for message in self._store.load():
+            self._held[message.key] = _Held(message.topic, None, on_disk=True)
+            self._next_key = message.key + 1
+
+    def add(self, message: MessageReceived) -> int:
+        """Write a message with a receipt to the disk. Returns its key."""
+        key = self._next_key
+        self._next_key += 1
+        stored = StoredMessage(key, message.source, message.topic, message.type_name, message.payload, None)
+        self._held[key] = _Held(message.topic, message.receipt, on_disk=self._store.put(stored))
+        return key
+
+    def on_distributed(self, key: int) -> None:
+        """The message was sent to all programs subscribed now."""
+        held = self._held.get(key)
+        if held is not None and not held.on_disk and not held.reading:
+            self._drop(key, held)
+        self.take_read()
+
+    async def flush(self) -> None:
+        """Wait until everything added so far is on disk, then confirm it."""
+        waiting = [key for key, held in self._held.items() if held.receipt is not None]
+        await self._flusher.flush()
+        for key in waiting:
+            held = self._held.get(key)
+            if held is None or held.receipt is None:
+                continue
+            held.on_disk = self._store.holds(key)
+            if held.on_disk:
+                self._confirm(held.receipt)
+                held.receipt = None
+            elif not held.reading:
+                self._drop(key, held)
+
+    def _drop(self, key: int, held: _Held) -> None:
+        del self._held[key]
+        if held.receipt is not None:
+            asyncio.get_running_loop().call_later(RETRY_S, self._request_again, held.receipt)
+
+    # Programs
+
+    def on_sent(self, key: int, client: Client, *, acknowledges: bool) -> None:
+        """The message was written to a client's connection."""
+        held = self._held.get(key)
+        if held is not None:
+            held.reading[client] = None if acknowledges else client.written_bytes
+
+    def waiting(self, matches: Callable[[str], bool]) -> list[int]:
+        """The messages of these topics that no program is reading, oldest first."""
+        return sorted(key for key, held in self._held.items() if not held.reading and matches(held.topic))
+
+    def is_waiting(self, key: int) -> bool:
+        """Whether no program is reading the message."""
+        held = self._held.get(key)
+        return held is not None and not held.reading
+
+    def read(self, key: int) -> StoredMessage | None:
+        """The message from the disk. Blocks; None if it cannot be read."""
+        return self._store.read(key)
+
+    def acknowledge(self, client: Client, key: int) -> bool:
+        """A program took the message. False if it was not sent to this client."""
+        held = self._held.get(key)
+        if held is None or client not in held.reading:
+            return False
+        self._take(key, held)
+        return True
+
+    def take_read(self) -> None:
+        """Remove what programs have read. A message waits for its acknowledgement if one of its readers is to give
+        it."""
+        for key, held in list(self._held.items()):
+            positions = list(held.reading.items())
+            if any(position is None for _, position in positions):
+                continue
+            if any(position is not None and client.read_bytes >= position for client, position in positions):
+                self._take(key, held)
+
+    def _take(self, key: int, held: _Held) -> None:
+        del self._held[key]
+        if held.receipt is not None:
+            self._confirm(held.receipt)
+        self._store.remove(key)
+
+    def client_gone(self, client: Client) -> None:
+        """What the client has not taken goes to another one."""
+        self.take_read()
+        for key, held in list(self._held.items()):
+            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk:
+                self._drop(key, held)
+
+    def topics(self) -> Iterator[str]:
+        return iter({held.topic for held in self._held.values()})
+
+    def close(self) -> None:
+        """Waits until everything added is written."""
+        self.take_read()
+        self._store.close()
