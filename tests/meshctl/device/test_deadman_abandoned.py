@@ -9,7 +9,17 @@ from pathlib import Path
 import pytest
 
 from meshctl.device.deadman import bundle
-from tests.meshctl.device.changes import BUNDLE, NONCE, NONCE_HASH, OWNER, change, is_after, is_before, prepare, refusal
+from tests.meshctl.device.changes import (
+    BUNDLE,
+    NONCE,
+    NONCE_HASH,
+    OWNER,
+    change,
+    is_after,
+    is_before,
+    prepare,
+    refusal,
+)
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import eventually
 from tests.meshctl.device.test_deadman import LONG, OTHER, applied, armed
