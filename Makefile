@@ -13,7 +13,9 @@ $(VENV)/.ready: pyproject.toml scripts/setup
 demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/demo
 
+# The tests start the programs hundreds of times; with PYTHONDONTWRITEBYTECODE each start would compile them.
 test: setup
+	$(BIN)/python -m compileall -q meshctl meshlab udp_mesh
 	$(BIN)/pytest -n 2 --dist loadgroup
 
 check: setup

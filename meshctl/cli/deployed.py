@@ -6,13 +6,14 @@ The edit is that of `meshctl inventory state`: one value per beacon; comments an
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import InventoryPath, Limit, read_selection
+from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, read_selection
 from meshctl.cli.output import echo
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
@@ -23,21 +24,42 @@ from meshctl.model import Fleet, Node, NodeState, Role
 
 def deployed(
     beacons: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(help="Beacons: names, labels, patterns, groups, robot:husky1, '!b07', @FILE."),
-    ],
+    ] = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),
     back: Annotated[bool, typer.Option("--back", help="Mark as carried again, after pick-up.")] = False,
+    from_mesh: Annotated[
+        bool,
+        typer.Option(
+            "--from-mesh", help="Query the mesh, and mark the carried beacons that are away from their robot."
+        ),
+    ] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
 ) -> None:
     """Mark dropped beacons as deployed; `meshctl status` then expects them to answer.
 
     Example: meshctl deployed husky1-b03 B4
+    Example: meshctl deployed --from-mesh
     """
+    if back and from_mesh:
+        raise InputError("expected --back or --from-mesh, found both")
+    if not beacons and not from_mesh:
+        raise InputError("expected beacons, or --from-mesh", hint="for example: meshctl deployed husky1-b03")
     fleet = load_fleet(inventory, environ=os.environ)
     before, after = (NodeState.DEPLOYED, NodeState.CARRIED) if back else (NodeState.CARRIED, NodeState.DEPLOYED)
-    chosen = chosen_beacons(fleet, beacons, limit or ())
+    chosen = chosen_beacons(fleet, beacons or ["role:beacon"], limit or ())
+    if from_mesh:
+        found = _found_in_mesh(inventory, key, lab)
+        chosen = [node for node in chosen if node.name in found]
+        for node in chosen:
+            echo(f"{node.name}: {found[node.name]}", err=True)
+        if not chosen:
+            echo("no carried beacon appears to have been dropped", err=True)
+            return
     wrong = [node for node in chosen if node.state not in (before, after)]
     if wrong:
         states = ", ".join(f"{node.name} is {node.state.value}" for node in wrong)
@@ -57,6 +79,18 @@ def deployed(
             echo(f"{node.name}: already {after.value}")
     if not dry_run:
         save(changes)
+
+
+def _found_in_mesh(inventory: Path, key: list[Path] | None, lab: Path | None) -> dict[str, str]:
+    """The dropped beacons that one snapshot of the mesh shows, each with the reason."""
+    from meshctl.cli.fleet_view import collect, open_fleet_view
+    from meshctl.status import assess
+    from meshctl.status.dropped import dropped_beacons
+
+    with open_fleet_view(inventory, key=key, lab=lab, no_robots=True) as fleet_view:
+        snapshot = collect(fleet_view)
+        status = assess(snapshot, fleet_view.nodes, time.time())
+    return dropped_beacons(fleet_view.fleet, status.nodes)
 
 
 def chosen_beacons(fleet: Fleet, words: Iterable[str], limits: Iterable[str] = ()) -> list[Node]:

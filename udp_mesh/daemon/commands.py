@@ -154,6 +154,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "unkeyed": settings.unkeyed,
         "keys": [key.key_id.hex() for key in settings.keys],
         "window": settings.window,
+        "inbox_messages": len(service.inbox),
         "configuration": plain(service.configuration.file),
         "links": [
             {

@@ -97,6 +97,8 @@ class Driver:
         self._drained_at = 0.0
         self._now = 0.0
         self._link_name = ""
+        self._unsorted: set[str] = set()
+        """Links whose kernel does not separate peers from strangers, already logged."""
         self.strangers = StrangerThrottle(
             self._loop, self._read_strangers, lambda: self.node.unauthenticated, batch=MAX_DRAIN_DATAGRAMS
         )
@@ -204,8 +206,9 @@ class Driver:
         """Receive from the addresses of online peers at the sockets for them."""
         known = self.node.peer_addresses()
         for name, link in self.hub.links.items():
-            if not link.set_peers(frozenset(known.get(name, ()))):
-                log.warning("flood-protection-off link=%s peers=%d", name, len(known[name]))
+            if not link.set_peers(frozenset(known.get(name, ()))) and name not in self._unsorted:
+                self._unsorted.add(name)
+                log.warning("flood-protection-off link=%s peers=%d", name, len(known.get(name, ())))
 
     def _interfaces_changed(self) -> None:
         assert self._monitor is not None

@@ -98,9 +98,12 @@ class UdpLink:
             raise
         try:
             self._attach(self.peers)
+            self._sorts = True
         except OSError:
-            self.close()
-            raise
+            # A kernel before Linux 4.5, or a sandbox: one socket receives everything.
+            self._sorts = False
+            self._socket.close()
+            self._socket = self._strangers
 
     def _open(self, family: int, buffer_bytes: int, *, share: bool = True) -> socket.socket:
         """A configured and bound socket."""
@@ -117,8 +120,8 @@ class UdpLink:
     def set_peers(self, peers: frozenset[Address]) -> bool:
         """Receive from these senders at the first socket, from all others at the strangers'. False if the kernel
         refused the programs: then everything arrives as from strangers."""
-        if peers == self.peers:
-            return True
+        if not self._sorts or peers == self.peers:
+            return self._sorts
         try:
             self._attach(peers)
         except OSError:

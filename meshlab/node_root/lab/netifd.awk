@@ -5,8 +5,8 @@
 #
 # Setting up radios takes time, so a change has two phases. Phase 1: everything else is as configured; radios whose
 # configuration differs from run/radios are pending, and their interfaces that will be recreated are gone. Phase 2: all is
-# as configured, and run/radios.new has the state: lines "device NAME OPTIONS" and "face NAME KEY MAC IFINDEX". A board's
-# own MAC address is base; from 23.05 on, the replacement of an interface that still exists gets the other one (wdev.uc).
+# as configured, and run/radios.new has the state: lines "device NAME OPTIONS UP" and "face NAME KEY MAC IFINDEX DEVICE BY
+# LAST_WDEV_KEY", where BY is wdev, supplicant or lost. A board's own MAC address is base; from 23.05 on, the replacement of an interface that still exists gets the other one (wdev.uc).
 
 /^package / { package = $2; next }
 /^config / {
@@ -33,7 +33,7 @@ function read_standing(    line, part) {
 	while ((getline line < (run "/radios")) > 0) {
 		split(line, part, "\t")
 		if (part[1] == "device") { was_device[part[2]] = part[3]; was_up[part[2]] = part[4] }
-		else { was_key[part[2]] = part[3]; was_mac[part[2]] = part[4]; was_index[part[2]] = part[5]; was_on[part[2]] = part[6]; was_by[part[2]] = part[7] }
+		else { was_key[part[2]] = part[3]; was_mac[part[2]] = part[4]; was_index[part[2]] = part[5]; was_on[part[2]] = part[6]; was_by[part[2]] = part[7]; was_wdev[part[2]] = part[8] }
 	}
 	close(run "/radios")
 	last_index = 20
@@ -95,15 +95,43 @@ function judge_face(id, device, ifname, path, algo, mode,    by, base, key) {
 	if (mode == "adhoc" && series == "25.12") by = "wdev"
 	key = own_key(id, device, by)
 	base = mac_of[path]
-	anew = whole[device] || !(ifname in was_key) || was_key[ifname] != key || was_on[ifname] != device
+	# one that outlived its radio (`stays`) is what wdev.uc finds
+	anew = (whole[device] && !((ifname in was_key) && !was_up[device] && was_by[ifname] == "wdev")) || !(ifname in was_key) || was_key[ifname] != key || was_on[ifname] != device
 	if (!anew) mac[ifname] = was_mac[ifname]
 	else if (get(id, "macaddr", "") ~ /:/) mac[ifname] = tolower(get(id, "macaddr", ""))
 	else if (series ~ /^(19.07|21.02|22.03)$/ || whole[device] || !(ifname in was_mac) || (by == "supplicant" && was_by[ifname] == "supplicant")) mac[ifname] = base
 	else mac[ifname] = was_mac[ifname] == base ? other_mac(base) : base
+	# 25.12: back from wpa_supplicant to the cell that wdev.uc has in its state file, it does nothing, and the supplicant
+	# deletes the interface; until the interface changes, or `wifi down` clears the file
+	if (is_lost(ifname, device, by, key)) {
+		if (phase == 1 && was_by[ifname] == "supplicant") { held[ifname] = 1; pending[device] = 1; return }
+		lost[ifname] = 1
+		stand(ifname, key, was_mac[ifname], was_index[ifname], device, "lost", key)
+		return
+	}
 	if (anew && phase == 1) { held[ifname] = 1; pending[device] = 1; return }
 	if (anew) index_of[ifname] = ++last_index
 	else index_of[ifname] = was_index[ifname]
-	standing = standing "face\t" ifname "\t" key "\t" mac[ifname] "\t" index_of[ifname] "\t" device "\t" by "\n"
+	stand(ifname, key, mac[ifname], index_of[ifname], device, by, by == "wdev" ? key : was_wdev[ifname])
+}
+function is_lost(ifname, device, by, key) {
+	if (series != "25.12" || by != "wdev" || whole[device]) return 0
+	return was_by[ifname] == "supplicant" ? was_wdev[ifname] == key : was_by[ifname] == "lost" && was_key[ifname] == key
+}
+function stand(ifname, key, address, number, device, by, wdev) {
+	standing = standing "face\t" ifname "\t" key "\t" address "\t" number "\t" device "\t" by "\t" wdev "\n"
+}
+
+# 25.12: wdev.uc is not called where no open interface is left, so a disabled one stays on the air
+function stays(ifname, device) {
+	return series == "25.12" && !mode_down && was_by[ifname] == "wdev" && was_on[ifname] == device && !open_faces[device]
+}
+# the interfaces that wdev.uc sets up
+function count_open_faces(    i, id, device) {
+	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface") {
+		id = order[i]; device = get(id, "device", "")
+		if ((device in radio_up) && !yes(get(id, "disabled", "0")) && get(id, "encryption", "none") == "none") open_faces[device]++
+	}
 }
 
 function frequency(band, channel) {
@@ -141,7 +169,7 @@ function default_ifname(mode, phy, count) {
 	return "phy" phy "-" mode count
 }
 
-function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifname, reason, algo, key, count, width) {
+function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifname, reason, algo, key, count, width, off) {
 	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-device") {
 		id = order[i]
 		device = label[id]
@@ -153,22 +181,30 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 		radio_up[device] = 1
 	}
 	for (i = 1; i <= ndevices; i++) judge_device(devices[i])
+	count_open_faces()
 	for (i = 1; i <= sections; i++) if (kind[order[i]] == "wireless.wifi-iface") {
 		id = order[i]
 		device = get(id, "device", "")
-		if (!(device in radio_path) || yes(get(id, "disabled", "0"))) continue
+		if (!(device in radio_path)) continue
+		off = yes(get(id, "disabled", "0"))
+		if (off && !stays(get(id, "ifname", ""), device)) continue
 		mode = get(id, "mode", "ap")
 		path = radio_path[device]; phy = phy_of[path]
 		count = made[device, mode]++
 		ifname = get(id, "ifname", default_ifname(mode, phy, count))
-		faces[device] = faces[device] " " id
-		if (!(device in radio_up) || mode_down) continue
-		iface_name[id] = ifname
+		if (!off) faces[device] = faces[device] " " id
+		off = off || !(device in radio_up)
+		if (mode_down || (off && !stays(ifname, device))) continue
+		if (!off) iface_name[id] = ifname
 		algo = get(id, "encryption", "none"); key = get(id, "key", "")
 		sub(/\+.*/, "", algo)
 		if (algo == "") algo = "none"
-		judge_face(id, device, ifname, path, algo, mode)
+		if (off) {
+			mac[ifname] = was_mac[ifname]; index_of[ifname] = was_index[ifname]
+			stand(ifname, was_key[ifname], mac[ifname], index_of[ifname], device, "wdev", was_wdev[ifname])
+		} else judge_face(id, device, ifname, path, algo, mode)
 		if (ifname in held) { delete iface_name[id]; continue }
+		if (ifname in lost) continue
 		exists[ifname] = 1; is_radio[ifname] = 1
 		split(get(id, "network", ""), wanted, " ")
 		network_of[ifname] = wanted[1]

@@ -104,3 +104,10 @@ def test_a_lost_beacon_is_not_brought_back_by_the_way(inventory: Path) -> None:
     assert result.exit_code == 2
     assert "expected carried beacons, found: husky1-b2 is lost" in result.stderr
     assert "meshctl inventory state husky1-b2 deployed" in result.stderr
+
+
+def test_without_beacons_the_command_says_what_it_expects(inventory: Path) -> None:
+    result = _run(inventory)
+    assert (result.exit_code, "expected beacons, or --from-mesh" in result.stderr) == (2, True)
+    both = _run(inventory, "--from-mesh", "--back")
+    assert (both.exit_code, "expected --back or --from-mesh, found both" in both.stderr) == (2, True)

@@ -74,3 +74,9 @@ def is_before(etc: Path) -> bool:
 def is_after(etc: Path) -> bool:
     """Exactly the new state."""
     return live(etc) == {**AFTER, LINK: (TARGET, 0)}
+
+
+def refusal(answer: str) -> str:
+    words = answer.split()
+    assert words[0] == "refused", answer
+    return words[1]

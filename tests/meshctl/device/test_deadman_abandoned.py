@@ -9,10 +9,20 @@ from pathlib import Path
 import pytest
 
 from meshctl.device.deadman import bundle
-from tests.meshctl.device.changes import BUNDLE, NONCE, NONCE_HASH, OWNER, change, is_after, is_before, prepare
+from tests.meshctl.device.changes import (
+    BUNDLE,
+    NONCE,
+    NONCE_HASH,
+    OWNER,
+    change,
+    is_after,
+    is_before,
+    prepare,
+    refusal,
+)
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import eventually
-from tests.meshctl.device.test_deadman import LONG, OTHER, applied, armed, refusal
+from tests.meshctl.device.test_deadman import LONG, OTHER, applied, armed
 
 
 def test_a_started_change_is_never_taken_over(node: Sandbox) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from meshctl.device.deadman import Change, packages
-from tests.meshctl.device.changes import BUNDLE, NONCE, OWNER, is_after, is_before, prepare
+from tests.meshctl.device.changes import BUNDLE, NONCE, OWNER, is_after, is_before, prepare, refusal
 from tests.meshctl.device.changes import change as files
 from tests.meshctl.device.package_tools import DATABASE, install_tool, installed_packages, package
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import eventually
-from tests.meshctl.device.test_deadman import LONG, applied, armed, last, refusal, staged, state
+from tests.meshctl.device.test_deadman import LONG, applied, armed, last, staged, state
 
 TOOLS = ("opkg", "apk")
 WPAD = "#!/bin/sh\necho $1 >>/harness/wpad\n"

@@ -27,10 +27,10 @@ def test_a_schedule_follows_from_its_seed() -> None:
 
 def test_the_model_knows_what_each_outcome_leaves() -> None:
     model = Model({name: frozenset("a") for name in ("done", "back", "lost", "both")})
-    model.learn("b", [ended(done="done", back="rolled back", lost="uncertain", both="refused"), None])
+    model.update("b", [ended(done="done", back="rolled back", lost="uncertain", both="refused"), None])
     # a killed operator may have changed any of them
     assert model.may_run == {name: frozenset("ab") for name in model.may_run} | {"done": frozenset("b")}
-    model.learn("a", [ended(done="refused", back="done", lost="unchanged", both="refused")])
+    model.update("a", [ended(done="refused", back="done", lost="unchanged", both="refused")])
     assert model.may_run == {
         "done": frozenset("b"),
         "back": frozenset("a"),
@@ -67,7 +67,7 @@ def test_no_schedule_strands_a_node_or_leaves_anything_behind(seed: int, tmp_pat
 
 
 def _check_round(rig: Rig, model: Model, label: str, target: str, round_: Round) -> None:
-    model.learn(target, play(rig, target, round_))
+    model.update(target, play(rig, target, round_))
     states = at_rest(rig, model.may_run)
     assert set(states.values()) <= {"idle", "staged"}, f"{label}: {states}"
     other = "ab".replace(target, "")

@@ -211,7 +211,7 @@ def test_an_emergency_stop_is_a_go_only_if_every_robot_acknowledges_it(fleet: Fl
     reason = found[("rover", "spot", "uav")]["emergency stop"].reason
     assert reason == "spot: expired (deadline); uav: no acknowledgment"
     assert not found[()]["emergency stop"].is_go
-    # nobody asked for one
+    # none was requested
     assert "emergency stop" not in checks(fleet)
 
 

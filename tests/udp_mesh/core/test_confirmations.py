@@ -9,6 +9,7 @@ import pytest
 
 from tests.udp_mesh.core.pair import World, settings
 from udp_mesh.core.events import MessageDelivered, MessageExpired, MessageReceived, Receipt
+from udp_mesh.core.peer_lifecycle import set_offline, set_online
 from udp_mesh.core.receiver import receiver
 from udp_mesh.core.settings import Outbox, Topic
 
@@ -96,6 +97,22 @@ def test_an_unconfirmed_message_outlives_an_absence_and_arrives_once() -> None:
         pipe.up = True
     made.run(30.0)
     assert len(made.events_of("b", MessageReceived)) == 1
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_a_confirmation_that_comes_right_after_an_absence_counts() -> None:
+    """Before the maintenance round that would forget the withdrawn message."""
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(1.0)
+    (receipt,) = receipts(made)
+    node = made.nodes["a"]
+    peer = node._state.peer_table.peers["b"]
+    set_offline(node._state, peer, made.now, left=False)
+    assert peer.session is not None
+    set_online(node._state, peer, peer.session, made.now)
+    made.nodes["b"].confirm(receipt)
+    made.run(0.1)
     assert len(made.events_of("a", MessageDelivered)) == 1
 
 

@@ -52,6 +52,7 @@ def test_what_was_delivered_while_no_program_ran_outlives_a_killed_daemon(
     assert held(bob) == 20
     bob.start()
     with bob.client() as program:
+        assert program.request("status")["inbox_messages"] == 20
         program.subscribe("kept")
         assert [message.payload for message in collect(program, 20)] == payloads
     poll(lambda: held(bob) == 0, "nothing is held")

@@ -91,6 +91,20 @@ def test_where_the_kernel_refuses_the_program_everything_still_arrives(monkeypat
         assert arrivals(alice, 1) == ([], [b"bob"])
 
 
+def test_a_kernel_without_such_programs_has_one_socket_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    def attach(own: socket.socket, option: int, program: bytes) -> None:
+        raise OSError(92, "Protocol not available")
+
+    monkeypatch.setattr("udp_mesh.links.udp.attach", attach)
+    port = free_port()
+    with closing(open_link(ALICE, port)) as alice, closing(open_link(BOB, port)) as bob:
+        assert not alice.set_peers(frozenset({(BOB, port)}))
+        for number in range(50):
+            assert bob.send([Out(b"%d" % number, (ALICE, port))]) == 1
+        from_peers, from_strangers = arrivals(alice, 50)
+        assert len(from_peers) + len(from_strangers) == 50
+
+
 def test_a_port_in_use_is_refused_although_sockets_may_share_it() -> None:
     port = free_port()
     with closing(open_link(ALICE, port)), pytest.raises(OSError, match="in use"):

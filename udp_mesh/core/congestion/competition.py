@@ -27,8 +27,8 @@ VARIATION = 0.03
 """Two drains on the same route differ by less than both together."""
 
 SUSPECT_HOLDS = 2
-"""A second drain follows soon after the first that found a long round trip. If it finds the same, a route is likely, and
-each full drain of a long route is expensive: the others come at their usual time."""
+"""A second drain follows soon after the first that found a long round trip. If it finds the same, a route is likely,
+and each full drain of a long route is expensive: the others come at their usual time."""
 
 ROUTE_HOLDS = 4
 """So many drains in a row that find the same round trip prove a route."""

@@ -161,10 +161,13 @@ class PendingMessages:
 
     def on_arrived(self, message: OutgoingMessage) -> None:
         """All of the message's fragments are acknowledged."""
-        if message.confirm and message.wire_id is not None:
-            self.unconfirmed.setdefault(message.wire_id, Unconfirmed(message))
-        else:
+        if not message.confirm or message.wire_id is None:
             self.finish(message, Outcome.DELIVERED)
+            return
+        entry = self.unconfirmed.get(message.wire_id)
+        if entry is None or entry.message is not message:
+            # Perhaps resumed: then the entry of the withdrawn message is replaced.
+            self.unconfirmed[message.wire_id] = Unconfirmed(message)
 
     def confirmations_due(self, now: float) -> list[OutgoingMessage]:
         """Messages of which a fragment is to be sent again, so that the peer repeats a confirmation that was lost."""

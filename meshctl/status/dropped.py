@@ -1,0 +1,51 @@
+"""Which beacons that the inventory has as carried have been dropped, judged from one snapshot of the mesh. Pure.
+
+A beacon in a robot's rack is off, or within a meter of the robot's own radios. One that answers has been dropped if
+others reach the base through it, or if its robot's radios hear it weakly or not at all while another node hears it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from meshctl.model import Fleet, NodeState, Role
+from meshctl.status.node_alarms import join_limited
+from meshctl.status.values import NodeStatus
+
+# Free space attenuates 2.4 GHz by 40 dB and 5.8 GHz by 48 dB per meter (FSPL); with 20 dBm and no antenna gain a radio
+# within a meter is stronger than this even through a chassis of 30 dB.
+RACK_DBM = -60
+
+
+def dropped_beacons(fleet: Fleet, nodes: Iterable[NodeStatus]) -> dict[str, str]:
+    """Beacon -> why it has been dropped. Only carried beacons that answer are judged."""
+    statuses = {status.name: status for status in nodes}
+    carriers = {name: robot.nodes for robot in fleet.robots.values() for name in robot.carries}
+    found = {}
+    for name, status in statuses.items():
+        if status.node.state is NodeState.CARRIED and status.node.role is Role.BEACON and status.health.answers:
+            radios = [statuses[radio] for radio in carriers.get(name, ()) if radio in statuses]
+            if reason := _reason(status, radios):
+                found[name] = reason
+    return found
+
+
+def _reason(beacon: NodeStatus, radios: Iterable[NodeStatus]) -> str:
+    if beacon.relays:
+        return f"relays to the base for {join_limited(beacon.relays)}"
+    answering = [radio for radio in radios if radio.health.answers]
+    own = {radio.name for radio in answering}
+    if not answering or not beacon.neighbors:
+        # a robot that does not answer says nothing about where its beacons are
+        return ""
+    heard = [one for one in beacon.neighbors if one.name in own]
+    if not heard:
+        return f"hears {join_limited(tuple(one.name for one in beacon.neighbors))}, not its robot's {_names(own)}"
+    signals = [one.signal_dbm for one in heard if one.signal_dbm is not None]
+    if signals and max(signals) < RACK_DBM:
+        return f"hears its robot's {_names(own)} with {max(signals)} dBm only"
+    return ""
+
+
+def _names(own: Iterable[str]) -> str:
+    return join_limited(tuple(sorted(own)))

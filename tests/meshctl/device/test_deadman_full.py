@@ -1,0 +1,99 @@
+"""What the dead-man's switch does on a node whose flash or memory is full."""
+
+from __future__ import annotations
+
+import re
+
+from tests.meshctl.device.changes import (
+    BUNDLE,
+    NONCE_HASH,
+    OWNER,
+    is_before,
+    prepare,
+    refusal,
+)
+from tests.meshctl.device.sandbox import Sandbox
+
+FULL = """\
+cp -a /etc /tmp/etc
+mount -t tmpfs -o size={size}k tmpfs /etc
+cp -a /tmp/etc/. /etc
+/usr/sbin/meshctl-deadman lock {owner} 1000 >/dev/null
+{script}
+cp -a /etc/. /tmp/after
+"""
+
+
+def on_small_flash(node: Sandbox, size_kib: int, steps: str) -> str:
+    """Run `steps` with /etc on a file system of that size; what is then in it is kept in /tmp/after."""
+    node.path("/tmp/after").mkdir()
+    done = node.run("/bin/sh", "-c", FULL.format(size=size_kib, owner=OWNER, script=steps))
+    return done.stdout.strip()
+
+
+def test_a_full_flash_is_noticed_before_anything_changes(node: Sandbox) -> None:
+    prepare(node)
+    answer = on_small_flash(node, 96, f"/usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}")
+    assert refusal(answer) == "flash-full"
+    assert re.search(r"needs \d+ KiB of flash, \d+ KiB are free", answer)
+    assert is_before(node.path("/tmp/after"))
+    assert not (node.path("/tmp/after") / "meshctl/change").exists()
+
+
+def test_a_flash_that_fills_up_later_does_not_stop_the_way_back(node: Sandbox) -> None:
+    prepare(node)
+    answer = on_small_flash(
+        node,
+        1024,
+        f"""
+        d=/usr/sbin/meshctl-deadman
+        $d stage {OWNER} c1 {BUNDLE} && $d arm {OWNER} c1 {NONCE_HASH} 0
+        mkdir -p /tmp/meshctl/change-c1
+        sed 's/^put_previous() {{/&\\nfill/' $d >/tmp/filled
+        echo 'fill() {{ cat /dev/zero >/etc/filler 2>/dev/null; df -k /etc >/tmp/df; }}' >/tmp/start
+        cat /tmp/start /tmp/filled >/tmp/full.sh
+        sh /tmp/full.sh watch c1 0
+        awk 'END {{ print "free", $(NF - 2) }}' /tmp/df
+        rm -f /etc/filler
+        """,
+    )
+    assert "ok state=armed id=c1" in answer
+    assert "free 0" in answer
+    assert is_before(node.path("/tmp/after"))
+
+
+def on_small_memory(node: Sandbox, script: str) -> list[str]:
+    """The lines that `script` says where /tmp/meshctl has 16 KiB; `fill` takes what is left."""
+    start = "mkdir -p /tmp/meshctl && mount -t tmpfs -o size=16k tmpfs /tmp/meshctl || exit 9\n"
+    done = node.run("sh", "-c", f"{start}fill() {{ cat /dev/zero >/tmp/meshctl/filler 2>/dev/null; }}\n{script}")
+    assert done.returncode != 9, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_lock_that_could_not_be_written_is_refused(node: Sandbox) -> None:
+    first, second = on_small_memory(
+        node,
+        f"""
+        fill
+        /usr/sbin/meshctl-deadman lock {OWNER} 60
+        rm /tmp/meshctl/filler
+        /usr/sbin/meshctl-deadman lock {OWNER} 60
+        """,
+    )
+    assert first == "refused tmp-full no room in /tmp/meshctl to write the lock"
+    assert second.startswith("ok")
+
+
+def test_a_lock_is_given_back_although_memory_is_full(node: Sandbox) -> None:
+    *_, given_back, taken = on_small_memory(
+        node,
+        f"""
+        /usr/sbin/meshctl-deadman lock {OWNER} 6000
+        fill
+        /usr/sbin/meshctl-deadman unlock {OWNER}
+        rm /tmp/meshctl/filler
+        /usr/sbin/meshctl-deadman lock somebody@else 60
+        """,
+    )
+    assert given_back == "ok"
+    assert taken == "ok lock_owner=somebody@else"

@@ -1,0 +1,101 @@
+"""Radios of 25.12 that keep an interface too long, or lose one (docs/facts/node-assumptions.md, findings 1 and 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from meshctl.apply.change_set import reload_script
+from meshlab.fleet import VirtualFleet, VirtualNode
+from tests.meshlab.conftest import MESH
+from tests.waiting import until
+
+WIRELESS = "etc/config/wireless"
+OPEN = """\
+set wireless.mesh0.mode=adhoc
+set wireless.mesh0.encryption=none
+delete wireless.mesh0.key
+delete wireless.mesh0.mesh_id"""
+ENCRYPTED = """\
+set wireless.mesh0.mode=mesh
+set wireless.mesh0.mesh_id=team
+set wireless.mesh0.encryption=sae
+set wireless.mesh0.key=a-pass-phrase"""
+
+
+@pytest.fixture
+def latest(fleet: VirtualFleet) -> Iterator[VirtualNode]:
+    """A node of 25.12 in an open cell, which is reset afterwards."""
+    new = fleet.node("new")
+    new.wait_up()
+    new.exec(MESH.format(address="10.42.0.9", channel=6)).check("set up")
+    until(lambda: index(new) != "", "mesh0")
+    yield new
+    new.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
+    new.power_cut()
+
+
+def index(node: VirtualNode) -> str:
+    """The interface index of mesh0; empty where there is none, or while netifd is setting radios up."""
+    show = "ubus call network.wireless status | grep -q 'pending.: true' || cat /sys/class/net/mesh0/ifindex"
+    return node.exec(show).stdout.strip()
+
+
+def has_joined(node: VirtualNode) -> bool:
+    return "ssid a team" in node.exec("iw dev").stdout
+
+
+def configure(node: VirtualNode, commands: str) -> None:
+    """Change the wireless settings; returns when netifd has done all that `network reload` makes it do."""
+    node.exec(f"uci -q batch <<END\n{commands}\ncommit wireless\nEND\nsh /rom/lab/netifd up").check("configure")
+
+
+@pytest.mark.parametrize("section", ["radio0", "mesh0"])
+def test_a_disabled_open_radio_stays_in_its_cell_until_its_radio_goes_down(latest: VirtualNode, section: str) -> None:
+    before = index(latest)
+    configure(latest, f"set wireless.{section}.disabled=1")
+    assert index(latest) == before
+    assert has_joined(latest)
+    latest.exec("wifi down; wifi up")
+    until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
+    assert not has_joined(latest)
+
+
+def test_one_that_stayed_is_found_and_left_alone_when_it_is_enabled_again(latest: VirtualNode) -> None:
+    before = index(latest)
+    configure(latest, "set wireless.radio0.disabled=1")
+    configure(latest, "set wireless.radio0.disabled=0")
+    assert index(latest) == before
+
+
+def test_back_from_the_supplicant_to_the_same_open_cell_the_interface_is_lost(latest: VirtualNode) -> None:
+    before = index(latest)
+    configure(latest, ENCRYPTED)
+    assert index(latest) not in ("", before)
+    configure(latest, OPEN)
+    assert index(latest) == ""
+    configure(latest, "set wireless.radio0.txpower=10")
+    assert index(latest) == ""
+    latest.exec("wifi down; wifi up")
+    until(lambda: index(latest) != "", "mesh0")
+
+
+def test_another_cell_creates_a_lost_interface(latest: VirtualNode) -> None:
+    configure(latest, ENCRYPTED)
+    configure(latest, OPEN)
+    assert index(latest) == ""
+    configure(latest, "set wireless.radio0.channel=11")
+    assert index(latest) != ""
+
+
+def test_the_reload_of_a_change_brings_a_lost_interface_back(latest: VirtualNode) -> None:
+    configure(latest, ENCRYPTED)
+    latest.exec(f"uci -q batch <<END\n{OPEN}\ncommit wireless\nEND\n{reload_script({WIRELESS}, ())}").check("reload")
+    until(lambda: index(latest) != "" and has_joined(latest), "mesh0 in its cell")
+
+
+def test_the_reload_of_a_change_takes_a_disabled_radio_off_the_air(latest: VirtualNode) -> None:
+    off = "uci set wireless.radio0.disabled=1; uci commit wireless"
+    latest.exec(f"{off}\n{reload_script({WIRELESS}, ())}").check("reload")
+    until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
