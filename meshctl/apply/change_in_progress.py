@@ -30,6 +30,7 @@ from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
+from meshctl.render.rendered import MARKER_PATH
 
 # The lock outlives the confirm window by this much, for the actions after it.
 LOCK_SLACK_S = 60
@@ -93,6 +94,12 @@ class ChangeInProgress:
     def status(self) -> ChangeStatus:
         """The state of the dead-man's switch in the latest observation."""
         return ABSENT if self.last is None else self.last.change or ABSENT
+
+    @property
+    def decides_logins(self) -> bool:
+        """Whether it may affect who can log in: all but settings of radios, which only decide over which links."""
+        harmless = (WIRELESS, MARKER_PATH)
+        return self.extra_s > 0 or any(change.path not in harmless for change in self.ctx.plan.files)
 
     @property
     def settle_s(self) -> float:

@@ -137,7 +137,9 @@ def _act(change: ChangeInProgress, connection: SshConnection, *, is_proof: bool)
     name = change.ctx.name
     match observe_and_decide(change, connection, is_opened_after_reload=is_proof):
         case Action.CONFIRM:
-            return Outcome(name, Result.DONE) if confirm(change, connection if is_proof else None) else None
+            # a second login, after the proof, where an effect that nothing showed could refuse it
+            proof = connection if is_proof and not change.decides_logins else None
+            return Outcome(name, Result.DONE) if confirm(change, proof) else None
         case Action.ABORT:
             abort(change, connection)
         case Action.KEPT:

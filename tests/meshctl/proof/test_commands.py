@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 
 import pytest
@@ -29,6 +30,26 @@ def test_a_saved_plan_is_applied_exactly_and_a_node_that_moved_on_is_refused(rig
     drifted = rig.meshctl("provision", new, "--check", "--json")
     assert (drifted.code, drifted.verdicts["n001"], drifted.verdicts["n002"]) == (1, "change", "same")
     assert rig.meshctl("provision", new, "n001", "--yes", "--json").results == {"n001": "done"}
+
+
+def test_a_change_of_more_than_radios_is_confirmed_over_a_login_after_the_proof(rig: Rig) -> None:
+    """An effect that nothing showed could refuse logins after the proof; settings of radios cannot."""
+    before_radio, before_system = (_before_confirmation(rig, key) for key in ("distance_m", "log_size_kib"))
+    assert (before_radio, before_system) == ("command", "connected")
+    rig.settle()
+
+
+def _before_confirmation(rig: Rig, key: str) -> str:
+    """What meshctl did on n001 right before it confirmed a change of one value: `command`, or `connected`."""
+    text = rig.inventory(rig.current).read_text(encoding="utf-8")
+    rig.inventory(key).write_text(re.sub(rf"({key}: )\d+", r"\g<1>777", text), encoding="utf-8")
+    log = rig.directory / f"{key}.log"
+    changed = rig.meshctl("provision", key, "n001", "--yes", "--json", "--log-file", str(log))
+    assert changed.results == {"n001": "done"}, changed.out + changed.err
+    events = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    own = [event for event in events if event.get("device", "").startswith("n001 ")]
+    (at,) = (place for place, event in enumerate(own) if "meshctl-deadman confirm" in event.get("script", ""))
+    return str(own[at - 1]["event"])
 
 
 def test_a_dry_run_shows_the_plan_and_changes_nothing(rig: Rig) -> None:
