@@ -23,6 +23,7 @@ from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
 from meshctl.device.openwrt import root_in_ram
 from meshctl.device.ssh import SshConnection
+from meshctl.device.upload import UploadProgress
 from meshctl.errors import NodeError
 from meshctl.model import Secret
 from meshctl.nodes.backoff import Backoff
@@ -198,6 +199,8 @@ def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> Non
                 await_reload_s=min(await_reload_s, change.window_s // 2),
                 sent=slot.release,
             )
+    size = len(change.sent.content)
+    ctx.progress(UploadProgress(size, size))
     change.is_reloaded = status is not None
 
 

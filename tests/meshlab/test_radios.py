@@ -74,7 +74,7 @@ def test_back_from_the_supplicant_to_the_same_open_cell_the_interface_is_lost(la
     configure(latest, ENCRYPTED)
     assert index(latest) not in ("", before)
     configure(latest, OPEN)
-    assert index(latest) == ""
+    until(lambda: index(latest) == "", "mesh0 to go")
     configure(latest, "set wireless.radio0.txpower=10")
     assert index(latest) == ""
     latest.exec("wifi down; wifi up")
@@ -84,7 +84,7 @@ def test_back_from_the_supplicant_to_the_same_open_cell_the_interface_is_lost(la
 def test_another_cell_creates_a_lost_interface(latest: VirtualNode) -> None:
     configure(latest, ENCRYPTED)
     configure(latest, OPEN)
-    assert index(latest) == ""
+    until(lambda: index(latest) == "", "mesh0 to go")
     configure(latest, "set wireless.radio0.channel=11")
     assert index(latest) != ""
 

@@ -75,7 +75,7 @@ def test_what_cannot_be_taken_back_is_refused(
 
 
 def test_a_node_without_a_record_or_unmanaged_is_refused() -> None:
-    assert "not kept" in irreversible(7, fleet().nodes["b01"], DONE, None, ())
+    assert "not recorded" in irreversible(7, fleet().nodes["b01"], DONE, None, ())
     assert "no longer manages" in irreversible(7, None, DONE, recorded(), ())
 
 

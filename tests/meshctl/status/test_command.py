@@ -150,8 +150,15 @@ def test_a_whole_fleet_is_all_well_and_compared_with_the_inventory(bench: Bench)
     assert "--lab queries only computers with ssh.host in the inventory" in " ".join(done.stdout.split())
 
 
+def alarm_of(bench: Bench, name: str) -> str:
+    """The text of the node's only alarm."""
+    (alarm,) = bench.status()["by_name"][name]["alarms"]
+    return str(alarm["text"])
+
+
 def test_a_node_without_power_is_shown_as_it_was(bench: Bench) -> None:
     bench.fleet.inject_fault("b02", "off")
+    until(lambda: "no node hears it" in alarm_of(bench, "b02"), "b01 to have heard nothing of it for a while")
     output = bench.status()
     assert output["exit_code"] == 3
     last = output["by_name"]["b02"]["last_known"]

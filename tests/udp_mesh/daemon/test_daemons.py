@@ -298,8 +298,8 @@ def test_any_bytes_on_the_udp_port_neither_stop_the_daemon_nor_its_urgent_messag
         assert len(collect(receiver, 10)) == 10
         after = receiver.request("status")["conditions"]["counters"]
     dropped = ("dropped_malformed", "dropped_unauthenticated", "dropped_unproven", "dropped_over_limit")
-    # The kernel drops what the queue for strangers cannot hold.
-    assert sum(after[name] - before[name] for name in dropped) > 300
+    # The kernel drops what the queue for strangers cannot hold; the smallest one holds a hundred.
+    assert sum(after[name] - before[name] for name in dropped) > 100
     assert "Traceback" not in bob.log.read_text()
 
 
