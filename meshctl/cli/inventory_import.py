@@ -17,9 +17,8 @@ from meshctl.errors import InputError
 from meshctl.inventory.csv_table import COLUMNS, NodeEdit, edits, read
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.inventory.load import load_fleet
+from meshctl.inventory.source import MAX_FILE_BYTES, Source, read_source
 from meshctl.inventory.suggest import did_you_mean
-
-MAX_BYTES = 16 << 20
 
 
 def import_nodes(
@@ -44,10 +43,10 @@ def import_nodes(
     Example: meshctl inventory import boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    file = "standard input" if table == "-" else table
-    rows = read(_text(table), file, headings=_headings(column or ()), ignored=ignore or ())
-    found = edits(rows, fleet, file, add=add)
-    changes = _changes(inventory, found, file)
+    source = _source(table)
+    rows = read(source.text, source.file, headings=_headings(column or ()), ignored=ignore or ())
+    found = edits(rows, fleet, source.file, add=add)
+    changes = _changes(inventory, found, source.file)
     if as_json:
         nodes = [{"node": each.node, "line": each.line, "new": each.is_new, "values": each.values} for each in found]
         echo_json(json.dumps({"fleet": fleet.name, "rows": len(rows), "nodes": nodes}, indent=2))
@@ -70,19 +69,15 @@ def _changes(inventory: Path, found: tuple[NodeEdit, ...], file: str) -> tuple[F
         raise InputError(f"{file}: the inventory would have errors, so nothing was written:\n{reason}") from reason
 
 
-def _text(table: str) -> str:
-    try:
-        with sys.stdin.buffer if table == "-" else Path(table).open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except OSError as reason:
-        raise InputError(f"{table}: cannot be read: {reason.strerror}") from reason
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{table}: larger than {MAX_BYTES >> 20} MiB", hint="is it a CSV file?")
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as reason:
-        line = data[: reason.start].count(b"\n") + 1
-        raise InputError(f"{table}:{line}: not UTF-8 text", hint="save it as CSV UTF-8") from reason
+def _source(table: str) -> Source:
+    """The file, or standard input. Raises InvalidInput."""
+    if table == "-":
+        found = read_source(Path("standard input"), lambda _: sys.stdin.buffer.read(MAX_FILE_BYTES + 1))
+    else:
+        found = read_source(Path(table))
+    if isinstance(found, Source):
+        return found
+    raise InvalidInput([found])
 
 
 def _headings(words: list[str] | tuple[str, ...]) -> dict[str, str]:

@@ -11,13 +11,13 @@ import io
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import printable
 from meshctl.inventory.documents.node import NodeDocument
-from meshctl.inventory.fields import is_name
+from meshctl.inventory.fields import Name
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import Plain
 from meshctl.inventory.validate import expected_value
@@ -76,7 +76,7 @@ def read(
     `headings` maps headings of the table to columns, `ignored` are headings to skip. Raises InvalidInput with all
     errors.
     """
-    lines = _records(text.removeprefix("\ufeff"), file)
+    lines = _records(text, file)
     number, header = next(lines, (1, []))
     columns = _columns(header, Position(file, number), headings or {}, ignored)
     rows: list[Row] = []
@@ -110,17 +110,16 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
     for row in rows:
         name, label = row.values.get(NODE, ""), row.values.get("label", "")
         node = fleet.nodes.get(name) if name else by_label.get(label.lower())
+        values = {key: value for key, value in row.values.items() if key != NODE}
         place = Position(file, row.line)
         if node is not None:
-            values = {key: value for key, value in row.values.items() if key != NODE and value != _GETTERS[key](node)}
-            if values:
-                found.append(NodeEdit(node.name, row.line, False, values))
+            changed = {key: value for key, value in values.items() if value != _GETTERS[key](node)}
+            if changed:
+                found.append(NodeEdit(node.name, row.line, False, changed))
         elif not (name or label):
             errors.append(_wrong(place, NODE, "a name or a label", "neither"))
         elif name and add:
-            found.append(
-                NodeEdit(name, row.line, True, {key: value for key, value in row.values.items() if key != NODE})
-            )
+            found.append(NodeEdit(name, row.line, True, values))
         else:
             key, word, known = (NODE, name, list(fleet.nodes)) if name else ("label", label, list(by_label))
             hint = did_you_mean(word, known) or (
@@ -184,12 +183,11 @@ def _normalized(column: str, cell: str) -> str:
 def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnostic]:
     """What the inventory's format says about the values of a row."""
     for column, value in values.items():
-        if column == NODE:
-            if not is_name(value):
-                yield _wrong(place, column, "a name of letters, digits, '.', '_' and '-'", f"'{printable(value)}'")
-            continue
         try:
-            NodeDocument.model_validate({column: Plain(value)})
+            if column == NODE:
+                TypeAdapter(Name).validate_python(Plain(value))
+            else:
+                NodeDocument.model_validate({column: Plain(value)})
         except ValidationError as reason:
             (error, *_) = reason.errors(include_url=False, include_input=False)
             yield _wrong(place, column, expected_value(error), f"'{printable(value)}'")

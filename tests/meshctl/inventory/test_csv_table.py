@@ -139,7 +139,7 @@ def test_a_table_in_another_encoding_names_the_line(inventory: Path, tmp_path: P
     words = ["inventory", "import", str(tmp_path / "boxes.csv"), "-i", str(inventory)]
     done = CliRunner().invoke(build("inventory"), words)
     assert done.exit_code == 2
-    assert "boxes.csv:3: not UTF-8 text" in done.stderr
+    assert "boxes.csv:3:13: the file is not UTF-8 text: found the byte 0xe4" in done.stderr
 
 
 @pytest.mark.parametrize("option", ["serial", "serial=", "seral=Serial number"])
