@@ -1,7 +1,8 @@
 """The steps of a change on one node; each may be repeated after its connection was cut.
 
-`arm` (install the dead-man's switch, lock, stage, arm) and `start` use the existing connection. After that every
-observation uses a new one (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change.
+`send` (one command), or `arm` (install the dead-man's switch, lock, stage, arm) and `start`, use the existing
+connection. After that the node is observed over new ones until its services have reloaded, then over one opened after
+that (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.rollback import EarlierState, EarlierStates, irreversible, without_undone
 from meshctl.cli.context import (
     AsJson,
@@ -71,8 +70,7 @@ def rollback(
         renderer = opened.renderer
         earlier = EarlierStates(opened.fleet, renderer.secrets, renderer.templates, states)
         opened = replace(opened, renderer=earlier)
-        given = choices_of(True, leave_behind, accept_cut)
-        choices = PlanOptions(False, given.leave_behind, given.accept_cuts)
+        choices = choices_of(True, leave_behind, accept_cut)
         prepared = prepare_plan(opened, list(states), choices)
         try:
             confirm_and_execute(

@@ -17,7 +17,6 @@ import typer
 from meshctl import event_log
 from meshctl.errors import ExitCode, InputError, MeshctlError
 
-_PANEL = "Logging"
 Verbose = Annotated[
     int,
     typer.Option(
@@ -25,7 +24,6 @@ Verbose = Annotated[
         "-v",
         count=True,
         show_default=False,
-        rich_help_panel=_PANEL,
         help="Show connections on standard error; -vv also every command on a device, with its exit status.",
     ),
 ]
@@ -34,7 +32,6 @@ LogFile = Annotated[
     typer.Option(
         "--log-file",
         envvar="MESHCTL_LOG_FILE",
-        rich_help_panel=_PANEL,
         help="Append all events to this file, as JSON lines with secrets masked.",
     ),
 ]

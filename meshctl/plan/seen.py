@@ -6,6 +6,7 @@ Paths have no leading slash (`etc/config/network`), as in rendered files.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from ipaddress import IPv4Address
 
 from meshctl.device.observation import FileInfo, Observation
 from meshctl.diagnostics import InvalidInput
@@ -54,6 +55,14 @@ def parsed(text: str | None, package: str) -> Package | None:
         return parse(text, package)
     except InvalidInput:
         return None
+
+
+def lan_address(network: str | None) -> IPv4Address | None:
+    """The management address in a network file; None if it has none, is missing or unreadable."""
+    tree = parsed(network, "network")
+    lan = None if tree is None else tree.section("lan")
+    text = "" if lan is None else lan.get("ipaddr").partition("/")[0]
+    return IPv4Address(text) if text else None
 
 
 def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]:

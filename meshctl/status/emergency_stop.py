@@ -6,12 +6,12 @@ on it, so only the operator may ask for it (`meshctl preflight --send-estop FILE
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from meshctl.model import Fleet, Topic, TopicClass
 from meshctl.robots.host import Host
+from meshctl.status.pings import replies
 
 DELIVERED = "delivered"
 # the script waits 10 s for each outcome, all at once
@@ -61,13 +61,7 @@ def send(host: Host, plan: StopPlan, message: bytes) -> StopResult:
 def parse_outcomes(text: str, destinations: Iterable[str]) -> StopResult:
     """The lines of `scripts/estop.sh`; a robot without a line did not acknowledge."""
     found: dict[str, str] = {}
-    for line in text.splitlines():
-        try:
-            reply = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(reply, dict) and isinstance(reply.get("peer"), str):
-            outcome = str(reply.get("outcome", ""))
-            reason = reply.get("reason")
-            found[reply["peer"]] = f"{outcome} ({reason})" if reason and outcome != DELIVERED else outcome
+    for peer, reply in replies(text):
+        outcome, reason = str(reply.get("outcome", "")), reply.get("reason")
+        found[peer] = f"{outcome} ({reason})" if reason and outcome != DELIVERED else outcome
     return StopResult({name: found.get(name) or "no acknowledgment" for name in destinations})

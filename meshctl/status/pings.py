@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from meshctl.robots.host import Host
 
@@ -26,20 +27,26 @@ def ping(host: Host, peers: Iterable[str]) -> dict[str, float | str]:
     return parse_pings(host.run("ping", *wanted, timeout_s=PING_TIMEOUT_S), wanted)
 
 
-def parse_pings(text: str, peers: Iterable[str]) -> dict[str, float | str]:
-    """The lines of `scripts/ping.sh`; a peer without a line has no answer."""
-    found: dict[str, float | str] = {}
+def replies(text: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Peer and reply of each line that is one: the scripts for robots print one JSON object per peer."""
     for line in text.splitlines():
         try:
             reply = json.loads(line)
         except ValueError:
             continue
         if isinstance(reply, dict) and isinstance(reply.get("peer"), str):
-            seconds = reply.get("round_trip_s")
-            if isinstance(seconds, int | float) and not isinstance(seconds, bool):
-                found[reply["peer"]] = float(seconds)
-            else:
-                found[reply["peer"]] = str(reply.get("error", "no answer"))
+            yield reply["peer"], reply
+
+
+def parse_pings(text: str, peers: Iterable[str]) -> dict[str, float | str]:
+    """The lines of `scripts/ping.sh`; a peer without a line has no answer."""
+    found: dict[str, float | str] = {}
+    for peer, reply in replies(text):
+        seconds = reply.get("round_trip_s")
+        if isinstance(seconds, int | float) and not isinstance(seconds, bool):
+            found[peer] = float(seconds)
+        else:
+            found[peer] = str(reply.get("error", "no answer"))
     return {peer: found.get(peer, "not sent") for peer in peers}
 
 
