@@ -1,11 +1,18 @@
-"""Write a benchmark's output to `docs/benchmarks.md`, between the two comments of its section."""
+"""Write a benchmark's output to `docs/benchmarks.md`, between the two comments of its section, with its machine."""
 
 from __future__ import annotations
 
+import os
+import platform
 import re
 from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
+
+
+def this_machine() -> dict[str, str | int | None]:
+    """What to record with each result: Python's version, the architecture and the number of cores."""
+    return {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
 
 
 def fill(section: str, text: str, page: Path = PAGE) -> None:

@@ -10,14 +10,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.page import fill
+from benchmarks.page import fill, this_machine
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results") / "start_up.jsonl"
@@ -93,7 +92,7 @@ def main() -> None:
     arguments = parser.parse_args()
     checkouts = {"now": ROOT, **({"before": arguments.against.resolve()} if arguments.against else {})}
     results = measure(checkouts)
-    machine = {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
+    machine = this_machine()
     arguments.results.write_text("".join(json.dumps({**machine, **result}) + "\n" for result in results))
     text = f"Python {machine['python']}, {machine['machine']}, {machine['cores']} cores\n\n{table(results)}"
     print(text)

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import signal
 import statistics
 import subprocess
@@ -30,7 +29,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.page import fill
+from benchmarks.page import fill, this_machine
 from benchmarks.status_fleet import Devices, programs_missing
 
 ROOT = Path(__file__).parents[1]
@@ -170,7 +169,7 @@ def main() -> None:
     if not arguments.tables:
         if missing := programs_missing():
             parser.error(f"it needs {', '.join(missing)}")
-        machine = {"python": platform.python_version(), "machine": platform.machine(), "cores": os.cpu_count()}
+        machine = this_machine()
         before = {"before": str(arguments.against.resolve())} if arguments.against else {}
         checkouts = {**before, "now": str(ROOT)}
         for radios in map(int, arguments.radios.split(",")):

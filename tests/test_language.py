@@ -20,14 +20,17 @@ RECORDS = ("docs/facts/",)
 TEST_PACKAGES = ("benchmarks", "docgen", "tests")
 
 
+def comments_of(file: Path) -> Iterator[tuple[int, str]]:
+    """Line and text of each comment."""
+    with file.open("rb") as source:
+        for token in tokenize.tokenize(source.readline):
+            if token.type == tokenize.COMMENT:
+                yield token.start[0], token.string
+
+
 def texts_for_readers(file: Path) -> Iterator[tuple[int, str]]:
     """Line and text of each docstring, comment and name that a file defines, without other strings."""
-    with file.open("rb") as source:
-        yield from (
-            (token.start[0], token.string)
-            for token in tokenize.tokenize(source.readline)
-            if token.type == tokenize.COMMENT
-        )
+    yield from comments_of(file)
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         match node:
             case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
@@ -41,12 +44,7 @@ def texts_for_readers(file: Path) -> Iterator[tuple[int, str]]:
 
 def words_of(file: Path) -> Iterator[tuple[int, str]]:
     """Line and text of each string and comment."""
-    with file.open("rb") as source:
-        yield from (
-            (token.start[0], token.string)
-            for token in tokenize.tokenize(source.readline)
-            if token.type == tokenize.COMMENT
-        )
+    yield from comments_of(file)
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.lineno, node.value
