@@ -16,13 +16,18 @@ import typer
 from meshctl.cli.context import DryRun, exit_for, line_width
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import SERVICE_TIMEOUT_S, RobotsContext, finish, run_command, with_robots_context
+from meshctl.cli.robots_dry_run import (
+    command_differences,
+    deploy_differences,
+    exit_for_dry_run,
+    print_differences,
+)
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.robots.deploy import plan_deploy
 from meshctl.robots.facts import RobotFacts, collect_facts, expected_release, facts_object
 from meshctl.robots.host import Host
-from meshctl.robots.status_table import difference, table
+from meshctl.robots.status_table import table
 
 app = typer.Typer(help="Deploy and manage udp_mesh on robots.", no_args_is_help=True)
 app.add_typer(topic_app, name="topic")
@@ -38,8 +43,7 @@ def deploy_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """
     context = context.with_fleet(context.fleet)
     if dry_run:
-        refused = any(one.result is Result.REFUSED for one in _differences(context).values())
-        raise typer.Exit(ExitCode.FINDINGS if refused else ExitCode.OK)
+        raise exit_for_dry_run(context, deploy_differences(context))
     raise finish(context, run_command(context, "deploy"))
 
 
@@ -50,33 +54,11 @@ def diff_command(context: RobotsContext) -> None:
 
     Example: meshctl robots diff
     """
-    outcomes = _differences(context.with_fleet(context.fleet))
+    context = context.with_fleet(context.fleet)
+    outcomes = print_differences(context, deploy_differences(context))
     if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
         raise typer.Exit(ExitCode.FINDINGS)
     raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
-
-
-def _differences(context: RobotsContext) -> dict[str, Outcome]:
-    """Print what a deploy would change on each robot."""
-
-    def work(host: Host, robot: str) -> Outcome:
-        plan = plan_deploy(host, robot, context.options)
-        if isinstance(plan, Outcome):
-            return plan
-        lines = difference(*plan)
-        return Outcome(robot, Result.PENDING if lines else Result.UNCHANGED, "\n".join(lines))
-
-    outcomes = context.run_on_each(work)
-    if context.as_json:
-        objects = {
-            name: {"result": one.result.value, "differences": one.reason.splitlines()} for name, one in outcomes.items()
-        }
-        echo_json(json.dumps(objects, indent=1))
-    else:
-        for name, one in outcomes.items():
-            for line in (one.reason or "no changes").splitlines():
-                echo(f"{name}: {line}")
-    return outcomes
 
 
 @app.command("status")
@@ -104,21 +86,25 @@ def status_command(context: RobotsContext) -> None:
 
 @app.command("restart")
 @with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
-def restart_command(context: RobotsContext) -> None:
+def restart_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """Restart the daemons and bridges. Messages queued in memory are lost; those on disk are kept.
 
     Example: meshctl robots restart husky1
     """
+    if dry_run:
+        raise exit_for_dry_run(context, command_differences("restart"))
     raise finish(context, run_command(context, "restart"))
 
 
 @app.command("stop")
 @with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
-def stop_command(context: RobotsContext) -> None:
+def stop_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """Stop the daemons and bridges until the next deploy, restart or boot.
 
     Example: meshctl robots stop husky1
     """
+    if dry_run:
+        raise exit_for_dry_run(context, command_differences("stop"))
     raise finish(context, run_command(context, "stop"))
 
 
@@ -149,11 +135,13 @@ def logs_command(
 
 @app.command("rollback")
 @with_robots_context("robots", "limit", "inventory", "wait_s", "ask_sudo", "as_json", "key")
-def rollback_command(context: RobotsContext) -> None:
+def rollback_command(context: RobotsContext, dry_run: DryRun = False) -> None:
     """Roll back to the previous release, with its configuration and keys.
 
     Example: meshctl robots rollback husky1
     """
+    if dry_run:
+        raise exit_for_dry_run(context, command_differences("rollback"))
     raise finish(context, run_command(context, "rollback"))
 
 
@@ -162,11 +150,14 @@ def rollback_command(context: RobotsContext) -> None:
 def uninstall_command(
     context: RobotsContext,
     purge: Annotated[bool, typer.Option("--purge", help="Also remove stored messages and the system user.")] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Remove udp_mesh from robots. Messages on disk are kept for the next install unless --purge is given.
 
     Example: meshctl robots uninstall husky1
     """
+    if dry_run:
+        raise exit_for_dry_run(context, command_differences("uninstall", purge=purge))
     raise finish(context, run_command(context, "uninstall", purge=purge))
 
 
@@ -176,18 +167,19 @@ def trust_command(
     context: RobotsContext,
     change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Show the robots' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
 
     Example: meshctl robots trust husky1
     """
-    trusted = {robot: _pin_key(context, robot, change=change, yes=yes) for robot in context.robots}
+    trusted = {robot: _pin_key(context, robot, change=change, yes=yes, dry_run=dry_run) for robot in context.robots}
     if not all(trusted.values()):
         raise typer.Exit(ExitCode.FINDINGS)
 
 
-def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool) -> bool:
-    """Show, confirm and pin the key; whether it is pinned in the end."""
+def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool, dry_run: bool) -> bool:
+    """Show, confirm and pin the key; whether it is pinned in the end, or would be with `dry_run`."""
     name = context.connector.endpoint(robot).identity
     try:
         shown = context.connector.presented_key(robot)
@@ -204,6 +196,9 @@ def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool) -> 
         echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
         echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
         return False
+    if dry_run:
+        echo(f"{line}: would be pinned" + (" instead of the pinned key" if pinned else ""))
+        return True
     if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the computer?")):
         context.opened.trust.replace(name, shown)
         echo(f"{line}: pinned now")

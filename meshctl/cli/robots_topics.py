@@ -14,14 +14,15 @@ from typing import Annotated
 import typer
 import yaml
 
+from meshctl.cli.context import DryRun
 from meshctl.cli.output import echo
 from meshctl.cli.robots_context import RobotsContext, finish, run_command, with_robots_context
+from meshctl.cli.robots_dry_run import deploy_differences, exit_for_dry_run
 from meshctl.errors import InputError
-from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, FileEdit, add_topic, remove_topic, save, set_topic
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import SecretRef
-from meshctl.robots.key_rotation import inventory_value, parse_ref, rotation_stages
+from meshctl.robots.key_rotation import RotationStage, inventory_value, parse_ref, rotation_stages
 
 topic_app = typer.Typer(help="Change topics in the inventory and on all robots.", no_args_is_help=True)
 
@@ -37,34 +38,34 @@ _SHARED = ("inventory", "wheels", "wait_s", "ask_sudo", "as_json", "key")
 
 @topic_app.command("add")
 @with_robots_context(*_SHARED)
-def topic_add(context: RobotsContext, topic: Topic, values: Assignments) -> None:
+def topic_add(context: RobotsContext, topic: Topic, values: Assignments, dry_run: DryRun = False) -> None:
     """Add a topic to the inventory and to every running daemon, without a restart.
 
     Example: meshctl robots topic add video priority=9 reliable=false destinations=[base-station]
     """
     fields = _fields(values)
-    _change_topics(context, topic, lambda editor: add_topic(editor, topic, fields))
+    _change_topics(context, topic, lambda editor: add_topic(editor, topic, fields), dry_run=dry_run)
 
 
 @topic_app.command("set")
 @with_robots_context(*_SHARED)
-def topic_set(context: RobotsContext, topic: Topic, values: Assignments) -> None:
+def topic_set(context: RobotsContext, topic: Topic, values: Assignments, dry_run: DryRun = False) -> None:
     """Change a topic in the inventory and in every running daemon, without a restart.
 
     Example: meshctl robots topic set video priority=12
     """
     fields = _fields(values)
-    _change_topics(context, topic, lambda editor: set_topic(editor, topic, fields))
+    _change_topics(context, topic, lambda editor: set_topic(editor, topic, fields), dry_run=dry_run)
 
 
 @topic_app.command("rm")
 @with_robots_context(*_SHARED)
-def topic_rm(context: RobotsContext, topic: Topic) -> None:
+def topic_rm(context: RobotsContext, topic: Topic, dry_run: DryRun = False) -> None:
     """Remove a topic from the inventory and from every running daemon, without a restart.
 
     Example: meshctl robots topic rm video
     """
-    _change_topics(context, topic, lambda editor: remove_topic(editor, topic))
+    _change_topics(context, topic, lambda editor: remove_topic(editor, topic), dry_run=dry_run)
 
 
 def _fields(assignments: list[str]) -> dict[str, Value]:
@@ -87,11 +88,14 @@ def _fields(assignments: list[str]) -> dict[str, Value]:
     return fields
 
 
-def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], None]) -> None:
+def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], None], *, dry_run: bool) -> None:
     changed, changes = _edited(context, edit)
     if not context.as_json:
         for change in changes:
             echo(change.diff(), nl=False)
+    if dry_run:
+        raise exit_for_dry_run(changed, deploy_differences(changed))
+    save(changes)
     journaled = run_command(changed, "topic", topic=topic)
     if not any(outcome.result.is_good for outcome in journaled.outcomes.values()):
         _undo(changes)
@@ -100,17 +104,13 @@ def _change_topics(context: RobotsContext, topic: str, edit: Callable[[Editor], 
 
 
 def _edited(context: RobotsContext, edit: Callable[[Editor], None]) -> tuple[RobotsContext, tuple[FileEdit, ...]]:
-    """Edit, validate and save the inventory; returns the context for it and the changes."""
+    """The context for the edited inventory, and the changes to save.
+
+    Raises InvalidInput and InputError if the edited inventory does not load, or a daemon would reject it.
+    """
     editor = Editor.open(context.inventory, environ=os.environ)
     edit(editor)
-    changes = editor.changes()
-    save(changes)
-    try:
-        return context.with_fleet(load_fleet(context.inventory, environ=os.environ), only_configuration=True), changes
-    except InputError:
-        # it loads, but the daemons would reject it
-        _undo(changes)
-        raise
+    return context.with_fleet(editor.fleet(), only_configuration=True), editor.changes()
 
 
 def _undo(changes: tuple[FileEdit, ...]) -> None:
@@ -127,6 +127,7 @@ def rotate_key_command(
             help="Reference to the new key: env:NAME, file:PATH or file:PATH#ENTRY, relative to the inventory.",
         ),
     ],
+    dry_run: DryRun = False,
 ) -> None:
     """Rotate the fleet key without an interruption: accept the new key everywhere, use it, then drop the old one.
 
@@ -136,10 +137,13 @@ def rotate_key_command(
     Example: meshctl robots rotate-key file:secrets.yaml#udp_mesh_2027
     """
     todo = rotation_stages(context.fleet.udp_mesh.keys, parse_ref(new_key))
+    if dry_run:
+        raise _rotation_differences(context, todo)
     for number, stage in enumerate(todo, start=1):
         if not context.as_json:
             echo(f"step {number} of {len(todo)}: {stage.title}")
-        context, _ = _edited(context, partial(_set_keys, keys=stage.keys))
+        context, changes = _edited(context, partial(_set_keys, keys=stage.keys))
+        save(changes)
         journaled = run_command(context, "rotate-key", new_key=new_key)
         late = ", ".join(name for name, outcome in journaled.outcomes.items() if not outcome.result.is_good)
         if late:
@@ -147,6 +151,18 @@ def rotate_key_command(
             echo("hint: run the same command again once they are reachable", err=True)
         if late or number == len(todo):
             raise finish(context, journaled)
+
+
+def _rotation_differences(context: RobotsContext, todo: tuple[RotationStage, ...]) -> typer.Exit:
+    """Print the steps, and what the first one would change; returns the exit to raise."""
+    changed, changes = _edited(context, partial(_set_keys, keys=todo[0].keys))
+    if not context.as_json:
+        for number, stage in enumerate(todo, start=1):
+            echo(f"step {number} of {len(todo)}: {stage.title}")
+        echo("the first step would change:")
+        for change in changes:
+            echo(change.diff(), nl=False)
+    return exit_for_dry_run(changed, deploy_differences(changed))
 
 
 def _set_keys(editor: Editor, keys: tuple[SecretRef, ...]) -> None:

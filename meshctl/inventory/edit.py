@@ -34,7 +34,7 @@ from meshctl.inventory.text_edit import (
 )
 from meshctl.inventory.tree import MappingNode, Plain, Scalar, descend, plain_data
 from meshctl.inventory.yaml_text import Value, is_bare, parsed_data
-from meshctl.model import NodeState
+from meshctl.model import Fleet, NodeState
 
 _BOM = "\ufeff"
 
@@ -106,12 +106,17 @@ class Editor:
 
     def changes(self) -> tuple[FileEdit, ...]:
         """The edits of each changed file. Raises InvalidInput if the edited inventory does not load."""
-        loaded = load(self.path, environ=self.environ, read=self._read)
-        if loaded.fleet is None:
-            raise InvalidInput(loaded.diagnostics)
+        self.fleet()
         return tuple(
             FileEdit(file, self._before[file], text) for file, text in self._texts.items() if text != self._before[file]
         )
+
+    def fleet(self) -> Fleet:
+        """The fleet of the edited inventory, before it is saved. Raises InvalidInput if it does not load."""
+        loaded = load(self.path, environ=self.environ, read=self._read)
+        if loaded.fleet is None:
+            raise InvalidInput(loaded.diagnostics)
+        return loaded.fleet
 
     def has(self, path: tuple[str, ...]) -> bool:
         """Whether a file sets `path`."""

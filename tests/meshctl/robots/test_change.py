@@ -52,6 +52,48 @@ def test_a_topic_is_added_set_and_removed_everywhere_at_once_without_a_restart(f
     assert fleet.file.read_text() == text
 
 
+def test_a_dry_run_shows_the_change_and_leaves_inventory_and_robots_as_they_are(fleet: RobotFleet) -> None:
+    boots = _pair(fleet)
+    fleet.meshctl("topic", "set", "status", "priority=6")
+    text = fleet.file.read_text()
+    releases = {name: fleet.shell(name, "readlink /opt/udp-mesh/current") for name in fleet.machines}
+
+    output = fleet.meshctl("topic", "add", "video", "priority=9", "--dry-run")
+    assert "+  video:" in output
+    assert "husky1: " in output
+    differences = json.loads(fleet.meshctl("topic", "rm", "status", "--dry-run", "--json"))
+    assert {one["result"] for one in differences.values()} == {"pending"}
+    assert all(one["differences"] for one in differences.values())
+    output = fleet.meshctl("rotate-key", "file:keys.yaml#new", "--dry-run")
+    assert "step 3 of 3: drop the old key" in output
+    assert "+" in output.split("the first step would change:")[1]
+
+    assert "would restart the daemon, which is active" in fleet.meshctl("restart", "--dry-run")
+    assert "husky2: would stop the daemon, which is active" in fleet.meshctl("stop", "husky2", "--dry-run")
+    assert "would switch from release" in fleet.meshctl("rollback", "--dry-run")
+    assert "would remove release" in fleet.meshctl("uninstall", "husky1", "--purge", "--dry-run")
+
+    assert fleet.file.read_text() == text
+    assert {name: fleet.shell(name, "readlink /opt/udp-mesh/current") for name in fleet.machines} == releases
+    assert _boots(fleet) == boots
+
+
+def test_a_dry_run_names_the_robots_that_would_refuse(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    assert "husky1: udp_mesh is not installed" in fleet.meshctl("restart", "--dry-run", exit_code=1)
+    fleet.deploy()
+    assert "husky1: there is no previous release" in fleet.meshctl("rollback", "--dry-run", exit_code=1)
+    trusted = fleet.directory / "known_hosts"
+    pins = trusted.read_text()
+    trusted.write_text("")
+    assert "would be pinned" in fleet.meshctl("trust", "--dry-run")
+    assert trusted.read_text() == ""
+    trusted.write_text(pins)
+    fleet.machines["husky1"].stop()
+    assert "husky1: " in fleet.meshctl("stop", "--dry-run", exit_code=3)
+
+
 def test_a_key_is_rotated_without_an_interruption_and_waits_for_robots_that_are_away(fleet: RobotFleet) -> None:
     boots = _pair(fleet)
     fleet.machines["husky2"].stop()
