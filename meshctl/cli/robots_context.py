@@ -41,7 +41,7 @@ from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.render.daemon import daemon_keys
-from meshctl.robots.bundle import configuration
+from meshctl.robots.bundle import UNIT_TITLES, configuration
 from meshctl.robots.connection import RobotConnector, selected_robots
 from meshctl.robots.deploy import DeployOptions, Wheelhouse, claim, deploy, roll_back
 from meshctl.robots.host import Host
@@ -267,10 +267,8 @@ def _task_for(command: str, context: RobotsContext, parameters: Parameters) -> R
 def _service(host: Host, robot: str, verb: str) -> Outcome:
     with claim(host):
         states = host.run("service", verb, timeout_s=SERVICE_TIMEOUT_S).splitlines()
-    parameters = [
-        f"the {'ROS bridge' if 'ros' in unit else 'service'} is {state}" for unit, state in map(str.split, states)
-    ]
-    return Outcome(robot, Result.DONE, ", ".join(parameters))
+    states_text = [f"{UNIT_TITLES[unit]} is {state}" for unit, state in map(str.split, states)]
+    return Outcome(robot, Result.DONE, ", ".join(states_text))
 
 
 def _remove(host: Host, robot: str, *, purge: bool) -> Outcome:

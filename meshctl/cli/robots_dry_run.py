@@ -17,6 +17,7 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import RobotsContext, RobotTask
 from meshctl.errors import ExitCode
 from meshctl.fleet import Outcome, Result
+from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, UNIT_TITLES
 from meshctl.robots.deploy import plan_deploy
 from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts
 from meshctl.robots.host import Host
@@ -83,11 +84,13 @@ def command_differences(command: str, *, purge: bool = False) -> RobotTask:
 
 
 def _service_changes(facts: RobotFacts, verb: str) -> tuple[str, ...]:
-    units = [("the daemon", facts.service)]
-    if facts.bridge is not None:
-        units.append(("the ROS bridge", facts.bridge))
+    units = {UNIT_NAME: facts.service, BRIDGE_UNIT_NAME: facts.bridge, HOSTS_UNIT_NAME: facts.hosts}
     return (
-        *(f"would {verb} {name}, which is {unit.active or 'not installed'}" for name, unit in units),
+        *(
+            f"would {verb} {UNIT_TITLES[name]}, which is {unit.active or 'not installed'}"
+            for name, unit in units.items()
+            if unit is not None
+        ),
         *_lost_messages(facts),
     )
 

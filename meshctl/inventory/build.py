@@ -304,4 +304,5 @@ def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
         window=settings.window,
         broadcast=settings.broadcast,
         metrics_port=settings.metrics_port,
+        etc_hosts=settings.etc_hosts,
     )

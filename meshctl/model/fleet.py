@@ -202,6 +202,7 @@ class UdpMesh:
     window: int | None = None
     broadcast: bool = True
     metrics_port: int | None = None
+    etc_hosts: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,13 @@ from meshctl.robots.wheels import Wheel
 
 UNIT_NAME = "udp-mesh.service"
 BRIDGE_UNIT_NAME = "udp-mesh-ros1.service"
+HOSTS_UNIT_NAME = "udp-mesh-hosts.service"
+# The units in messages.
+UNIT_TITLES: Mapping[str, str] = {
+    UNIT_NAME: "the service",
+    BRIDGE_UNIT_NAME: "the ROS bridge",
+    HOSTS_UNIT_NAME: "the service for /etc/hosts",
+}
 _CURRENT = "/opt/udp-mesh/current"
 # 64 bits of the SHA-256: short enough to read, long enough against accidental collisions.
 _ID_DIGITS = 16
@@ -130,6 +137,9 @@ def configuration(
     keys = daemon_keys(fleet, secrets)
     if keys is not None:
         files.append(File(f"etc/{KEY_NAME}", keys, _SECRET_MODE))
+    if fleet.udp_mesh.etc_hosts:
+        hosts = f"{_CURRENT}/bin/udp-mesh hosts --write /etc/hosts"
+        files.append(File(HOSTS_UNIT_NAME, service_unit(units[HOSTS_UNIT_NAME], hosts).encode()))
     if has_bridge(fleet, robot):
         files += [
             File("bin/udp-mesh-ros1", shipped("bridge.sh").encode(), 0o755),

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from meshctl.model import Fleet, Secret, SecretRef
-from meshctl.robots.bundle import BRIDGE_UNIT_NAME, UNIT_NAME, configuration
+from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, configuration
 from meshctl.robots.host import Host
 from meshctl.robots.wheels import own_wheel, stock_units
 
@@ -24,12 +24,15 @@ FACTS_TIMEOUT_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class ExpectedRelease:
-    """The desired release of one robot: `files` are hashes by path, `wheel` is the hash of our own package; `bridge`:
-    whether it has a ROS 1 bridge."""
+    """The desired release of one robot: `files` are hashes by path, `wheel` is the hash of our own package."""
 
     files: Mapping[str, str] = field(default_factory=dict)
     wheel: str = ""
-    bridge: bool = False
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The systemd units, the daemon's first."""
+        return (UNIT_NAME, *(name for name in (BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME) if name in self.files))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +110,8 @@ class RobotFacts:
     """One robot at `seen_s` (our clock, Unix time).
 
     `trouble` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
-    the inventory. `bridge` is None if no ROS 1 bridge is expected or installed. `status` is the output of
-    `udp-mesh status --json`, empty if the daemon does not answer.
+    the inventory. `bridge` and `hosts` (the service for /etc/hosts) are None if neither expected nor installed.
+    `status` is the output of `udp-mesh status --json`, empty if the daemon does not answer.
     """
 
     robot: str
@@ -116,6 +119,7 @@ class RobotFacts:
     trouble: str = ""
     service: ServiceFacts = ServiceFacts()
     bridge: ServiceFacts | None = None
+    hosts: ServiceFacts | None = None
     release: str = ""
     previous: str = ""
     is_proven: bool = True
@@ -142,8 +146,9 @@ class RobotFacts:
     @property
     def is_healthy(self) -> bool:
         """Whether all expected services run and are proven; drift does not count."""
-        bridge_is_well = self.bridge is None or self.bridge.is_up
-        return not self.trouble and self.service.is_up and self.is_proven and self.answers and bridge_is_well
+        others = (service for service in (self.bridge, self.hosts) if service is not None)
+        services_are_up = self.service.is_up and all(service.is_up for service in others)
+        return not self.trouble and services_are_up and self.is_proven and self.answers
 
     @property
     def remark(self) -> str:
@@ -159,6 +164,8 @@ class RobotFacts:
             problems.append("the daemon does not answer")
         if self.bridge is not None and not self.bridge.is_up:
             problems.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
+        if self.hosts is not None and not self.hosts.is_up:
+            problems.append(f"the service for /etc/hosts is {self.hosts.active or 'absent'}")
         problems += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
         away = [peer.name for peer in self.peers if not peer.online]
         problems += [f"offline peers: {', '.join(away)}"] if away else []
@@ -171,7 +178,7 @@ def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Se
     Raises InvalidInput for settings the daemon would reject, and for missing keys.
     """
     files = {file.path: file.sha256 for file in configuration(fleet, robot, secrets, stock_units())}
-    return ExpectedRelease(files, own_wheel().sha256, bridge=BRIDGE_UNIT_NAME in files)
+    return ExpectedRelease(files, own_wheel().sha256)
 
 
 def collect_facts(host: Host, robot: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
@@ -186,12 +193,17 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
     release = _values(sections.get("release", ()))
     status = _object(sections.get("status", ()))
     peers = tuple(_objects(_within(status, "conditions").get("peers")))
-    bridge = services.get(BRIDGE_UNIT_NAME, ServiceFacts())
+
+    def optional(unit: str) -> ServiceFacts | None:
+        found = services.get(unit, ServiceFacts())
+        return found if unit in expected.units or found.enabled else None
+
     return RobotFacts(
         robot,
         seen_s=now_s,
         service=services.get(UNIT_NAME, ServiceFacts()),
-        bridge=bridge if expected.bridge or bridge.enabled else None,
+        bridge=optional(BRIDGE_UNIT_NAME),
+        hosts=optional(HOSTS_UNIT_NAME),
         release=_last(release, "current"),
         previous=_last(release, "previous"),
         is_proven=_last(release, "proven") != "no",
@@ -217,13 +229,15 @@ def drift(
     here = {path: digest for digest, _, path in (row.partition("  ") for row in release.get("file", ()))}
     lines = [f"changed on the robot: {path}" for path in release.get("damaged", ())]
     lines += [f"differs from the inventory: {path}" for path, sha in expected.files.items() if here.get(path) != sha]
-    if BRIDGE_UNIT_NAME in here and not expected.bridge:
-        lines.append(f"not in the inventory: {BRIDGE_UNIT_NAME}")
+    lines += [
+        f"not in the inventory: {unit}"
+        for unit in (BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME)
+        if unit in here and unit not in expected.units
+    ]
     wheels = {row.split()[0] for row in release.get("wheel", ()) if row.strip()}
     if expected.wheel and expected.wheel not in wheels:
         lines.append("another version of udp-mesh than in this meshctl")
-    units = (UNIT_NAME, BRIDGE_UNIT_NAME) if expected.bridge else (UNIT_NAME,)
-    for unit in units:
+    for unit in expected.units:
         if services.get(unit, ServiceFacts()).enabled != "enabled":
             lines.append(f"{unit} will not start at boot")
     return tuple(lines)

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterable
 
 from meshctl.report.duration import duration
-from meshctl.robots.bundle import UNIT_NAME, Bundle
+from meshctl.robots.bundle import UNIT_TITLES, Bundle
 from meshctl.robots.facts import RobotFacts
 from meshctl.robots.preconditions import HostFacts, changed_files
 
@@ -92,11 +92,7 @@ def difference(facts: HostFacts, release: Bundle) -> tuple[str, ...]:
         lines.append("a switch was interrupted")
     for unit, active, enabled in facts.units:
         if active != "active":
-            lines.append(f"{_unit_text(unit)} is {active or 'absent'}")
+            lines.append(f"{UNIT_TITLES[unit]} is {active or 'absent'}")
         if enabled != "enabled":
-            lines.append(f"{_unit_text(unit)} is {enabled or 'absent'}: it will not start at boot")
+            lines.append(f"{UNIT_TITLES[unit]} is {enabled or 'absent'}: it will not start at boot")
     return tuple(lines)
-
-
-def _unit_text(unit: str) -> str:
-    return "the service" if unit == UNIT_NAME else "the ROS bridge"

@@ -43,6 +43,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "unproven": "a switch to another release was interrupted",
         "restarts": "its daemon crashed and was restarted since the last snapshot",
         "ros-bridge": "its ROS bridge is down",
+        "hosts": "the service that keeps the peers' names in /etc/hosts is down",
         "version": "its daemon version differs from most others",
         "key": "another robot cannot decrypt its messages",
         "unkeyed": "it neither encrypts nor authenticates",

@@ -84,6 +84,9 @@ def _daemon(seen: RobotAlarmInput) -> Iterator[Alarm]:
             text,
             "start roscore if it is down; then check the bridge's journal",
         )
+    if facts.hosts is not None and not facts.hosts.is_up:
+        text = f"its service for /etc/hosts is {facts.hosts.active or 'absent'}"
+        yield Alarm(Level.WARNING, "hosts", text, f"meshctl robots logs {name}; then meshctl robots restart {name}")
 
 
 def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from udp_mesh import __version__
-from udp_mesh.cli import change, inspect, serve, traffic
+from udp_mesh.cli import change, hosts, inspect, serve, traffic
 from udp_mesh.cli.argument_types import count, ping_s, positive
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
@@ -46,6 +46,7 @@ RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
     inspect.peers,
     inspect.topics,
     inspect.events,
+    hosts.hosts,
     traffic.echo,
 )
 """Commands that are normally ended with Ctrl-C, so that an interrupt is a success."""
@@ -231,6 +232,18 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _command(
         commands, "metrics", inspect.metrics, "print metrics for Prometheus", example="udp-mesh metrics", json=False
     )
+    names = _command(
+        commands,
+        "hosts",
+        hosts.hosts,
+        "print the peers' addresses as lines of a hosts file, or keep them in one",
+        example="udp-mesh hosts --write /etc/hosts",
+    )
+    action = names.add_mutually_exclusive_group()
+    action.add_argument(
+        "--write", type=Path, metavar="FILE", help="keep the peers in this file until interrupted, then remove them"
+    )
+    action.add_argument("--remove", type=Path, metavar="FILE", help="remove the peers from this file")
 
 
 def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

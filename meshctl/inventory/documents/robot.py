@@ -102,6 +102,8 @@ class UdpMeshDocument(Document):
     """Discover peers and reach all of them by broadcast."""
     metrics_port: Whole = Field(default=NOT_WRITTEN, ge=1, le=65_535)
     """TCP port of Prometheus metrics. Default: no metrics."""
+    etc_hosts: Flag = False
+    """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
 
 
 class TopicDocument(Document):

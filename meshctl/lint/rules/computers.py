@@ -1,7 +1,8 @@
-"""The robots' computers: architecture and ROS distribution (MC631 to MC632)."""
+"""The robots' computers: architecture, ROS distribution, names for /etc/hosts (MC631 to MC633)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
@@ -12,6 +13,8 @@ from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet
 from meshctl.model.computers import ARCHITECTURES, ROS_1, ROS_2, ROS_TOO_OLD
 
+# one label of a host name (RFC 1123, section 2.1), and not an address
+_HOST_LABEL = re.compile(r"(?!\d+$)[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
 # other names of the same architectures
 _ALIASES = {"amd64": "x86_64", "x64": "x86_64", "arm64": "aarch64", "armhf": "armv7l", "i386": "i686"}
 
@@ -54,3 +57,42 @@ def ros_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         elif ros not in ("", ROS_1, *ROS_2):
             _, hint = suggest((ROS_1, *ROS_2), ros)
             yield Finding(path, "unknown ROS distribution", f"{ROS_1}, or a ROS 2 distribution", ros, hint)
+
+
+@fleet_rule(
+    "MC633",
+    Severity.WARNING,
+    "A robot's name cannot be a host name",
+    why="""With `udp_mesh.etc_hosts` the robots' computers get each other's names in /etc/hosts. A name with characters
+    other than letters, digits and hyphens is left out, so `ssh` and `ping` do not know that robot.""",
+    fix="Rename the robot, or remove `etc_hosts`.",
+    failing="""
+        udp_mesh: {etc_hosts: true}
+        robots:
+          husky1: <removed>
+          husky_1: {nodes: [husky1-front], carries: [b01], computer: {address: 10.42.0.110/24, ssh: {user: robot}}}
+        topics:
+          commands: {destinations: [husky_1]}
+          artifacts: {sources: [husky_1]}
+          map: {sources: [husky_1]}
+          video: {sources: [husky_1]}
+    """,
+    passing="""
+        udp_mesh: {etc_hosts: true}
+        robots:
+          husky1: <removed>
+          husky-1: {nodes: [husky1-front], carries: [b01], computer: {address: 10.42.0.110/24, ssh: {user: robot}}}
+        topics:
+          commands: {destinations: [husky-1]}
+          artifacts: {sources: [husky-1]}
+          map: {sources: [husky-1]}
+          video: {sources: [husky-1]}
+    """,
+)
+def name_is_no_host_name(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    if not fleet.udp_mesh.etc_hosts:
+        return
+    for robot in fleet.robots.values():
+        if robot.computer is not None and not _HOST_LABEL.fullmatch(robot.name):
+            expected = "letters, digits and hyphens, at most 63"
+            yield Finding(("robots", robot.name), "not a host name", expected, robot.name)

@@ -14,6 +14,8 @@ export LC_ALL PATH
 root=/opt/udp-mesh
 unit=udp-mesh.service
 bridge_unit=udp-mesh-ros1.service
+hosts_unit=udp-mesh-hosts.service
+all_units="$unit $bridge_unit $hosts_unit"
 units=/etc/systemd/system
 socket=/run/udp-mesh/udp-mesh.sock
 account=udp-mesh
@@ -60,11 +62,11 @@ claimed_by() {
 mesh() { "$root/current/bin/udp-mesh" "$@"; }
 
 # ours: the units that are installed here, the daemon's first.
-ours() { for service in $unit $bridge_unit; do [ ! -e "$units/$service" ] || echo "$service"; done; }
+ours() { for service in $all_units; do [ ! -e "$units/$service" ] || echo "$service"; done; }
 
 # none_masked: refuse if a unit is masked (`systemctl mask`).
 none_masked() {
-	for service in $unit $bridge_unit; do
+	for service in $all_units; do
 		case $(systemctl is-enabled "$service" 2>/dev/null) in
 		masked*) die masked "masked unit: $service" ;;
 		esac

@@ -1,7 +1,7 @@
 # facts: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes nothing, and
 # reads little from the disk, since status calls it often.
 echo "== services"
-for service in $unit $bridge_unit; do
+for service in $all_units; do
 	# of a service that was never installed systemd knows ActiveState=inactive, UnitFileState= and LoadState=not-found
 	systemctl show -p Id,LoadState,ActiveState,SubState,UnitFileState,NRestarts,Result "$service" 2>/dev/null
 	echo

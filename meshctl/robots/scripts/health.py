@@ -116,7 +116,9 @@ def _is_bridge(unit: ServiceState) -> bool:
 
 
 def _called(unit: ServiceState) -> str:
-    return "the ROS bridge" if _is_bridge(unit) else "the daemon"
+    if _is_bridge(unit):
+        return "the ROS bridge"
+    return "the service for /etc/hosts" if "hosts" in unit.name else "the daemon"
 
 
 def query(*operations: str) -> list[Json]:

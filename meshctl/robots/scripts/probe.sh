@@ -62,12 +62,12 @@ if [ -n "$current" ]; then
 	[ -e "$root/current/lib/.sums" ] || echo damaged=lib
 	has_whole_tree "$root/current" ||
 		(cd "$root/current/lib" && sha256sum -c .sums) 2>/dev/null | sed -n 's/: FAILED.*//p' | sed 's|^|damaged=lib/|'
-	for service in $unit $bridge_unit; do
+	for service in $all_units; do
 		[ ! -e "$root/current/$service" ] || cmp -s "$root/current/$service" "$units/$service" ||
 			echo "damaged=$units/$service"
 	done
 	id "$account" >/dev/null 2>&1 || echo "damaged=the user $account"
 fi
-for service in $unit $bridge_unit; do
+for service in $all_units; do
 	echo "unit=$service $(systemctl is-active "$service" 2>/dev/null) $(systemctl is-enabled "$service" 2>/dev/null)"
 done

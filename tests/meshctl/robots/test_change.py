@@ -68,8 +68,8 @@ def test_a_dry_run_shows_the_change_and_leaves_inventory_and_robots_as_they_are(
     assert "step 3 of 3: drop the old key" in output
     assert "+" in output.split("the first step would change:")[1]
 
-    assert "would restart the daemon, which is active" in fleet.meshctl("restart", "--dry-run")
-    assert "husky2: would stop the daemon, which is active" in fleet.meshctl("stop", "husky2", "--dry-run")
+    assert "would restart the service, which is active" in fleet.meshctl("restart", "--dry-run")
+    assert "husky2: would stop the service, which is active" in fleet.meshctl("stop", "husky2", "--dry-run")
     assert "would switch from release" in fleet.meshctl("rollback", "--dry-run")
     assert "would remove release" in fleet.meshctl("uninstall", "husky1", "--purge", "--dry-run")
 

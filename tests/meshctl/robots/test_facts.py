@@ -115,7 +115,7 @@ def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_han
 
 
 def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
-    wanted = ExpectedRelease(WANTED.files, WANTED.wheel, bridge=True)
+    wanted = ExpectedRelease({**WANTED.files, "udp-mesh-ros1.service": "e" * 64}, WANTED.wheel)
     facts = _facts(wanted=wanted)
     assert facts.bridge is not None
     assert not facts.is_healthy
