@@ -87,7 +87,7 @@ def process_frames(
                     state.schedule_control(session)
                 else:
                     # The ping validates the path it came on: answer to that address.
-                    send_on_path(state, session, Pong(token, 0), link, source, now)
+                    send_on_path(state, session, [Pong(token, 0)], link, source, now)
             case Pong(token):
                 sender.pmtu.on_pong(token, now)
             case Bye():

@@ -10,16 +10,15 @@ from heapq import heappop
 from udp_mesh.core.frame_handlers import inflate_step
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peer_lifecycle import maintain
-from udp_mesh.core.peers.heartbeat import heartbeat_datagrams, own_features
+from udp_mesh.core.peers.heartbeat import heartbeat_datagrams
+from udp_mesh.core.peers.introduction import introduction
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
-from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
 from udp_mesh.core.settings import Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Cancel, Delivered, Frame, Heartbeat, Ping
-from udp_mesh.wire.header import VERSION
+from udp_mesh.wire.frames import Cancel, Delivered, Frame, Ping
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 BATCH_BYTES = 65_536
@@ -83,7 +82,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
         frames.append(Cancel(tuple(cancelled[:MAX_IDS])))
         del cancelled[:MAX_IDS]
     if not path.confirmed and frames and not session.knows_us:
-        frames.insert(0, _introduction(state, session, now))
+        frames.insert(0, introduction(state, session, now))
     while frames:
         count = min(len(frames), MAX_FRAMES_PER_DATAGRAM - 1)
         encoded = path.encode(frames[:count], now)
@@ -95,25 +94,6 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
         out.append(Datagram(path.link, path.address, data, True))
         del frames[:count]
     state.arm(peer)
-
-
-def _introduction(state: State, session: Session, now: float) -> Heartbeat:
-    """A heartbeat for a peer that may not know our current boot yet."""
-    settings = state.settings
-    return Heartbeat(
-        settings.name,
-        VERSION,
-        VERSION,
-        own_features(settings),
-        min(65_535, int(settings.rates.heartbeat_sparse_s * 1000)),
-        0,
-        0,
-        state.broadcast_channel.next_number,
-        state.broadcasts.next_number,
-        (session.heard_tag,),
-        (),
-        clock_ms(now),
-    )
 
 
 def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> None:
@@ -138,7 +118,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 and now >= session.introduced_at + INTRODUCTION_INTERVAL_S
             ):
                 session.introduced_at = now
-                number, data = session.path.seal(encode([_introduction(state, session, now)]))
+                number, data = session.path.seal(encode([introduction(state, session, now)]))
                 sender.in_flight.add(number, None)
                 out.append(Datagram(session.path.link, session.path.address, data, True))
             peers.append(peer)

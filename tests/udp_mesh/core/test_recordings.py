@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 
 from tests.udp_mesh.core.pair import KEY, Pair, World, pair, settings
-from udp_mesh.core import transmit
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -19,7 +18,7 @@ from udp_mesh.core.events import (
     PeerOnline,
 )
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.peers import heartbeat
+from udp_mesh.core.peers import heartbeat, introduction
 from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness, clock_ms
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
@@ -63,7 +62,7 @@ def without_dates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both nodes as in the first version: they neither send nor accept timestamps."""
     monkeypatch.setattr(heartbeat, "OWN_FEATURES", Feature.ZLIB | Feature.REPAIR)
     monkeypatch.setattr(heartbeat, "clock_ms", lambda now: None)
-    monkeypatch.setattr(transmit, "clock_ms", lambda now: None)
+    monkeypatch.setattr(introduction, "clock_ms", lambda now: None)
 
 
 @pytest.mark.parametrize("topic", [STOP, BEST, replace(BEST, reliable=True)])

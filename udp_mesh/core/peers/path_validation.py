@@ -38,12 +38,12 @@ def _send_challenge(state: State, session: Session, challenge: Challenge) -> Non
     session.challenges[token] = challenge
     while len(session.challenges) > MAX_CHALLENGES:
         del session.challenges[next(iter(session.challenges))]
-    send_on_path(state, session, Ping(token), challenge.link, challenge.address, challenge.sent_at)
+    send_on_path(state, session, [Ping(token)], challenge.link, challenge.address, challenge.sent_at)
 
 
-def send_on_path(state: State, session: Session, frame: Frame, link: str, address: Address, now: float) -> None:
-    """Send one small frame to this address, regardless of the current path."""
-    number, data = session.path.seal(encode(session.path.with_timestamp([frame], now)))
+def send_on_path(state: State, session: Session, frames: list[Frame], link: str, address: Address, now: float) -> None:
+    """Send small frames to this address, regardless of the current path."""
+    number, data = session.path.seal(encode(session.path.with_timestamp(frames, now)))
     if session.is_current and session.peer is not None:
         session.peer.open_sender().in_flight.add(number, None)
     state.outgoing.append(Datagram(link, address, data, True))

@@ -97,7 +97,7 @@ def drop_stale(state: State, session: Session, frames: Sequence[Frame], link: st
     state.event_queue.counters.dropped_stale += 1
     for frame in frames:
         if isinstance(frame, Ping) and session.peer is not None:
-            send_on_path(state, session, Pong(frame.token, 0), link, source, now)
+            send_on_path(state, session, [Pong(frame.token, 0)], link, source, now)
     validate_path(state, session, link, source, now)
 
 
