@@ -1,6 +1,7 @@
 """The life of a peer: heartbeats and authenticated datagrams in -> sessions, events and the outcome of messages out.
 
-1. `on_heartbeat` processes a heartbeat: an unknown boot is remembered and answered; one that lists us is verified.
+1. `on_heartbeat` processes a heartbeat: an unknown boot is remembered and answered; one that lists us is verified, or
+   challenged if the heartbeat may be a recording.
 2. `on_verified` makes a session the current one of its name: online or restarted. A retired boot that is still heard is
    a name conflict.
 3. `on_activity` keeps a peer online and migrates its path to a new address. A peer that does not hear us stays offline.
@@ -19,6 +20,7 @@ from udp_mesh.core.events import (
     TopicStarved,
 )
 from udp_mesh.core.path_mtu import refragment, update_pmtu
+from udp_mesh.core.peers.first_contact import challenge_contact, proves_contact
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.path_validation import validate_path
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
@@ -69,7 +71,10 @@ def on_heartbeat(
         else:
             migrate_path(state, session, link, source, now)
         if lists_us:
-            on_verified(state, session, now)
+            if proves_contact(state, session, beat, now):
+                on_verified(state, session, now)
+            else:
+                challenge_contact(state, session, link, source, now)
     else:
         on_activity(state, session, link, source, now)
         if session.name == state.settings.name:
@@ -225,6 +230,10 @@ def on_path_validated(state: State, session: Session, challenge: Challenge, now:
         session.challenges.clear()
     if (path.link, path.address) != (challenge.link, challenge.address):
         _switch_path(state, session, challenge.link, challenge.address, now)
+    if not session.verified:
+        on_verified(state, session, now)
+        if session.peer is None:
+            return
     on_activity(state, session, challenge.link, challenge.address, now)
 
 

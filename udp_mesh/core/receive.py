@@ -3,13 +3,22 @@
 1. A short header's tag selects candidate channels; opening one authenticates the sender. Replays cost no decryption.
 2. A plain fragment goes straight to reassembly; other frames are decoded and go to `frame_handlers`.
 3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
+4. What a boot sends before its first contact is proven is held, then processed as if it had just arrived.
 """
 
 from udp_mesh.core.frame_handlers import ack_mid_batch, deliver, process_frames
 from udp_mesh.core.peer_lifecycle import migrate_path, on_activity, on_bye, on_heartbeat, on_verified
+from udp_mesh.core.peers.first_contact import hold, needs_proof, proves_contact
+from udp_mesh.core.peers.path_validation import answer_pings
 from udp_mesh.core.peers.peer_state import PeerState
-from udp_mesh.core.peers.session import Session
-from udp_mesh.core.receiver.replay_check import broadcast_lateness_s, data_lateness_s, long_lateness_s, timestamp_of
+from udp_mesh.core.peers.session import HeldDatagram, Session
+from udp_mesh.core.receiver.replay_check import (
+    broadcast_lateness_s,
+    data_lateness_s,
+    long_lateness_s,
+    small_frames,
+    timestamp_of,
+)
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
@@ -132,11 +141,18 @@ def _receive_data(
         session.last_heard = path.heard_at = now
     else:
         if not session.verified:
+            if needs_proof(session):
+                held = HeldDatagram(number, frames, link, source, introduced=False)
+                hold(state, session, held, small_frames(frames), now)
+                return
             on_verified(state, session, now)
         on_activity(state, session, link, source, now)
         peer = session.peer
         if peer is None or peer.session is not session:
+            answer_pings(state, session, small_frames(frames), link, source, now)
             return
+        if session.held:
+            _release_held(state, session, now)
     receiver = session.receiver
     if receiver.receive_plain(frames, number, now):
         acks = receiver.acks
@@ -232,22 +248,59 @@ def _receive_long(
         for frame in decoded:
             if isinstance(frame, Bye) and session.verified:
                 on_bye(state, session, now)
+        if session.held and session.verified:
+            _release_held(state, session, now)
         return
-    if beat is not None and not session.verified:
-        session.update_from(beat, now)
-        migrate_path(state, session, link, source, now)
-        on_verified(state, session, now)
+    if not session.verified:
+        if beat is not None:
+            session.update_from(beat, now)
+            migrate_path(state, session, link, source, now)
+        if beat is not None and proves_contact(state, session, beat, now):
+            on_verified(state, session, now)
+        elif needs_proof(session):
+            hold(state, session, HeldDatagram(number, frames, link, source, introduced=True), decoded, now)
+            return
+    _process_introduction(state, session, decoded, beat, number, link, source, now, late_s)
+
+
+def _process_introduction(
+    state: State,
+    session: Session,
+    frames: list[Frame],
+    beat: Heartbeat | None,
+    number: int,
+    link: str,
+    source: Address,
+    now: float,
+    late_s: float,
+) -> None:
     if beat is not None:
         on_heartbeat(state, session, beat, link, source, now, to_all=False)
-    if not session.verified or session.peer is None:
+    if session.verified and session.peer is not None:
+        on_activity(state, session, link, source, now)
+    if not session.is_current:
+        answer_pings(state, session, frames, link, source, now)
         return
-    on_activity(state, session, link, source, now)
-    if session.peer.session is not session:
-        return
-    process_frames(state, session, decoded, number, link, source, now, late_s)
+    if session.held:
+        _release_held(state, session, now)
+    process_frames(state, session, frames, number, link, source, now, late_s)
     # The sender uses long headers until it is answered.
     session.receiver.acks.send_now = True
     state.schedule_control(session)
+
+
+def _release_held(state: State, session: Session, now: float) -> None:
+    """Process what came before the first contact was proven. What turns out to be a recording is dropped as late."""
+    held, session.held = session.held, []
+    for datagram in held:
+        number, frames, link, source, introduced = datagram
+        if not introduced:
+            _receive_data(state, session, number, frames, link, source, now)
+            continue
+        decoded = decode(frames)
+        late_s = long_lateness_s(state, session, decoded, link, source, now)
+        if late_s is not None:
+            _process_introduction(state, session, decoded, _beat(decoded), number, link, source, now, late_s)
 
 
 def _key(state: State, key_id: bytes) -> Key:

@@ -64,6 +64,8 @@ _NO_EXTENSION = b"\x00"
 """Length of an empty heartbeat extension; a reader skips extension fields it does not know."""
 _CLOCK = struct.Struct(">I")
 """The first field of the extension: the sender's clock."""
+HEARD_CLOCK_BYTES = 3
+"""Each following field: the clock of a heard boot."""
 
 _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 
@@ -142,6 +144,11 @@ def _encode_heartbeat(beat: Heartbeat) -> bytes:
             f"heartbeat: expected at most {limits.MAX_HEARD} tags of {limits.HEARD_TAG_BYTES} bytes, "
             f"found {len(beat.heard)}"
         )
+    if len(beat.heard_clocks) > min(len(beat.heard), limits.MAX_HEARD_CLOCKS):
+        raise ValueError(
+            f"heartbeat: expected at most {limits.MAX_HEARD_CLOCKS} clocks, one per heard boot, "
+            f"found {len(beat.heard_clocks)}"
+        )
     return b"".join(
         (
             bytes((Type.HEARTBEAT,)),
@@ -159,9 +166,18 @@ def _encode_heartbeat(beat: Heartbeat) -> bytes:
             bytes((len(beat.heard),)),
             *beat.heard,
             _encode_waiting(beat.waiting),
-            _NO_EXTENSION if beat.clock_ms is None else b"\x04" + _CLOCK.pack(beat.clock_ms),
+            _encode_clocks(beat.clock_ms, beat.heard_clocks),
         )
     )
+
+
+def _encode_clocks(clock_ms: int | None, heard_clocks: Sequence[int]) -> bytes:
+    if clock_ms is None:
+        if heard_clocks:
+            raise ValueError("heartbeat: expected the sender's clock beside those of heard boots, found none")
+        return _NO_EXTENSION
+    fields = b"".join((_CLOCK.pack(clock_ms), *(clock.to_bytes(HEARD_CLOCK_BYTES, "big") for clock in heard_clocks)))
+    return bytes((len(fields),)) + fields
 
 
 def _encode_waiting(waiting: Sequence[Waiting]) -> bytes:
@@ -222,7 +238,17 @@ def _decode_heartbeat(reader: Reader) -> Heartbeat:
     waiting = _decode_waiting(reader)
     extension = reader.take(reader.integer(1, "extension length"), "heartbeat extension")
     clock_ms = _CLOCK.unpack_from(extension)[0] if len(extension) >= _CLOCK.size else None
-    return Heartbeat(name, low, high, features, interval_ms, known, rate, number, messages, heard, waiting, clock_ms)
+    heard_clocks = _decode_heard_clocks(extension, count)
+    return Heartbeat(
+        name, low, high, features, interval_ms, known, rate, number, messages, heard, waiting, clock_ms, heard_clocks
+    )
+
+
+def _decode_heard_clocks(extension: bytes | memoryview, heard: int) -> tuple[int, ...]:
+    """Whole clocks, at most one per heard boot; what follows them is of a later version."""
+    count = min(heard, max(0, len(extension) - _CLOCK.size) // HEARD_CLOCK_BYTES)
+    places = range(_CLOCK.size, _CLOCK.size + count * HEARD_CLOCK_BYTES, HEARD_CLOCK_BYTES)
+    return tuple([int.from_bytes(extension[at : at + HEARD_CLOCK_BYTES], "big") for at in places])
 
 
 def _decode_waiting(reader: Reader) -> tuple[Waiting, ...]:

@@ -69,6 +69,9 @@ class Heartbeat:
     waiting: tuple[Waiting, ...] = ()
     clock_ms: int | None = None
     """The sender's clock as in `Sent`; None if its version does not include it."""
+    heard_clocks: tuple[int, ...] = ()
+    """For the first boots of `heard`: the clock of the newest heartbeat heard from each, in units of 256 ms, modulo
+    2**24. A boot that finds its own recent clock here knows that this heartbeat is no recording."""
 
 
 class MessageFlag(IntFlag):

@@ -34,6 +34,9 @@ lacked."""
 MAX_HEARD = 96
 """Neighbors that a heartbeat lists as heard (8 B each, 768 B): keeps it in one datagram whatever the team's size."""
 
+MAX_HEARD_CLOCKS = 64
+"""Clocks that a heartbeat echoes (3 B each, 192 B): a full one still fits IPv6's smallest MTU (1,280 B)."""
+
 MAX_WAITING = 16
 """One entry for each of the 16 priority levels."""
 

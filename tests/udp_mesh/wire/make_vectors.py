@@ -69,6 +69,9 @@ FRAMES: dict[str, list[Frame]] = {
     "ping and pong": [Ping(0x0102030405060708), Pong(0x0102030405060708, 1500)],
     "bye": [Bye("shutting down")],
     "heartbeat with its sender's clock": [Heartbeat("ugv1", 1, 1, 7, 1000, 0, 0, 9, 0, clock_ms=0xFFFFFFF0)],
+    "heartbeat with the clocks of heard boots": [
+        Heartbeat("ugv1", 1, 1, 7, 1000, 0, 0, 9, 0, (b"peerone!", b"peertwo!"), (), 0x01020304, (0x0A0B0C, 0xFFFFFF))
+    ],
     "dated message with a remaining life": [
         Sent(0x01020304),
         Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 40, 1500), ack_now=True),

@@ -37,6 +37,9 @@ waiting = st.lists(st.builds(Waiting, st.integers(0, 15), unsigned(16)), max_siz
 @st.composite
 def heartbeats(draw: st.DrawFn) -> Heartbeat:
     low = draw(st.integers(1, 7))
+    heard = draw(st.lists(st.binary(min_size=8, max_size=8), max_size=5))
+    clock_ms = draw(st.one_of(st.none(), unsigned(32)))
+    clocks = [] if clock_ms is None else draw(st.lists(unsigned(24), max_size=len(heard)))
     return Heartbeat(
         draw(names),
         low,
@@ -47,9 +50,10 @@ def heartbeats(draw: st.DrawFn) -> Heartbeat:
         draw(unsigned(32)),
         draw(unsigned(64)),
         draw(unsigned(32)),
-        tuple(draw(st.lists(st.binary(min_size=8, max_size=8), max_size=5))),
+        tuple(heard),
         draw(waiting),
-        draw(st.one_of(st.none(), unsigned(32))),
+        clock_ms,
+        tuple(clocks),
     )
 
 

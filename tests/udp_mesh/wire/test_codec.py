@@ -1,12 +1,15 @@
 """Properties of the frames: what is encoded is decoded, and any bytes give frames or DecodeError."""
 
 import struct
+from dataclasses import replace
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.wire.strategies import frames as any_frame
+from udp_mesh.core.sender.packetizer import IP6_EXTRA_BYTES, IP_UDP_BYTES
+from udp_mesh.crypto import LONG_OVERHEAD_BYTES
 from udp_mesh.wire import limits
 from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
@@ -69,8 +72,8 @@ def test_an_acknowledgement_without_gaps_costs_no_bitmap() -> None:
 def test_a_full_heartbeat_fits_one_datagram() -> None:
     heard = tuple(struct.pack(">Q", n) for n in range(limits.MAX_HEARD))
     waiting = tuple(Waiting(level, 65_535) for level in range(16))
-    beat = Heartbeat("n" * 63, 1, 1, 0, 1000, 1000, 0, 0, 0, heard, waiting)
-    assert len(encode([beat])) < 1000
+    beat = Heartbeat("n" * 63, 1, 1, 0, 1000, 1000, 0, 0, 0, heard, waiting, 0, (0,) * limits.MAX_HEARD_CLOCKS)
+    assert len(encode([beat])) + LONG_OVERHEAD_BYTES + IP_UDP_BYTES + IP6_EXTRA_BYTES <= 1280
 
 
 def test_too_many_frames_are_refused() -> None:
@@ -115,6 +118,8 @@ def test_a_value_past_its_cap_is_an_error_that_names_it(raw: bytes, message: str
         Cancel(()),
         Nack(1, ((0, 1),) * 65),
         Heartbeat("n" * 64, 1, 1, 0, 1, 0, 0, 0, 0),
+        Heartbeat("ugv1", 1, 1, 0, 1, 0, 0, 0, 0, (b"peerone!",), (), 0, (1, 2)),
+        Heartbeat("ugv1", 1, 1, 0, 1, 0, 0, 0, 0, (b"peerone!",), (), None, (1,)),
     ],
 )
 def test_our_own_mistakes_raise_value_error(frame: Frame) -> None:
@@ -126,3 +131,24 @@ def test_a_heartbeat_of_a_later_version_may_be_longer() -> None:
     beat = Heartbeat("ugv1", 1, 2, 0, 1000, 0, 0, 0, 0)
     raw = encode([beat])
     assert decode(raw[:-1] + b"\x03new" + encode([Ping(7)])) == [beat, Ping(7)]
+
+
+@pytest.mark.parametrize(
+    ("extension", "clock_ms", "heard_clocks"),
+    [
+        ("00000007", 7, ()),
+        ("00000007 000001", 7, (1,)),
+        ("00000007 000001 ffffff", 7, (1, 0xFFFFFF)),
+        ("00000007 000001 ffffff 0a0b0c0d", 7, (1, 0xFFFFFF)),
+        ("00000007 0000", 7, ()),
+        ("0007", None, ()),
+    ],
+)
+def test_the_extension_of_any_version_is_read(
+    extension: str, clock_ms: int | None, heard_clocks: tuple[int, ...]
+) -> None:
+    """There are no more clocks than heard boots; what follows them is of a later version."""
+    beat = Heartbeat("ugv1", 1, 1, 0, 1000, 0, 0, 0, 0, (b"peerone!", b"peertwo!"))
+    fields = bytes.fromhex(extension)
+    raw = encode([beat])[:-1] + bytes((len(fields),)) + fields
+    assert decode(raw) == [replace(beat, clock_ms=clock_ms, heard_clocks=heard_clocks)]

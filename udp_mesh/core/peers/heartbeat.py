@@ -10,13 +10,13 @@ from dataclasses import replace
 
 from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.peers.session import Session
-from udp_mesh.core.receiver.datagram_age import clock_ms
+from udp_mesh.core.receiver.datagram_age import clock_echo, clock_ms
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Rates, Settings
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
 from udp_mesh.wire.header import VERSION
-from udp_mesh.wire.limits import MAX_HEARD
+from udp_mesh.wire.limits import MAX_HEARD, MAX_HEARD_CLOCKS
 
 OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
 
@@ -55,13 +55,13 @@ class HeartbeatScheduler:
         self._heard_per_s = rates.heartbeats_heard_per_s
         self._interval_s = 1.0
         self._last_at = float("-inf")
-        self._pending_replies: dict[bytes, None] = {}
+        self._pending_replies: dict[bytes, Session] = {}
         self._next_listed = 0
         self.next_at = now
 
     def reply_to(self, session: Session, team: int, now: float) -> None:
         """List a newly heard (or still unverified) session soon."""
-        self._pending_replies[session.heard_tag] = None
+        self._pending_replies[session.heard_tag] = session
         if len(self._pending_replies) > MAX_PENDING_REPLIES:
             del self._pending_replies[next(iter(self._pending_replies))]
         self.schedule_now(team, now)
@@ -102,7 +102,7 @@ class HeartbeatScheduler:
         self._interval_s = self.interval_s(settings, sessions, now)
         self._last_at = now
         self.next_at = now + self._interval_s * (1 - JITTER * self._rng.random())
-        heard = self._heard(sessions, settings.name, now)
+        heard, heard_clocks = self._heard(sessions, settings.name, now)
         if self._pending_replies:
             # More new nodes than one heartbeat can list: send another one soon instead of waiting for the regular one.
             self.schedule_now(len(sessions), now)
@@ -119,13 +119,18 @@ class HeartbeatScheduler:
             heard,
             waiting,
             clock_ms(now),
+            heard_clocks,
         )
 
-    def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[bytes, ...]:
-        """Tags of the nodes to answer first, then of the others in turn."""
+    def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[tuple[bytes, ...], tuple[int, ...]]:
+        """Tags of the nodes to answer first, then of the others in turn; and the clocks of the first ones: who is
+        answered may not believe us without (see `first_contact`)."""
         tags = list(self._pending_replies)[:MAX_HEARD]
-        for tag in tags:
-            del self._pending_replies[tag]
+        replied = [self._pending_replies.pop(tag) for tag in tags]
+        # Those of earlier versions, which send no clock, follow.
+        replied.sort(key=lambda session: session.clock_ms is None)
+        tags = [session.heard_tag for session in replied]
+        clocks = [clock_echo(session.clock_ms) for session in replied if session.clock_ms is not None]
         # A boot whose name was taken by another is not listed: its messages are not accepted, and it must learn that.
         listed = [one for one in sessions if one.is_current or not one.verified or one.name == own_name]
         recent = [session for session in listed if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
@@ -137,7 +142,7 @@ class HeartbeatScheduler:
                 if session.heard_tag not in tags:
                     tags.append(session.heard_tag)
                 self._next_listed += 1
-        return tuple(tags)
+        return tuple(tags), tuple(clocks[:MAX_HEARD_CLOCKS])
 
 
 def encode_numbered(beat: Heartbeat, channel: SendChannel) -> bytes:

@@ -2,7 +2,7 @@
 
 from udp_mesh.core.peers.heartbeat import own_features
 from udp_mesh.core.peers.session import Session
-from udp_mesh.core.receiver.datagram_age import clock_ms
+from udp_mesh.core.receiver.datagram_age import clock_echo, clock_ms
 from udp_mesh.core.state import State
 from udp_mesh.wire.frames import Heartbeat
 from udp_mesh.wire.header import VERSION
@@ -24,4 +24,5 @@ def introduction(state: State, session: Session, now: float) -> Heartbeat:
         (session.heard_tag,),
         (),
         clock_ms(now),
+        () if session.clock_ms is None else (clock_echo(session.clock_ms),),
     )

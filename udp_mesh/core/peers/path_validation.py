@@ -7,8 +7,11 @@
    attacker that forwards everything (RFC 9000, 9.3.3).
 """
 
+from collections.abc import Sequence
+
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.session import CHALLENGE_TIMEOUT_S, Challenge, Session
+from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.wire.codec import encode
@@ -34,11 +37,17 @@ def validate_path(state: State, session: Session, link: str, source: Address, no
 
 
 def _send_challenge(state: State, session: Session, challenge: Challenge) -> None:
+    token = add_challenge(state, session, challenge)
+    send_on_path(state, session, [Ping(token)], challenge.link, challenge.address, challenge.sent_at)
+
+
+def add_challenge(state: State, session: Session, challenge: Challenge) -> int:
+    """Remember a challenge; returns the token of its ping."""
     token = state.rng.getrandbits(64)
     session.challenges[token] = challenge
     while len(session.challenges) > MAX_CHALLENGES:
         del session.challenges[next(iter(session.challenges))]
-    send_on_path(state, session, [Ping(token)], challenge.link, challenge.address, challenge.sent_at)
+    return token
 
 
 def send_on_path(state: State, session: Session, frames: list[Frame], link: str, address: Address, now: float) -> None:
@@ -49,10 +58,23 @@ def send_on_path(state: State, session: Session, frames: list[Frame], link: str,
     state.outgoing.append(Datagram(link, address, data, True))
 
 
+def answer_pings(
+    state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float
+) -> None:
+    """Answer the pings of a datagram that has no other effect, or not yet: its sender may not believe us without."""
+    for frame in frames:
+        if isinstance(frame, Ping):
+            send_on_path(state, session, [Pong(frame.token, 0)], link, source, now)
+
+
 def match_response(session: Session, pong: Pong, link: str, source: Address, now: float) -> Challenge | None:
-    """The challenge answered by this pong, if it came from the challenged address."""
+    """The challenge answered by this pong, if it came from the challenged address, and in time.
+
+    A first contact must answer within `ACCEPT_AGE_S`: the clock in its answer is the reference for all that follows.
+    """
     challenge = session.challenges.get(pong.token)
     if challenge is None or (challenge.link, challenge.address) != (link, source):
         return None
     del session.challenges[pong.token]
-    return challenge if now - challenge.sent_at <= CHALLENGE_TIMEOUT_S else None
+    timeout_s = CHALLENGE_TIMEOUT_S if session.verified else ACCEPT_AGE_S
+    return challenge if now - challenge.sent_at <= timeout_s else None

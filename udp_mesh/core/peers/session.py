@@ -27,6 +27,17 @@ from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
 from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
 
 
+class HeldDatagram(NamedTuple):
+    """An opened datagram from a boot whose first contact is not proven yet (see `first_contact`)."""
+
+    number: int
+    frames: bytes
+    link: str
+    source: Address
+    introduced: bool
+    """It came with a long header."""
+
+
 class Challenge(NamedTuple):
     """A ping that validates a path when its pong comes from the same address."""
 
@@ -152,9 +163,11 @@ class Session:
         "broadcast_channels",
         "challenged_at",
         "challenges",
+        "clock_ms",
         "data_channels",
         "features",
         "freshness",
+        "held",
         "interval_s",
         "introduced_at",
         "last_heard",
@@ -214,6 +227,10 @@ class Session:
         self.path = Path(SendChannel(keys[0], own_boot, boot_id))
         self.pending_control: list[Frame] = []
         self.freshness = Freshness()
+        self.clock_ms: int | None = None
+        """Clock of its newest heartbeat, which ours echo; None if its version does not send it."""
+        self.held: list[HeldDatagram] = []
+        """Datagrams that take effect once its first contact is proven."""
         self.challenges: dict[int, Challenge] = {}
         """Path challenges without an answer yet, by token (see `path_validation`)."""
         self.challenged_at = float("-inf")
@@ -347,5 +364,6 @@ class Session:
         self.interval_s = beat.interval_ms / 1000
         self.versions = (beat.min_version, beat.max_version)
         self.features = beat.features
+        self.clock_ms = beat.clock_ms
         self.path.timed = bool(beat.features & Feature.TIMED)
         self.path.confirms = bool(beat.features & Feature.CONFIRM)

@@ -27,14 +27,32 @@ def clock_ms(now: float) -> int:
     return int(now * 1000) & 0xFFFFFFFF
 
 
+ECHO_UNIT_MS = 256
+"""Unit of a clock that a heartbeat echoes: three bytes of it wrap together with the clock."""
+
+_ECHO_MASK = 0xFFFFFF
+
+
+def clock_echo(clock: int) -> int:
+    """A heartbeat's clock as its receiver echoes it."""
+    return clock // ECHO_UNIT_MS
+
+
+def echo_age_s(echo: int, now: float) -> float:
+    """Seconds since our clock was what a peer echoes, to within a unit."""
+    return (clock_echo(clock_ms(now)) - echo & _ECHO_MASK) * ECHO_UNIT_MS / 1000
+
+
 class Freshness:
     """What is known about one boot's clock, in its milliseconds and our seconds."""
 
-    __slots__ = ("_offset_ms", "_set_at", "fresh_at", "trusted_until")
+    __slots__ = ("_offset_ms", "_set_at", "confirmed", "fresh_at", "trusted_until")
 
     def __init__(self) -> None:
         self._offset_ms: int | None = None
         self._set_at = 0.0
+        self.confirmed = False
+        """Its clock is compared with that of a datagram which was no recording."""
         self.fresh_at = float("-inf")
         """When something that cannot be a replay last came."""
         self.trusted_until = float("-inf")
@@ -56,7 +74,9 @@ class Freshness:
         return late_s
 
     def confirm(self, now: float, clock: int | None = None) -> None:
-        """Record the answer to a challenge. Its timestamp, if any, replaces what was known about the clock."""
+        """Record a proof that the boot is there now, such as the answer to a challenge. Its timestamp, if any, replaces
+        what was known about the clock."""
+        self.confirmed = True
         self._is_fresh(now)
         if clock is not None:
             self._set(clock_ms(now) - clock & 0xFFFFFFFF, now)

@@ -10,7 +10,8 @@
 from collections.abc import Sequence
 
 from udp_mesh.core.peer_lifecycle import on_path_validated
-from udp_mesh.core.peers.path_validation import match_response, send_on_path, validate_path
+from udp_mesh.core.peers.first_contact import challenge_contact
+from udp_mesh.core.peers.path_validation import answer_pings, match_response, validate_path
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, CHALLENGE_AFTER_S
 from udp_mesh.core.settings import Address
@@ -18,7 +19,7 @@ from udp_mesh.core.state import State
 from udp_mesh.wire.codec import SENT_BYTES, Type, decode
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.fragment import FRAGMENT
-from udp_mesh.wire.frames import Frame, Heartbeat, Ping, Pong, Sent
+from udp_mesh.wire.frames import Frame, Heartbeat, Pong, Sent
 
 
 def data_lateness_s(
@@ -26,7 +27,7 @@ def data_lateness_s(
 ) -> float | None:
     """Seconds by which a datagram between two boots was delayed. None: drop it."""
     clock = timestamp_of(frames)
-    if session.challenges and _has_response(state, session, _small_frames(frames), clock, link, source, now):
+    if session.challenges and _has_response(state, session, small_frames(frames), clock, link, source, now):
         return 0.0
     if not session.timed:
         return 0.0
@@ -40,11 +41,11 @@ def data_lateness_s(
             validate_path(state, session, link, source, now)
         if undated_s <= ACCEPT_AGE_S:
             return 0.0
-    drop_stale(state, session, _small_frames(frames), link, source, now)
+    drop_stale(state, session, small_frames(frames), link, source, now)
     return None
 
 
-def _small_frames(frames: bytes) -> list[Frame]:
+def small_frames(frames: bytes) -> list[Frame]:
     """The frames of a datagram that may hold a ping or a pong; none if they are malformed (counted later)."""
     if frames[0] >= FRAGMENT:
         return []
@@ -95,10 +96,11 @@ def drop_stale(state: State, session: Session, frames: Sequence[Frame], link: st
     """Drop a replayed datagram, or one whose sender's clock stood still (its computer was suspended): the answer to the
     challenge shows which."""
     state.event_queue.counters.dropped_stale += 1
-    for frame in frames:
-        if isinstance(frame, Ping) and session.peer is not None:
-            send_on_path(state, session, [Pong(frame.token, 0)], link, source, now)
-    validate_path(state, session, link, source, now)
+    answer_pings(state, session, frames, link, source, now)
+    if session.verified:
+        validate_path(state, session, link, source, now)
+    else:
+        challenge_contact(state, session, link, source, now)
 
 
 def _has_response(
