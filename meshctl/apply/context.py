@@ -12,8 +12,9 @@ from meshctl.apply.health_checks import Expectation
 from meshctl.device.observation import Observation
 from meshctl.device.upload import UploadProgress
 from meshctl.fleet import Event, EventKind, Interrupt, Observer
-from meshctl.fleet.journal import Run
+from meshctl.fleet.journal import Journal, Run
 from meshctl.model import Fleet, Node
+from meshctl.nodes.collect import facts_of
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.radios import Radios
@@ -22,10 +23,11 @@ from meshctl.topology import mesh_macs
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """What all nodes of a run share. `owner` identifies this process in the nodes' locks. `remember` stores a node's
-    facts for later runs. `observations` were made before any change, of the plan's nodes and their meshes.
-    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base. `new_listener` makes the
-    listener of a change on one node that restarts the given radios.
+    """What all nodes of a run share, complete before the first node is changed.
+
+    `owner` identifies this process in the nodes' locks. `new_listener` makes the listener of a change on one node that
+    restarts the given radios. `observations` were made before any change, of the plan's nodes and their meshes.
+    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base.
 
     `macs` are the MACs each node's radios have had during the run: OpenWrt 24.10 and 25.12 give a recreated radio
     interface a new one.
@@ -33,22 +35,22 @@ class RunContext:
 
     fleet: Fleet
     connections: ConnectionPool
+    journal: Journal
     journal_run: Run
     observer: Observer
     interrupt: Interrupt
     owner: str
     new_listener: Callable[[NodeContext, Radios], ChangeListener]
-    remember: Callable[[str, Observation], None] = lambda name, seen: None
+    observations: Mapping[str, Observation]
+    mac_owners: Mapping[str, str]
+    base_macs: Sequence[str]
     rate_bytes_per_s: float | None = None
-    observations: Mapping[str, Observation] = field(default_factory=dict)
-    mac_owners: Mapping[str, str] = field(default_factory=dict)
-    base_macs: Sequence[str] = ()
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def record(self, name: str, seen: Observation) -> None:
         """Record an observation for the rest of this run and for later ones."""
         self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(seen))
-        self.remember(name, seen)
+        self.journal_run.remember(self.fleet.name, name, facts_of(seen), seen.answered_at_s)
 
     def current_mac_owners(self) -> dict[str, str]:
         """MAC -> node, including MACs learned during the run."""

@@ -7,17 +7,16 @@ as one. A failed canary, an exhausted failure budget or Ctrl-C prevents further 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from meshctl.apply.commit_confirm import configure
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import expectation
 from meshctl.apply.mesh_commit import commit_mesh
-from meshctl.apply.neighbor_query import observe_neighbors
 from meshctl.apply.packages import install
-from meshctl.apply.prepare import Prepared, base_macs
+from meshctl.apply.prepare import Prepared
 from meshctl.apply.stale_stations import unflushed_boot_s
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.apply.sysupgrade import checked_image, flash
@@ -27,7 +26,6 @@ from meshctl.fleet import (
     Event,
     EventKind,
     FailureBudget,
-    Interrupt,
     Observer,
     Outcome,
     Result,
@@ -37,42 +35,27 @@ from meshctl.fleet import (
 )
 from meshctl.fleet.journal import Journal, Run
 from meshctl.model import Fleet, NodeState
-from meshctl.nodes.collect import facts_of, known_macs
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.last_seen import query_neighbors
 from meshctl.nodes.slots import MESH_SLOTS, nodes_in_work
 from meshctl.plan import NodePlan, Plan, Stage, StageKind, Verdict
 
 
-@dataclass(frozen=True, slots=True)
-class RunSettings:
-    """The settings of a run: fleet, connections, journal, owner, observers."""
+def execute(
+    prepared: Prepared, run_context: RunContext, flushes: StationFlushes, unflushed: Mapping[str, float]
+) -> dict[str, Outcome]:
+    """Apply the plan. `unflushed` is the result of `unflushed_since`; the radios of these nodes are flushed as well.
 
-    fleet: Fleet
-    connections: ConnectionPool
-    journal: Journal
-    journal_run: Run
-    owner: str
-    interrupt: Interrupt
-    observer: Observer
-    rate_bytes_per_s: float | None = None
-
-
-def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
-    """Apply the plan. Raises InputError and InvalidInput, before any change, for an image that does not match the
-    inventory."""
-    plan, fleet = prepared.plan, settings.fleet
+    Raises InputError and InvalidInput, before any change, for an image that does not match the inventory.
+    """
+    plan, fleet = prepared.plan, run_context.fleet
     images = {
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    _assign_slots(prepared, settings)
-    unflushed = _unflushed(prepared, settings)
-    flushes = StationFlushes()
-    run_context = _run_context(prepared, settings, unflushed, flushes)
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
-        _finish(settings, outcome)
+        _finish(run_context, outcome)
     contexts = _node_contexts(prepared, run_context)
     for name, since_s in unflushed.items():
         flushes.flush_later(_node_context(prepared, run_context, name), max(0.0, time.time() - since_s))
@@ -80,64 +63,38 @@ def execute(prepared: Prepared, settings: RunSettings) -> dict[str, Outcome]:
     stopped = ""
     for stage in plan.stages:
         # an interrupted canary is not a failed one
-        reason = "interrupted before it started" if settings.interrupt.stopping else stopped
+        reason = "interrupted before it started" if run_context.interrupt.stopping else stopped
         if reason:
             ended = {name: Outcome(name, Result.PENDING, reason) for name in stage.nodes}
             for outcome in ended.values():
-                _finish(settings, outcome)
+                _finish(run_context, outcome)
         else:
-            ended = _run_stage(stage, contexts, plan, run_context, settings, budget, images)
+            ended = _run_stage(stage, contexts, plan, run_context, budget, images)
         outcomes.update(ended)
         if stage.kind is StageKind.CANARY and any(outcome.result.is_failure for outcome in ended.values()):
             stopped = f"stopped: the canary {stage.nodes[0]} failed"
         elif budget.spent:
             stopped = budget.reason
-    outcomes.update(_with_last_seen(prepared, settings, contexts, outcomes))
+    outcomes.update(_with_last_seen(prepared, run_context, contexts, outcomes))
     outcomes.update(_with_unflushed_neighbors(flushes.retry_unanswered(run_context), run_context, outcomes))
     return {name: outcomes[name] for name in plan.nodes}
 
 
-def _assign_slots(prepared: Prepared, settings: RunSettings) -> None:
+def assign_slots(prepared: Prepared, connections: ConnectionPool) -> None:
     """Nodes that were observed in a mesh share its channel; the entry node is reached by a cable."""
     for name, made in prepared.plan.nodes.items():
         is_behind_mesh = made.is_meshed and bool(prepared.plan.entry) and name != prepared.plan.entry
-        settings.connections.slots.assign(name, made.meshes[0] if is_behind_mesh and made.meshes else "")
+        connections.slots.assign(name, made.meshes[0] if is_behind_mesh and made.meshes else "")
 
 
-def _unflushed(prepared: Prepared, settings: RunSettings) -> dict[str, float]:
+def unflushed_since(prepared: Prepared, journal: Journal) -> dict[str, float]:
     """Node -> since when (Unix time) its radios may have restarted without a station flush: the end of a change was not
     observed, or the node has booted since. Only nodes that answered."""
     seen = prepared.observed.observations
-    missing = settings.journal.unfinished_changes(settings.fleet.name)
+    missing = journal.unfinished_changes(prepared.plan.fleet)
     booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
     since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | missing
     return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
-
-
-def _run_context(
-    prepared: Prepared, settings: RunSettings, unflushed: Iterable[str], flushes: StationFlushes
-) -> RunContext:
-    fleet, seen = settings.fleet, prepared.observed.observations
-    known = settings.journal.last_known(fleet.name)
-    observations = {**seen, **prepared.neighbor_observations}
-    if again := {name: seen[name] for name in unflushed}:
-        observations = observe_neighbors(
-            settings.connections, fleet, again, known, observations=observations, interrupt=settings.interrupt
-        )
-    return RunContext(
-        fleet,
-        settings.connections,
-        settings.journal_run,
-        settings.observer,
-        settings.interrupt,
-        settings.owner,
-        flushes.listener,
-        remember=lambda name, seen: settings.journal_run.remember(fleet.name, name, facts_of(seen), seen.answered_at_s),
-        rate_bytes_per_s=settings.rate_bytes_per_s,
-        observations=observations,
-        mac_owners=known_macs(fleet, known),
-        base_macs=base_macs(fleet, seen, known),
-    )
 
 
 # Results of a node that was in progress and is unreachable now.
@@ -145,24 +102,24 @@ _LOST = (Result.UNCERTAIN, Result.UNREACHABLE)
 
 
 def _with_last_seen(
-    prepared: Prepared, settings: RunSettings, contexts: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
+    prepared: Prepared, run_context: RunContext, contexts: Mapping[str, NodeContext], outcomes: Mapping[str, Outcome]
 ) -> dict[str, Outcome]:
     """The outcomes of nodes that did not come back, with their last known state and who still hears them."""
     missing = [name for name in contexts if outcomes[name].result in _LOST]
-    if not missing or settings.interrupt.leaving:
+    if not missing or run_context.interrupt.leaving:
         return {}
-    fleet = settings.fleet
-    known = settings.journal.last_known(fleet.name)
+    fleet = run_context.fleet
+    known = run_context.journal.last_known(fleet.name)
     found = query_neighbors(
-        settings.connections, fleet, missing, prepared.observed, known, interrupt=settings.interrupt
+        run_context.connections, fleet, missing, prepared.observed, known, interrupt=run_context.interrupt
     )
     updated = {}
     for name, place in found.items():
         text = place.text(time.time())
         outcome = outcomes[name]
         updated[name] = replace(outcome, reason=f"{outcome.reason}; {text}", facts={**outcome.facts, **place.facts})
-        settings.journal_run.finish_node(updated[name])
-        settings.observer(Event(EventKind.NOTE, name, time.time(), text))
+        run_context.journal_run.finish_node(updated[name])
+        run_context.observer(Event(EventKind.NOTE, name, time.time(), text))
     return updated
 
 
@@ -177,9 +134,9 @@ def _with_unflushed_neighbors(
     return updated
 
 
-def _finish(settings: RunSettings, outcome: Outcome) -> None:
-    settings.journal_run.finish_node(outcome)
-    settings.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
+def _finish(run_context: RunContext, outcome: Outcome) -> None:
+    run_context.journal_run.finish_node(outcome)
+    run_context.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
 
 
 def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
@@ -212,11 +169,10 @@ def _run_stage(
     contexts: Mapping[str, NodeContext],
     plan: Plan,
     run_context: RunContext,
-    settings: RunSettings,
     budget: FailureBudget,
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
-    observer = Tee((_journaling(settings.journal_run), settings.observer))
+    observer = Tee((_journaling(run_context.journal_run), run_context.observer))
     if stage.kind is StageKind.SWITCH:
         ended = _switch_stage(stage, contexts, plan, run_context, observer)
         for outcome in ended.values():
@@ -228,7 +184,7 @@ def _run_stage(
         # the stage limits which nodes may be down together, the policy how many are worked on at once
         parallel=nodes_in_work(run_context.fleet.apply.parallel),
         budget=budget,
-        interrupt=settings.interrupt,
+        interrupt=run_context.interrupt,
         observer=observer,
     )
 

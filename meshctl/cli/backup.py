@@ -21,10 +21,8 @@ from meshctl.apply.backup import (
     restore_backup,
     uninstalled_packages,
 )
-from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
-from meshctl.apply.neighbor_query import observe_neighbors
-from meshctl.apply.prepare import base_macs
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
 from meshctl.cli.context import (
     AsJson,
@@ -42,7 +40,7 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, run_context
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.plan import Yes
 from meshctl.cli.plan_execution import PlanRefused
@@ -50,7 +48,7 @@ from meshctl.device.observation import Observation
 from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result, run
 from meshctl.model import Node
-from meshctl.nodes.collect import facts_of, known_macs, observe_cleared
+from meshctl.nodes.collect import facts_of, observe_cleared
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
 
@@ -204,19 +202,6 @@ def _context(
     opened: Session, journaled: JournaledRun, node: Node, seen: Observation, flushes: StationFlushes
 ) -> NodeContext:
     """The context of a node to be restored, once its neighbors were observed."""
-    fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
-    observations = observe_neighbors(opened.access, fleet, {node.name: seen}, known, interrupt=opened.interrupt)
-    run_context = RunContext(
-        fleet,
-        opened.access,
-        journaled.entry,
-        journaled.progress,
-        opened.interrupt,
-        opened.owner,
-        flushes.listener,
-        observations=observations,
-        mac_owners=known_macs(fleet, known),
-        base_macs=base_macs(fleet, observations, known),
-    )
+    shared = run_context(opened, journaled, flushes, {node.name: seen})
     plan = NodePlan(node.name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-    return NodeContext(run_context, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
+    return NodeContext(shared, node, plan, opened.renderer.desired(node, seen), seen, Expectation())

@@ -5,9 +5,10 @@ the screen -> exit code. Provisioning, bootstrap, restore and the robots' comman
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import typer
@@ -18,6 +19,9 @@ from meshctl.fleet import Outcome, totals
 from meshctl.fleet.journal import Run
 
 if TYPE_CHECKING:
+    from meshctl.apply.context import RunContext
+    from meshctl.apply.station_flush import StationFlushes
+    from meshctl.device.observation import Observation
     from meshctl.report.progress import RunProgress
 
 
@@ -54,6 +58,44 @@ def journaled_run(
         with ignore_broken_pipe():
             echo(f"the journal is incomplete: {entry.error}", err=True)
             echo("hint: `meshctl resume` checks the missing nodes again", err=True)
+
+
+def run_context(
+    opened: Session,
+    run: JournaledRun,
+    flushes: StationFlushes,
+    seen: Mapping[str, Observation],
+    *,
+    observed: Mapping[str, Observation] = MappingProxyType({}),
+    rate_bytes_per_s: float | None = None,
+) -> RunContext:
+    """What all nodes of a run share. The neighbors of the nodes in `seen` are observed first; `observed` holds
+    observations already made."""
+    from meshctl.apply.context import RunContext
+    from meshctl.apply.neighbor_query import observe_neighbors
+    from meshctl.apply.prepare import base_macs
+    from meshctl.nodes.collect import known_macs
+
+    fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
+    observations = (
+        observe_neighbors(opened.access, fleet, seen, known, observations=observed, interrupt=opened.interrupt)
+        if seen
+        else observed
+    )
+    return RunContext(
+        fleet,
+        opened.access,
+        opened.journal,
+        run.entry,
+        run.progress,
+        opened.interrupt,
+        opened.owner,
+        flushes.listener,
+        observations,
+        known_macs(fleet, known),
+        base_macs(fleet, observations, known),
+        rate_bytes_per_s,
+    )
 
 
 def print_totals(opened: Session, run: JournaledRun, *, as_json: bool, unfinished: str = "nodes") -> typer.Exit:

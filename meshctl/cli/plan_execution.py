@@ -8,11 +8,12 @@ from dataclasses import asdict
 
 import typer
 
-from meshctl.apply.executor import RunSettings, execute
+from meshctl.apply.executor import assign_slots, execute, unflushed_since
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.apply.rollback import before_state
+from meshctl.apply.station_flush import StationFlushes
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, run_context
 from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
@@ -158,15 +159,16 @@ def execute_plan(
     )
     with journaled_run(opened, command, tuple(plan.nodes), plan=recorded, as_json=as_json) as run:
         _save_before(opened, run, prepared)
-        settings = RunSettings(
-            opened.fleet,
-            opened.access,
-            opened.journal,
-            run.entry,
-            opened.owner,
-            opened.interrupt,
-            run.progress,
-            None if rate is None else rate * 1000,
+        assign_slots(prepared, opened.access)
+        seen, flushes = prepared.observed.observations, StationFlushes()
+        unflushed = unflushed_since(prepared, opened.journal)
+        context = run_context(
+            opened,
+            run,
+            flushes,
+            {name: seen[name] for name in unflushed},
+            observed={**seen, **prepared.neighbor_observations},
+            rate_bytes_per_s=None if rate is None else rate * 1000,
         )
-        run.outcomes.update(execute(prepared, settings))
+        run.outcomes.update(execute(prepared, context, flushes, unflushed))
     raise print_totals(opened, run, as_json=as_json)
