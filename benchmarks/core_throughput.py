@@ -14,8 +14,8 @@ import pstats
 import random
 import time
 
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import MessageDelivered, MessageReceived
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key
 
@@ -26,10 +26,10 @@ ROUND_TRIP_S = 0.001
 MESSAGE_BYTES = 20_000_000
 
 
-def make(name: str) -> Node:
+def make(name: str) -> Endpoint:
     rng = random.Random(name)
     settings = Settings(name=name, keys=(Key(bytes(32)),), topics=(Topic("bulk"),))
-    node = Node(settings, boot_id=rng.randbytes(16), rng=rng, now=0.0)
+    node = Endpoint(settings, boot_id=rng.randbytes(16), rng=rng, now=0.0)
     node.link_up(LinkInfo("wire", LinkKind.BROADCAST, ADDRESSES[name], ("10.0.0.255", 8700)), 0.0)
     return node
 

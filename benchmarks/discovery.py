@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from udp_mesh.core import receive
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import PeerOffline, PeerOnline
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import channel
 from udp_mesh.sim.event_queue import SimEventQueue
@@ -72,7 +72,7 @@ class OpenField:
         self._by_address = {address: index for index, address in enumerate(self.addresses)}
         topics = (Topic("telemetry", priority=3, reliable=False),)
         self.nodes = [
-            Node(
+            Endpoint(
                 Settings(f"robot{index:04}", unkeyed=True, topics=topics), boot_id=rng.randbytes(16),
                 rng=random.Random(index), now=0.0,
             )

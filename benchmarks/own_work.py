@@ -16,20 +16,20 @@ from typing import Any
 from benchmarks.one_channel import COUNT_FROM_S, COUNT_S, OneChannel, channel
 from benchmarks.page import fill
 from benchmarks.tables import row
-from udp_mesh.core.node import Node
+from udp_mesh.core.endpoint import Endpoint
 
 ENTRIES = ("receive", "datagrams_to_send", "handle_timer", "next_timer", "next_event")
-"""The methods of `Node` that a driver calls for datagrams."""
+"""The methods of `Endpoint` that a driver calls for datagrams."""
 
 
 @contextmanager
 def timed() -> Iterator[dict[str, float]]:
     """CPU seconds in these methods, by the node's name."""
     spent_s: dict[str, float] = defaultdict(float)
-    kept = {entry: getattr(Node, entry) for entry in ENTRIES}
+    kept = {entry: getattr(Endpoint, entry) for entry in ENTRIES}
 
     def clocked(call: Any) -> Any:
-        def entry(node: Node, *arguments: Any, **options: Any) -> Any:
+        def entry(node: Endpoint, *arguments: Any, **options: Any) -> Any:
             started_s = time.process_time()
             try:
                 return call(node, *arguments, **options)
@@ -40,11 +40,11 @@ def timed() -> Iterator[dict[str, float]]:
 
     try:
         for name, call in kept.items():
-            setattr(Node, name, clocked(call))
+            setattr(Endpoint, name, clocked(call))
         yield spent_s
     finally:
         for name, call in kept.items():
-            setattr(Node, name, call)
+            setattr(Endpoint, name, call)
 
 
 def cores() -> tuple[float, float]:

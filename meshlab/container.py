@@ -132,8 +132,8 @@ def _mount_all(container: Container) -> None:
     ns.mount("lab", f"{root}/lab", "tmpfs", 0, "size=16k,mode=755")
     (root / "lab" / "node").mkdir()
     ns.bind(str(home), f"{root}/lab/node")
-    (root / "lab" / "bell").touch()
-    ns.bind(str(container.fleet / "bell"), f"{root}/lab/bell")
+    (root / "lab" / "events").touch()
+    ns.bind(str(container.fleet / "events"), f"{root}/lab/events")
     ns.mount("tmpfs", f"{root}/tmp", "tmpfs", ns.MS_NOSUID, f"size={container.memory_kib // _TMP_SHARE}k,mode=1777")
     ns.mount("sysfs", f"{root}/sys", "tmpfs", 0, "size=1m,mode=755")
     if container.real_devices:

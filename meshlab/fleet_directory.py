@@ -27,7 +27,7 @@ _DIGESTS = "inventory.digests.json"
 # the earlier copy, until the new one has replaced it
 _PREVIOUS = "before"
 _FOLDERS = ("rom", "nodes", "mnt")
-_FILES = ("bell", "failure", "control.sock", "supervisor.pid", "log", "ground.json")
+_FILES = ("events", "failure", "control.sock", "supervisor.pid", "log", "ground.json")
 
 
 def claim(directory: Path) -> None:

@@ -1,7 +1,7 @@
 """The process of a running fleet: it boots the nodes, keeps their link state and forwards the operator's connections.
 
 It starts as `python -m meshlab.supervisor DIRECTORY`, becomes root of a user namespace if it is not root, forks the
-node runner, and then serves one event loop: events of the node runner (nodes that ended), the bell (a pipe on which
+node runner, and then serves one event loop: events of the node runner (nodes that ended), the events pipe (on which
 nodes report that they are up or have changed), connections of the operator, and requests on `control.sock`.
 """
 
@@ -72,8 +72,8 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         self._runner.setblocking(False)
         loop.add_reader(self._runner, self._on_runner_event)
-        bell = os.open(self.directory / "bell", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-        loop.add_reader(bell, self._on_bell, bell)
+        events = os.open(self.directory / "events", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        loop.add_reader(events, self._on_events, events)
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
         self.port_forwarder.open()
@@ -88,8 +88,8 @@ class Supervisor:
             control.close()
             await self.port_forwarder.close()
             loop.remove_reader(self._runner)
-            loop.remove_reader(bell)
-            os.close(bell)
+            loop.remove_reader(events)
+            os.close(events)
 
     def _make(self, number: int) -> None:
         node = self.spec.nodes[number]
@@ -224,11 +224,11 @@ class Supervisor:
             self.power_on(state.spec.name)
         self._boot_next()
 
-    # -- the bell --
+    # -- the events pipe --
 
-    def _on_bell(self, bell: int) -> None:
+    def _on_events(self, events: int) -> None:
         with contextlib.suppress(BlockingIOError):
-            for line in os.read(bell, 65536).decode("utf-8", "replace").splitlines():
+            for line in os.read(events, 65536).decode("utf-8", "replace").splitlines():
                 word, _, rest = line.partition(" ")
                 name, _, detail = rest.partition(" ")
                 if name not in self.fleet.nodes:
@@ -237,7 +237,7 @@ class Supervisor:
                     self._on_message(word, self.fleet.nodes[name], detail)
                 except (OSError, ValueError, LabError):
                     # the following lines may be from other nodes
-                    log.exception("bell-failed line=%s", line)
+                    log.exception("event-failed line=%s", line)
 
     def _on_message(self, word: str, state: NodeState, detail: str) -> None:
         match word:
@@ -288,8 +288,8 @@ def main(arguments: Sequence[str]) -> int:
         deny_setgroups = _acquire_privileges()
         rootfs.build(directory / "rom")
         (directory / "mnt").mkdir(exist_ok=True)
-        os.mkfifo(directory / "bell", 0o622)
-        (directory / "bell").chmod(0o622)
+        os.mkfifo(directory / "events", 0o622)
+        (directory / "events").chmod(0o622)
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         fork_node_runner(lambda: NodeRunner(theirs), theirs, close=ours)
         spec = load((directory / "spec.json").read_text(encoding="utf-8"))

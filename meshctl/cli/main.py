@@ -108,7 +108,7 @@ def build(requested: str) -> typer.Typer:
     return app
 
 
-class _Group(TyperGroup):
+class _CommandGroup(TyperGroup):
     """Lists commands with their whole summaries, which click would cut at the end of the line."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -151,7 +151,7 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
     target = getattr(importlib.import_module(entry.module), entry.attribute) if entry.module else load(name)
     if isinstance(target, typer.Typer):
         _prepare_group(target)
-        app.add_typer(target, name=name, cls=_Group, help=entry.summary, no_args_is_help=True)
+        app.add_typer(target, name=name, cls=_CommandGroup, help=entry.summary, no_args_is_help=True)
     else:
         # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
         app.command(name)(_guarded(target))
@@ -168,7 +168,7 @@ def _prepare_group(group: typer.Typer) -> None:
         if command.callback is not None:
             command.callback = _guarded(command.callback)
     for inner in group.registered_groups:
-        inner.cls = _Group
+        inner.cls = _CommandGroup
         if inner.typer_instance is not None:
             _prepare_group(inner.typer_instance)
 

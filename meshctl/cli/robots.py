@@ -76,7 +76,7 @@ def status_command(context: RobotsContext) -> None:
         return Outcome(robot, Result.DONE if found[robot].is_healthy else Result.FAILED)
 
     outcomes = context.run_on_each(work)
-    rows = [found.get(name, RobotFacts(name, trouble=one.reason)) for name, one in outcomes.items()]
+    rows = [found.get(name, RobotFacts(name, error=one.reason)) for name, one in outcomes.items()]
     if context.as_json:
         echo_json(json.dumps([facts_object(one) for one in rows], indent=2))
     else:

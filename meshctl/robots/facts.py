@@ -109,14 +109,14 @@ class ComputerFacts:
 class RobotFacts:
     """One robot at `seen_s` (our clock, Unix time).
 
-    `trouble` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
+    `error` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
     the inventory. `bridge` and `hosts` (the service for /etc/hosts) are None if neither expected nor installed.
     `status` is the output of `udp-mesh status --json`, empty if the daemon does not answer.
     """
 
     robot: str
     seen_s: float = 0.0
-    trouble: str = ""
+    error: str = ""
     service: ServiceFacts = ServiceFacts()
     bridge: ServiceFacts | None = None
     hosts: ServiceFacts | None = None
@@ -148,13 +148,13 @@ class RobotFacts:
         """Whether all expected services run and are proven; drift does not count."""
         others = (service for service in (self.bridge, self.hosts) if service is not None)
         services_are_up = self.service.is_up and all(service.is_up for service in others)
-        return not self.trouble and services_are_up and self.is_proven and self.answers
+        return not self.error and services_are_up and self.is_proven and self.answers
 
     @property
     def remark(self) -> str:
         """What is wrong, in one line; empty if nothing is."""
-        if self.trouble:
-            return self.trouble
+        if self.error:
+            return self.error
         if not self.service.enabled and not self.release:
             return "not installed: run `meshctl robots deploy`"
         problems = []

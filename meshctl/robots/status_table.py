@@ -37,9 +37,9 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
         for line in lines
     ]
     for one in robots:
-        if one.trouble or one.remark:
+        if one.error or one.remark:
             drawn += textwrap.wrap(
-                f"{one.robot}: {one.trouble or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
+                f"{one.robot}: {one.error or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
             )
     if len(shown) < len(_HEADINGS):
         left_out = ", ".join(name for name in _HEADINGS if name not in shown)
@@ -48,7 +48,7 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
 
 
 def _row(one: RobotFacts) -> tuple[str, ...]:
-    if one.trouble:
+    if one.error:
         return (one.robot, "?", *["-"] * (len(_HEADINGS) - 2))
     load = one.computer.load
     return (

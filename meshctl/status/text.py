@@ -150,9 +150,9 @@ def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
     rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]
     widths = [max(len(cells[column]) for cells in rows) for column in range(len(rows[0]) - 1)]
     lines = []
-    for *cells, trouble in rows:
+    for *cells, problem in rows:
         lead = "".join(f"{cell.ljust(room)}  " for cell, room in zip(cells, widths, strict=True))
-        lines += [line.rstrip() for line in _beside(lead, trouble, width)]
+        lines += [line.rstrip() for line in _beside(lead, problem, width)]
     return lines
 
 

@@ -57,8 +57,8 @@ def _status(topic: Topic, here: TopicFacts | None, robots: Mapping[str, RobotFac
     if here is None or here.priority is None:
         return TopicStatus(topic.name, topic.priority, None, None, limit, "is not declared", "undeclared")
     status = TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit)
-    for code, trouble in _problems(topic, here, robots, facts, limit):
-        return TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit, trouble, code)
+    for code, problem in _problems(topic, here, robots, facts, limit):
+        return TopicStatus(topic.name, here.priority, here.sent_ago_s, here.received_ago_s, limit, problem, code)
     return status
 
 

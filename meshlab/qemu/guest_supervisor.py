@@ -105,8 +105,8 @@ def main(arguments: Sequence[str]) -> int:
     hwsim_devices.ip([f"addr add {ADDRESS}/24 dev eth0", "link set eth0 up"])
     hwsim_devices.prepare(spec)
     (directory / "mnt").mkdir(exist_ok=True)
-    os.mkfifo(directory / "bell", 0o622)
-    (directory / "bell").chmod(0o622)
+    os.mkfifo(directory / "events", 0o622)
+    (directory / "events").chmod(0o622)
     hardware = hwsim_devices.node_hardware(spec)
 
     def attach_devices(container: Container, pid: int) -> None:

@@ -1,4 +1,4 @@
-"""Nodes that go down and come back: no signal, bell message or descriptor may keep one from starting."""
+"""Nodes that go down and come back: no signal, events message or descriptor may keep one from starting."""
 
 from __future__ import annotations
 
@@ -97,8 +97,8 @@ def test_a_word_that_the_fleet_cannot_read_does_not_take_the_next_one_along(pair
     air.write_text("\t".join(("cell", "-", "mesh0", "adhoc", "no frequency", *"abcdefg")) + "\n", encoding="ascii")
     (pair.directory / "nodes" / "there" / "air" / "effective").write_text("", encoding="ascii")
     assert pair.node("there").address is not None
-    with (pair.directory / "bell").open("wb", buffering=0) as bell:
-        bell.write(b"changed here\nchanged there\n")
+    with (pair.directory / "events").open("wb", buffering=0) as events:
+        events.write(b"changed here\nchanged there\n")
     until(lambda: pair.node("there").address is None, "the second node's word to be heard")
 
 

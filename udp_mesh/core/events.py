@@ -10,11 +10,11 @@ from typing import NamedTuple, NewType
 from udp_mesh.core.settings import Address
 
 MessageId = NewType("MessageId", int)
-"""Identifies one `Node.send`, unique within a node's life; its outcomes carry it once per destination."""
+"""Identifies one `Endpoint.send`, unique within a node's life; its outcomes carry it once per destination."""
 
 
 class RejectReason(Enum):
-    """Why `Node.send` did not accept a message."""
+    """Why `Endpoint.send` did not accept a message."""
 
     UNKNOWN_TOPIC = "unknown topic"
     UNKNOWN_PEER = "unknown peer"
@@ -26,7 +26,7 @@ class RejectReason(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """`Node.send` refused the message; nothing of it is kept and no outcome follows."""
+    """`Endpoint.send` refused the message; nothing of it is kept and no outcome follows."""
 
     reason: RejectReason
     detail: str
@@ -116,7 +116,7 @@ class Receipt(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class MessageReceived:
     """A complete message. `payload` is as passed to the sender's `send`. One with a receipt is delivered only once
-    `Node.confirm` was called for it."""
+    `Endpoint.confirm` was called for it."""
 
     source: str
     topic: str

@@ -50,7 +50,7 @@ MAX_CHANNELS = 65_536
 def send(
     state: State, topic_name: str, payload: bytes, destination: str | None, type_name: str, now: float
 ) -> MessageId | Rejected:
-    """See `Node.send`."""
+    """See `Endpoint.send`."""
     if state.closed:
         return Rejected(RejectReason.CLOSED, "the node is closed")
     topic = state.topics.get(topic_name)

@@ -63,7 +63,7 @@ _UNRESPONSIVE = SendState.UNRESPONSIVE
 
 
 def receive_datagram(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
-    """See `Node.receive`."""
+    """See `Endpoint.receive`."""
     counters = state.event_queue.counters
     size = len(data)
     counters.datagrams_received += 1

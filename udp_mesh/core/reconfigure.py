@@ -53,7 +53,7 @@ def link_down(state: State, name: str) -> None:
 
 
 def apply(state: State, settings: Settings, now: float) -> list[str]:
-    """See `Node.apply`."""
+    """See `Endpoint.apply`."""
     old = state.settings
     if (settings.name, settings.port) != (old.name, old.port):
         raise ValueError("name and port cannot change at run time; restart the node")
@@ -177,7 +177,7 @@ def _retopic(state: State, now: float) -> None:
 
 
 def close(state: State, now: float) -> None:
-    """See `Node.close`."""
+    """See `Endpoint.close`."""
     if state.closed:
         return
     flush_compression(state, now)

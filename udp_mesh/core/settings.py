@@ -1,6 +1,6 @@
 """The settings of a node: topics, neighbors, rates and limits, as validated values.
 
-A `Settings` is passed to `Node` at start and, if changed at run time, to `Node.apply`. It is immutable;
+A `Settings` is passed to `Endpoint` at start and, if changed at run time, to `Endpoint.apply`. It is immutable;
 `dataclasses.replace` creates the next one.
 """
 
@@ -229,8 +229,8 @@ class Settings:
 
     `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes`
     is the maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does
-    not list (None: they are refused). With `confirms`, the driver calls `Node.confirm` for each received message that
-    has a receipt, once the message is safe.
+    not list (None: they are refused). With `confirms`, the driver calls `Endpoint.confirm` for each received message
+    that has a receipt, once the message is safe.
     """
 
     name: str

@@ -32,7 +32,7 @@ _ALWAYS = float("-inf")
 
 
 def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
-    """See `Node.datagrams_to_send`."""
+    """See `Endpoint.datagrams_to_send`."""
     out: list[Datagram] = []
     room = BATCH_BYTES if max_bytes is None else min(max_bytes, BATCH_BYTES)
     if room <= 0:
@@ -204,17 +204,17 @@ def _max_timestamped_bytes(state: State) -> int:
 
 
 def has_datagrams(state: State) -> bool:
-    """See `Node.has_datagrams`."""
+    """See `Endpoint.has_datagrams`."""
     return bool(state.control_ready or state.ready or state.outgoing or state.broadcasts.waiting)
 
 
 def is_quiet(state: State) -> bool:
-    """See `Node.is_quiet`."""
+    """See `Endpoint.is_quiet`."""
     return not (has_datagrams(state) or state.event_queue.has_events)
 
 
 def next_timer(state: State) -> float | None:
-    """See `Node.next_timer`."""
+    """See `Endpoint.next_timer`."""
     at = min(state.maintenance_at, state.heartbeats.next_at, state.broadcasts.next_at(), state.next_peer_at())
     for bucket in state.rate_limits.values():
         if bucket.parked:
@@ -226,7 +226,7 @@ def next_timer(state: State) -> float | None:
 
 
 def handle_timer(state: State, now: float) -> None:
-    """See `Node.handle_timer`."""
+    """See `Endpoint.handle_timer`."""
     if state.closed:
         return
     due_peers: list[Peer] = []

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
 from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     Event,
     MessageId,
@@ -27,7 +28,6 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.daemon.link_output import LinkOutput
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
@@ -76,7 +76,7 @@ class Driver:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
-        self.node = Node(
+        self.node = Endpoint(
             settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store, legacy_positions=legacy_positions
         )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
@@ -136,7 +136,7 @@ class Driver:
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
     ) -> MessageId | Rejected:
-        """`Node.send`, now; the datagrams leave in this loop iteration."""
+        """`Endpoint.send`, now; the datagrams leave in this loop iteration."""
         outcome = self.node.send(
             topic, payload, destination=destination, now=self._advance_clock(), type_name=type_name
         )
@@ -144,7 +144,7 @@ class Driver:
         return outcome
 
     def apply(self, settings: Settings) -> list[str]:
-        """`Node.apply`, now. Raises ValueError for a changed name or port."""
+        """`Endpoint.apply`, now. Raises ValueError for a changed name or port."""
         changes = self.node.apply(settings, self._advance_clock())
         self._schedule_pump()
         return changes

@@ -1,8 +1,8 @@
 """A team of real transport cores on a simulated channel: traffic in, events out.
 
-`Team` gives each robot a `udp_mesh.core.Node` and connects them with a `Medium`. Every input to a node (a datagram, its
-timer, a message of the scenario) is followed by `_pump`, which fetches its datagrams, its events and its next timer.
-Events go to `on_event`; `Ledger` accounts for reliable messages.
+`Team` gives each robot a `udp_mesh.core.Endpoint` and connects them with a `Medium`. Every input to a node (a datagram,
+its timer, a message of the scenario) is followed by `_pump`, which fetches its datagrams, its events and its next
+timer. Events go to `on_event`; `Ledger` accounts for reliable messages.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
@@ -22,7 +23,6 @@ from udp_mesh.core.events import (
     MessagePeerLost,
     Rejected,
 )
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
@@ -65,10 +65,10 @@ class Ledger:
 
 
 @dataclass(slots=True)
-class _Member:
+class _Robot:
     name: str
     address: str
-    node: Node
+    node: Endpoint
     link: LinkInfo
     run: int = 0
     is_running: bool = True
@@ -95,7 +95,7 @@ class Team:
         names = [*robots, *relays]
         self.medium = Medium(self.event_queue, channel, names, loss, self._deliver, random.Random(self._rng.random()))
         self._addresses: dict[str, str] = {}
-        self._members: dict[str, _Member] = {}
+        self._members: dict[str, _Robot] = {}
         for number, (name, settings) in enumerate(robots.items(), 1):
             address = f"10.0.{number // 250}.{number % 250 + 1}"
             self._members[name] = self._started(name, address, settings, run=0)
@@ -103,12 +103,12 @@ class Team:
         for member in self._members.values():
             self._pump(member)
 
-    def _started(self, name: str, address: str, settings: Settings, run: int) -> _Member:
+    def _started(self, name: str, address: str, settings: Settings, run: int) -> _Robot:
         link = LinkInfo(LINK, LinkKind.BROADCAST, (address, settings.port), (BROADCAST, settings.port))
         boot_id = self._rng.randbytes(16)
-        node = Node(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.event_queue.now)
+        node = Endpoint(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.event_queue.now)
         node.link_up(link, self.event_queue.now)
-        return _Member(name, address, node, link, run)
+        return _Robot(name, address, node, link, run)
 
     # Called by the scenario
 
@@ -167,7 +167,7 @@ class Team:
         member.node.receive(frame.data, LINK, (source.address, source.link.address[1]), self.event_queue.now)
         self._pump(member)
 
-    def _pump(self, member: _Member) -> None:
+    def _pump(self, member: _Robot) -> None:
         now = self.event_queue.now
         while datagrams := member.node.datagrams_to_send(now):
             for datagram in datagrams:
@@ -183,7 +183,7 @@ class Team:
             member.wakes_at_s = max(timer_s, now + _MIN_STEP_S)
             self.event_queue.at(member.wakes_at_s, partial(self._wake, member))
 
-    def _wake(self, member: _Member) -> None:
+    def _wake(self, member: _Robot) -> None:
         if (
             self.event_queue.now < member.wakes_at_s
             or not member.is_running

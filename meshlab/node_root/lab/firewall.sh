@@ -25,7 +25,7 @@ put_rules() {
 no_rules() {
 	: >$LOADED
 	rm -f $RUN/handle
-	sh /rom/lab/tell_air
+	sh /rom/lab/report_interfaces
 }
 shown_rules() { # [HANDLES]: as nft lists the input chain
 	awk -F '\t' -v handles="$1" '

@@ -46,8 +46,8 @@ def test_packages_come_first_a_flash_that_is_not_ready_is_waited_for_and_netifd_
                     assert not {"n001: stage\n", "n001: apply\n"} & set(said)
                     mark.unlink()
             assert process.stderr is not None
-            trouble = process.stderr.read()
-        assert process.returncode == 0, "".join(said) + trouble
+            stderr = process.stderr.read()
+        assert process.returncode == 0, "".join(said) + stderr
         assert "n001: flash ready\n" in said
         for name in ("base", "n001"):
             steps = [text.split(": ")[1].strip() for text in said if text.startswith(f"{name}: ")]

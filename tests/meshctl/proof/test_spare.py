@@ -56,9 +56,9 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
                 if json.loads(line)["event"] == "step":
                     inventory.write_text(good + "nonsense: [", encoding="utf-8")
             assert process.stderr is not None
-            trouble = process.stderr.read()
-        assert process.returncode == 2, trouble
-        assert "n001 runs on its new device, but the inventory could not be updated" in trouble
-        assert '{"n001": {"label": "S3"}, "n003": {"state": "retired"}}' in trouble
+            stderr = process.stderr.read()
+        assert process.returncode == 2, stderr
+        assert "n001 runs on its new device, but the inventory could not be updated" in stderr
+        assert '{"n001": {"label": "S3"}, "n003": {"state": "retired"}}' in stderr
         inventory.write_text(good, encoding="utf-8")
         assert rig.fleet.node("n003").address == "10.42.1.1"

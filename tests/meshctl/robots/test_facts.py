@@ -136,7 +136,7 @@ def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
     assert not nothing.is_healthy
     assert nothing.drift == ("not installed",)
     assert "not installed" in nothing.remark
-    away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer")
+    away = RobotFacts("husky9", error="husky9 (10.42.0.19): no answer")
     assert "no answer" in table([away])
 
 
@@ -147,8 +147,8 @@ def test_the_table_shows_queues_by_priority_and_the_latest_message() -> None:
     assert "1/2" in output
 
 
-def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_trouble() -> None:
-    away = RobotFacts("husky9", trouble="husky9 (10.42.0.19): no answer to connect within 5 s: is it on?")
+def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_error() -> None:
+    away = RobotFacts("husky9", error="husky9 (10.42.0.19): no answer to connect within 5 s: is it on?")
     for width in (60, 80, 100, 200):
         lines = table([_facts(), away], width).splitlines()
         assert [line for line in lines if len(line) > width] == []

@@ -149,7 +149,7 @@ def test_the_environment_names_the_socket(
 
 
 def test_a_command_that_only_asks_loads_no_transport() -> None:
-    code = "import sys, udp_mesh.cli.main; print('udp_mesh.core.node' in sys.modules)"
+    code = "import sys, udp_mesh.cli.main; print('udp_mesh.core.endpoint' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S).stdout
     assert found == "False\n"
 

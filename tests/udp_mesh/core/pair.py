@@ -12,9 +12,9 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event
 from udp_mesh.core.interfaces import Datagram, Store
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import Address, LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key
 
@@ -69,7 +69,7 @@ class World:
     def __init__(self, seed: int = 1, start: float = 1000.0) -> None:
         self.now = start
         self.rng = random.Random(seed)
-        self.nodes: dict[str, Node] = {}
+        self.nodes: dict[str, Endpoint] = {}
         self.addresses: dict[str, Address] = {}
         self.pipes: dict[tuple[str, str], Pipe] = {}
         self.events: dict[str, list[tuple[float, Event]]] = {}
@@ -79,10 +79,10 @@ class World:
         self._calls: list[tuple[float, int, Callable[[], object]]] = []
         self._serial = 0
 
-    def add(self, config: Settings, *, address: str | None = None, store: Store | None = None) -> Node:
+    def add(self, config: Settings, *, address: str | None = None, store: Store | None = None) -> Endpoint:
         """Start (or restart) a node on link `mesh`."""
         name = config.name
-        node = Node(config, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now, store=store)
+        node = Endpoint(config, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now, store=store)
         host = address or (self.addresses[name][0] if name in self.addresses else f"10.0.0.{len(self.addresses) + 1}")
         self.addresses[name] = (host, 8700)
         self.nodes[name] = node
@@ -131,7 +131,7 @@ class World:
                 self._pump(name)
 
     def send(self, source: str, topic: str, payload: bytes, destination: str | None = None) -> object:
-        """Call `Node.send` and transmit."""
+        """Call `Endpoint.send` and transmit."""
         result = self.nodes[source].send(topic, payload, destination=destination, now=self.now)
         self._pump(source)
         return result
@@ -172,12 +172,12 @@ class Pair:
     def __init__(self, a: Settings, b: Settings) -> None:
         self.now = 1000.0
         self.rng = random.Random(7)
-        self.a = Node(a, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now)
-        self.b = Node(b, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now)
+        self.a = Endpoint(a, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now)
+        self.b = Endpoint(b, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now)
         self.a.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), BROADCAST), self.now)
         self.b.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.2", 8700), BROADCAST), self.now)
 
-    def leave(self, node: Node) -> list[Datagram]:
+    def leave(self, node: Endpoint) -> list[Datagram]:
         """Everything that a node sends now."""
         node.handle_timer(self.now)
         out = []
@@ -198,11 +198,11 @@ class Pair:
             self.now += step_s
         return carried
 
-    def drop(self, node: Node) -> list[Datagram]:
+    def drop(self, node: Endpoint) -> list[Datagram]:
         """Lose what a node sends now; returned for inspection or a later replay."""
         return self.leave(node)
 
-    def events(self, node: Node) -> list[Event]:
+    def events(self, node: Endpoint) -> list[Event]:
         """A node's events since the last call."""
         events = []
         while (event := node.next_event()) is not None:

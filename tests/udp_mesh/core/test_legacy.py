@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from tests.udp_mesh.core.pair import BROADCAST, KEY, World, pair, settings
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     Event,
     MessageDelivered,
@@ -23,7 +24,6 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.reassembly import LegacyReassembly
 from udp_mesh.core.legacy.sender import LAST_SEQUENCE
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.wire.legacy import (
     Host,
@@ -50,7 +50,7 @@ class OldRobot:
         rng = random.Random(3)
         config = settings("new", Topic("stop", priority=0), Topic("map", priority=9), **changes)
         config = replace(config, neighbours=(Neighbour(OLD, name="old", legacy=True),))
-        self.node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=self.now, legacy_positions=positions or {})
+        self.node = Endpoint(config, boot_id=rng.randbytes(16), rng=rng, now=self.now, legacy_positions=positions or {})
         self.node.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), ("10.0.0.255", 8700)), self.now)
         self.say(Host("old", "10.0.0.9"))
         self.events()
@@ -269,7 +269,7 @@ def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
     impostor = replace(settings("b"), keys=(KEY,))
     real = world.nodes.pop("b")
     world.addresses["b2"] = ("10.0.0.77", 8700)
-    fake = Node(impostor, boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+    fake = Endpoint(impostor, boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
     fake.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.77", 8700), ("10.0.0.255", 8700)), world.now)
     world.nodes["b"] = real
     world.nodes["b2"] = fake
@@ -437,7 +437,7 @@ def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:
     for seed in range(5):
         rng = random.Random(seed)
         config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
-        node = Node(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
+        node = Endpoint(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
         numbers.add(next(iter(node._legacy._by_host.values())).sender._next_sequence())
     assert len(numbers) == 5
     assert all(1 <= number <= LAST_SEQUENCE for number in numbers)

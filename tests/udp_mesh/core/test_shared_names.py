@@ -3,6 +3,7 @@
 import pytest
 
 from tests.udp_mesh.core.pair import BROADCAST, Pipe, World, settings
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     MessageDelivered,
     MessagePeerLost,
@@ -11,7 +12,6 @@ from udp_mesh.core.events import (
     PeerOffline,
     PeerOnline,
 )
-from udp_mesh.core.node import Node
 from udp_mesh.core.peer_lifecycle import REPORT_INTERVAL_S
 from udp_mesh.core.settings import LinkInfo, LinkKind, Topic
 
@@ -25,7 +25,7 @@ def conflict() -> World:
         world.add(settings(name, MAP))
     assert world.run(5.0, until=lambda: bool(world.events_of("c", PeerOnline)))
     exchange(world, "a")
-    second = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+    second = Endpoint(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
     world.nodes["a2"], world.addresses["a2"], world.events["a2"] = second, ("10.0.0.9", 8700), []
     second.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
     for other in ("a", "c"):
@@ -52,7 +52,7 @@ def exchange(world: World, name: str) -> None:
 def test_each_of_them_is_reported_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
     world = conflict()
     for number in range(20):
-        again = Node(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
+        again = Endpoint(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
         again.link_up(LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a2"], BROADCAST), world.now)
         world.nodes["a2"] = again
         world.run(9.0)

@@ -28,7 +28,7 @@ class TopicChannel:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedMessage:
-    """A message accepted by `Node.send`, shared by the copies for every destination."""
+    """A message accepted by `Endpoint.send`, shared by the copies for every destination."""
 
     message_id: MessageId
     channel: TopicChannel

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.node import Node
 from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.sim.event_queue import SimEventQueue
@@ -27,10 +27,10 @@ OnEvent = Callable[[float, str, Event], None]
 
 
 @dataclass(slots=True)
-class _Member:
+class _Attached:
     name: str
     address: tuple[str, int]
-    node: Node
+    node: Endpoint
     paths: dict[str, Carrier] = field(default_factory=dict)
     """By the address of the node that they lead to."""
     wakes_at_s: float = float("inf")
@@ -44,17 +44,17 @@ class Network:
     ) -> None:
         self._event_queue = event_queue
         self._on_event = on_event or (lambda now, name, event: None)
-        self._members: dict[str, _Member] = {}
-        self._by_address: dict[str, _Member] = {}
+        self._members: dict[str, _Attached] = {}
+        self._by_address: dict[str, _Attached] = {}
         self.datagrams_sent = dict.fromkeys((member.name for member in settings), 0)
         self.bytes_sent = dict(self.datagrams_sent)
         """IP packets, by sending node."""
         rng = random.Random(f"network {seed}")
         for number, one in enumerate(settings, 1):
             address = (f"10.0.0.{number}", one.port)
-            node = Node(one, boot_id=rng.randbytes(16), rng=random.Random(rng.random()), now=event_queue.now)
+            node = Endpoint(one, boot_id=rng.randbytes(16), rng=random.Random(rng.random()), now=event_queue.now)
             node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, address, (BROADCAST, one.port)), event_queue.now)
-            self._members[one.name] = self._by_address[address[0]] = _Member(one.name, address, node)
+            self._members[one.name] = self._by_address[address[0]] = _Attached(one.name, address, node)
 
     def connect(self, source: str, target: str, path: Carrier) -> None:
         """Datagrams from `source` to `target` take this path from now on."""
@@ -64,7 +64,7 @@ class Network:
         for member in self._members.values():
             self.pump(member.name)
 
-    def node(self, name: str) -> Node:
+    def node(self, name: str) -> Endpoint:
         return self._members[name].node
 
     def send(self, source: str, topic: str, payload: bytes, target: str) -> None:
@@ -88,7 +88,7 @@ class Network:
             member.wakes_at_s = max(timer_s, now + _MIN_STEP_S)
             self._event_queue.at(member.wakes_at_s, partial(self._wake, member))
 
-    def _carry(self, source: _Member, datagram: Datagram) -> None:
+    def _carry(self, source: _Attached, datagram: Datagram) -> None:
         size_bytes = len(datagram.data) + IP_UDP_BYTES
         destination = datagram.destination
         to_all = destination is None or destination[0] == BROADCAST
@@ -99,11 +99,11 @@ class Network:
                 target = self._by_address[address]
                 path.send(size_bytes, partial(self._deliver, source.address, target, datagram.data))
 
-    def _deliver(self, source: tuple[str, int], target: _Member, data: bytes) -> None:
+    def _deliver(self, source: tuple[str, int], target: _Attached, data: bytes) -> None:
         target.node.receive(data, LINK, source, self._event_queue.now)
         self.pump(target.name)
 
-    def _wake(self, member: _Member) -> None:
+    def _wake(self, member: _Attached) -> None:
         if self._event_queue.now < member.wakes_at_s:
             return
         member.wakes_at_s = float("inf")

@@ -6,6 +6,7 @@ import random
 from dataclasses import replace
 
 from tests.udp_mesh.core.pair import BROADCAST, KEY, Pair, World, pair, settings
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     Event,
     Incompatible,
@@ -18,7 +19,6 @@ from udp_mesh.core.events import (
     PeerRestarted,
 )
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.node import Node
 from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Rates, Topic
 from udp_mesh.crypto import TO_ALL, Key, SendChannel
 from udp_mesh.wire.codec import encode
@@ -29,7 +29,7 @@ OTHER_KEY = Key(bytes(range(1, 33)))
 A, B = ("10.0.0.1", 8700), ("10.0.0.2", 8700)
 
 
-def received(both: Pair, node: Node) -> list[bytes]:
+def received(both: Pair, node: Endpoint) -> list[bytes]:
     return [event.payload for event in both.events(node) if isinstance(event, MessageReceived)]
 
 
@@ -67,7 +67,7 @@ def test_a_replayed_heartbeat_brings_no_peer_online() -> None:
     world.tap = lambda name, datagram, now: recorded.append(datagram)
     world.run(3.0)
     rng = random.Random(1)
-    late = Node(settings("a"), boot_id=rng.randbytes(16), rng=rng, now=world.now)
+    late = Endpoint(settings("a"), boot_id=rng.randbytes(16), rng=rng, now=world.now)
     late.link_up(LinkInfo("mesh", LinkKind.BROADCAST, A, BROADCAST), world.now)
     for datagram in recorded:
         late.receive(datagram.data, "mesh", B, world.now)
@@ -81,7 +81,7 @@ def test_everything_recorded_from_an_earlier_run_is_worthless_to_the_next() -> N
         both.a.send("any", bytes([number]), destination="b", now=both.now)
         both.a.send("any", bytes([number]), now=both.now)
         recorded += both.drop(both.a)
-    both.b = Node(settings("b"), boot_id=both.rng.randbytes(16), rng=both.rng, now=both.now)
+    both.b = Endpoint(settings("b"), boot_id=both.rng.randbytes(16), rng=both.rng, now=both.now)
     both.b.link_up(LinkInfo("mesh", LinkKind.BROADCAST, B, BROADCAST), both.now)
     for datagram in recorded:
         both.b.receive(datagram.data, "mesh", A, both.now)
@@ -178,7 +178,7 @@ def test_neighbors_are_met_without_any_broadcast() -> None:
     nodes = {}
     for name, own, other in (("a", A, B), ("b", B, A)):
         config = replace(settings(name), neighbours=(Neighbour(other),))
-        nodes[name] = Node(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
+        nodes[name] = Endpoint(config, boot_id=rng.randbytes(16), rng=rng, now=0.0)
         nodes[name].link_up(LinkInfo("tunnel", LinkKind.NEIGHBOURS, own), 0.0)
     now = 0.0
     destinations = set()

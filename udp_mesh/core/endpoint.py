@@ -1,5 +1,5 @@
-"""A node: bytes and the time in; datagrams, events and one timer out. It never blocks, reads no clock and opens
-nothing.
+"""The transport of one node: bytes and the time in; datagrams, events and one timer out. It never blocks, reads no
+clock and opens nothing.
 
 A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` is due, then `datagrams_to_send` until it
 returns none, then `next_event` until None.
@@ -34,8 +34,8 @@ UNVERIFIED_AFTER_S = 3.0
 """A node heard for this long without hearing us is listed as unverified; discovery takes a fraction of that."""
 
 
-class Node:
-    """One run of one named node. `boot_id` (16 random bytes, never used before) identifies the run."""
+class Endpoint:
+    """The transport of one run of one named node. `boot_id` (16 random bytes, never used before) identifies the run."""
 
     def __init__(
         self,
@@ -184,7 +184,7 @@ class Node:
 
 
 def _snapshot(state: State, now: float) -> Conditions:
-    """See `Node.conditions`."""
+    """See `Endpoint.conditions`."""
     idle = Sender(state.settings)
     peers = tuple(
         _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
