@@ -1,6 +1,7 @@
 """Datagrams in: header -> channel -> opened frames -> effects. Never raises, whatever arrives.
 
-1. A short header's tag selects candidate channels; opening one authenticates the sender. Replays cost no decryption.
+1. A short header's tag selects candidate channels; opening one authenticates the sender. Of replays, few are decrypted
+   (`receiver.copies`).
 2. A plain fragment goes straight to reassembly; other frames are decoded and go to `frame_handlers`.
 3. A long header introduces a boot: its check is verified before anything is derived or stored for it.
 4. What a boot sends before its first contact is proven is held, then processed as if it had just arrived.
@@ -12,6 +13,7 @@ from udp_mesh.core.peers.first_contact import hold, needs_proof, proves_contact
 from udp_mesh.core.peers.path_validation import answer_pings
 from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import HeldDatagram, Session
+from udp_mesh.core.receiver.copies import on_copy
 from udp_mesh.core.receiver.replay_check import (
     broadcast_lateness_s,
     data_lateness_s,
@@ -74,7 +76,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
     first = data[0]
     if first in _SHORT:
         to_one = first == DATA_BYTE
-        replayed = False
+        replayed: tuple[ReceiveChannel, Session] | None = None
         _, tag, low = SHORT_HEADER.unpack_from(data)
         tags = state.peer_table.data_tags if to_one else state.peer_table.broadcast_tags
         for channel, session in tags.get(tag, ()):
@@ -82,7 +84,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
                 number, frames = channel.open(data, low)
             except ReplayError:
                 # It may be a new packet of another channel with this tag.
-                replayed = True
+                replayed = channel, session
                 continue
             except OpenError:
                 continue
@@ -91,8 +93,9 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
             else:
                 _receive_broadcast(state, session, frames, link, source, now)
             return
-        if replayed:
+        if replayed is not None:
             counters.dropped_replayed += 1
+            on_copy(state, replayed[1], replayed[0], data, link, source, now)
         else:
             counters.dropped_unauthenticated += 1
     else:
@@ -218,7 +221,11 @@ def _receive_long(
     introduced = header.kind is Kind.INTRODUCTION
     if session is not None:
         channel = _channel(session.data_channels if introduced else session.broadcast_channels, key)
-        number, frames = channel.open_long(data, header)
+        try:
+            number, frames = channel.open_long(data, header)
+        except ReplayError:
+            on_copy(state, session, channel, data, link, source, now)
+            raise
         decoded = decode(frames)
         beat = _beat(decoded)
     else:

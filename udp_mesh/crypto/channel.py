@@ -35,6 +35,7 @@ from udp_mesh.wire.header import (
     Kind,
     LongHeader,
     encode_long,
+    parse_header,
 )
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
@@ -156,16 +157,28 @@ class ReceiveChannel(_Channel):
             raise OpenError(f"packet number: expected at most 48 bits, found {header.number}")
         return self._open(memoryview(data), header.number, LONG_HEADER_BYTES)
 
+    def open_copy(self, data: bytes | bytearray | memoryview) -> bytes:
+        """The encoded frames of a datagram that may have been opened before. Raises `OpenError` or `DecodeError`."""
+        header = parse_header(data)
+        if isinstance(header, LongHeader):
+            number, header_bytes = header.number, LONG_HEADER_BYTES
+        else:
+            number, header_bytes = expand_number(header.number_low, self.window.largest), SHORT_HEADER_BYTES
+        return self._decrypt(memoryview(data), number, header_bytes)
+
     def _open(self, view: memoryview, number: int, header_bytes: int) -> tuple[int, bytes]:
         window = self.window
         if not window.would_accept(number):
             raise ReplayError(f"packet {number} was already seen or is too old")
-        try:
-            frames = self._cipher.decrypt(_NONCE.pack(self._salt, number), view[header_bytes:], view[:header_bytes])
-        except InvalidTag as error:
-            raise OpenError(f"packet {number} cannot be decrypted") from error
+        frames = self._decrypt(view, number, header_bytes)
         window.accept(number)
         return number, frames
+
+    def _decrypt(self, view: memoryview, number: int, header_bytes: int) -> bytes:
+        try:
+            return self._cipher.decrypt(_NONCE.pack(self._salt, number), view[header_bytes:], view[:header_bytes])
+        except InvalidTag as error:
+            raise OpenError(f"packet {number} cannot be decrypted") from error
 
 
 def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeader) -> None:

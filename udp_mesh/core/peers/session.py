@@ -164,6 +164,7 @@ class Session:
         "challenged_at",
         "challenges",
         "clock_ms",
+        "copy_opened_at",
         "data_channels",
         "features",
         "freshness",
@@ -234,6 +235,8 @@ class Session:
         self.challenges: dict[int, Challenge] = {}
         """Path challenges without an answer yet, by token (see `path_validation`)."""
         self.challenged_at = float("-inf")
+        self.copy_opened_at = float("-inf")
+        """When a copy of a datagram that had come before was last opened."""
         self._key_floors: dict[tuple[bytes, bytes], int] = {}
         """(key id, receiver) of removed keys -> the number from which on datagrams are new."""
         self._forgotten_floor = 0

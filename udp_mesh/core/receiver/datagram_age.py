@@ -73,6 +73,12 @@ class Freshness:
             self._is_fresh(now)
         return late_s
 
+    def late_by_s(self, clock: int, now: float) -> float:
+        """The same without any effect; infinite while no clock is known."""
+        if self._offset_ms is None:
+            return float("inf")
+        return max(0.0, _signed((clock_ms(now) - clock & 0xFFFFFFFF) - self._offset_ms) / 1000)
+
     def confirm(self, now: float, clock: int | None = None) -> None:
         """Record a proof that the boot is there now, such as the answer to a challenge. Its timestamp, if any, replaces
         what was known about the clock."""

@@ -27,7 +27,7 @@ def data_lateness_s(
 ) -> float | None:
     """Seconds by which a datagram between two boots was delayed. None: drop it."""
     clock = timestamp_of(frames)
-    if session.challenges and _has_response(state, session, small_frames(frames), clock, link, source, now):
+    if session.challenges and has_response(state, session, small_frames(frames), clock, link, source, now):
         return 0.0
     if not session.timed:
         return 0.0
@@ -47,7 +47,7 @@ def data_lateness_s(
 
 def small_frames(frames: bytes) -> list[Frame]:
     """The frames of a datagram that may hold a ping or a pong; none if they are malformed (counted later)."""
-    if frames[0] >= FRAGMENT:
+    if not frames or frames[0] >= FRAGMENT:
         return []
     try:
         return decode(frames)
@@ -59,17 +59,23 @@ def long_lateness_s(
     state: State, session: Session, frames: Sequence[Frame], link: str, source: Address, now: float
 ) -> float | None:
     """The same for a HELLO or an INTRODUCTION; without a timestamp, as from earlier versions, it is accepted."""
-    clock = None
-    for frame in frames:
-        if isinstance(frame, Sent) or (isinstance(frame, Heartbeat) and frame.clock_ms is not None):
-            clock = frame.clock_ms
-    if _has_response(state, session, frames, clock, link, source, now):
+    clock = clock_of(frames)
+    if has_response(state, session, frames, clock, link, source, now):
         return 0.0
     late_s = 0.0 if clock is None else session.freshness.lateness_s(clock, now)
     if late_s <= ACCEPT_AGE_S:
         return late_s
     drop_stale(state, session, frames, link, source, now)
     return None
+
+
+def clock_of(frames: Sequence[Frame]) -> int | None:
+    """The sender's clock in a datagram's frames, if they have one."""
+    clock = None
+    for frame in frames:
+        if isinstance(frame, Sent) or (isinstance(frame, Heartbeat) and frame.clock_ms is not None):
+            clock = frame.clock_ms
+    return clock
 
 
 def broadcast_lateness_s(
@@ -103,7 +109,7 @@ def drop_stale(state: State, session: Session, frames: Sequence[Frame], link: st
         challenge_contact(state, session, link, source, now)
 
 
-def _has_response(
+def has_response(
     state: State,
     session: Session,
     frames: Sequence[Frame],
