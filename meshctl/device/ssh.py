@@ -30,7 +30,7 @@ from meshctl.device.framing import framed
 from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
-from meshctl.device.ssh_channel import collect, ignoring_closed, sending_stdin
+from meshctl.device.ssh_channel import collect, ignoring_closed, open_session, sending_stdin
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.errors import MeshctlError
 from meshctl.model import Release
@@ -274,7 +274,7 @@ class SshConnection(Connection):
         pieces = (stdin,) if isinstance(stdin, bytes) else stdin
         with keepalives(self._transport, self._limits.ask_s, self._limits.keepalive_s):
             with self._waiting(min(seconds, self._limits.channel_s), "opening a channel"):
-                channel = self._transport.open_session()
+                channel = open_session(self._transport)
             try:
                 with self._waiting(seconds, "a command"):
                     channel.exec_command(sent.command)

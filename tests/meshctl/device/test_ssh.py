@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import paramiko
 import pytest
 
 from meshctl.device.connection import Credentials, Deadlines, Endpoint
@@ -125,15 +126,38 @@ def test_a_command_killed_on_the_node_is_distinguished_from_a_failed_one(connect
     assert connection.run("echo still here").stdout == "still here\n"
 
 
-def test_output_that_does_not_fit_is_the_command_s_failure_and_not_the_node_s_silence(
-    connection: SshConnection, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("command", ["head -c 3000000 /dev/zero", "cat /dev/zero", "cat /dev/zero >&2"])
+def test_too_much_output_ends_the_command_and_keeps_the_connection(
+    connection: SshConnection, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("meshctl.device.ssh_channel.MAX_OUTPUT_BYTES", 1 << 20)
     with pytest.raises(OutputTooLarge, match="printed more than 1 MiB") as caught:
-        connection.run("head -c 3000000 /dev/zero")
+        connection.run(command, timeout_s=60.0)
     assert "| tail" in caught.value.hint
     assert not isinstance(caught.value, Unreachable)
     assert connection.run("echo still here").stdout == "still here\n"
+
+
+def test_a_channel_closed_before_its_command_is_opened_again(
+    connection: SshConnection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As dropbear before 2024.86 does when the process of an earlier channel ends in between."""
+    transport = connection._transport
+    opened: list[paramiko.Channel] = []
+    real = transport.open_session
+
+    def open_and_lose_two() -> paramiko.Channel:
+        channel = real()
+        opened.append(channel)
+        if len(opened) == 1:
+            channel.close()
+        if len(opened) == 2:
+            raise paramiko.SSHException("Unable to open channel.")
+        return channel
+
+    monkeypatch.setattr(transport, "open_session", open_and_lose_two)
+    assert connection.run("echo once").stdout == "once\n"
+    assert len(opened) == 3
 
 
 def test_a_server_that_dies_in_the_middle_is_a_lost_connection(connection: SshConnection, server: Server) -> None:
