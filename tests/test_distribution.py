@@ -22,7 +22,7 @@ def documents() -> list[Path]:
     return [path for path in found if path.is_file()]
 
 
-def test_the_distribution_has_a_name_of_its_own_and_keeps_the_commands() -> None:
+def test_the_distribution_is_named_meshctl_fleet_and_installs_both_commands() -> None:
     assert PROJECT["name"] == "meshctl-fleet"
     assert set(PROJECT["scripts"]) == {"meshctl", "udp-mesh"}
 

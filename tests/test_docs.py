@@ -35,7 +35,7 @@ def test_every_source_file_that_a_page_names_exists(page: Path) -> None:
     assert missing == set() or page.name in FOREIGN
 
 
-def test_assumptions_about_a_node_name_existing_files() -> None:
+def test_node_assumptions_reference_existing_files_and_identifiers() -> None:
     """The tables of node-assumptions.md name files relative to meshctl/ or to the scripts that run on a node."""
     text = (DOCS / "facts/node-assumptions.md").read_text(encoding="utf-8")
     rows = [row.split("|") for row in text.splitlines() if row.startswith("| ")]
@@ -119,7 +119,7 @@ def test_every_command_and_option_that_a_page_shows_exists(page: Path, commands:
     assert wrong == []
 
 
-def test_the_tutorial_shows_what_every_command_printed() -> None:
+def test_the_tutorial_shows_the_output_of_every_command() -> None:
     text = (DOCS / "tutorial.md").read_text(encoding="utf-8")
     lines = [line for block in re.findall(r"```console\n(.*?)```", text, re.DOTALL) for line in block.splitlines()]
     silent = re.compile(r"\$ (export|sed -i) ")

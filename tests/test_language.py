@@ -51,7 +51,7 @@ def words_of(file: Path) -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_messages_docstrings_and_comments(package: str) -> None:
+def test_messages_docstrings_and_comments_use_plain_words(package: str) -> None:
     bad = [
         f"{file.relative_to(ROOT)}:{line}: {word}"
         for file in sorted((ROOT / package).rglob("*.py"))
@@ -62,7 +62,7 @@ def test_messages_docstrings_and_comments(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", [*PACKAGES, *TEST_PACKAGES])
-def test_names_docstrings_and_comments_of_all_code(package: str) -> None:
+def test_names_docstrings_and_comments_of_all_code_use_plain_words(package: str) -> None:
     bad = [
         f"{file.relative_to(ROOT)}:{line}: {word}"
         for file in sorted((ROOT / package).rglob("*.py"))
@@ -72,7 +72,7 @@ def test_names_docstrings_and_comments_of_all_code(package: str) -> None:
     assert bad == []
 
 
-def test_docs() -> None:
+def test_docs_use_plain_words() -> None:
     files = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     bad = [
         f"{name}:{number}: {word}"
@@ -84,7 +84,7 @@ def test_docs() -> None:
     assert bad == []
 
 
-def test_a_word_of_the_list_is_found() -> None:
+def test_listed_words_are_found() -> None:
     assert bad_words("nobody tells of b07, run `meshctl lab mend`") == ["nobody", "tells of"]
     assert bad_words("names no-nobody; `mend`") == []
     assert bad_page_words("Tells `colour` of a behaviour") == ["Tells", "behaviour"]

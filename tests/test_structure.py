@@ -18,7 +18,7 @@ SHARED = {"Bridge", "Node"}
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_a_class_name_is_used_for_one_thing(package: str) -> None:
+def test_public_class_names_are_unique_within_a_package(package: str) -> None:
     places: dict[str, list[str]] = defaultdict(list)
     for file in sorted((ROOT / package).rglob("*.py")):
         for node in ast.parse(file.read_text(encoding="utf-8")).body:
@@ -48,7 +48,7 @@ def test_a_file_is_short_enough_to_read(folder: str) -> None:
     assert {name: length for name, length in lengths.items() if length > LONG.get(name, limit)} == {}
 
 
-def test_no_import_circle() -> None:
+def test_no_import_cycles() -> None:
     """Imports for types alone count, too."""
     graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=False)
     imports = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}

@@ -49,7 +49,7 @@ def asked(directory: Path, *messages: dict[str, Any]) -> list[str]:
     return asyncio.run(serve())
 
 
-def test_a_fault_of_the_lab_is_an_answer_and_the_next_request_is_served(tmp_path: Path) -> None:
+def test_an_internal_error_is_returned_and_the_next_request_is_still_served(tmp_path: Path) -> None:
     answers = asked(tmp_path, {"op": "status"}, {"op": "no_such"}, {"op": "mend", "what": 1}, {"op": "down"})
     assert answers[0] == "the lab failed at 'status': KeyError: 'b02'"
     assert answers[1].startswith("the lab failed at 'no_such': AttributeError")
@@ -57,7 +57,7 @@ def test_a_fault_of_the_lab_is_an_answer_and_the_next_request_is_served(tmp_path
     assert answers[3] == "not now"
 
 
-def test_a_fleet_of_another_version_is_named_with_the_way_out() -> None:
+def test_a_spec_of_another_version_is_rejected_with_a_hint() -> None:
     spec = json.loads(dump(FleetSpec("old", (NodeSpec("b01"),))))
     without = {key: value for key, value in spec.items() if key != "lans"}
     with pytest.raises(InputError, match="found nothing under 'lans'") as caught:
@@ -71,7 +71,7 @@ def test_a_fleet_of_another_version_is_named_with_the_way_out() -> None:
 
 @pytest.mark.lab
 @pytest.mark.xdist_group("lab")
-def test_a_fleet_is_ended_without_its_spec(tmp_path: Path) -> None:
+def test_a_fleet_can_be_stopped_without_a_valid_spec(tmp_path: Path) -> None:
     with VirtualFleet(FleetSpec("old", (NodeSpec("b01", host_key_types=("ed25519",)),)), tmp_path / "fleet") as fleet:
         (fleet.directory / "spec.json").write_text("{}")
         with pytest.raises(InputError):

@@ -16,7 +16,7 @@ CLOSE = "uci set firewall.@zone[0].input=REJECT; uci commit firewall"
 LOADED = "nft -a list chain inet fw4 input"
 
 
-def test_a_zone_that_rejects_keeps_new_connections_out_once_it_is_loaded(node: VirtualNode) -> None:
+def test_a_rejecting_zone_blocks_new_connections_once_loaded(node: VirtualNode) -> None:
     transport = connect(node.bench)
     before = node.exec(LOADED).check("list").stdout
     node.exec(f"{CLOSE}; reload_config").check("close")
@@ -28,7 +28,7 @@ def test_a_zone_that_rejects_keeps_new_connections_out_once_it_is_loaded(node: V
     transport.close()
 
 
-def test_a_rule_for_ssh_goes_before_its_zone(node: VirtualNode) -> None:
+def test_an_ssh_rule_takes_precedence_over_its_zone(node: VirtualNode) -> None:
     rule = "uci add firewall rule; " + "".join(
         f"uci set firewall.@rule[-1].{option}; "
         for option in ("name=Allow-SSH", "src=lan", "proto=tcp", "dest_port=22", "target=ACCEPT")
@@ -39,7 +39,7 @@ def test_a_rule_for_ssh_goes_before_its_zone(node: VirtualNode) -> None:
     until(lambda: not answers(node.bench), "the firewall")
 
 
-def test_fw4_ends_with_0_although_nft_refused_and_the_old_rules_stay(node: VirtualNode) -> None:
+def test_fw4_reload_exits_0_and_keeps_the_old_rules_when_nft_fails(node: VirtualNode) -> None:
     node.exec("mkdir -p /etc/nftables.d; echo 'chain broken {' >/etc/nftables.d/own.nft").check("break it")
     before = node.exec(LOADED).stdout
     state = node.exec("ls -li /var/run/fw4.state").stdout
@@ -50,7 +50,7 @@ def test_fw4_ends_with_0_although_nft_refused_and_the_old_rules_stay(node: Virtu
     assert node.exec("fw4 check").exit_status == 1
 
 
-def test_the_rules_handles_are_new_with_every_load_and_the_chains_is_not(node: VirtualNode) -> None:
+def test_rule_handles_change_on_every_load_but_table_and_chain_handles_do_not(node: VirtualNode) -> None:
     def handles() -> list[int]:
         return [int(found) for found in re.findall(r"# handle (\d+)", node.exec(LOADED).check("list").stdout)]
 
@@ -61,14 +61,14 @@ def test_the_rules_handles_are_new_with_every_load_and_the_chains_is_not(node: V
     assert min(after[2:]) > max(before[2:])
 
 
-def test_fw4_without_its_state_file_reloads_nothing(node: VirtualNode) -> None:
+def test_fw4_reload_fails_without_its_state_file(node: VirtualNode) -> None:
     refused = node.exec("rm /var/run/fw4.state; fw4 reload")
     assert (refused.exit_status, refused.stderr) == (1, "The fw4 firewall does not appear to be loaded.\n")
     node.exec("fw4 start").check("start")
     assert node.exec("fw4 start").exit_status == 1
 
 
-def test_a_configuration_that_cannot_be_read_locks_out_with_fw4_and_changes_nothing_with_fw3(
+def test_an_invalid_config_blocks_all_access_under_fw4_and_changes_nothing_under_fw3(
     fleet: VirtualFleet, node: VirtualNode
 ) -> None:
     damage = "cp /etc/config/firewall /tmp/firewall; echo 'option without' >/etc/config/firewall"

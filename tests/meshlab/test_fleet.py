@@ -84,7 +84,7 @@ def test_a_killed_supervisor_takes_its_nodes_with_it(tmp_path: Path) -> None:
         assert fleet.node("n0").is_up()
 
 
-def test_a_second_fleet_in_the_same_place_is_refused_and_one_beside_it_is_not(
+def test_a_second_fleet_is_rejected_in_the_same_directory_but_not_in_another(
     fleet: VirtualFleet, tmp_path: Path
 ) -> None:
     with pytest.raises(LabError, match=r"runs in .* already"):
@@ -95,7 +95,7 @@ def test_a_second_fleet_in_the_same_place_is_refused_and_one_beside_it_is_not(
         assert answers(fleet.node("box").bench)
 
 
-def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
+def test_a_port_in_use_is_reported(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.255.255.254", 0))
         taken.listen(1)
@@ -104,7 +104,7 @@ def test_a_port_that_is_taken_is_named(tmp_path: Path) -> None:
             VirtualFleet(FleetSpec("x", spec(1).nodes, port=port), tmp_path).up()
 
 
-def test_unknown_nodes_links_and_breaks_are_named(fleet: VirtualFleet) -> None:
+def test_unknown_nodes_faults_and_link_options_are_reported(fleet: VirtualFleet) -> None:
     with pytest.raises(InputError, match="no node named nobody"):
         fleet.inject_fault("nobody", "power-cut")
     with pytest.raises(InputError, match="unknown fault"):

@@ -49,7 +49,7 @@ def test_a_directory_with_other_files_is_refused_and_left_as_it_is(mine: Path, m
         copy_inventory(mine / "inventory", mine)
 
 
-def test_a_fleet_with_19_07_gets_an_rsa_key_even_where_an_earlier_one_had_none(tmp_path: Path) -> None:
+def test_a_fleet_with_19_07_gets_an_rsa_key_in_a_reused_lab_directory(tmp_path: Path) -> None:
     keys = []
     for example in (EXAMPLE, shipped("inventory") / "community", shipped("inventory") / "community"):
         copy = copy_inventory(example, tmp_path)
@@ -72,7 +72,7 @@ def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
     assert contents(project) == before
 
 
-def test_a_directory_in_which_a_fleet_runs_keeps_everything(tmp_path: Path) -> None:
+def test_the_directory_of_a_running_fleet_is_left_unchanged(tmp_path: Path) -> None:
     copy_inventory(EXAMPLE, tmp_path)
     (tmp_path / "inventory" / "firmware.bin").write_bytes(b"image")
     (tmp_path / "inventory" / "known_hosts").write_text("b01 ssh-ed25519 AAAA\n", encoding="utf-8")
@@ -112,7 +112,7 @@ def test_a_fleet_can_start_again_from_its_own_edited_copy(tmp_path: Path) -> Non
     assert again.fleet.operators.ssh_keys == copy.fleet.operators.ssh_keys, "the lab's key is there once"
 
 
-def test_a_lab_may_lie_inside_its_inventory_s_directory(tmp_path: Path) -> None:
+def test_a_lab_directory_inside_its_inventory_is_not_copied(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project)
     for _ in range(2):
@@ -121,7 +121,7 @@ def test_a_lab_may_lie_inside_its_inventory_s_directory(tmp_path: Path) -> None:
     assert load_fleet(project / "lab" / "inventory", environ={}).name
 
 
-def test_the_copy_has_host_keys_of_its_own(tmp_path: Path) -> None:
+def test_the_copy_uses_its_own_known_hosts(tmp_path: Path) -> None:
     project, real = tmp_path / "project", tmp_path / "real_known_hosts"
     shutil.copytree(EXAMPLE, project)
     real.write_text("base ssh-ed25519 AAAA\n", encoding="utf-8")
@@ -144,9 +144,7 @@ def test_an_inventory_that_cannot_be_copied_leaves_the_earlier_copy(tmp_path: Pa
     assert not [path for path in (tmp_path / "lab").iterdir() if path.name.startswith(".inventory.")]
 
 
-def test_a_copy_that_cannot_be_put_in_place_leaves_the_earlier_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_rename_keeps_the_previous_inventory_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = copy_inventory(EXAMPLE, tmp_path)
     before = contents(copy.inventory)
     rename = Path.rename
@@ -163,7 +161,7 @@ def test_a_copy_that_cannot_be_put_in_place_leaves_the_earlier_one(
         assert contents(copy.inventory) == before
 
 
-def test_what_no_fleet_leaves_is_named_and_stays(tmp_path: Path) -> None:
+def test_clear_reports_and_keeps_unexpected_files(tmp_path: Path) -> None:
     fleet_directory.claim(tmp_path)
     (tmp_path / "log").mkdir()
     (tmp_path / "rom").mkdir()
@@ -176,7 +174,7 @@ def test_what_no_fleet_leaves_is_named_and_stays(tmp_path: Path) -> None:
     assert not (tmp_path / "rom").exists()
 
 
-def test_a_link_among_what_a_fleet_left_is_removed_and_not_followed(tmp_path: Path) -> None:
+def test_clear_removes_a_symlink_without_following_it(tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "work.txt").write_text("weeks of work\n", encoding="utf-8")
@@ -187,7 +185,7 @@ def test_a_link_among_what_a_fleet_left_is_removed_and_not_followed(tmp_path: Pa
     assert (elsewhere / "work.txt").exists()
 
 
-def test_a_lab_of_a_version_that_did_not_mark_is_recognized(tmp_path: Path) -> None:
+def test_an_older_lab_directory_without_a_mark_is_recognized(tmp_path: Path) -> None:
     copy_inventory(EXAMPLE, tmp_path)
     (tmp_path / "spec.json").write_text('{"nodes": [], "links": []}', encoding="utf-8")
     (tmp_path / MARK).unlink()
@@ -195,7 +193,7 @@ def test_a_lab_of_a_version_that_did_not_mark_is_recognized(tmp_path: Path) -> N
     assert (tmp_path / MARK).exists()
 
 
-def test_an_inventory_belongs_to_the_lab_whose_copy_it_is(tmp_path: Path) -> None:
+def test_an_inventory_copy_is_attributed_to_its_lab(tmp_path: Path) -> None:
     copy = copy_inventory(EXAMPLE, tmp_path / "lab")
     assert lab_of(str(copy.inventory)) == str(tmp_path / "lab")
     assert lab_of(str(copy.inventory / "fleet.yaml")) == str(tmp_path / "lab")

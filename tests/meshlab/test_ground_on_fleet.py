@@ -66,7 +66,7 @@ def lab(fleet: VirtualFleet, *words: str, status: int = 0) -> str:
     return done.output
 
 
-def test_a_loss_shows_as_quality_in_both_directions_and_one_way_in_one(grounded: VirtualFleet) -> None:
+def test_loss_lowers_tq_in_both_directions_and_one_way_loss_in_one(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "near", "far", "--loss", "30%")
     until(lambda: neighbors(grounded, "near").get("far") == tq_of(0.3, 0.3), "the lossy link at near")
     assert neighbors(grounded, "far")["near"] == tq_of(0.3, 0.3)
@@ -78,7 +78,7 @@ def test_a_loss_shows_as_quality_in_both_directions_and_one_way_in_one(grounded:
     until(lambda: neighbors(grounded, "far").get("near") == 200, "the link as it was")
 
 
-def test_a_node_that_no_one_hears_still_hears_others_and_is_unreachable(grounded: VirtualFleet) -> None:
+def test_a_node_that_only_receives_hears_others_but_is_unreachable(grounded: VirtualFleet) -> None:
     lab(grounded, "link", "far", "near", "--loss", "100%", "--one-way")
     until(lambda: in_mesh(grounded) == {"near"}, "the mesh without far")
     assert not answers(grounded.endpoint("10.42.0.3"))
@@ -87,7 +87,7 @@ def test_a_node_that_no_one_hears_still_hears_others_and_is_unreachable(grounded
     assert neighbors(grounded, "far") == {}
 
 
-def test_a_node_that_moves_away_leaves_the_mesh_and_returns_over_another(grounded: VirtualFleet) -> None:
+def test_moving_a_node_reroutes_it_over_a_neighbor_and_then_out_of_the_mesh(grounded: VirtualFleet) -> None:
     placement.set_environment(grounded, ROW)
     until(lambda: set(neighbors(grounded, "base")) == {"near", "far"}, "three that hear each other")
     (link,) = [link for link in links_of(ROW) if link.ends == {"base", "near"}]
@@ -127,7 +127,7 @@ def test_an_environment_is_loaded_and_shown_and_rejected_if_it_is_for_another_fl
     assert "ground.yaml:1:12: nodes.x: expected" in lab(grounded, "ground", str(file), status=2)
 
 
-def test_words_that_say_nothing_are_refused_with_what_was_expected(grounded: VirtualFleet) -> None:
+def test_invalid_link_and_move_arguments_are_rejected_with_what_was_expected(grounded: VirtualFleet) -> None:
     assert "expected a share such as 30% or 0.3, found 'much'" in lab(
         grounded, "link", "base", "near", "--loss", "much", status=2
     )
@@ -138,7 +138,7 @@ def test_words_that_say_nothing_are_refused_with_what_was_expected(grounded: Vir
         placement.move(grounded, "nobody", (0, 0))
 
 
-def test_a_big_ground_comes_in_parts(grounded: VirtualFleet) -> None:
+def test_a_large_environment_is_sent_in_parts(grounded: VirtualFleet) -> None:
     crowd = {f"other{number}": NodePosition((0, number)) for number in range(40)}
     placement.set_environment(grounded, RadioEnvironment({**ROW.positions, **crowd}, (Wall((90, -9), (90, 9)),)))
     until(lambda: set(neighbors(grounded, "base")) == {"near"}, "the wall between near and far")
@@ -163,7 +163,7 @@ def test_a_mission_drops_a_beacon_and_the_robot_is_reached_over_it(grounded: Vir
     until(lambda: set(neighbors(grounded, "base")) == {"near"}, "the robot out of the base's own earshot")
 
 
-def test_a_mission_that_is_interrupted_says_where_to_go_on(grounded: VirtualFleet, tmp_path: Path) -> None:
+def test_an_interrupted_mission_prints_how_to_continue(grounded: VirtualFleet, tmp_path: Path) -> None:
     file = tmp_path / "mission.yaml"
     file.write_text(
         "nodes: {base: [0, 0], near: [60, 0]}\nduration_s: 600\n"

@@ -52,7 +52,7 @@ def configured(fleet: VirtualFleet, request: pytest.FixtureRequest) -> Iterator[
 
 
 @pytest.mark.parametrize("configured", ["old", "box", "new"], indirect=True)
-def test_recreation_of_an_interface_and_its_address_follow_the_release(configured: VirtualNode) -> None:
+def test_interface_recreation_and_its_mac_depend_on_the_release(configured: VirtualNode) -> None:
     release = configured.spec.release
     first, own = index(configured), mac(configured)
     change(configured, "radio0.txpower=11")
@@ -69,7 +69,7 @@ def test_recreation_of_an_interface_and_its_address_follow_the_release(configure
     assert mac(configured) == own
 
 
-def test_a_radio_is_pending_while_it_is_set_up_and_its_interface_gone(mesh: VirtualFleet) -> None:
+def test_a_radio_being_set_up_is_pending_and_has_no_interface(mesh: VirtualFleet) -> None:
     near = mesh.node("near")
     near.exec("uci set wireless.radio0.channel=11; uci commit; reload_config").check("change")
     assert near.exec("iw dev mesh0 info").exit_status == 0
@@ -79,7 +79,7 @@ def test_a_radio_is_pending_while_it_is_set_up_and_its_interface_gone(mesh: Virt
 
 
 @pytest.mark.parametrize("configured", ["box"], indirect=True)
-def test_calls_of_netifd_are_handled_in_the_order_in_which_they_come(configured: VirtualNode) -> None:
+def test_netifd_calls_are_handled_in_order(configured: VirtualNode) -> None:
     configured.exec("for turn in 1 2 3 4 5 6; do wifi down; wifi up; done").check("restart the radio")
     last = "! grep -qE 'lab/netifd|wifi|ubus' /proc/$(cat /tmp/run/netifd.call)/cmdline"
     until(lambda: configured.exec(last).exit_status == 0, "the last call")
@@ -112,7 +112,7 @@ def test_a_restarted_radio_is_half_deaf_until_its_neighbors_delete_its_entry(mes
     until(lambda: near.exec(f"batctl -m bat0 ping -c 1 {macs[0]}").exit_status == 0, "the echo")
 
 
-def test_forgetting_a_radio_that_did_not_restart_cuts_it_off_until_it_forgets_in_turn(mesh: VirtualFleet) -> None:
+def test_deleting_the_entry_of_a_running_radio_cuts_it_off_until_it_deletes_its_own(mesh: VirtualFleet) -> None:
     base, near = mesh.node("base"), mesh.node("near")
     base.exec(f"iw dev mesh0 station del {mac(near)}").check("forget")
     until(lambda: not answers(mesh.endpoint("10.42.0.2")), "the cut")
@@ -121,7 +121,7 @@ def test_forgetting_a_radio_that_did_not_restart_cuts_it_off_until_it_forgets_in
     until(lambda: answers(mesh.endpoint("10.42.0.2")), "the way")
 
 
-def test_a_station_that_falls_silent_stays_for_a_minute_and_says_so(mesh: VirtualFleet) -> None:
+def test_a_silent_station_entry_remains_with_its_inactive_time(mesh: VirtualFleet) -> None:
     near, far = mesh.node("near"), mesh.node("far")
     of = mac(far)
     far.power_cut(back=False)

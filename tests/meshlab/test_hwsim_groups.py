@@ -65,7 +65,7 @@ def test_cliques_cover_every_edge_and_nothing_else(graph: tuple[list[str], Edges
 
 
 @given(st.data(), st.sampled_from([(2, 9, False), (12, 20, True)]))
-def test_no_step_joins_a_pair_that_is_joined_neither_before_nor_after(
+def test_no_transition_step_links_a_pair_that_is_unlinked_before_and_after(
     data: st.DataObject, shape: tuple[int, int, bool]
 ) -> None:
     _, most, close = shape
@@ -80,7 +80,7 @@ def test_no_step_joins_a_pair_that_is_joined_neither_before_nor_after(
     assert transition(wanted, wanted) == []
 
 
-def test_a_changed_link_of_a_small_fleet_touches_its_two_ends_alone() -> None:
+def test_a_link_change_in_a_small_fleet_rewrites_only_its_two_endpoints() -> None:
     names = [f"n{number}" for number in range(11)]
     all_pairs = set(combinations(names, 2))
     written = transition(assign(names, all_pairs), assign(names, all_pairs - {("n3", "n7")}))
@@ -92,12 +92,12 @@ def test_forty_nodes_that_all_hear_each_other_need_one_group() -> None:
     assert set(assign(names, set(combinations(names, 2))).values()) == {1}
 
 
-def test_a_graph_that_needs_more_groups_is_refused_with_the_number() -> None:
+def test_a_graph_that_needs_too_many_groups_is_rejected_with_the_number() -> None:
     names = [f"n{number}" for number in range(66)]
     with pytest.raises(InputError, match="66 radios and 65 links need 65 groups, hwsim has 64"):
         assign(names, [("n0", name) for name in names[1:]])
 
 
-def test_an_edge_to_an_unknown_node_is_a_bug_of_the_caller() -> None:
+def test_an_edge_to_an_unknown_node_raises_value_error() -> None:
     with pytest.raises(ValueError, match="edge a-z"):
         assign(["a"], [("a", "z")])

@@ -94,7 +94,7 @@ def test_a_change_that_locks_out_all_logins_is_not_confirmed(rig: Rig, lockout: 
     assert rig.state_of("n001", "b", "a") == "new"
 
 
-def test_a_change_of_power_alone_leaves_a_node_reachable(rig: Rig) -> None:
+def test_a_tx_power_change_keeps_a_node_reachable(rig: Rig) -> None:
     before = rig.fleet.node("n001").exec("cat /sys/class/net/mesh0/ifindex").stdout
     weaker = variant(rig, "weaker", "radios: {radio0: {tx_power_dbm: 20}}")
     ended = rig.meshctl("provision", weaker, "n001", "--yes", "--json")
@@ -105,7 +105,7 @@ def test_a_change_of_power_alone_leaves_a_node_reachable(rig: Rig) -> None:
     assert passes(rig)
 
 
-def test_a_change_of_the_cell_that_gives_radios_other_addresses_stays(rig: Rig) -> None:
+def test_a_cell_change_that_changes_radio_macs_is_kept(rig: Rig) -> None:
     before = {name: mac(rig.fleet, name) for name in ("base", *rig.names)}
     ended = rig.meshctl("provision", "split", "--yes", "--json")
     assert ended.results == dict.fromkeys(before, "done"), ended.out + ended.err

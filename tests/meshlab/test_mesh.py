@@ -32,7 +32,7 @@ def test_a_node_in_the_mesh_is_reachable_at_its_address_and_lists_its_neighbors(
     assert (info["mode"], info["channel"], info["ssid"]) == ("Ad-Hoc", 6, "a team")
 
 
-def test_another_channel_cuts_a_node_and_what_lies_behind_it_off(mesh: VirtualFleet) -> None:
+def test_a_channel_change_cuts_off_a_node_and_the_nodes_behind_it(mesh: VirtualFleet) -> None:
     mesh.node("near").exec("uci set wireless.radio0.channel=11; uci commit; reload_config").check("change")
     until(lambda: in_mesh(mesh) == set(), "the cut")
     assert not answers(mesh.endpoint("10.42.0.3"))
@@ -51,7 +51,7 @@ def test_a_node_without_batman_has_no_mesh(mesh: VirtualFleet) -> None:
     assert bat0["errors"][0]["code"] == "NO_PROTO_HANDLER"
 
 
-def test_a_cut_link_stops_a_connection_and_does_not_close_it(mesh: VirtualFleet) -> None:
+def test_a_down_link_stalls_a_connection_without_closing_it(mesh: VirtualFleet) -> None:
     transport = connect(mesh.endpoint("10.42.0.3"))
     channel = transport.open_session(timeout=60)
     channel.exec_command("cat")
@@ -71,7 +71,7 @@ def test_a_cut_link_stops_a_connection_and_does_not_close_it(mesh: VirtualFleet)
     transport.close()
 
 
-def test_a_node_that_lost_power_is_silent_and_then_knows_nothing_of_the_connection(mesh: VirtualFleet) -> None:
+def test_a_power_cycled_node_is_silent_and_then_resets_the_connection(mesh: VirtualFleet) -> None:
     far = mesh.node("far")
     transport = connect(mesh.endpoint("10.42.0.3"))
     far.power_cut(back=False)
@@ -89,7 +89,7 @@ def test_a_node_that_lost_power_is_silent_and_then_knows_nothing_of_the_connecti
     transport.close()
 
 
-def test_a_slow_link_slows_and_delivers(mesh: VirtualFleet) -> None:
+def test_a_slow_lossy_link_still_delivers_all_data(mesh: VirtualFleet) -> None:
     mesh.link("base", "near", delay_ms=30, loss=0.02, rate_kbps=4000)
     transport = connect(mesh.endpoint("10.42.0.3"))
     sent = b"x" * 100_000
@@ -103,7 +103,7 @@ def test_a_slow_link_slows_and_delivers(mesh: VirtualFleet) -> None:
     transport.close()
 
 
-def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) -> None:
+def test_a_node_severed_at_a_step_keeps_running_in_isolation(mesh: VirtualFleet) -> None:
     far = mesh.node("far")
     mesh.inject_fault("far", "sever@sync")
     far.exec("touch /etc/a; sync; touch /etc/b").check("work")
@@ -115,7 +115,7 @@ def test_severing_at_a_step_leaves_the_node_working_alone(mesh: VirtualFleet) ->
     until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
 
 
-def test_a_wrong_key_or_one_encrypted_side_separates(mesh: VirtualFleet) -> None:
+def test_nodes_with_different_keys_do_not_mesh(mesh: VirtualFleet) -> None:
     for name, key in (("base", "first-secret"), ("near", "first-secret"), ("far", "other-secret")):
         command = (
             f"uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key={key}; uci commit; reload_config"
@@ -131,7 +131,7 @@ def test_the_same_release_encrypts_only_with_a_full_supplicant(mesh: VirtualFlee
     until(lambda: near.exec("iw dev mesh0 link").stdout == "Not connected.\n", "the radio")
 
 
-def test_25_12_joins_open_when_asked_to_encrypt(fleet: VirtualFleet) -> None:
+def test_openwrt_25_12_joins_an_open_cell_when_configured_for_encryption(fleet: VirtualFleet) -> None:
     new = fleet.node("new")
     new.exec(MESH.format(address="10.42.9.9", channel=6)).check("configure")
     new.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=secret-123; uci commit; wifi")

@@ -41,25 +41,25 @@ def chain(count: int) -> tuple[dict[str, EffectiveState], list[LinkSpec]]:
         {"algorithm": "psk2", "key": "secret"},
     ],
 )
-def test_any_difference_of_the_cell_separates(change: dict[str, object]) -> None:
+def test_nodes_with_different_cell_settings_are_not_linked(change: dict[str, object]) -> None:
     nodes = {"a": node(1), "b": node(2, **change)}
     assert mesh_model.edges(nodes, [LinkSpec("a", "b")]) == {"a": [], "b": []}
 
 
-def test_the_same_cell_hears_both_ways_and_only_over_links() -> None:
+def test_nodes_in_one_cell_are_linked_in_both_directions_only_over_up_links() -> None:
     nodes = {"a": node(1), "b": node(2), "c": node(3)}
     graph = mesh_model.edges(nodes, [LinkSpec("a", "b"), LinkSpec("b", "c", up=False)])
     assert {name: [edge.node for edge in found] for name, found in graph.items()} == {"a": ["b"], "b": ["a"], "c": []}
 
 
-def test_two_routing_algorithms_hear_but_do_not_route() -> None:
+def test_nodes_with_different_routing_algorithms_are_linked_but_not_routed() -> None:
     nodes = {"a": node(1), "b": node(2, routing="BATMAN_V")}
     graph = mesh_model.edges(nodes, [LinkSpec("a", "b")])
     assert len(graph["a"]) == 1
     assert mesh_model.best_routes(graph, "a") == {}
 
 
-def test_a_path_takes_the_better_way_around() -> None:
+def test_the_best_route_prefers_a_better_detour() -> None:
     nodes = {"a": node(1), "b": node(2), "c": node(3)}
     links = [LinkSpec("a", "c", tq=80), LinkSpec("a", "b", tq=250), LinkSpec("b", "c", tq=250)]
     path = mesh_model.best_routes(mesh_model.edges(nodes, links), "a")["c"]
@@ -68,7 +68,7 @@ def test_a_path_takes_the_better_way_around() -> None:
     assert path.tq == 250 * 250 // 255 * (255 - mesh_model.HOP_PENALTY) // 255
 
 
-def test_of_two_equal_ways_one_is_taken_and_the_same_every_time() -> None:
+def test_equal_routes_are_resolved_deterministically() -> None:
     nodes = {name: node(number) for number, name in enumerate("abcd")}
     links = [LinkSpec(one, other, tq=200) for one, other in ("ab", "ac", "bd", "cd")]
     taken = {mesh_model.best_routes(mesh_model.edges(nodes, links), "a")["d"].first.node for _ in range(3)}
@@ -76,7 +76,7 @@ def test_of_two_equal_ways_one_is_taken_and_the_same_every_time() -> None:
 
 
 @given(st.integers(2, 12), st.data())
-def test_cutting_a_chain_separates_exactly_what_lies_behind(count: int, data: st.DataObject) -> None:
+def test_cutting_a_chain_separates_exactly_the_nodes_behind_the_cut(count: int, data: st.DataObject) -> None:
     nodes, links = chain(count)
     cut = data.draw(st.integers(0, count - 2))
     links[cut] = replace(links[cut], up=False)
@@ -84,7 +84,7 @@ def test_cutting_a_chain_separates_exactly_what_lies_behind(count: int, data: st
     assert set(reached) == {f"n{number}" for number in range(1, cut + 1)}
 
 
-def test_what_a_node_hears_is_one_line_per_station_neighbor_and_originator() -> None:
+def test_heard_text_has_one_line_per_station_neighbor_and_originator() -> None:
     nodes, links = chain(3)
     graph = mesh_model.edges(nodes, links)
     lines = [
@@ -96,7 +96,7 @@ def test_what_a_node_hears_is_one_line_per_station_neighbor_and_originator() -> 
     assert {line[3] for line in lines if line[0] == "O"} == {"02:00:00:00:00:01"}
 
 
-def test_effective_text_is_read_as_the_stand_in_writes_it() -> None:
+def test_effective_state_written_by_the_stand_in_is_parsed() -> None:
     text = (
         "addr\tlan\tbr-lan\t10.42.0.11\t24\t1\t0\n"
         "cell\tradio0\tmesh0\tadhoc\t2437\ta team\t02:ca:fe:00:00:01\tnone\t\t02:4d:00:00:00:01\tbat0\tBATMAN_IV\n"

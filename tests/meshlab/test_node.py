@@ -44,7 +44,7 @@ def test_dropbear_has_no_sftp(fleet: VirtualFleet) -> None:
     transport.close()
 
 
-def test_every_node_has_processes_memory_clock_and_boot_id_of_its_own(fleet: VirtualFleet) -> None:
+def test_every_node_has_its_own_processes_memory_clock_and_boot_id(fleet: VirtualFleet) -> None:
     box, far = fleet.node("box"), fleet.node("far")
     assert box.boot_id != far.boot_id
     processes = box.exec("ps").stdout
@@ -58,12 +58,12 @@ def test_every_node_has_processes_memory_clock_and_boot_id_of_its_own(fleet: Vir
     assert uptime_s < float(far.exec("cat /proc/uptime").stdout.split()[0])
 
 
-def test_openwrts_busybox_has_not_what_openwrt_leaves_out(fleet: VirtualFleet) -> None:
+def test_the_nodes_busybox_lacks_applets_that_openwrt_disables(fleet: VirtualFleet) -> None:
     missing = fleet.node("box").exec("for tool in stat timeout base64 nohup setsid; do command -v $tool; done; true")
     assert missing.stdout == ""
 
 
-def test_what_is_not_synced_is_lost_at_a_power_cut(node: VirtualNode) -> None:
+def test_unsynced_data_is_lost_in_a_power_cut(node: VirtualNode) -> None:
     node.exec("echo kept >/etc/kept; sync; echo lost >/etc/lost; echo changed >/etc/kept").check("write")
     boot_id = node.boot_id
     assert flash_text(node, "/etc/kept") == "kept\n"
@@ -72,7 +72,7 @@ def test_what_is_not_synced_is_lost_at_a_power_cut(node: VirtualNode) -> None:
     assert node.boot_id != boot_id
 
 
-def test_a_power_cut_may_also_keep_or_tear_what_was_not_synced(node: VirtualNode) -> None:
+def test_a_power_cut_can_keep_or_truncate_unsynced_data(node: VirtualNode) -> None:
     node.exec("echo old >/etc/file; sync; echo new >/etc/file").check("write")
     node.power_cut(unsynced="kept")
     assert node.exec("cat /etc/file").stdout == "new\n"
@@ -87,7 +87,7 @@ def test_an_orderly_reboot_keeps_everything_but_ram(node: VirtualNode) -> None:
     assert node.exec("cat /etc/file; ls /tmp/file").stdout == "here\n"
 
 
-def test_a_radio_that_its_configuration_does_not_name_is_added_at_every_boot_and_switched_off(
+def test_an_unconfigured_radio_is_added_as_disabled_at_boot(
     node: VirtualNode,
 ) -> None:
     stock = node.exec("cat /etc/config/wireless").stdout
@@ -126,7 +126,7 @@ def test_reload_config_reloads_only_what_changed(node: VirtualNode) -> None:
     until(lambda: node.exec("logread").stdout.count("dnsmasq: reloaded") == 2, "dnsmasq")
 
 
-def test_an_address_change_moves_the_node(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_node_is_reachable_only_at_its_new_address_after_a_change(fleet: VirtualFleet, node: VirtualNode) -> None:
     transport = connect(node.bench)
     run(transport, "uci set network.lan.ipaddr=10.42.7.9; uci commit; (sleep 0; reload_config) >/dev/null 2>&1 &")
     until(lambda: node.address == "10.42.7.9", "the new address")
@@ -135,13 +135,13 @@ def test_an_address_change_moves_the_node(fleet: VirtualFleet, node: VirtualNode
     transport.close()
 
 
-def test_a_network_that_the_firewall_closes_is_not_reachable(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_network_without_a_firewall_zone_is_unreachable(fleet: VirtualFleet, node: VirtualNode) -> None:
     node.exec("uci delete firewall.@zone[0]; uci commit; reload_config").check("close")
     until(lambda: not answers(node.bench), "the firewall")
 
 
 @pytest.mark.parametrize("name", ["old", "new", "box"])
-def test_facts_have_the_shape_of_the_release(fleet: VirtualFleet, name: str) -> None:
+def test_system_facts_match_the_release(fleet: VirtualFleet, name: str) -> None:
     node = fleet.node(name)
     release = node.spec.release
     board = json.loads(node.exec("ubus call system board").stdout)
@@ -163,7 +163,7 @@ def test_facts_have_the_shape_of_the_release(fleet: VirtualFleet, name: str) -> 
     assert keys == (["dropbear_rsa_host_key"] if release is Release.V19_07 else ["dropbear_ed25519_host_key"])
 
 
-def test_a_full_flash_and_a_full_memory_are_really_full(fleet: VirtualFleet) -> None:
+def test_full_flash_and_full_memory_faults_make_writes_fail(fleet: VirtualFleet) -> None:
     node = fleet.node("new")
     fleet.inject_fault("new", "full-flash")
     assert node.exec("dd if=/dev/zero of=/etc/big bs=1k count=64 2>/dev/null").exit_status != 0
@@ -174,7 +174,7 @@ def test_a_full_flash_and_a_full_memory_are_really_full(fleet: VirtualFleet) -> 
     node.exec("rm -f /etc/big /tmp/one /tmp/two; echo x >/etc/small && echo y >/tmp/small").check("write again")
 
 
-def test_a_changed_host_key_is_another_key(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_the_host_key_fault_changes_the_host_key(fleet: VirtualFleet, node: VirtualNode) -> None:
     before = host_key(node)
     fleet.inject_fault("box", "host-key")
     until(lambda: answers(node.bench), "the restarted server")
@@ -186,7 +186,7 @@ def test_a_foreign_delta_is_seen_by_uci_changes(fleet: VirtualFleet, node: Virtu
     assert "description='left by hand'" in node.exec("uci changes").stdout
 
 
-def test_a_clock_off_by_years_moves_date_and_not_uptime(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_the_clock_fault_shifts_the_date_and_repair_restores_it(fleet: VirtualFleet, node: VirtualNode) -> None:
     now = int(node.exec("date +%s").stdout)
     fleet.inject_fault("box", "clock")
     assert now - int(node.exec("date +%s").stdout) > 9 * 365 * 86400
@@ -194,7 +194,7 @@ def test_a_clock_off_by_years_moves_date_and_not_uptime(fleet: VirtualFleet, nod
     assert int(node.exec("date +%s").stdout) >= now
 
 
-def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_the_ssh_hang_fault_accepts_connections_without_a_banner(fleet: VirtualFleet, node: VirtualNode) -> None:
     fleet.inject_fault("box", "ssh-hang")
     transport = paramiko.Transport((node.bench.host, node.bench.port))
     transport.banner_timeout = 0.5
@@ -203,7 +203,7 @@ def test_ssh_that_hangs_accepts_and_says_nothing(fleet: VirtualFleet, node: Virt
     transport.close()
 
 
-def test_a_wrong_board_says_so_before_and_after_a_boot(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_wrong_board_name_is_reported_before_and_after_a_boot(fleet: VirtualFleet, node: VirtualNode) -> None:
     fleet.inject_fault("box", "wrong-board")
     for _ in range(2):
         board = json.loads(node.exec("ubus call system board").stdout)
@@ -220,7 +220,7 @@ def put_image(node: VirtualNode, image: bytes) -> None:
     node.exec("cat >/tmp/firmware.bin", stdin=image).check("upload")
 
 
-def test_sysupgrade_refuses_what_is_not_for_this_board(node: VirtualNode) -> None:
+def test_sysupgrade_rejects_an_image_for_another_board(node: VirtualNode) -> None:
     put_image(node, firmware_image(Release.V24_10, board="other,board"))
     done = node.exec("sysupgrade -T /tmp/firmware.bin")
     assert done.exit_status == 1
@@ -233,7 +233,7 @@ def test_sysupgrade_refuses_what_is_not_for_this_board(node: VirtualNode) -> Non
     assert (verdict["valid"], verdict["tests"]["fwtool_device_match"]) == (False, False)
 
 
-def test_sysupgrade_refuses_an_image_cut_short_or_changed(node: VirtualNode) -> None:
+def test_sysupgrade_rejects_a_truncated_or_corrupted_image(node: VirtualNode) -> None:
     image = firmware_image(Release.V24_10, board=node.spec.board)
     put_image(node, image[:-1])
     assert node.exec("sysupgrade -T /tmp/firmware.bin").exit_status == 1
@@ -241,7 +241,7 @@ def test_sysupgrade_refuses_an_image_cut_short_or_changed(node: VirtualNode) -> 
     assert node.exec("sysupgrade -T /tmp/firmware.bin").exit_status == 1
 
 
-def test_flashing_brings_the_new_release_the_given_files_and_new_host_keys(node: VirtualNode) -> None:
+def test_sysupgrade_installs_the_new_release_given_files_and_new_host_keys(node: VirtualNode) -> None:
     put_image(node, firmware_image(Release.V25_12, board=node.spec.board))
     key, boot_id = host_key(node), node.boot_id
     node.exec(
@@ -269,7 +269,7 @@ def test_flashing_brings_the_new_release_the_given_files_and_new_host_keys(node:
     until(lambda: node.boot_id not in (None, boots), "the old firmware")
 
 
-def test_a_power_cut_in_the_middle_of_a_flash_leaves_a_node_that_needs_the_bench(
+def test_a_power_cut_while_flashing_bricks_the_node_until_it_is_repaired(
     fleet: VirtualFleet, node: VirtualNode
 ) -> None:
     put_image(node, firmware_image(Release.V24_10, board=node.spec.board))
@@ -285,7 +285,7 @@ def test_a_power_cut_in_the_middle_of_a_flash_leaves_a_node_that_needs_the_bench
 # -- steps --
 
 
-def test_a_power_cut_strikes_before_the_step_it_names(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_power_cut_happens_before_the_given_step(fleet: VirtualFleet, node: VirtualNode) -> None:
     work = "echo 1 >/etc/one; sync; cp /etc/one /etc/two; sync; rm /etc/one; sync"
     node.record_steps()
     node.exec(work).check("work")
@@ -301,7 +301,7 @@ def test_a_power_cut_strikes_before_the_step_it_names(fleet: VirtualFleet, node:
         node.exec("rm -f /etc/one /etc/two; sync")
 
 
-def test_a_step_can_be_named_by_its_words(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_fault_step_can_be_given_as_command_text(fleet: VirtualFleet, node: VirtualNode) -> None:
     boot_id = node.boot_id
     fleet.inject_fault("box", "power-cut@uci commit system")
     node.exec("uci set system.@system[0].hostname=a; uci commit network; uci commit system; uci commit")
@@ -333,7 +333,9 @@ SERVICE = (
 )
 
 
-def test_a_package_comes_and_goes_with_its_files_and_services(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_installing_and_removing_a_package_handles_its_files_and_services(
+    fleet: VirtualFleet, node: VirtualNode
+) -> None:
     from meshlab.images import apk_package, opkg_package
 
     files = {"/etc/init.d/tool": SERVICE, "/usr/bin/tool": "#!/bin/sh\n"}
@@ -359,7 +361,7 @@ def test_a_package_comes_and_goes_with_its_files_and_services(fleet: VirtualFlee
     assert new.exec(listed).stdout.split() == ["start", "stop"]
 
 
-def test_the_database_of_packages_is_written_last(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_the_package_database_is_written_last(fleet: VirtualFleet, node: VirtualNode) -> None:
     from meshlab.images import opkg_package
 
     script = (
@@ -375,7 +377,7 @@ def test_the_database_of_packages_is_written_last(fleet: VirtualFleet, node: Vir
     assert {"first", "second"} <= set(node.exec("opkg list-installed").stdout.split())
 
 
-def test_netifd_knows_the_protocols_that_were_there_when_it_started(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_netifd_detects_protocol_handlers_only_at_startup(fleet: VirtualFleet, node: VirtualNode) -> None:
     known = json.loads(node.exec("ubus call network get_proto_handlers").stdout)
     assert set(known) >= {"static", "batadv", "batadv_hardif"}
     node.exec("opkg remove kmod-batman-adv && /etc/init.d/network restart").check("forget")

@@ -35,7 +35,7 @@ def pair(tmp_path: Path) -> Iterator[VirtualFleet]:
         yield running
 
 
-def test_a_signal_that_comes_just_before_process_1_waits_is_not_lost(tmp_path: Path) -> None:
+def test_a_signal_just_before_init_waits_is_not_lost(tmp_path: Path) -> None:
     """The shell writes each command it runs into a pipe that holds one line: so it stands still before its read."""
     script = (rootfs.STAND_INS / "lab" / "init").read_text(encoding="utf-8")
     traps, loop = (
@@ -68,7 +68,7 @@ def _is_writing(pid: int) -> bool:
     return Path(f"/proc/{pid}/syscall").read_text(encoding="ascii").split()[0] == _WRITE
 
 
-def test_a_shell_on_one_node_holds_nothing_of_another_one() -> None:
+def test_a_node_shell_closes_inherited_descriptors_of_other_nodes() -> None:
     program = (
         "import os, sys; from meshlab.node_runner import _close_all_except\n"
         "kept, other = os.open('/dev/null', os.O_RDONLY), os.open('/proc/self/ns/net', os.O_RDONLY)\n"
@@ -92,7 +92,7 @@ def _has_ended(lines: int) -> bool:
 
 
 @pytest.mark.lab
-def test_a_word_that_the_fleet_cannot_read_does_not_take_the_next_one_along(pair: VirtualFleet) -> None:
+def test_an_invalid_node_state_does_not_discard_the_next_event(pair: VirtualFleet) -> None:
     air = pair.directory / "nodes" / "here" / "air" / "effective"
     air.write_text("\t".join(("cell", "-", "mesh0", "adhoc", "no frequency", *"abcdefg")) + "\n", encoding="ascii")
     (pair.directory / "nodes" / "there" / "air" / "effective").write_text("", encoding="ascii")
@@ -112,7 +112,7 @@ def test_a_node_that_cannot_be_started_is_not_waited_for(pair: VirtualFleet, mon
 
 
 @pytest.mark.lab
-def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: VirtualFleet) -> None:
+def test_a_failure_report_contains_the_console_of_a_node_that_is_down(pair: VirtualFleet) -> None:
     pair.node("here").power_cut(back=False)
     (fleet,) = fleets_of([1, pair.node("there"), pair])
     text = report(fleet, "waited 180 s for something")
@@ -128,7 +128,7 @@ def test_a_failure_s_report_holds_the_console_of_the_node_that_is_down(pair: Vir
 @pytest.mark.proof
 @pytest.mark.lab
 @pytest.mark.timeout(3600)
-def test_every_node_comes_back_a_thousand_times(tmp_path: Path) -> None:
+def test_every_node_survives_a_thousand_power_cycles(tmp_path: Path) -> None:
     names = [f"n{number}" for number in range(8)]
     spec = FleetSpec("eight", tuple(NodeSpec(name, host_key_types=KEYS) for name in names))
     with VirtualFleet(spec, tmp_path / "fleet") as fleet:

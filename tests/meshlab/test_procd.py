@@ -55,7 +55,7 @@ def test_the_failure_of_a_script_is_ignored(node: VirtualNode) -> None:
     until(lambda: node.exec("cat /tmp/ran").stdout == "ran\n", "the script")
 
 
-def test_a_trigger_of_ones_own_comes_a_second_later_and_after_those_before_it(node: VirtualNode) -> None:
+def test_a_custom_trigger_runs_delayed_and_after_earlier_triggers(node: VirtualNode) -> None:
     node.exec(MARKER).check("register")
     listed = service(node, "mark", verbose=True)
     assert listed["triggers"][0][1][1] == ["eq", "package", "mark"]
@@ -71,7 +71,7 @@ def test_a_trigger_of_ones_own_comes_a_second_later_and_after_those_before_it(no
     assert service(node, "mark") is None
 
 
-def test_events_within_a_second_are_one_and_one_that_comes_while_it_runs_is_another(node: VirtualNode) -> None:
+def test_events_within_a_second_are_merged_but_an_event_during_a_run_triggers_another(node: VirtualNode) -> None:
     node.exec(
         """ubus call service set '{"name":"mark","triggers":[["config.change",["if",["eq","package","mark"],
         ["run_script","/bin/sh","-c","echo ran >>/tmp/mark; sleep 2"]],1000]]}'"""
@@ -87,7 +87,7 @@ def test_events_within_a_second_are_one_and_one_that_comes_while_it_runs_is_anot
     until(lambda: node.exec("cat /tmp/mark").stdout == "ran\nran\nran\n", "the third")
 
 
-def test_dropbear_is_listed_as_procd_lists_it_and_restarted_only_by_another_command(node: VirtualNode) -> None:
+def test_dropbear_is_listed_like_in_procd_and_restarted_only_on_a_command_change(node: VirtualNode) -> None:
     before = dropbear(node)
     assert before["running"] is True
     assert before["command"][:2] == ["/usr/sbin/dropbear", "-F"]
@@ -107,7 +107,7 @@ def test_dropbear_is_listed_as_procd_lists_it_and_restarted_only_by_another_comm
 @pytest.mark.parametrize(
     "change", ["enable=0", "Interface=absent", "PasswordAuth=perhaps", "Port=ssh"], ids=lambda text: text.split("=")[0]
 )
-def test_dropbear_that_is_left_out_listens_no_longer_and_leaves_sessions_alone(node: VirtualNode, change: str) -> None:
+def test_disabled_dropbear_stops_listening_but_keeps_open_sessions(node: VirtualNode, change: str) -> None:
     transport = connect(node.bench)
     node.exec(f"uci set dropbear.@dropbear[0].{change}; uci commit; reload_config").check("change")
     assert answers(node.bench)
@@ -126,7 +126,7 @@ def test_a_service_that_dies_comes_back_after_five_seconds(node: VirtualNode) ->
     assert dropbear(node)["pid"] != before["pid"]
 
 
-def test_a_service_of_ones_own_is_started_changed_and_stopped(fleet: VirtualFleet, node: VirtualNode) -> None:
+def test_a_custom_service_is_started_restarted_on_change_and_stopped(fleet: VirtualFleet, node: VirtualNode) -> None:
     def put(seconds: int) -> None:
         asked = json.dumps({"name": "own", "instances": {"one": {"command": ["/bin/sleep", str(seconds)]}}})
         node.exec(f"ubus call service set '{asked}'").check("set")

@@ -54,7 +54,7 @@ def loss_at(distance_m: float, air: PathLossModel = PathLossModel(), walls_db: f
     return frame_loss(air, received_dbm(air, distance_m, air.tx_power_dbm, walls_db))
 
 
-def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_meter() -> None:
+def test_frame_loss_is_10_percent_at_sensitivity_and_the_first_meter_is_free_space() -> None:
     air = PathLossModel()
     assert frame_loss(air, air.sensitivity_dbm) == 0.1
     first_meter = received_dbm(replace(air, antenna_gain_dbi=0.0), 1.0, 0.0)
@@ -64,13 +64,13 @@ def test_a_tenth_is_lost_at_the_sensitivity_and_free_space_holds_for_the_first_m
 
 
 @given(st.floats(0.0, 1000.0), st.floats(0.0, 100.0), st.floats(0.0, 50.0))
-def test_farther_or_behind_more_rock_is_never_heard_better(near_m: float, more_m: float, rock_db: float) -> None:
+def test_loss_never_decreases_with_distance_or_wall_attenuation(near_m: float, more_m: float, rock_db: float) -> None:
     assert loss_at(near_m + more_m) >= loss_at(near_m)
     assert loss_at(near_m, walls_db=rock_db) >= loss_at(near_m)
 
 
 @given(grounds)
-def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: RadioEnvironment) -> None:
+def test_each_audible_pair_is_linked_exactly_once(ground: RadioEnvironment) -> None:
     found = links_of(ground)
     assert len({link.ends for link in found}) == len(found)
     by_hand = {link.ends for link in ground.links}
@@ -82,12 +82,14 @@ def test_links_join_each_pair_once_and_the_deaf_not_at_all(ground: RadioEnvironm
 
 
 @given(grounds)
-def test_a_link_by_hand_holds_wherever_its_nodes_are(ground: RadioEnvironment) -> None:
+def test_a_manual_link_applies_regardless_of_node_positions(ground: RadioEnvironment) -> None:
     assert set(ground.links) <= set(links_of(ground))
 
 
 @given(grounds, points)
-def test_who_moves_changes_no_link_of_others(ground: RadioEnvironment, to: tuple[float, float]) -> None:
+def test_moving_a_node_does_not_change_links_between_other_nodes(
+    ground: RadioEnvironment, to: tuple[float, float]
+) -> None:
     if "n0" not in ground.positions:
         with pytest.raises(InputError, match="n0: it has no position"):
             ground.with_moved("n0", to)
@@ -96,7 +98,7 @@ def test_who_moves_changes_no_link_of_others(ground: RadioEnvironment, to: tuple
     assert [link for link in links_of(ground.with_moved("n0", to)) if "n0" not in link.ends] == before
 
 
-def test_the_stronger_sender_is_heard_where_the_weaker_is_not() -> None:
+def test_the_weaker_sender_is_not_heard_by_the_stronger_one() -> None:
     ground = RadioEnvironment({"strong": NodePosition((0, 0), 33.0), "weak": NodePosition((330, 0), 15.0)})
     (link,) = links_of(ground)
     assert link.loss_to("weak") < 0.5
@@ -115,7 +117,7 @@ def test_a_wall_between_two_nodes_separates_them_and_one_beside_them_does_not() 
 # -- the file --
 
 
-def test_a_ground_is_read_as_it_is_written() -> None:
+def test_an_environment_file_is_parsed() -> None:
     text = """
 nodes: {base: [0, 0], b01: {at: [80, 0.5], tx_power_dbm: 33}}
 walls: [{a: [40, 10], b: [200, 10], loss_db: 40}, {a: [0, 0], b: [1, 1]}]
@@ -135,19 +137,19 @@ links:
     )
 
 
-def test_the_example_s_links_are_a_ground_without_places() -> None:
+def test_the_links_example_has_no_positions() -> None:
     ground = propagation_file.load(EXAMPLES / "links.yaml")
     assert ground.positions == {}
     assert links_of(ground)[0] == LinkSpec("base", "b01", tq=252, signal_dbm=-52)
 
 
-def test_the_example_s_places_make_a_line_with_a_robot_at_two_of_its_nodes() -> None:
+def test_the_ground_example_forms_a_chain_with_a_robot_at_two_nodes() -> None:
     pairs = {"-".join(sorted(link.ends)) for link in links_of(propagation_file.load(EXAMPLES / "ground.yaml"))}
     assert pairs == {"b01-base", "b01-b02", "b02-b03", "b01-rover1", "b03-rover2"}
 
 
 @given(grounds)
-def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
+def test_an_environment_round_trips_through_its_file(ground: RadioEnvironment) -> None:
     assert propagation_file.parse(propagation_file.dump(ground), FILE) == ground
 
 
@@ -175,7 +177,7 @@ def test_a_ground_survives_its_file(ground: RadioEnvironment) -> None:
         ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: duplicate key 'a'"),
     ],
 )
-def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
+def test_a_parse_error_reports_file_line_expected_and_found(text: str, said: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         propagation_file.parse(text, FILE)
     assert said in str(caught.value)
@@ -188,7 +190,7 @@ def test_all_problems_are_reported_at_once() -> None:
 
 
 @given(st.text(max_size=200))
-def test_any_text_is_a_ground_or_a_list_of_problems(text: str) -> None:
+def test_any_text_parses_or_raises_diagnostics(text: str) -> None:
     try:
         propagation_file.parse(text, FILE)
     except InvalidInput as problems:
@@ -201,5 +203,5 @@ def test_a_share_is_a_number_or_a_percentage(text: str, share: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["30", "-1%", "nan", "%", "", "1.01"])
-def test_what_is_no_share_is_none(text: str) -> None:
+def test_an_invalid_share_is_none(text: str) -> None:
     assert share_of(text) is None

@@ -16,7 +16,7 @@ from meshlab.images import firmware_image
 from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec, RadioSpec, dump, load
 
 
-def test_a_spec_survives_its_file() -> None:
+def test_a_fleet_spec_round_trips_through_dump_and_load() -> None:
     spec = FleetSpec(
         "x",
         (
@@ -29,21 +29,21 @@ def test_a_spec_survives_its_file() -> None:
     assert load(dump(spec)) == spec
 
 
-def test_a_spec_names_what_is_wrong_with_it() -> None:
+def test_an_invalid_fleet_spec_is_rejected_with_the_reason() -> None:
     with pytest.raises(InputError, match="twice: a"):
         FleetSpec("x", (NodeSpec("a"), NodeSpec("a")))
     with pytest.raises(InputError, match="link a-c: no node named c"):
         FleetSpec("x", (NodeSpec("a"),), (LinkSpec("a", "c"),))
 
 
-def test_every_address_has_one_place_on_this_machine() -> None:
+def test_every_node_address_maps_to_a_unique_loopback_address() -> None:
     assert addresses.loopback_of("10.42.0.11") == "127.42.0.11"
     assert addresses.bench_of(0) == "127.255.0.1"
     assert addresses.bench_of(299) == "127.255.1.44"
     assert len({addresses.bench_of(number) for number in range(1000)}) == 1000
 
 
-def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
+def test_default_links_keep_every_node_of_a_large_fleet_within_six_hops() -> None:
     names = [f"n{number}" for number in range(200)]
     parents = {link.b: link.a for link in from_inventory.default_links(names) if link.tq > 200}
 
@@ -53,7 +53,7 @@ def test_every_node_of_a_big_fleet_is_a_few_hops_away() -> None:
     assert max(map(hops, names)) <= 6
 
 
-def test_breaks_are_words_and_some_take_a_step() -> None:
+def test_faults_are_parsed_and_described_with_an_optional_step() -> None:
     assert faults.parse("power-cut@7") == FaultRequest(Fault.CUT, "7")
     assert faults.parse("full-flash") == FaultRequest(Fault.FULL_FLASH)
     assert faults.describe(FaultRequest(Fault.FULL_FLASH)) == "only 8 KiB left in flash"
@@ -69,14 +69,14 @@ def test_breaks_are_words_and_some_take_a_step() -> None:
 
 
 @pytest.mark.parametrize("release", list(Release))
-def test_an_image_passes_the_host_side_check_of_any_image(release: Release) -> None:
+def test_a_generated_image_has_readable_sysupgrade_metadata(release: Release) -> None:
     metadata = read_metadata(firmware_image(release, board="ubnt,rocket-m"))
     assert metadata is not None
     assert metadata.boards == ("ubnt,rocket-m",)
     assert releases.facts(release).revision == metadata.revision
 
 
-def test_an_image_holds_one_supplicant() -> None:
+def test_an_image_contains_exactly_one_wpad_package() -> None:
     with_full = releases.image_packages(Release.V23_05, ("wpad-openssl",))
     assert [name for name in with_full if name.startswith("wpad")] == ["wpad-openssl"]
     plain = releases.image_packages(Release.V23_05, ())
@@ -89,7 +89,7 @@ names_of_applets = st.lists(st.text("abcdefghs12[", min_size=2, max_size=6), min
 
 
 @given(names_of_applets)
-def test_hiding_applets_keeps_the_order_that_lookups_rely_on(names: list[str]) -> None:
+def test_hiding_applets_preserves_the_sort_order_of_the_table(names: list[str]) -> None:
     table = "\0".join(names).encode() + b"\0"
     image = b"before" + table + b"after"
     changed = rootfs.without_applets(image, names, set(names) - {"ash", "sh"}, keep=("ash", "sh"))
@@ -102,6 +102,6 @@ def test_hiding_applets_keeps_the_order_that_lookups_rely_on(names: list[str]) -
         assert all(other > kept for other in found[place + 1 :])
 
 
-def test_a_busybox_with_another_table_is_refused() -> None:
+def test_a_busybox_without_the_expected_applet_table_is_rejected() -> None:
     with pytest.raises(LabError, match="applet names"):
         rootfs.without_applets(b"nothing here", ["ash", "cat"], {"cat"}, keep=("ash",))

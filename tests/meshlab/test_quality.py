@@ -13,19 +13,19 @@ shares = st.integers(0, 100).map(lambda hundredths: hundredths / 100)
 
 
 @given(shares, shares)
-def test_more_loss_in_either_direction_never_gives_more_quality(there: float, back: float) -> None:
+def test_tq_never_increases_with_loss_in_either_direction(there: float, back: float) -> None:
     assert 0 <= tq_of(there, back) <= TQ_MAX
     assert tq_of(min(1.0, there + 0.01), back) <= tq_of(there, back)
     assert tq_of(there, min(1.0, back + 0.01)) <= tq_of(there, back)
 
 
 @pytest.mark.parametrize(("there", "back"), [(1.0, 0.0), (0.0, 1.0), (1.0, 1.0)])
-def test_a_deaf_end_leaves_no_quality(there: float, back: float) -> None:
+def test_total_loss_in_either_direction_gives_tq_zero(there: float, back: float) -> None:
     assert tq_of(there, back) == 0
 
 
 @given(st.integers(0, TQ_MAX))
-def test_the_loss_of_a_quality_gives_it_back(tq: int) -> None:
+def test_converting_tq_to_loss_and_back_round_trips(tq: int) -> None:
     loss = loss_of(tq)
     assert abs(tq_of(loss, loss) - tq) <= 1
 
@@ -42,7 +42,7 @@ links = st.builds(
 
 
 @given(links)
-def test_a_link_says_the_same_from_either_end(link: LinkSpec) -> None:
+def test_a_link_has_the_same_properties_from_either_end(link: LinkSpec) -> None:
     turned = link.seen_from("b")
     assert (turned.a, turned.b) == ("b", "a")
     for name in ("a", "b"):
@@ -53,12 +53,12 @@ def test_a_link_says_the_same_from_either_end(link: LinkSpec) -> None:
 
 
 @given(links, shares)
-def test_a_loss_one_way_leaves_the_other_way_as_it_was(link: LinkSpec, loss: float) -> None:
+def test_a_one_way_loss_change_keeps_the_other_direction(link: LinkSpec, loss: float) -> None:
     changed = changed_link(link, {"loss_to_b": loss})
     assert (changed.loss_to("b"), changed.loss_to("a")) == (loss, link.loss_to("a"))
 
 
-def test_a_new_loss_holds_both_ways_and_decides_the_quality() -> None:
+def test_a_new_loss_applies_in_both_directions_and_determines_tq() -> None:
     changed = changed_link(LinkSpec("a", "b", tq=100, loss=0.5, loss_back=0.1), {"loss": 0.0})
     assert (changed.loss_to("a"), changed.tq_to("a"), changed.tq_to("b")) == (0.0, TQ_MAX, TQ_MAX)
     assert changed_link(LinkSpec("a", "b"), {"loss": 0.1, "tq": 90}).tq_to("b") == 90

@@ -52,7 +52,7 @@ def configure(node: VirtualNode, commands: str) -> None:
 
 
 @pytest.mark.parametrize("section", ["radio0", "mesh0"])
-def test_a_disabled_open_radio_stays_in_its_cell_until_its_radio_goes_down(latest: VirtualNode, section: str) -> None:
+def test_a_disabled_open_interface_stays_in_its_cell_until_wifi_down(latest: VirtualNode, section: str) -> None:
     before = index(latest)
     configure(latest, f"set wireless.{section}.disabled=1")
     assert index(latest) == before
@@ -62,14 +62,14 @@ def test_a_disabled_open_radio_stays_in_its_cell_until_its_radio_goes_down(lates
     assert not has_joined(latest)
 
 
-def test_one_that_stayed_is_found_and_left_alone_when_it_is_enabled_again(latest: VirtualNode) -> None:
+def test_reenabling_a_disabled_radio_keeps_its_remaining_interface(latest: VirtualNode) -> None:
     before = index(latest)
     configure(latest, "set wireless.radio0.disabled=1")
     configure(latest, "set wireless.radio0.disabled=0")
     assert index(latest) == before
 
 
-def test_back_from_the_supplicant_to_the_same_open_cell_the_interface_is_lost(latest: VirtualNode) -> None:
+def test_switching_from_encrypted_back_to_the_same_open_cell_loses_the_interface(latest: VirtualNode) -> None:
     before = index(latest)
     configure(latest, ENCRYPTED)
     assert index(latest) not in ("", before)
@@ -81,7 +81,7 @@ def test_back_from_the_supplicant_to_the_same_open_cell_the_interface_is_lost(la
     until(lambda: index(latest) != "", "mesh0")
 
 
-def test_another_cell_creates_a_lost_interface(latest: VirtualNode) -> None:
+def test_a_channel_change_recreates_a_lost_interface(latest: VirtualNode) -> None:
     configure(latest, ENCRYPTED)
     configure(latest, OPEN)
     until(lambda: index(latest) == "", "mesh0 to go")
@@ -89,13 +89,13 @@ def test_another_cell_creates_a_lost_interface(latest: VirtualNode) -> None:
     assert index(latest) != ""
 
 
-def test_the_reload_of_a_change_brings_a_lost_interface_back(latest: VirtualNode) -> None:
+def test_the_reload_script_recreates_a_lost_interface(latest: VirtualNode) -> None:
     configure(latest, ENCRYPTED)
     latest.exec(f"uci -q batch <<END\n{OPEN}\ncommit wireless\nEND\n{reload_script({WIRELESS}, ())}").check("reload")
     until(lambda: index(latest) != "" and has_joined(latest), "mesh0 in its cell")
 
 
-def test_the_reload_of_a_change_takes_a_disabled_radio_off_the_air(latest: VirtualNode) -> None:
+def test_the_reload_script_removes_the_interface_of_a_disabled_radio(latest: VirtualNode) -> None:
     off = "uci set wireless.radio0.disabled=1; uci commit wireless"
     latest.exec(f"{off}\n{reload_script({WIRELESS}, ())}").check("reload")
     until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")

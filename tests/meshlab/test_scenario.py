@@ -44,7 +44,7 @@ def happenings(mission: Scenario, what: EventKind) -> list[tuple[float, str, str
 
 
 @given(times)
-def test_a_beacon_rides_without_power_and_stays_with_power_where_it_was_dropped(t: float) -> None:
+def test_a_carried_beacon_is_off_and_a_dropped_one_stays_in_place_powered(t: float) -> None:
     now = snapshot(AWAY, t)
     rover, beacon = now.environment.positions["rover"].at, now.environment.positions["beacon"].at
     assert rover == pytest.approx((2 * t, 0.0))
@@ -54,7 +54,7 @@ def test_a_beacon_rides_without_power_and_stays_with_power_where_it_was_dropped(
 
 
 @given(st.lists(st.tuples(times, st.tuples(times, times)), min_size=1, max_size=5, unique_by=lambda point: point[0]))
-def test_a_course_goes_through_its_points_and_stands_at_its_ends(
+def test_a_trajectory_passes_through_its_waypoints_and_is_clamped_at_its_ends(
     points: list[tuple[float, tuple[float, float]]],
 ) -> None:
     points.sort()
@@ -65,7 +65,7 @@ def test_a_course_goes_through_its_points_and_stands_at_its_ends(
 
 
 @pytest.mark.parametrize("way_points", [[], [(1.0, (0.0, 0.0)), (1.0, (1.0, 0.0))]])
-def test_a_course_needs_rising_times(way_points: list[tuple[float, tuple[float, float]]]) -> None:
+def test_a_trajectory_requires_increasing_times(way_points: list[tuple[float, tuple[float, float]]]) -> None:
     with pytest.raises(ValueError, match="increasing times"):
         trajectory(way_points)
 
@@ -85,7 +85,7 @@ def test_the_timeline_has_planned_events_and_their_effects() -> None:
 
 
 @given(st.sampled_from([0.5, 1.0, 3.0, 7.0]))
-def test_events_come_in_order_and_links_as_the_ground_has_them(step_s: float) -> None:
+def test_events_are_ordered_and_link_events_match_the_environment(step_s: float) -> None:
     mission = replace(AWAY, step_s=step_s)
     events = timeline(mission)
     assert [event.at_s for event in events] == sorted(event.at_s for event in events)
@@ -101,7 +101,7 @@ def test_events_come_in_order_and_links_as_the_ground_has_them(step_s: float) ->
     assert joined == end
 
 
-def test_an_incident_takes_a_radio_off_and_back_and_never_wakes_a_carried_beacon() -> None:
+def test_a_power_event_switches_a_node_but_never_powers_a_carried_beacon() -> None:
     mission = replace(
         AWAY,
         power_events=(
@@ -126,7 +126,7 @@ def test_the_order_of_incidents_in_the_file_does_not_matter() -> None:
 # -- the file --
 
 
-def test_a_mission_is_read_as_it_is_written(tmp_path: Path) -> None:
+def test_a_mission_file_is_parsed(tmp_path: Path) -> None:
     (tmp_path / "ground.yaml").write_text(
         "nodes: {base: [0, 0], spare: [9, 9]}\nair: {exponent: 2}\n", encoding="utf-8"
     )
@@ -169,7 +169,7 @@ GOOD = "nodes: {base: [0, 0]}\nduration_s: 9\nrobots: {r: {path: [[0, 0, 0]]}}\n
         ("duration_s: 9\nnodes: {base: [0, 0]}\nrobots: {r: {path: [[1, 0]]}}", "path[0]: expected [seconds, x, y]"),
     ],
 )
-def test_a_problem_names_file_line_what_was_expected_and_found(text: str, said: str) -> None:
+def test_a_parse_error_reports_file_line_expected_and_found(text: str, said: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         scenario_file.parse(text, FILE)
     assert said in str(caught.value)

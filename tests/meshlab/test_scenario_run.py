@@ -79,7 +79,7 @@ def test_the_fleet_gets_only_changed_links() -> None:
 
 
 @given(st.integers(1, 199))
-def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int) -> None:
+def test_a_stopped_and_resumed_mission_reports_the_same_events(stop_at_s: int) -> None:
     first = RecordedTarget(stop_at_s=stop_at_s)
     stopped_s = played(first)
     assert stopped_s is not None
@@ -94,7 +94,7 @@ def test_what_was_stopped_and_taken_up_again_is_the_same_mission(stop_at_s: int)
     ("on_s", "is_forgotten"), [(80.0 + STATION_EXPIRY_S - 1, False), (80.0 + STATION_EXPIRY_S, True)]
 )
 @pytest.mark.parametrize("start_s", [0.0, 85.0])
-def test_station_entries_of_a_node_that_was_off_for_long_are_flushed(
+def test_station_entries_are_flushed_after_a_node_was_off_past_expiry(
     on_s: float, start_s: float, is_forgotten: bool
 ) -> None:
     stage = RecordedTarget()
@@ -112,7 +112,7 @@ def test_events_of_nodes_outside_the_fleet_are_reported_but_not_applied() -> Non
 
 
 @pytest.mark.parametrize("speed", [1.0, 50.0])
-def test_incidents_switch_radios(speed: float) -> None:
+def test_power_events_switch_nodes_off_and_on(speed: float) -> None:
     stage = RecordedTarget()
     mission = replace(AWAY, power_events=(PowerEvent(80.0, "spare", False), PowerEvent(90.0, "spare", True)))
     play(mission, stage, on_event=stage.events.append, clock=stage.clock, wait=stage.wait, speed=speed)

@@ -58,7 +58,7 @@ def pair() -> Pair:
     return Pair()
 
 
-def test_two_that_just_met_hear_each_other(pair: Pair) -> None:
+def test_two_new_neighbors_hear_each_other(pair: Pair) -> None:
     pair.hear(after_s=100)
     assert pair.passes()
     assert pair.connected_s("a") == pair.connected_s("b") == [100]
@@ -76,7 +76,7 @@ def test_a_recreated_radio_is_not_heard_by_a_former_neighbor_until_it_deletes_th
     assert pair.connected_s("a") == [0]
 
 
-def test_a_radio_with_another_address_is_a_stranger_and_the_old_entry_falls_silent(pair: Pair) -> None:
+def test_a_radio_with_a_new_mac_gets_a_new_entry_and_the_old_one_goes_silent(pair: Pair) -> None:
     pair.change("b", mac="42:00:00:00:00:02", index=22)
     pair.hear(after_s=10)
     assert pair.passes()
@@ -86,7 +86,7 @@ def test_a_radio_with_another_address_is_a_stranger_and_the_old_entry_falls_sile
     assert [entry.mac for entry in pair.stations.entries_of("a")] == ["42:00:00:00:00:02"]
 
 
-def test_one_that_forgets_a_radio_that_did_not_restart_is_not_heard_until_that_one_forgets_it_too(pair: Pair) -> None:
+def test_deleting_a_running_radios_entry_blocks_traffic_until_it_deletes_its_own(pair: Pair) -> None:
     pair.stations.delete("a", "mesh0", B, pair.now_s)
     pair.hear()
     assert not pair.passes()
@@ -95,7 +95,7 @@ def test_one_that_forgets_a_radio_that_did_not_restart_is_not_heard_until_that_o
     assert pair.passes()
 
 
-def test_numbers_catch_up_after_minutes(pair: Pair) -> None:
+def test_a_restarted_radio_is_heard_again_after_the_deaf_period(pair: Pair) -> None:
     pair.restart("b")
     pair.hear(after_s=DEAF_S - 1)
     assert not pair.passes()
@@ -103,7 +103,7 @@ def test_numbers_catch_up_after_minutes(pair: Pair) -> None:
     assert pair.passes()
 
 
-def test_one_that_was_away_for_longer_than_it_is_remembered_is_heard_at_once(pair: Pair) -> None:
+def test_a_radio_away_past_station_expiry_is_heard_immediately(pair: Pair) -> None:
     cells = pair.nodes["b"].interfaces
     pair.nodes["b"] = EffectiveState()
     pair.hear()
@@ -115,7 +115,7 @@ def test_one_that_was_away_for_longer_than_it_is_remembered_is_heard_at_once(pai
     assert pair.passes()
 
 
-def test_a_link_that_fails_for_a_moment_changes_nothing_about_it(pair: Pair) -> None:
+def test_a_brief_link_failure_does_not_clear_stale_station_entries(pair: Pair) -> None:
     pair.restart("b")
     nodes, pair.nodes = pair.nodes, {}
     pair.hear()
@@ -124,7 +124,7 @@ def test_a_link_that_fails_for_a_moment_changes_nothing_about_it(pair: Pair) -> 
     assert not pair.passes()
 
 
-def test_an_entry_that_is_deleted_while_its_radio_is_silent_costs_nothing(pair: Pair) -> None:
+def test_deleting_the_entry_of_a_silent_radio_does_not_block_its_return(pair: Pair) -> None:
     cells = pair.nodes["b"].interfaces
     pair.nodes["b"] = EffectiveState()
     pair.hear()
@@ -134,7 +134,7 @@ def test_an_entry_that_is_deleted_while_its_radio_is_silent_costs_nothing(pair: 
     assert pair.passes()
 
 
-def test_a_reboot_forgets_ones_own_table(pair: Pair) -> None:
+def test_a_reboot_clears_the_nodes_own_station_table(pair: Pair) -> None:
     pair.boots["a"] = 2
     pair.hear(after_s=50)
     assert pair.connected_s("a") == [0]

@@ -74,7 +74,7 @@ def test_show_names_anonymous_sections_by_type_and_index(uci: Uci) -> None:
     ]
 
 
-def test_show_can_give_anonymous_sections_their_internal_names(uci: Uci) -> None:
+def test_show_x_prints_internal_names_of_anonymous_sections(uci: Uci) -> None:
     lines = uci.out("-X", "show", "network").splitlines()
     assert lines[3].startswith("network.cfg02")
 
@@ -86,13 +86,13 @@ def test_get_gives_a_type_a_value_or_a_list(uci: Uci) -> None:
 
 
 @pytest.mark.parametrize("path", ["network.wan", "network.lan.gateway", "wireless.radio0", "network.@device[1].name"])
-def test_what_is_not_there_is_an_error(uci: Uci, path: str) -> None:
+def test_getting_a_missing_entry_is_an_error(uci: Uci, path: str) -> None:
     done = uci.run("get", path)
     assert (done.returncode, done.stderr) == (1, "uci: Entry not found\n")
     assert uci.run("-q", "get", path).stderr == ""
 
 
-def test_changes_stay_apart_until_commit(uci: Uci) -> None:
+def test_changes_are_staged_until_commit(uci: Uci) -> None:
     uci.out("set", "network.lan.ipaddr=10.0.0.1")
     uci.out("delete", "network.loopback.proto")
     uci.out("add_list", "network.@device[0].ports=bat0")
@@ -137,7 +137,7 @@ def test_rename_reorder_and_del_list(uci: Uci) -> None:
     assert "network.@device[0].ports='eth1'" in lines
 
 
-def test_batch_stages_until_its_own_commit(uci: Uci) -> None:
+def test_batch_changes_are_staged_until_committed(uci: Uci) -> None:
     uci.out("batch", stdin="set network.lan.ipaddr='10.0.0.7'\nset network.lan.note='two words'\n")
     assert "10.0.0.7" not in (uci.config / "network").read_text()
     uci.out("batch", stdin="commit network\n")

@@ -57,7 +57,7 @@ def test_a_file_is_read_once(tmp_path: Path) -> None:
     assert store.get(_ref(SecretKind.FILE, "many.yaml", "b")).reveal() == "two"
 
 
-def test_paths_begin_at_the_file_that_names_them_or_at_home(tmp_path: Path) -> None:
+def test_paths_are_relative_to_the_file_that_names_them_or_to_home(tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "k").write_text("below")
     (tmp_path / "k").write_text("home")
@@ -101,7 +101,7 @@ def _broken(directory: Path) -> dict[str, SecretRef]:
     }
 
 
-def test_what_cannot_be_had_is_a_located_error_that_tells_nothing_of_it(tmp_path: Path) -> None:
+def test_an_unavailable_secret_is_a_located_error_that_does_not_reveal_it(tmp_path: Path) -> None:
     store = SecretStore({}, tmp_path)
     for name, ref in _broken(tmp_path).items():
         with pytest.raises(InputError) as caught:
@@ -111,7 +111,7 @@ def test_what_cannot_be_had_is_a_located_error_that_tells_nothing_of_it(tmp_path
         assert not any(word in text for word in ("correct", "battery", "correcthorse")), name
 
 
-def test_no_text_form_of_a_secret_or_a_store_shows_it(tmp_path: Path) -> None:
+def test_secrets_and_stores_are_never_shown_as_text_or_serialized(tmp_path: Path) -> None:
     store = SecretStore({"K": _VALUE}, tmp_path)
     secret = store.get(_ref(SecretKind.ENV, "K"))
     shown = [repr(secret), str(secret), f"{secret}", f"{secret:>40}", f"{secret!r}", repr([secret]), repr(store)]
@@ -145,7 +145,7 @@ def test_a_secret_written_into_the_inventory_is_refused_and_not_repeated(text: s
     assert not any("hunter2!" in repr(item) for item in loaded.diagnostics)
 
 
-def test_an_error_of_the_loader_never_shows_the_environment(tmp_path: Path) -> None:
+def test_loader_errors_never_show_environment_values(tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(HEAD + "udp_mesh: {keys: [{env: K, key: x}]}\n")
     loaded = load(tmp_path, environ={"K": _VALUE})
     assert loaded.diagnostics

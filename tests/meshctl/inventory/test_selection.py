@@ -47,7 +47,7 @@ def chosen(*words: str) -> list[str]:
         ((" b01 , ,b02",), ["b01", "b02"]),
     ],
 )
-def test_words_select(words: tuple[str, ...], names: list[str]) -> None:
+def test_terms_select_nodes(words: tuple[str, ...], names: list[str]) -> None:
     assert chosen(*words) == names
 
 
@@ -88,7 +88,7 @@ def test_every_limit_narrows_the_selection(limits: list[str], names: list[str]) 
     assert list(select(["base", "b0*"], CANDIDATES, read, limits, what="node")) == names
 
 
-def test_a_limit_that_leaves_nothing_is_an_error() -> None:
+def test_a_limit_that_excludes_every_node_is_an_error() -> None:
     with pytest.raises(InputError, match="husky1: selects no node among those selected without it"):
         select(["b0*"], CANDIDATES, read, ["husky1"], what="node")
 
@@ -108,7 +108,7 @@ def test_candidates_of_two_kinds_may_share_a_name() -> None:
     assert chosen_kinds("role:computer") == ["robot"]
 
 
-def test_words_may_decide_the_order() -> None:
+def test_the_selection_can_follow_the_order_of_the_terms() -> None:
     """One --at or --interface per node, in the order of the words."""
     found = select(["b02", "b*", "!base"], CANDIDATES, read, what="node", in_word_order=True)
     assert found == ("b02", "b01")
@@ -118,7 +118,7 @@ MAC = "02:4d:00:00:00:01"
 
 
 @pytest.mark.parametrize("word", ["b01", "B01", "h1-1", "label:h1-*", "sn1", MAC.upper(), f"mac:{MAC}"])
-def test_a_node_is_selected_by_what_is_printed_on_it(word: str) -> None:
+def test_a_node_is_selected_by_name_label_serial_or_mac(word: str) -> None:
     team = fleet()
     b01 = replace(team.nodes["b01"], mac=MAC, label="H1-1", serial="SN1")
     team = replace(team, nodes=MappingProxyType({**team.nodes, "b01": b01}))

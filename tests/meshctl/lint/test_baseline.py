@@ -22,7 +22,7 @@ def _written(directory: Path, *items: Diagnostic) -> Path:
     return path
 
 
-def test_what_was_written_is_known_again_on_another_line(tmp_path: Path) -> None:
+def test_a_baseline_finding_is_recognized_on_another_line(tmp_path: Path) -> None:
     path = _written(tmp_path, _FINDING)
     moved = replace(_FINDING, position=Position("elsewhere/fleet.yaml", 90, 1), message="said in other words")
     compared = compare([moved, _OTHER], read(path), path, _RAN)
@@ -31,26 +31,26 @@ def test_what_was_written_is_known_again_on_another_line(tmp_path: Path) -> None
     assert compared.stale == ()
 
 
-def test_another_value_is_another_finding() -> None:
+def test_a_different_value_or_path_is_a_different_finding() -> None:
     assert fingerprint(replace(_FINDING, found="14")) != fingerprint(_FINDING)
     assert fingerprint(replace(_FINDING, path="meshes.b.channel")) != fingerprint(_FINDING)
 
 
-def test_two_alike_need_two_entries(tmp_path: Path) -> None:
+def test_two_identical_findings_need_two_entries(tmp_path: Path) -> None:
     path = _written(tmp_path, _FINDING)
     assert compare([_FINDING, _FINDING], read(path), path, _RAN).new == (_FINDING,)
     path = _written(tmp_path, _FINDING, _FINDING)
     assert compare([_FINDING, _FINDING], read(path), path, _RAN).new == ()
 
 
-def test_what_is_no_longer_found_is_named_unless_its_rule_did_not_run(tmp_path: Path) -> None:
+def test_stale_entries_are_reported_unless_their_rule_did_not_run(tmp_path: Path) -> None:
     path = _written(tmp_path, _FINDING, _OTHER)
     (stale,) = compare([_OTHER], read(path), path, _RAN).stale
     assert (stale.code, stale.found, stale.position.file) == ("MC004", "meshes.main.channel", str(path))
     assert compare([_OTHER], read(path), path, ("MC614",)).stale == ()
 
 
-def test_the_file_is_the_same_for_the_same_findings_in_any_order() -> None:
+def test_the_baseline_does_not_depend_on_the_order_of_findings() -> None:
     assert dump([_FINDING, _OTHER]) == dump([_OTHER, _FINDING])
 
 
@@ -64,7 +64,7 @@ def test_the_file_is_the_same_for_the_same_findings_in_any_order() -> None:
         ('{"version": 1, "findings": [7]}', "finding 1: expected fingerprint, code and about"),
     ],
 )
-def test_a_file_that_is_no_baseline_is_refused_with_its_name(text: str, message: str, tmp_path: Path) -> None:
+def test_an_invalid_baseline_is_rejected_by_file_name(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "other.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=f"other.json: .*{message}"):

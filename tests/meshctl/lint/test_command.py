@@ -41,7 +41,7 @@ def test_a_clean_inventory_exits_with_0(capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out == "nothing found in 1 file\n"
 
 
-def test_findings_exit_with_1_and_name_their_places(capsys: pytest.CaptureFixture[str]) -> None:
+def test_findings_exit_with_1_and_show_their_positions(capsys: pytest.CaptureFixture[str]) -> None:
     assert _lint(_file("faulty.yaml", _FAULTY)) == 1
     out = capsys.readouterr().out
     assert f"faulty.yaml:{_FAULTY.count(chr(10))}:17: warning: apply.canary" in out
@@ -53,7 +53,7 @@ def test_an_inventory_that_does_not_load_is_a_finding() -> None:
     assert _lint(_file("broken.yaml", "a: [")) == 1
 
 
-def test_what_cannot_be_read_exits_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unreadable_files_and_invalid_options_exit_with_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert _lint("absent.yaml") == 2
     assert "absent.yaml: error: cannot be read" in capsys.readouterr().out
     assert _lint(_file("clean.yaml", BASE), "--regdb", "absent.db") == 2
@@ -67,14 +67,14 @@ def test_what_cannot_be_read_exits_with_2(capsys: pytest.CaptureFixture[str]) ->
     assert "absent.db: cannot be read" in err
 
 
-def test_the_default_is_the_variable_and_then_the_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_inventory_is_the_variable_then_the_directory(monkeypatch: pytest.MonkeyPatch) -> None:
     _file("fleet.yaml", BASE)
     assert _lint() == 0
     monkeypatch.setenv("MESHCTL_INVENTORY", _file("other.yaml", _FAULTY))
     assert _lint() == 1
 
 
-def test_the_inventory_is_named_as_for_every_other_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_inventory_option_works_as_for_other_commands(capsys: pytest.CaptureFixture[str]) -> None:
     assert _lint("-i", _file("faulty.yaml", _FAULTY)) == 1
     capsys.readouterr()
     assert _lint("--inventory", "faulty.yaml", _file("clean.yaml", BASE), "--format", "json") == 1
@@ -89,7 +89,7 @@ def test_severities_below_the_threshold_do_not_count() -> None:
     assert _lint(_file("faulty.yaml", _FAULTY), "--fail-on", "error") == 0
 
 
-def test_rules_are_chosen_by_the_start_of_their_codes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_rules_are_selected_and_ignored_by_code_prefix(capsys: pytest.CaptureFixture[str]) -> None:
     faulty = _file("faulty.yaml", _FAULTY)
     assert _lint(faulty, "--select", "MC615") == 1
     assert "MC614" not in capsys.readouterr().out

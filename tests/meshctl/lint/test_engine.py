@@ -23,7 +23,7 @@ def _found(fragment: str, directory: Path) -> list[Diagnostic]:
     return list(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
 
 
-def test_a_value_that_a_group_shares_is_reported_once_where_it_is_written(tmp_path: Path) -> None:
+def test_a_group_value_is_reported_once_at_its_definition(tmp_path: Path) -> None:
     fragment = """
 groups: {strong: {radios: {radio0: {tx_power_dbm: 30}}}}
 nodes: {"c[01-07]": {groups: [strong], address: {from: 10.42.0.121}}}
@@ -35,13 +35,13 @@ nodes: {"c[01-07]": {groups: [strong], address: {from: 10.42.0.121}}}
     assert "also c02, c03, c04, c05 and 2 more" in finding.message
 
 
-def test_findings_come_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_findings_are_in_file_order(tmp_path: Path) -> None:
     found = _found("{meshes: {main: {channel: 13, mtu: 1400}}, apply: {quorum: 0.1}, country: XX}", tmp_path)
     assert [item.code for item in found] == ["MC321", "MC506", "MC615"]
     assert found == sorted(found, key=lambda item: item.position)
 
 
-def test_the_power_sum_is_shown(tmp_path: Path) -> None:
+def test_the_power_calculation_is_shown(tmp_path: Path) -> None:
     example = BY_CODE["MC342"].failing
     (finding,) = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
     assert finding.found == "27 drive + 6 amplifier = 33 dBm"
@@ -49,14 +49,14 @@ def test_the_power_sum_is_shown(tmp_path: Path) -> None:
     assert "3 dB above the limit" in finding.message
 
 
-def test_each_dbi_above_six_takes_a_db_from_the_fccs_watt(tmp_path: Path) -> None:
+def test_the_fcc_limit_drops_1_db_per_dbi_above_6_dbi(tmp_path: Path) -> None:
     found = _found("{hardware: {rocket: {radios: {radio0: {antenna_gain_dbi: 9, cable_loss_db: 0.5}}}}}", tmp_path)
     (finding,) = (item for item in found if item.code == "MC342")
     assert finding.expected == "at most 27 dBm conducted (country US: 30 less 3 for an antenna of 9 dBi)"
     assert finding.found == "28 drive - 0.5 cable = 27.5 dBm"
 
 
-def test_the_radiated_sum_counts_amplifier_cable_and_antenna(tmp_path: Path) -> None:
+def test_the_eirp_includes_amplifier_cable_and_antenna(tmp_path: Path) -> None:
     fragment = """
 country: DE
 hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 3, cable_loss_db: 1}}}}
@@ -66,7 +66,7 @@ hardware: {rocket: {radios: {radio0: {rated_power_dbm: 30, amplifier_gain_db: 3,
     assert finding.found == "28 drive + 3 amplifier, at most 30 rated - 1 cable + 5 antenna = 34 dBm EIRP"
 
 
-def test_secrets_are_judged_but_never_shown(tmp_path: Path) -> None:
+def test_secrets_are_checked_but_never_shown(tmp_path: Path) -> None:
     example = Example("{udp_mesh: {port: 8701}}", environment={"MESH_KEY": "zu-kurz", "UDP_MESH_KEY": "geheimnis-1234"})
     examined = check_path(write(example, tmp_path), _REGDB, environment(example))
     assert {item.code for item in examined.diagnostics} == {"MC409", "MC445"}
@@ -74,12 +74,12 @@ def test_secrets_are_judged_but_never_shown(tmp_path: Path) -> None:
     assert "geheimnis" not in repr(examined)
 
 
-def test_without_the_secrets_at_hand_nothing_is_said_of_them(tmp_path: Path) -> None:
+def test_unavailable_environment_secrets_are_not_reported(tmp_path: Path) -> None:
     example = Example("udp_mesh: {port: 8701}")
     assert check_path(write(example, tmp_path), _REGDB, {}).diagnostics == ()
 
 
-def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
+def test_key_material_is_found_even_if_the_inventory_does_not_load(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(
         "meshctl: 1\nnonsense: |\n  -----BEGIN OPENSSH PRIVATE KEY-----\n  b3BlbnNzaC1rZXk\n", encoding="utf-8"
@@ -98,7 +98,7 @@ def test_key_material_is_found_even_when_no_fleet_loads(tmp_path: Path) -> None:
         "wpa_key=correcthorse",
     ],
 )
-def test_a_key_on_any_line_is_found_and_not_repeated(line: str, tmp_path: Path) -> None:
+def test_key_material_on_any_line_is_reported_without_showing_it(line: str, tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     path.write_text(f"meshctl: 1\n{line}\n", encoding="utf-8")
     found = [item for item in check_path(path, _REGDB, {}).diagnostics if item.code == "MC441"]
@@ -106,12 +106,12 @@ def test_a_key_on_any_line_is_found_and_not_repeated(line: str, tmp_path: Path) 
     assert not any(word in str(found) for word in ("b4f8e7", "tPjn8M", "1QQQQQ", "correcthorse"))
 
 
-def test_a_hash_is_no_key(tmp_path: Path) -> None:
+def test_a_hash_is_not_reported_as_a_key(tmp_path: Path) -> None:
     example = BY_CODE["MC801"].passing
     assert check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics == ()
 
 
-def test_references_to_secrets_are_not_taken_for_secrets(tmp_path: Path) -> None:
+def test_secret_references_are_not_reported_as_secrets(tmp_path: Path) -> None:
     fragment = """
 udp_mesh: {keys: [{file: ../password.yaml, key: udp_mesh_secret_key}, {env: THE_PASSWORD}]}
 operators: {password_login: false}
@@ -121,12 +121,12 @@ operators: {password_login: false}
 
 
 @pytest.mark.parametrize(("name", "expected"), [("subt-final", []), ("starter", ["MC423"])])
-def test_the_shipped_inventories_lack_nothing_but_what_their_owner_must_add(name: str, expected: list[str]) -> None:
+def test_the_shipped_inventories_have_only_the_expected_findings(name: str, expected: list[str]) -> None:
     found = check_path(shipped("inventory") / name, _REGDB, ENVIRONMENT).diagnostics
     assert [item.code for item in found if item.severity is not Severity.NOTE] == expected
 
 
-def test_a_missing_inventory_is_a_finding_that_says_so(tmp_path: Path) -> None:
+def test_a_missing_inventory_is_a_finding(tmp_path: Path) -> None:
     examined = check_path(tmp_path / "absent.yaml", _REGDB, {})
     assert not examined.is_readable
     assert [item.code for item in examined.diagnostics] == ["INV001"]
@@ -163,13 +163,13 @@ def _work(fleet: Fleet) -> int:
     return calls
 
 
-def test_the_work_grows_linearly_with_the_fleet(tmp_path: Path) -> None:
+def test_lint_work_grows_linearly_with_fleet_size(tmp_path: Path) -> None:
     small, large = _large(600, tmp_path), _large(1800, tmp_path)
     lint(small, LintContext(_REGDB, DiskFiles()))
     assert _work(large) < 3.3 * _work(small)
 
 
-def test_the_rules_are_many_and_their_codes_unique() -> None:
+def test_rule_codes_are_unique() -> None:
     assert len({rule.code for rule in RULES}) == len(RULES) > 150
 
 

@@ -17,7 +17,7 @@ def test_the_pages_in_the_repository_are_up_to_date() -> None:
     assert written == pages(), "run: python -m meshctl.lint.pages docs/lint"
 
 
-def test_every_rule_stands_in_one_chapter_under_its_own_code_and_name() -> None:
+def test_every_rule_is_in_one_chapter_with_a_unique_name_and_title() -> None:
     chaptered = [rule for _, module in CHAPTERS for rule in rules_of(module)]
     assert sorted(rule.code for rule in chaptered) == [rule.code for rule in RULES]
     assert len({rule.name for rule in RULES}) == len(RULES)
@@ -25,7 +25,7 @@ def test_every_rule_stands_in_one_chapter_under_its_own_code_and_name() -> None:
 
 
 @pytest.mark.parametrize(("title", "module"), CHAPTERS, ids=[title for title, _ in CHAPTERS])
-def test_a_chapter_says_which_codes_it_holds(title: str, module: ModuleType) -> None:
+def test_a_chapter_states_the_range_of_its_codes(title: str, module: ModuleType) -> None:
     codes = [rule.code for rule in rules_of(module)]
     assert codes == sorted(codes), title
     span = re.search(r"\((MC\d{3})(?: to (MC\d{3}))?\)", (module.__doc__ or "").replace("\n", " "))

@@ -29,5 +29,5 @@ def test_the_passing_example_yields_nothing(rule: Rule, tmp_path: Path) -> None:
     assert _codes(rule.passing, tmp_path) == set(rule.passing.also)
 
 
-def test_the_base_inventory_has_nothing_to_report(tmp_path: Path) -> None:
+def test_the_base_inventory_has_no_findings(tmp_path: Path) -> None:
     assert _codes(Example("apply: {canary: true}"), tmp_path) == set()

@@ -16,7 +16,7 @@ def _line(key: ed25519.Ed25519PublicKey | rsa.RSAPublicKey | ec.EllipticCurvePub
     return key.public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH).decode()
 
 
-def test_the_kinds_that_openssh_writes_are_read() -> None:
+def test_key_types_written_by_openssh_are_parsed() -> None:
     key = parse_authorized_key(_line(ed25519.Ed25519PrivateKey.generate().public_key()) + " alice@laptop")
     assert (key.kind, key.bits, key.comment) == ("ssh-ed25519", 256, "alice@laptop")
     key = parse_authorized_key(_line(rsa.generate_private_key(65537, 2048).public_key()))
@@ -25,7 +25,7 @@ def test_the_kinds_that_openssh_writes_are_read() -> None:
         assert parse_authorized_key(_line(ec.generate_private_key(curve).public_key())).bits == bits
 
 
-def test_options_may_stand_before_the_key() -> None:
+def test_options_may_precede_the_key() -> None:
     line = _line(ed25519.Ed25519PrivateKey.generate().public_key())
     assert parse_authorized_key(f'no-pty,from="10.42.0.*" {line} bob').comment == "bob"
 
@@ -44,13 +44,13 @@ def test_options_may_stand_before_the_key() -> None:
         ("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAAkFC", "truncated"),
     ],
 )
-def test_what_is_no_whole_key_is_refused(line: str, why: str) -> None:
+def test_an_invalid_or_truncated_key_is_rejected(line: str, why: str) -> None:
     with pytest.raises(BadKey, match=why):
         parse_authorized_key(line)
 
 
 @given(st.binary(max_size=60), st.sampled_from(["ssh-rsa", "ssh-ed25519", "ssh-dss", "ecdsa-sha2-nistp256"]))
-def test_any_bytes_give_a_key_or_a_refusal_without_them(blob: bytes, kind: str) -> None:
+def test_arbitrary_bytes_parse_or_are_rejected_without_being_shown(blob: bytes, kind: str) -> None:
     inside = struct.pack(">I", len(kind)) + kind.encode() + blob
     encoded = base64.b64encode(inside).decode()
     try:

@@ -20,11 +20,11 @@ def _lint(tail: str, directory: Path) -> tuple[list[str], list[str]]:
     return [item.code for item in examined.diagnostics], [item.diagnostic.code for item in examined.suppressed]
 
 
-def test_a_comment_on_the_line_excuses_the_finding(tmp_path: Path) -> None:
+def test_a_comment_on_the_line_suppresses_the_finding(tmp_path: Path) -> None:
     assert _lint("apply: {canary: false}  # meshctl: ignore MC614 -- bench\n", tmp_path) == ([], ["MC614"])
 
 
-def test_a_comment_of_its_own_speaks_for_the_next_line_that_holds_something(tmp_path: Path) -> None:
+def test_a_standalone_comment_applies_to_the_next_line_with_content(tmp_path: Path) -> None:
     tail = "# meshctl: ignore MC614 -- bench\n\n# another comment\napply: {canary: false}\n"
     assert _lint(tail, tmp_path) == ([], ["MC614"])
 
@@ -34,12 +34,12 @@ def test_one_comment_may_name_several_codes(tmp_path: Path) -> None:
     assert _lint(tail, tmp_path) == ([], ["MC614", "MC615"])
 
 
-def test_it_excuses_only_the_code_and_line_it_names(tmp_path: Path) -> None:
+def test_a_comment_suppresses_only_its_code_on_its_line(tmp_path: Path) -> None:
     tail = "apply:\n  canary: false\n  quorum: 0.2  # meshctl: ignore MC615 -- bench\n"
     assert _lint(tail, tmp_path) == (["MC614"], ["MC615"])
 
 
-def test_without_a_reason_it_excuses_nothing(tmp_path: Path) -> None:
+def test_a_comment_without_a_reason_suppresses_nothing(tmp_path: Path) -> None:
     assert _lint("apply: {canary: false}  # meshctl: ignore MC614\n", tmp_path) == (["MC614", "MC001"], [])
     assert _lint("apply: {canary: false}  # meshctl: ignore MC614 --  \n", tmp_path) == (["MC614", "MC001"], [])
 
@@ -54,17 +54,17 @@ def test_without_a_reason_it_excuses_nothing(tmp_path: Path) -> None:
         ("ignore everything -- why", "MC003"),
     ],
 )
-def test_a_comment_that_does_nothing_is_a_finding(comment: str, code: str, tmp_path: Path) -> None:
+def test_a_comment_without_effect_is_a_finding(comment: str, code: str, tmp_path: Path) -> None:
     assert _lint(f"apply: {{canary: true}}  # meshctl: {comment}\n", tmp_path) == ([code], [])
 
 
-def test_the_loaders_findings_cannot_be_excused(tmp_path: Path) -> None:
+def test_loader_findings_cannot_be_suppressed(tmp_path: Path) -> None:
     stay, excused = _lint("aply: {canary: false}  # meshctl: ignore INV020 -- why\n", tmp_path)
     assert "INV020" in stay
     assert excused == []
 
 
-def test_what_stands_inside_a_text_is_no_comment() -> None:
+def test_a_comment_inside_a_string_is_ignored() -> None:
     text = (
         'a: "x # meshctl: ignore MC614 -- no"\n'
         "b: |\n"
@@ -76,6 +76,6 @@ def test_what_stands_inside_a_text_is_no_comment() -> None:
     assert (found.position.line, found.position.column) == (4, 6)
 
 
-def test_a_file_that_is_no_yaml_is_read_as_far_as_it_goes() -> None:
+def test_comments_in_invalid_yaml_are_read_up_to_the_error() -> None:
     (found,) = find("f.yaml", "a: [1  # meshctl: ignore MC614 -- yes\n}: {")
     assert found.codes == ("MC614",)

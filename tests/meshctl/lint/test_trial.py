@@ -24,7 +24,7 @@ def _codes(example: Example | str, directory: Path) -> list[str]:
     return [item.code for item in _found(example, directory)]
 
 
-def test_a_secret_above_the_repository_is_not_inside_it(tmp_path: Path) -> None:
+def test_a_secret_outside_the_repository_is_accepted(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     (repository / ".git").mkdir(parents=True)
     (tmp_path / "id").write_text(_KEY, encoding="utf-8")
@@ -33,7 +33,7 @@ def test_a_secret_above_the_repository_is_not_inside_it(tmp_path: Path) -> None:
     assert _codes(fragment, repository) == []
 
 
-def test_a_link_to_a_secret_outside_the_repository_is_not_the_secret(tmp_path: Path) -> None:
+def test_secret_symlinks_are_resolved_before_the_repository_check(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     (repository / ".git").mkdir(parents=True)
     (tmp_path / "id").write_text(_KEY, encoding="utf-8")
@@ -48,7 +48,7 @@ def test_a_link_to_a_secret_outside_the_repository_is_not_the_secret(tmp_path: P
     assert _codes("udp_mesh: {keys: [{file: link}]}", outside) == ["MC443"]
 
 
-def test_known_hosts_that_is_a_directory_is_said_to_be_one(tmp_path: Path) -> None:
+def test_a_directory_as_known_hosts_is_reported(tmp_path: Path) -> None:
     (tmp_path / "pins").mkdir()
     (finding,) = _found("operators: {known_hosts: pins}", tmp_path)
     assert (finding.code, finding.message) == ("MC431", "not a regular file")
@@ -63,12 +63,12 @@ def test_known_hosts_that_is_a_directory_is_said_to_be_one(tmp_path: Path) -> No
         (f"{_KEY}\n{_KEY}", ["MC445"]),
     ],
 )
-def test_a_transport_key_is_read_as_udp_mesh_reads_it(key: str, codes: list[str], tmp_path: Path) -> None:
+def test_a_transport_key_is_parsed_as_in_udp_mesh(key: str, codes: list[str], tmp_path: Path) -> None:
     example = Example("udp_mesh: {keys: [{file: mode-0600.key}]}", files={"mode-0600.key": key})
     assert _codes(example, tmp_path) == codes
 
 
-def test_one_key_with_and_without_its_id_is_one_key(tmp_path: Path) -> None:
+def test_the_same_key_with_and_without_its_id_is_a_duplicate(tmp_path: Path) -> None:
     example = Example(
         "udp_mesh: {keys: [{env: UDP_MESH_KEY}, {file: mode-0600.key}]}", files={"mode-0600.key": f"{_KEY}  # 5d3c1a90"}
     )
@@ -83,7 +83,7 @@ def test_one_key_with_and_without_its_id_is_one_key(tmp_path: Path) -> None:
         ("udp_mesh: {", "is not valid YAML"),
     ],
 )
-def test_a_file_of_secrets_at_hand_must_hold_the_secret(text: str, found: str, tmp_path: Path) -> None:
+def test_an_available_secret_file_must_contain_the_secret(text: str, found: str, tmp_path: Path) -> None:
     fragment = "udp_mesh: {keys: [{file: mode-0600.yaml, key: udp_mesh}]}"
     (finding,) = _found(Example(fragment, files={"mode-0600.yaml": text}), tmp_path)
     assert finding.code == "MC450"
@@ -93,7 +93,7 @@ def test_a_file_of_secrets_at_hand_must_hold_the_secret(text: str, found: str, t
     assert "abc" not in repr(finding)
 
 
-def test_a_directory_is_no_file_of_secrets(tmp_path: Path) -> None:
+def test_a_directory_is_not_accepted_as_a_secret_file(tmp_path: Path) -> None:
     (tmp_path / "keys").mkdir()
     assert _codes("udp_mesh: {keys: [{file: keys}]}", tmp_path) == ["MC450"]
 
@@ -157,12 +157,12 @@ def test_a_robot_may_carry_another_robot(tmp_path: Path) -> None:
         ("robots: {husky1: {carries: [b01, base]}}", "MC607", "base"),
     ],
 )
-def test_a_robots_list_is_blamed_at_its_element(fragment: str, code: str, text: str, tmp_path: Path) -> None:
+def test_a_finding_in_a_robots_list_points_at_the_element(fragment: str, code: str, text: str, tmp_path: Path) -> None:
     (finding,) = (item for item in _found(fragment, tmp_path) if item.code == code)
     assert _at(finding, tmp_path).strip("- '\"").startswith(text)
 
 
-def test_each_wrong_element_of_a_list_is_a_finding_and_a_range_is_one(tmp_path: Path) -> None:
+def test_each_invalid_list_element_is_a_finding_and_a_range_counts_as_one(tmp_path: Path) -> None:
     found = _found("robots: {husky1: {carries: [b01, x1, 'c[1-9]', x2]}}", tmp_path)
     assert [(item.code, item.found) for item in found] == [
         ("MC104", "x1"),
@@ -178,18 +178,18 @@ def test_each_wrong_element_of_a_list_is_a_finding_and_a_range_is_one(tmp_path: 
         ("nodes: {B01: {address: 10.42.0.99, hostname: other, role: beacon}}", "nodes.B01"),
     ],
 )
-def test_names_that_differ_in_capitals_are_found_in_every_section(fragment: str, place: str, tmp_path: Path) -> None:
+def test_names_that_differ_only_in_case_are_found_in_every_section(fragment: str, place: str, tmp_path: Path) -> None:
     assert place in [item.path for item in _found(fragment, tmp_path) if item.code == "MC112"]
 
 
-def test_a_zone_written_as_the_time_zone_is_answered_with_its_posix_string(tmp_path: Path) -> None:
+def test_a_zone_name_as_timezone_suggests_its_posix_string(tmp_path: Path) -> None:
     (finding,) = _found("system: {timezone: America/Denver}", tmp_path)
     assert finding.expected == "MST7MDT,M3.2.0,M11.1.0"
     assert finding.hint == "write `timezone: MST7MDT,M3.2.0,M11.1.0` and `zonename: America/Denver`"
     assert _at(finding, tmp_path) == "America/Denver"
 
 
-def test_a_misspelt_zone_is_answered_with_the_nearest(tmp_path: Path) -> None:
+def test_a_misspelled_zone_name_suggests_the_nearest(tmp_path: Path) -> None:
     (finding,) = _found("system: {zonename: America/Dever}", tmp_path)
     assert (finding.code, finding.hint) == ("MC232", "did you mean America/Denver?")
 
@@ -200,12 +200,12 @@ def test_every_zone_of_the_table_has_a_posix_string() -> None:
 
 
 @pytest.mark.parametrize("text", ["UTC", "UTC0", "EST5", "<+0330>-3:30", "EST5EDT", "CET-1CEST,M3.5.0,M10.5.0/3"])
-def test_a_posix_time_zone_is_one(text: str) -> None:
+def test_valid_posix_time_zones_are_accepted(text: str) -> None:
     assert is_posix(text)
 
 
 @pytest.mark.parametrize("text", ["", "CET", "Europe/Berlin", "UTC+", "5EST", "CET-1CEST,M3.5.0", "<+03>"])
-def test_what_the_c_library_cannot_read_is_no_posix_time_zone(text: str) -> None:
+def test_strings_libc_cannot_parse_are_not_posix_time_zones(text: str) -> None:
     assert not is_posix(text)
 
 
@@ -223,9 +223,7 @@ def test_what_the_c_library_cannot_read_is_no_posix_time_zone(text: str) -> None
         ("MST7MDT,M3.2.0,M11.1.0", "UTC", []),
     ],
 )
-def test_time_zone_and_name_are_held_against_each_other(
-    timezone: str, zonename: str, codes: list[str], tmp_path: Path
-) -> None:
+def test_timezone_and_zonename_must_agree(timezone: str, zonename: str, codes: list[str], tmp_path: Path) -> None:
     assert _codes(f"system: {{timezone: '{timezone}', zonename: '{zonename}'}}", tmp_path) == codes
 
 
@@ -233,7 +231,7 @@ def test_time_zone_and_name_are_held_against_each_other(
     ("one", "other"),
     [("abcd", "abd"), ("abcd", "abxcd"), ("abcd", "abxd"), ("abcd", "acbd"), ("abcd", "abcde"), ("abc", "xabc")],
 )
-def test_one_slip_is_one_letter_or_one_exchange(one: str, other: str) -> None:
+def test_one_insertion_deletion_substitution_or_swap_is_one_edit(one: str, other: str) -> None:
     assert is_one_edit_apart(one, other)
     assert is_one_edit_apart(other, one)
 
@@ -241,22 +239,22 @@ def test_one_slip_is_one_letter_or_one_exchange(one: str, other: str) -> None:
 @pytest.mark.parametrize(
     ("one", "other"), [("abcd", "abcd"), ("abcd", "ab"), ("abcd", "axyd"), ("abcd", "dcba"), ("", "ab")]
 )
-def test_two_slips_are_not_one(one: str, other: str) -> None:
+def test_zero_or_several_edits_are_not_one_edit(one: str, other: str) -> None:
     assert not is_one_edit_apart(one, other)
     assert not is_one_edit_apart(other, one)
 
 
-def test_no_known_package_is_taken_for_another() -> None:
+def test_no_known_package_is_flagged_as_a_misspelling() -> None:
     assert [name for name in PACKAGES if suggest_package(name) is not None] == []
 
 
-def test_flash_that_is_too_small_is_found_where_the_image_is_not_at_hand(tmp_path: Path) -> None:
+def test_too_small_flash_is_reported_even_without_the_image(tmp_path: Path) -> None:
     image = "{image: absent.bin, revision: r1, sha256: " + "ab" * 32 + "}"
     assert sorted(_codes(f"hardware: {{rocket: {{flash_mib: 4, firmware: {image}}}}}", tmp_path)) == ["MC801", "MC828"]
 
 
 @pytest.mark.parametrize("target", ["newchip9000/generic", "ramips/en7581"])
-def test_a_target_that_is_near_to_none_may_be_a_new_one(target: str, tmp_path: Path) -> None:
+def test_an_unknown_target_unlike_any_known_one_is_accepted(target: str, tmp_path: Path) -> None:
     assert _codes(f"hardware: {{rocket: {{target: {target}}}}}", tmp_path) == []
 
 
@@ -270,7 +268,7 @@ def test_a_target_that_is_near_to_none_may_be_a_new_one(target: str, tmp_path: P
         ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean kmod-ath9k?"),
     ],
 )
-def test_a_slip_is_answered_with_what_was_meant(fragment: str, code: str, hint: str, tmp_path: Path) -> None:
+def test_a_misspelling_gets_a_suggestion(fragment: str, code: str, hint: str, tmp_path: Path) -> None:
     (finding,) = _found(fragment, tmp_path)
     assert finding.code == code
     assert hint in finding.hint
@@ -295,20 +293,20 @@ def test_a_slip_is_answered_with_what_was_meant(fragment: str, code: str, hint: 
         ("hardware: {rocket: {radios: {radio0: {max_drive_dbm: 31}}}}", "MC344", "31"),
     ],
 )
-def test_a_finding_about_two_values_points_at_the_one_that_is_written(
+def test_a_finding_about_two_values_points_at_the_explicit_one(
     fragment: str, code: str, text: str, tmp_path: Path
 ) -> None:
     (finding,) = (item for item in _found(fragment, tmp_path) if item.code == code)
     assert _at(finding, tmp_path).strip("'\"") == text
 
 
-def test_a_profile_without_ports_is_one_finding_for_all_robots_that_have_it(tmp_path: Path) -> None:
+def test_a_profile_without_ports_is_one_finding_for_all_its_robots(tmp_path: Path) -> None:
     (finding,) = (item for item in _found("hardware: {rocket: {lan_ports: []}}", tmp_path) if item.code == "MC528")
     assert finding.path == "hardware.rocket.lan_ports"
     assert finding.message == "the computer of base-station, husky1 is cut off"
 
 
-def test_a_host_key_twice_is_found_at_the_key(tmp_path: Path) -> None:
+def test_a_duplicate_host_key_is_reported_at_the_key(tmp_path: Path) -> None:
     key = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f"
     own = key[:-4] + "HR4g"
     fragment = f"nodes: {{base: {{host_keys: ['{key}']}}, b01: {{host_keys: ['{own}', '{key}']}}}}"
@@ -331,18 +329,20 @@ _PACKAGES = "hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw,
         ("kmod-ath10k", "radios: {radio1: {driver: ath9k}}", []),
     ],
 )
-def test_a_package_says_what_drives_a_radio_at_5_ghz(driver: str, more: str, codes: list[str], tmp_path: Path) -> None:
+def test_the_driver_of_a_5_ghz_radio_is_inferred_from_the_packages(
+    driver: str, more: str, codes: list[str], tmp_path: Path
+) -> None:
     hardware = _PACKAGES.replace("DRIVER", driver).rstrip("}\n") + (f", {more}" if more else "") + "}}\n"
     found = _found(_AT_5G + hardware, tmp_path)
     assert [item.code for item in found] == codes
     assert all(_at(item, tmp_path).startswith(driver) for item in found)
 
 
-def test_a_package_for_5_ghz_says_nothing_of_the_other_radio(tmp_path: Path) -> None:
+def test_a_5_ghz_driver_package_does_not_affect_the_2_4_ghz_radio(tmp_path: Path) -> None:
     assert _codes(_PACKAGES.replace("DRIVER", "kmod-ath10k"), tmp_path) == []
 
 
-def test_802_11s_is_what_those_drivers_have(tmp_path: Path) -> None:
+def test_802_11s_requires_driver_support(tmp_path: Path) -> None:
     fragment = (
         "{meshes: {main: {mode: mesh, encryption: sae}}, hardware: {rocket: {radios: {radio0: {driver: DRIVER}}}}}"
     )

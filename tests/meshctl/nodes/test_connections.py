@@ -31,7 +31,7 @@ class Kept(SshConnection):
         self._closed.append(self._name)
 
 
-def test_kept_connections_are_closed_side_by_side_before_those_they_go_through(tmp_path: Path) -> None:
+def test_pooled_connections_close_in_parallel_before_their_jump_hosts(tmp_path: Path) -> None:
     closed: list[str] = []
     access = ConnectionPool(load_fleet(ROOT / "inventory/lab"), TrustStore(tmp_path / "known_hosts"))
     together = threading.Barrier(8)

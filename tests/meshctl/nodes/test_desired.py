@@ -35,11 +35,11 @@ def test_the_board_provides_the_switch_layout_that_vlan_ports_need() -> None:
     assert kinds(facts.packages["network"]) == ["interface", "switch", "switch_vlan"]
 
 
-def test_where_no_port_is_a_vlan_a_switch_without_a_layout_is_left_without() -> None:
+def test_without_vlan_ports_no_switch_layout_is_added() -> None:
     assert kinds(device_facts(NODE, SEEN).packages["network"]) == ["interface"]
 
 
-def test_a_package_that_no_uci_reader_accepts_is_no_fact() -> None:
+def test_an_unparsable_uci_package_is_not_a_device_fact() -> None:
     broken = replace(SEEN, uci={"network": "config", "system": "config system\n\toption compat_version '1.1'\n"})
     facts = device_facts(NODE, broken)
     assert (facts.compat_version, list(facts.packages)) == ("1.1", ["system"])

@@ -18,7 +18,7 @@ from tests.meshctl.plan.support import fleet
 MAC = "02:4d:00:00:00:01"
 
 
-def test_a_retired_spare_keeps_no_claim_on_the_device_that_took_over_a_node() -> None:
+def test_a_retired_spare_does_not_claim_the_mac_of_the_replacement_device() -> None:
     """After `meshctl replace b01 b05`, both names have the same MAC in the journal."""
     team = fleet()
     known = {name: LastKnown(name, 100.0, {"macs": MAC}) for name in ("b01", "b05")}

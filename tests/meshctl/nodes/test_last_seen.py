@@ -28,7 +28,7 @@ def of(**observations: Observation) -> LastSeen:
     return last_seen_of(fleet(), ["b03"], observations, KNOWN)["b03"]
 
 
-def test_the_last_sighting_and_the_nodes_that_hear_it_are_shown_latest_first() -> None:
+def test_the_last_sighting_is_shown_with_the_nodes_that_hear_it_latest_first() -> None:
     stations = (Station("mesh0", LOST, signal_dbm=-61, inactive_ms=40),)
     place = of(b01=hears("b01", 42_000), b02=hears("b02", 400, stations=stations), b04=running(fleet(), "b04"))
     assert place.text(NOW_S) == (
@@ -56,11 +56,11 @@ def test_if_no_node_hears_it_the_number_of_queried_nodes_is_shown() -> None:
     assert of().text(NOW_S).endswith("; no other node is reachable")
 
 
-def test_what_batman_has_long_forgotten_does_not_count() -> None:
+def test_a_batman_neighbor_not_heard_for_long_does_not_count() -> None:
     assert of(b01=hears("b01", 200_001)).heard == ()
 
 
-def test_never_seen_is_shown_as_such_and_an_old_sighting_with_its_date() -> None:
+def test_a_node_never_seen_is_reported_and_an_old_sighting_is_dated() -> None:
     assert last_seen_of(fleet(), ["b04"], {}, {})["b04"].text(NOW_S) == (
         "never seen before; no other node is reachable"
     )

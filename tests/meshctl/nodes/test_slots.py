@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from meshctl.nodes.slots import BENCH_SLOTS, MESH_SLOTS, AdaptiveLimit, ChannelSlots, nodes_in_work, transfers_at_once
 
 
-def test_a_limit_grows_with_usual_logins_and_shrinks_once_for_slow_ones() -> None:
+def test_the_limit_grows_with_fast_logins_and_shrinks_once_per_slow_batch() -> None:
     limit = AdaptiveLimit(8, 32)
     for _ in range(100):
         limit.login_ended(0.5)
@@ -23,7 +23,7 @@ def test_a_limit_grows_with_usual_logins_and_shrinks_once_for_slow_ones() -> Non
     assert limit.slots == 18
 
 
-def test_a_far_node_is_not_slow() -> None:
+def test_a_moderately_slow_login_does_not_shrink_the_limit() -> None:
     limit = AdaptiveLimit(8, 32)
     limit.login_ended(0.5)
     before = limit.slots
@@ -32,7 +32,7 @@ def test_a_far_node_is_not_slow() -> None:
 
 
 @given(st.lists(st.floats(min_value=0, max_value=1e6)))
-def test_a_limit_never_ends_all_work_and_never_exceeds_its_maximum(logins: list[float]) -> None:
+def test_the_limit_stays_between_1_and_its_maximum(logins: list[float]) -> None:
     limit = AdaptiveLimit(8, 32)
     for took_s in logins:
         limit.login_ended(took_s)
@@ -58,7 +58,7 @@ def test_each_mesh_has_its_own_slots() -> None:
     assert not waiting.is_alive()
 
 
-def test_a_slot_that_is_released_twice_is_given_back_once() -> None:
+def test_releasing_a_slot_twice_frees_it_once() -> None:
     slots = ChannelSlots()
     slots.assign("b01", "main")
     with slots.use("b01") as slot:

@@ -37,15 +37,13 @@ def cut_by(old: str, new: str, release: Release) -> Effect:
 
 
 @pytest.mark.parametrize("release", RELEASES)
-def test_another_channel_restarts_the_radio_on_every_release(release: Release) -> None:
+def test_a_channel_change_restarts_the_radio_on_every_release(release: Release) -> None:
     assert cut_by("channel '6'", "channel '11'", release) == Effect("wifi", Cut.MESH, "radio0 restarts: channel")
 
 
 @pytest.mark.parametrize("release", RELEASES)
 @pytest.mark.parametrize(("old", "new"), [("txpower '27'", "txpower '28'"), ("rts '2347'", "rts '500'")])
-def test_up_to_22_03_every_difference_restarts_the_radio_and_later_some_options_do_not(
-    old: str, new: str, release: Release
-) -> None:
+def test_some_options_restart_the_radio_only_up_to_22_03(old: str, new: str, release: Release) -> None:
     option = old.partition(" ")[0]
     expected = (
         Effect("wifi", Cut.MESH, f"radio0 restarts: {option}")
@@ -59,7 +57,7 @@ def test_up_to_22_03_every_difference_restarts_the_radio_and_later_some_options_
     ("old", "new"), [("txpower '27'", "txpower '9'"), ("country 'US'", "country 'DE'"), ("option txpower '27'\n", "")]
 )
 @pytest.mark.parametrize("release", RELEASES)
-def test_less_range_cuts_weak_links_where_the_radio_does_not_restart(old: str, new: str, release: Release) -> None:
+def test_reduced_range_cuts_weak_links_if_the_radio_does_not_restart(old: str, new: str, release: Release) -> None:
     effect = cut_by(old, new, release)
     if release < Release.V23_05:
         assert effect.cut is Cut.MESH
@@ -69,7 +67,7 @@ def test_less_range_cuts_weak_links_where_the_radio_does_not_restart(old: str, n
         assert effect.why.endswith("set without a restart")
 
 
-def test_wpa_supplicant_names_the_country_and_restarts_for_another() -> None:
+def test_with_wpa_supplicant_a_country_change_restarts_the_radio() -> None:
     before = WIRELESS.replace("'none'", "'psk2+ccmp'")
     after = before.replace("'US'", "'DE'")
     (effect,) = effects(

@@ -48,12 +48,12 @@ def test_meshes_that_share_a_changing_node_are_one_switch() -> None:
     assert switches_of(two_meshes(channel=11, far_channel=40)) == [("main, far", everybody)]
 
 
-def test_a_node_of_two_meshes_switches_with_the_one_that_changes() -> None:
+def test_a_node_in_two_meshes_switches_with_the_changed_one() -> None:
     assert switches_of(two_meshes(channel=11)) == [("main", {"base", "b01", "b02"})]
     assert switches_of(two_meshes(far_channel=40)) == [("far", {"b02", "b03", "b04"})]
 
 
-def test_a_switch_never_leaves_anybody_behind_unasked() -> None:
+def test_a_switch_leaves_nodes_behind_only_if_acknowledged() -> None:
     plan = changed_channel(away=("b03",))
     assert "would leave behind b03" in plan.refusal
     assert plan.refusal_hint == "switch them on, or acknowledge with --leave-behind b03"
@@ -72,7 +72,7 @@ def test_a_switch_of_a_part_of_the_mesh_is_refused() -> None:
     assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0).refusal
 
 
-def test_one_that_stayed_in_the_old_cell_comes_back_alone_when_the_rest_is_seen_in_the_new_one() -> None:
+def test_a_node_left_in_the_old_cell_rejoins_alone() -> None:
     new = fleet(channel=11)
     stray = plans(new, {"b01": running(fleet(), "b01")})
     others = plans(new, {name: running(new, name) for name in TEAM if name != "b01"})
@@ -81,27 +81,27 @@ def test_one_that_stayed_in_the_old_cell_comes_back_alone_when_the_rest_is_seen_
     assert plan.stages[0].kind is not StageKind.SWITCH
 
 
-def test_others_that_still_run_the_old_cell_are_not_left_behind_by_a_part_of_their_mesh() -> None:
+def test_unselected_members_in_the_old_cell_block_a_partial_switch() -> None:
     new = fleet(channel=11)
     some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
     others = plans(new, {name: running(fleet(), name) for name in TEAM[3:]})
     assert "would leave behind b03, b04, b05" in fleet_plan(new, some, STAR, now_s=0.0, unchanged=others).refusal
 
 
-def test_members_that_are_refused_in_the_old_cell_block_a_switch_however_many_they_are() -> None:
+def test_refused_members_in_the_old_cell_block_a_switch() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name, uci_changes=("system.x",) if name > "b01" else ()) for name in TEAM}
     plan = fleet_plan(new, plans(new, seen), STAR, now_s=0.0)
     assert "changes its cell, but not every member can take part" in plan.refusal
 
 
-def test_even_a_base_without_neighbors_does_not_leave_its_mesh_unacknowledged() -> None:
+def test_a_base_without_neighbors_cannot_leave_its_mesh_unacknowledged() -> None:
     new = fleet(channel=11)
     seen = {name: running(fleet(), name, neighbours=()) if name == "base" else None for name in TEAM}
     assert "would leave behind b01" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
 
 
-def test_a_stray_comes_back_to_its_mesh_by_itself() -> None:
+def test_a_stray_node_rejoins_its_mesh_without_a_switch() -> None:
     plan = changed_channel(already=TEAM[:5])
     assert [(stage.kind, stage.nodes) for stage in plan.stages] == [(StageKind.ROLLING, ("b05",))]
     assert plan.notes[0].startswith("b05: alone in its cell")
@@ -114,7 +114,7 @@ def test_a_switch_with_a_refused_member_is_refused() -> None:
     assert "b02: it has uncommitted UCI changes" in fleet_plan(new, plans(new, seen), STAR, now_s=0.0).refusal
 
 
-def test_a_switch_and_new_firmware_at_once_are_refused() -> None:
+def test_a_switch_combined_with_a_firmware_change_is_refused() -> None:
     new = fleet(channel=11, firmware="firmware: {image: box.bin, revision: r24106}")
     plan = fleet_plan(new, plans(new, {name: running(fleet(), name) for name in TEAM}), STAR, now_s=0.0)
     assert "its firmware changes too" in plan.refusal
@@ -129,13 +129,13 @@ def test_flashing_a_cut_vertex_has_to_be_acknowledged() -> None:
     assert fleet_plan(team, todo, line, now_s=0.0, accept_cuts=["b01"]).refusal == ""
 
 
-def test_factory_devices_are_all_taken_at_once_since_they_have_nothing_to_lose() -> None:
+def test_factory_devices_are_provisioned_all_at_once() -> None:
     team = fleet(canary=True)
     plan = fleet_plan(team, plans(team, {name: factory(team, name) for name in TEAM}), graph(), now_s=0.0)
     assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.FREE, 6)]
 
 
-def test_nodes_off_the_mesh_that_were_in_one_have_a_canary() -> None:
+def test_formerly_meshed_nodes_without_neighbors_get_a_canary() -> None:
     new = fleet(canary=True, max_down=2)
     seen = {}
     for name in TEAM[:3]:
@@ -146,13 +146,13 @@ def test_nodes_off_the_mesh_that_were_in_one_have_a_canary() -> None:
     assert [(stage.kind, len(stage.nodes)) for stage in plan.stages] == [(StageKind.CANARY, 1), (StageKind.FREE, 2)]
 
 
-def test_a_right_fleet_has_an_empty_plan() -> None:
+def test_an_up_to_date_fleet_has_an_empty_plan() -> None:
     plan = fleet_plan(fleet(), plans(fleet(), {name: running(fleet(), name) for name in TEAM}), STAR, now_s=0.0)
     assert plan.is_empty
     assert len(plan.of(Verdict.SAME)) == len(TEAM)
 
 
-def test_a_saved_plan_reads_back_equal_and_holds_no_secret() -> None:
+def test_a_saved_plan_round_trips_and_contains_no_secrets() -> None:
     team = fleet(channel=11, firmware="firmware: {image: box.bin, revision: r24106}")
     seen = {"base": running(fleet(), "base"), "b01": factory(fleet(), "b01"), "b02": None}
     saved = SavedPlan(fleet_plan(team, plans(team, seen), STAR, now_s=12.5), SALT, "inventory/")
@@ -183,7 +183,7 @@ def test_a_damaged_plan_is_refused_with_its_file(damage: object, message: str) -
     assert message in str(caught.value)
 
 
-def test_what_is_no_json_is_refused() -> None:
+def test_invalid_json_is_rejected() -> None:
     with pytest.raises(InputError, match=r"x\.json: expected a plan in JSON"):
         load("{", "x.json")
 

@@ -24,11 +24,11 @@ def contents(want: DesiredState) -> dict[str, bytes]:
     return {file.path: file.content for file in want.files}
 
 
-def test_a_change_is_planned_where_one_of_our_keys_is_let_in() -> None:
+def test_a_change_is_planned_if_one_of_our_keys_is_authorized() -> None:
     assert planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=(OTHER, OURS)).verdict is Verdict.CHANGE
 
 
-def test_a_change_that_lets_in_none_of_our_keys_is_refused_with_both_lists() -> None:
+def test_a_change_that_locks_out_all_our_keys_is_refused_with_both_lists() -> None:
     plan = planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=(OTHER,))
     assert plan.verdict is Verdict.REFUSED
     assert f"it gets the keys {OURS.fingerprint} (alice)" in plan.reason
@@ -37,21 +37,21 @@ def test_a_change_that_lets_in_none_of_our_keys_is_refused_with_both_lists() -> 
     assert plan.files == ()
 
 
-def test_without_any_key_nothing_is_begun() -> None:
+def test_a_change_without_any_own_key_is_refused() -> None:
     plan = planned(TEAM, "b01", factory(TEAM, "b01"), own_keys=())
     assert plan.verdict is Verdict.REFUSED
     assert plan.reason.endswith("your keys: none")
 
 
-def test_a_node_to_which_nothing_is_done_needs_none_of_our_keys() -> None:
+def test_an_unchanged_node_needs_none_of_our_keys() -> None:
     assert planned(TEAM, "b01", running(TEAM, "b01"), own_keys=()).verdict is Verdict.SAME
 
 
-def test_where_the_keys_were_not_asked_for_nothing_is_said() -> None:
+def test_lockout_is_not_checked_without_our_keys() -> None:
     assert planned(TEAM, "b01", factory(TEAM, "b01")).verdict is Verdict.CHANGE
 
 
-def test_1907_lets_in_rsa_alone() -> None:
+def test_openwrt_19_07_accepts_only_rsa_keys() -> None:
     want = wanted(TEAM, "b01")
     old = replace(want.node, release=Release.V19_07)
     assert lockout(want.node, contents(want), (OURS,)) is None
@@ -60,7 +60,7 @@ def test_1907_lets_in_rsa_alone() -> None:
     assert "your keys that OpenWrt 19.07 supports: none" in refused.reason
 
 
-def test_another_user_than_root_has_keys_of_its_own() -> None:
+def test_a_user_other_than_root_is_not_checked_for_lockout() -> None:
     want = wanted(TEAM, "b01")
     node = replace(want.node, ssh=replace(want.node.ssh, user="admin"))
     assert lockout(node, contents(want), ()) is None
@@ -112,6 +112,6 @@ def test_a_dropbear_that_would_not_listen_after_a_boot_is_refused(options: str, 
 @pytest.mark.parametrize(
     "missing", ["\toption Interface 'nosuch'\n", "\toption Interface 'nosuch'\n\toption DirectInterface 'nosuch'\n"]
 )
-def test_one_server_that_listens_is_enough(missing: str) -> None:
+def test_one_listening_dropbear_instance_is_enough(missing: str) -> None:
     text = f"config dropbear 'main'\n\toption enable '1'\n\nconfig dropbear 'other'\n{missing}"
     assert server_lockout({"network": parse(NETWORK, "network"), "dropbear": parse(text, "dropbear")}) is None

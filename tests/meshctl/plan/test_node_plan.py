@@ -14,20 +14,20 @@ from meshctl.uci import Section
 from tests.meshctl.plan.support import FINGERPRINTS, PASS_PHRASE, factory, fleet, planned, running, wanted
 
 
-def test_a_node_that_runs_what_is_wanted_has_nothing_to_do() -> None:
+def test_an_up_to_date_node_has_no_changes() -> None:
     plan = planned(fleet(), "b01", running(fleet(), "b01"))
     assert (plan.verdict, plan.files, plan.effects, plan.splits) == (Verdict.SAME, (), (), ())
     assert (plan.has_cell, plan.is_meshed) == (True, True)
 
 
-def test_other_quoting_and_comments_are_no_difference() -> None:
+def test_quoting_and_comments_are_not_a_difference() -> None:
     seen = running(fleet(), "b01")
     assert seen.uci is not None
     loose = {name: "# by hand\n" + text.replace("'", '"') + "\n\n" for name, text in seen.uci.items()}
     assert planned(fleet(), "b01", replace(seen, uci=loose)).verdict is Verdict.SAME
 
 
-def test_a_factory_device_gets_everything_and_nothing_in_use_is_cut() -> None:
+def test_a_factory_device_gets_all_files_and_loses_no_mesh_links() -> None:
     plan = planned(fleet(), "b01", factory(fleet(), "b01"))
     assert plan.verdict is Verdict.CHANGE
     assert {file.path for file in plan.files} == {file.path for file in wanted(fleet(), "b01").files}
@@ -35,7 +35,7 @@ def test_a_factory_device_gets_everything_and_nothing_in_use_is_cut() -> None:
     assert any("changes from 192.168.1.1 to 10.42.0.101" in effect.why for effect in plan.effects)
 
 
-def test_another_channel_parts_the_node_from_its_mesh_and_says_so() -> None:
+def test_a_channel_change_splits_the_node_from_its_mesh() -> None:
     plan = planned(fleet(channel=11), "b01", running(fleet(), "b01"))
     assert plan.splits == ("radio0: channel 6 -> 11",)
     assert plan.cut is Cut.MESH
@@ -43,7 +43,7 @@ def test_another_channel_parts_the_node_from_its_mesh_and_says_so() -> None:
     assert "-\toption channel '6'\n+\toption channel '11'" in plan.files[0].diff
 
 
-def test_another_key_is_reported_and_never_shown() -> None:
+def test_a_key_change_is_reported_without_showing_the_keys() -> None:
     seen = running(fleet(), "b01")
     assert seen.uci is not None
     old = {**seen.uci, "wireless": seen.uci["wireless"].replace(PASS_PHRASE, "the old pass phrase")}
@@ -54,7 +54,7 @@ def test_another_key_is_reported_and_never_shown() -> None:
     assert "the old pass phrase" not in repr(plan)
 
 
-def test_a_host_name_cuts_nothing() -> None:
+def test_a_hostname_change_interrupts_nothing() -> None:
     seen = running(fleet(), "b01")
     assert seen.uci is not None
     other = {**seen.uci, "system": seen.uci["system"].replace("b01", "OpenWrt")}
@@ -62,7 +62,7 @@ def test_a_host_name_cuts_nothing() -> None:
     assert ([file.path for file in plan.files], plan.cut) == (["etc/config/system"], Cut.NOTHING)
 
 
-def test_a_key_file_with_another_mode_is_a_difference() -> None:
+def test_a_changed_key_file_mode_is_a_difference() -> None:
     seen = running(fleet(), "b01")
     path = "/etc/dropbear/authorized_keys"
     info = seen.files[path]
@@ -71,7 +71,7 @@ def test_a_key_file_with_another_mode_is_a_difference() -> None:
     assert [(file.path, file.diff) for file in plan.files] == [("etc/dropbear/authorized_keys", "mode 0644 -> 0600\n")]
 
 
-def test_what_no_reader_accepts_is_replaced_and_not_shown() -> None:
+def test_an_unparsable_uci_file_is_replaced_and_not_shown() -> None:
     seen = running(fleet(), "b01")
     assert seen.uci is not None
     plan = planned(fleet(), "b01", replace(seen, uci={**seen.uci, "wireless": "config wifi-device 'radio0"}))
@@ -79,7 +79,7 @@ def test_what_no_reader_accepts_is_replaced_and_not_shown() -> None:
     assert "wifi-device" not in plan.files[0].diff
 
 
-def test_a_silent_node_is_away_with_its_reason() -> None:
+def test_an_unreachable_node_is_away_with_the_reason() -> None:
     plan = planned(fleet(), "b01", None, unreachable="no answer at 10.42.0.101")
     assert (plan.verdict, plan.reason) == (Verdict.AWAY, "no answer at 10.42.0.101")
 
@@ -104,7 +104,7 @@ def test_a_silent_node_is_away_with_its_reason() -> None:
         ({"change": ChangeStatus("applied", owner="bob@laptop:1")}, "bob@laptop:1 has a change applied on it"),
     ],
 )
-def test_what_must_not_be_touched_is_refused_with_its_reason(changes: dict[str, Any], reason: str) -> None:
+def test_a_node_with_an_unmet_precondition_is_refused_with_the_reason(changes: dict[str, Any], reason: str) -> None:
     plan = planned(fleet(), "b01", running(fleet(), "b01", **changes), owner="alice@base:7")
     assert plan.verdict is Verdict.REFUSED
     assert plan.reason.startswith(reason)
@@ -118,12 +118,12 @@ def test_a_radio_at_another_path_is_refused() -> None:
     assert "wrong path of radio0: expected platform/ahb/18100000.wmac" in plan.reason
 
 
-def test_our_own_lock_is_no_obstacle() -> None:
+def test_our_own_lock_does_not_block_the_plan() -> None:
     seen = running(fleet(), "b01", change=ChangeStatus("idle", lock_owner="alice@base:7", lock_left_s=42.0))
     assert planned(fleet(), "b01", seen, owner="alice@base:7").verdict is Verdict.SAME
 
 
-def test_another_revision_is_flashed_when_the_inventory_names_an_image() -> None:
+def test_a_different_revision_is_flashed_if_the_inventory_names_an_image() -> None:
     team = fleet(firmware="firmware: {image: box.bin, revision: r24106}")
     plan = planned(team, "b01", running(team, "b01"))
     assert plan.firmware is not None
@@ -134,7 +134,7 @@ def test_another_revision_is_flashed_when_the_inventory_names_an_image() -> None
     assert planned(team, "b01", old).verdict is Verdict.CHANGE
 
 
-def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> None:
+def test_a_fingerprint_depends_on_files_and_salt_but_not_on_order() -> None:
     one = Fingerprints(b"salt")
     assert one.of({"a": "1", "b": "2"}) == one.of({"b": "2", "a": "1"})
     assert one.of({"a": "1", "b": "2"}) != one.of({"a": "12", "b": ""})
@@ -142,7 +142,7 @@ def test_a_fingerprint_depends_on_the_files_and_the_salt_and_not_on_order() -> N
     assert one.of({"a": "key x"}, ["x"]) != one.of({"a": "key y"}, ["y"])
 
 
-def test_a_node_without_the_radios_own_scripts_is_planned_with_a_word_of_caution() -> None:
+def test_a_factory_device_without_hostapd_common_is_planned_with_a_note() -> None:
     team = fleet()
     stock = factory(team, "b01")
     bare = {name: version for name, version in (stock.packages or {}).items() if name != "hostapd-common"}
@@ -151,7 +151,7 @@ def test_a_node_without_the_radios_own_scripts_is_planned_with_a_word_of_caution
     assert planned(team, "b01", replace(stock, packages=None)).notes == ()
 
 
-def test_a_node_that_is_in_its_mesh_has_what_it_needs() -> None:
+def test_missing_packages_are_not_noted_on_a_node_in_its_mesh() -> None:
     team = fleet()
     seen = running(team, "b01")
     other = {name: text for name, text in (seen.uci or {}).items() if name != "firewall"}
@@ -160,7 +160,7 @@ def test_a_node_that_is_in_its_mesh_has_what_it_needs() -> None:
     assert (plan.verdict, plan.notes) == (Verdict.CHANGE, ())
 
 
-def test_a_port_that_leads_to_a_switch_of_tagged_frames_is_planned_with_a_word_of_caution() -> None:
+def test_an_untagged_port_to_a_vlan_switch_is_planned_with_a_note() -> None:
     team = fleet()
     seen = factory(team, "b01")
     behind = replace(seen, board=BoardInfo("compex,wpj344-16m", lan_ports=("eth0.1",)))

@@ -34,7 +34,7 @@ def meshes(draw: st.DrawFn) -> Graph:
 
 
 @given(meshes(), st.integers(1, 4), st.booleans(), st.sets(st.sampled_from(NAMES)))
-def test_every_node_is_in_exactly_one_stage_and_no_stage_takes_more_than_max_down(
+def test_every_node_is_in_one_stage_of_at_most_max_down_nodes(
     mesh: Graph, max_down: int, canary: bool, names: set[str]
 ) -> None:
     stages = stages_of([changing(name) for name in names], around(mesh, max_down=max_down, canary=canary))
@@ -43,7 +43,7 @@ def test_every_node_is_in_exactly_one_stage_and_no_stage_takes_more_than_max_dow
 
 
 @given(meshes(), st.integers(1, 4))
-def test_nodes_down_together_cut_off_no_node_that_one_alone_would_not(mesh: Graph, max_down: int) -> None:
+def test_nodes_down_together_cut_off_only_what_one_node_alone_would(mesh: Graph, max_down: int) -> None:
     for stage in stages_of([changing(name) for name in NAMES], around(mesh, max_down=max_down)):
         lost = mesh.cut_off_by_all("base", stage.nodes)
         if stage.kind is not StageKind.LAST:
@@ -52,7 +52,7 @@ def test_nodes_down_together_cut_off_no_node_that_one_alone_would_not(mesh: Grap
 
 
 @given(meshes())
-def test_one_at_a_time_no_node_goes_before_a_farther_one(mesh: Graph) -> None:
+def test_stages_run_from_the_farthest_node_to_the_base(mesh: Graph) -> None:
     stages = stages_of([changing(name) for name in NAMES], around(mesh))
     paths = mesh.paths("base")
     hops = [paths[stage.nodes[0]].hops if stage.nodes[0] in paths else len(NAMES) for stage in stages]
@@ -61,14 +61,14 @@ def test_one_at_a_time_no_node_goes_before_a_farther_one(mesh: Graph) -> None:
     assert stages[-1].nodes == ("base",)
 
 
-def test_a_line_goes_from_its_end_and_names_its_cut_vertices() -> None:
+def test_a_line_topology_is_changed_from_its_far_end() -> None:
     stages = stages_of([changing(name) for name in NAMES[:4]], around(graph("base-b00", "b00-b01", "b01-b02")))
     assert [stage.nodes for stage in stages] == [("b02",), ("b01",), ("b00",), ("base",)]
     assert stages[1].reason == "alone, because it is a cut vertex: while it is down b02 cannot be reached"
     assert stages[0].reason == "b02 is 3 hops away, quality 73%"
 
 
-def test_a_cut_vertex_whose_radio_stays_up_goes_alone_and_may_cut_off_others() -> None:
+def test_a_cut_vertex_with_weak_links_gets_its_own_stage() -> None:
     mesh = graph("base-b00", "b00-b01", "b01-b02")
     stages = stages_of([changing(name, cut=Cut.WEAK_LINKS) for name in ("b01", "b02")], around(mesh))
     assert [stage.nodes for stage in stages] == [("b02",), ("b01",)]
@@ -94,7 +94,7 @@ def test_both_radios_of_a_robot_are_never_down_together() -> None:
     assert [stage.nodes for stage in stages] == [("b00", "b02"), ("b01",)]
 
 
-def test_nodes_outside_the_mesh_and_harmless_changes_go_together_before_what_cuts() -> None:
+def test_unmeshed_nodes_and_harmless_changes_precede_disruptive_ones() -> None:
     mesh = graph("base-b00", "base-b01", "base-b02")
     stages = stages_of(
         [
@@ -119,5 +119,5 @@ def test_a_switch_is_one_stage_with_the_entry_last() -> None:
     assert (stage.kind, stage.mesh, stage.nodes) == (StageKind.SWITCH, "main", ("b01", "b00", "base"))
 
 
-def test_nothing_to_do_is_no_stage() -> None:
+def test_an_empty_plan_has_no_stages() -> None:
     assert stages_of([], around(graph("base-b00"))) == ()

@@ -29,14 +29,14 @@ def another_host_name() -> Plan:
     return fleet_plan(fleet(), plans(fleet(), seen), LINE, now_s=0.0)
 
 
-def test_it_begins_with_the_totals_and_gives_every_stage_its_reason() -> None:
+def test_the_text_starts_with_the_totals_and_gives_a_reason_per_stage() -> None:
     text = read(another_host_name())
     assert text.startswith("fleet team: 2 to change, 1 up to date\nreached through base\n")
     assert "  1  rolling b02\n             b02 is 2 hops away" in text
     assert "alone, because it is a cut vertex: while it is down b02 cannot be reached" in text
 
 
-def test_it_shows_what_is_interrupted_and_masked_diffs() -> None:
+def test_the_text_shows_interruptions_and_masked_diffs() -> None:
     text = read(another_host_name())
     assert "2 nodes  each cuts its mesh links\n  b01, b02\n" in text
     assert "-\toption beacon_int '200'" in text
@@ -46,7 +46,7 @@ def test_it_shows_what_is_interrupted_and_masked_diffs() -> None:
     assert "option" not in brief
 
 
-def test_a_lower_power_says_that_its_radio_stays_up() -> None:
+def test_a_txpower_reduction_is_shown_as_cutting_only_weak_links() -> None:
     seen = {name: running(fleet(), name) for name in ("base", "b01", "b02")}
     old = seen["b01"].uci
     assert old is not None
@@ -60,7 +60,7 @@ def test_a_lower_power_says_that_its_radio_stays_up() -> None:
     assert "b01 is a cut vertex: b02 may be unreachable meanwhile" in text
 
 
-def test_a_refusal_stands_at_its_end_with_its_remedy() -> None:
+def test_a_refusal_is_shown_last_with_its_remedy() -> None:
     new = fleet(channel=11)
     seen = {name: None if name == "b02" else running(fleet(), name) for name in ("base", "b01", "b02")}
     text = read(fleet_plan(new, plans(new, seen), LINE, now_s=0.0))
@@ -69,7 +69,7 @@ def test_a_refusal_stands_at_its_end_with_its_remedy() -> None:
     assert text.endswith("acknowledge with --leave-behind b02,b03,b04,b05")
 
 
-def test_the_question_counts_what_is_dangerous() -> None:
+def test_the_prompt_counts_the_nodes_that_change_cell() -> None:
     assert question(another_host_name()) == "Change 2 nodes?"
     new = fleet(channel=11)
     everybody = plans(new, {name: running(fleet(), name) for name in new.nodes})
@@ -107,7 +107,7 @@ ORDER = (*(f"b{number:02}" for number in range(13)), "uav1-radio", "gone", "odd"
 
 
 @pytest.mark.parametrize("with_diffs", [True, False])
-def test_nodes_to_which_the_same_happens_are_one_block_in_the_inventory_s_order(with_diffs: bool) -> None:
+def test_nodes_with_equal_changes_form_one_block_in_inventory_order(with_diffs: bool) -> None:
     text = read(large(), with_diffs=with_diffs, order=ORDER)
     assert "13 nodes  each cuts its mesh links\n  b00, b01, b02, b03," in text
     assert "  changed   etc/config/wireless: radio0: channel 149 -> 157, txpower 27 -> 25\n" in text
@@ -115,7 +115,7 @@ def test_nodes_to_which_the_same_happens_are_one_block_in_the_inventory_s_order(
     assert text.index("13 nodes") < text.index("uav1-radio  refused") < text.index("odd  cuts")
 
 
-def test_the_last_lines_repeat_the_totals_and_which_nodes_are_left_out_and_why() -> None:
+def test_the_last_lines_repeat_the_totals_and_the_excluded_nodes() -> None:
     assert read(large(), order=ORDER).splitlines()[-3:] == [
         "14 to change, 1 away, 1 refused",
         "  refused: uav1-radio, no port eth0.1 (it has eth0)",
@@ -130,7 +130,7 @@ def test_a_mesh_change_shows_each_members_reason() -> None:
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 120])
-def test_no_line_but_a_diff_s_is_wider_than_the_terminal(width: int) -> None:
+def test_only_diff_lines_may_be_wider_than_the_terminal(width: int) -> None:
     lines = list(plan_lines(large(), width=width, order=ORDER))
     assert max(len(line.text) for line in lines if not line.is_diff) <= width
     joined = " ".join(" ".join(line.text.split()) for line in lines)

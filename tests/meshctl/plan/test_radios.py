@@ -44,24 +44,24 @@ def wireless(old: str = "", new: str = "") -> Package:
         ("option channel '6'", "option channel '6'\n\toption disabled '1'", "mesh0"),
     ],
 )
-def test_only_the_radio_whose_settings_or_interface_differ_restarts(old: str, new: str, ifname: str) -> None:
+def test_only_the_radio_with_changed_settings_or_interface_restarts(old: str, new: str, ifname: str) -> None:
     assert restarting_radios(wireless(), wireless(old, new)) == Radios(frozenset({ifname}))
 
 
-def test_a_radio_that_is_taken_out_of_the_settings_stops() -> None:
+def test_a_radio_removed_from_the_configuration_restarts() -> None:
     _, _, without = WIRELESS.partition("config wifi-device 'radio1'")
     assert restarting_radios(
         wireless(), parse(WIRELESS.removesuffix("config wifi-device 'radio1'" + without), "wireless")
     ) == (Radios(frozenset({"mesh1"})))
 
 
-def test_other_quoting_and_order_of_options_start_no_radio() -> None:
+def test_quoting_and_option_order_restart_no_radio() -> None:
     same = wireless("option ifname 'mesh0'\n\toption key 'one'", 'option key one\n\toption ifname "mesh0"')
     assert restarting_radios(wireless(), same) == NO_RADIOS
     assert not NO_RADIOS
 
 
-def test_where_names_or_files_are_not_known_every_radio_may_have_started() -> None:
+def test_unknown_interface_names_or_files_count_as_restarting_every_radio() -> None:
     nameless = wireless("\toption ifname 'mesh1'\n", "")
     assert restarting_radios(nameless, wireless()) == EVERY_RADIO
     assert restarting_radios(None, wireless()) == EVERY_RADIO
@@ -69,7 +69,7 @@ def test_where_names_or_files_are_not_known_every_radio_may_have_started() -> No
     assert "anything" in EVERY_RADIO
 
 
-def test_a_radio_with_only_younger_entries_has_restarted_and_one_without_entries_has_not() -> None:
+def test_a_radio_with_only_recent_station_entries_has_restarted() -> None:
     stations = (
         Station("mesh0", "02:00:00:00:00:01", connected_s=90),
         Station("mesh0", "02:00:00:00:00:02", connected_s=20),

@@ -25,7 +25,7 @@ def test_a_schedule_follows_from_its_seed() -> None:
     assert {strike.node for one in everything for strike in one.strikes} == set(names)
 
 
-def test_the_model_knows_what_each_outcome_leaves() -> None:
+def test_the_model_tracks_the_states_each_outcome_allows() -> None:
     model = Model({name: frozenset("a") for name in ("done", "back", "lost", "both")})
     model.update("b", [ended(done="done", back="rolled back", lost="uncertain", both="refused"), None])
     # a killed operator may have changed any of them
@@ -50,7 +50,7 @@ def test_the_model_knows_every_result() -> None:
 @pytest.mark.xdist_group("fleet")
 @pytest.mark.timeout(3 * 3600)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_schedule_strands_a_node_or_leaves_anything_behind(seed: int, tmp_path: Path) -> None:
+def test_no_schedule_strands_a_node_or_leaves_files_behind(seed: int, tmp_path: Path) -> None:
     with Rig(tmp_path / "rig", NODES) as rig:
         assert rig.take_in("a").code == 0
         names = ("base", *rig.names)

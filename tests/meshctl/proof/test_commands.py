@@ -13,12 +13,12 @@ from tests.meshctl.proof.rig import Ended, Rig
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
-def test_a_fleet_that_is_right_has_nothing_to_do(rig: Rig) -> None:
+def test_an_up_to_date_fleet_needs_no_changes(rig: Rig) -> None:
     again = rig.meshctl("provision", rig.current, "--check", "--json")
     assert (again.code, set(again.verdicts.values())) == (0, {"same"}), again.err
 
 
-def test_a_saved_plan_is_applied_exactly_and_a_node_that_moved_on_is_refused(rig: Rig) -> None:
+def test_a_saved_plan_is_applied_and_a_node_changed_since_is_refused(rig: Rig) -> None:
     old, new = rig.flip()
     file = rig.directory / "plan.json"
     assert rig.meshctl("plan", new, "--brief", "--out", str(file)).code == 0
@@ -32,7 +32,7 @@ def test_a_saved_plan_is_applied_exactly_and_a_node_that_moved_on_is_refused(rig
     assert rig.meshctl("provision", new, "n001", "--yes", "--json").results == {"n001": "done"}
 
 
-def test_a_change_of_more_than_radios_is_confirmed_over_a_login_after_the_proof(rig: Rig) -> None:
+def test_a_non_radio_change_is_confirmed_over_a_new_login_after_the_proof(rig: Rig) -> None:
     """An effect that nothing showed could refuse logins after the proof; settings of radios cannot."""
     before_radio, before_system = (_before_confirmation(rig, key) for key in ("distance_m", "log_size_kib"))
     assert (before_radio, before_system) == ("command", "connected")
@@ -65,7 +65,7 @@ def test_a_dry_run_shows_the_plan_and_changes_nothing(rig: Rig) -> None:
     assert rig.meshctl("history", "", "--json").out == before
 
 
-def test_a_rollback_returns_to_what_was_and_refuses_what_it_cannot(rig: Rig) -> None:
+def test_a_rollback_restores_the_old_state_and_refuses_a_bootstrap(rig: Rig) -> None:
     old, new = rig.flip()
     provisioned = rig.meshctl("provision", new, "--yes", "--json")
     number = str(provisioned.events[-1]["run"])
@@ -88,7 +88,7 @@ def test_a_rollback_returns_to_what_was_and_refuses_what_it_cannot(rig: Rig) -> 
     assert (factory.code, "run 1 was a bootstrap and cannot be rolled back" in factory.err) == (1, True)
 
 
-def test_a_rollback_of_another_channel_is_one_commit_of_the_whole_mesh(rig: Rig) -> None:
+def test_a_channel_rollback_switches_the_whole_mesh_at_once(rig: Rig) -> None:
     before = rig.current
     moved = rig.meshctl("provision", "split", "--yes", "--json")
     assert moved.code == 0, moved.out + moved.err
@@ -99,7 +99,7 @@ def test_a_rollback_of_another_channel_is_one_commit_of_the_whole_mesh(rig: Rig)
     assert {rig.state_of(name, "split", before) for name in ("base", *rig.names)} == {"new"}
 
 
-def test_ctrl_c_ends_the_nodes_in_work_properly_and_a_resume_takes_up_the_rest(rig: Rig) -> None:
+def test_ctrl_c_finishes_active_nodes_and_resume_continues_the_rest(rig: Rig) -> None:
     _, new = rig.flip()
     said: list[str] = []
     events: list[str] = []
@@ -122,7 +122,7 @@ def test_ctrl_c_ends_the_nodes_in_work_properly_and_a_resume_takes_up_the_rest(r
     assert (resumed.code, resumed.results) == (0, dict.fromkeys(sorted(left), "done")), resumed.err
 
 
-def test_a_backup_brings_back_what_was(rig: Rig) -> None:
+def test_a_backup_restores_the_previous_configuration(rig: Rig) -> None:
     folder = rig.directory / "backups"
     assert rig.meshctl("backup", rig.current, "n001", "--out", str(folder)).code == 0
     (file,) = folder.iterdir()
@@ -146,7 +146,7 @@ def test_a_command_runs_on_all_nodes_and_a_failure_is_reported(rig: Rig) -> None
     assert (failed.code, failed.err) == (1, "n001: exit status 1\n")
 
 
-def test_the_journal_tells_every_run_with_its_steps(rig: Rig) -> None:
+def test_the_journal_records_each_run_with_its_steps(rig: Rig) -> None:
     first = json.loads(rig.meshctl("history", "", "1", "--json").out)
     assert (first["command"], {outcome["result"] for outcome in first["outcomes"]}) == ("bootstrap", {"done"})
     steps = [step["step"] for step in first["steps"] if step["node"] == "n001"]

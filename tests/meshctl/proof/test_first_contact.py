@@ -31,7 +31,7 @@ sync
 """
 
 
-def test_a_device_is_taken_in_only_by_who_will_be_let_in_and_keeps_what_its_board_wrote(tmp_path: Path) -> None:
+def test_bootstrap_requires_an_authorized_key_and_keeps_the_board_configuration(tmp_path: Path) -> None:
     with Rig(tmp_path / "rig", 1) as rig:
         rig.wait_all_up()
         node = rig.fleet.node("n001")

@@ -29,7 +29,7 @@ def files(directory: Path) -> str:
     return f"    package_files: [{', '.join(f'{name}_1_mips_24kc.ipk' for name in PACKAGES)}]"
 
 
-def test_packages_come_first_a_flash_that_is_not_ready_is_waited_for_and_netifd_learns_batman(tmp_path: Path) -> None:
+def test_bootstrap_waits_for_the_flash_and_installs_packages_first(tmp_path: Path) -> None:
     line = files(tmp_path / "rig")
     with Rig(tmp_path / "rig", 1, firmware=dict.fromkeys(("a", "b", "split"), line), packages=()) as rig:
         rig.wait_all_up()
@@ -63,7 +63,7 @@ def test_packages_come_first_a_flash_that_is_not_ready_is_waited_for_and_netifd_
         assert rig.meshctl("provision", "a", "--check", "--json").verdicts == {"base": "same", "n001": "same"}
 
 
-def test_a_package_that_cannot_be_installed_leaves_the_node_as_it_was(tmp_path: Path) -> None:
+def test_a_failed_package_installation_leaves_the_node_unchanged(tmp_path: Path) -> None:
     line = files(tmp_path / "rig")
     (tmp_path / "rig" / "batctl-default_1_mips_24kc.ipk").write_bytes(
         opkg_package("batctl-default", "1", {}, depends=("absent",))

@@ -20,7 +20,7 @@ def test_no_cut_at_any_step_of_an_apply_strands_a_node(tmp_path_factory: pytest.
     assert bad == []
 
 
-def test_killing_meshctl_at_any_of_its_words_strands_no_node(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_killing_meshctl_at_any_event_strands_no_node(tmp_path_factory: pytest.TempPathFactory) -> None:
     bad: list[Case] = []
     with Rig(tmp_path_factory.mktemp("kill"), 8) as rig:
         assert rig.take_in("a").code == 0
@@ -37,7 +37,7 @@ def test_no_cut_at_any_step_of_a_flash_strands_a_node(tmp_path_factory: pytest.T
     assert bad == []
 
 
-def test_killing_meshctl_at_any_of_its_words_in_a_flash_strands_no_node(
+def test_killing_meshctl_at_any_event_of_a_flash_strands_no_node(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     bad: list[Case] = []
@@ -48,7 +48,9 @@ def test_killing_meshctl_at_any_of_its_words_in_a_flash_strands_no_node(
     assert bad == []
 
 
-def test_of_two_hundred_nodes_every_outcome_is_right_and_none_is_lost(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_every_outcome_of_200_nodes_with_faults_is_right_and_none_is_lost(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     with Rig(tmp_path_factory.mktemp("crowd"), 200) as rig:
         assert rig.take_in("a").code == 0
         report = hurt_and_provision(rig, share=0.05, old="a", new="b")

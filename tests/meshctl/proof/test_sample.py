@@ -29,7 +29,7 @@ def test_after_meshctl_was_killed_every_node_is_old_or_new_and_a_resume_finishes
 
 
 @pytest.mark.proof
-def test_a_mesh_whose_base_fails_in_a_switch_goes_back_as_a_whole_and_then_changes_as_a_whole(rig: Rig) -> None:
+def test_a_failed_switch_rolls_back_the_whole_mesh_and_is_resumed(rig: Rig) -> None:
     everybody = ("base", *rig.names)
     rig.fleet.inject_fault("base", "power-cut@reload_config")
     failed = rig.meshctl("provision", "split", "--yes", "--json")

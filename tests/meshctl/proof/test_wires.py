@@ -13,7 +13,7 @@ from tests.meshctl.proof.wires import WIRES, in_own_network
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
 
-def test_two_devices_at_one_address_are_taken_in_at_once_each_through_its_own_interface(tmp_path: Path) -> None:
+def test_two_devices_at_one_address_bootstrap_through_their_interfaces(tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[3]
     done = subprocess.run(in_own_network(tmp_path), cwd=root, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr

@@ -13,7 +13,7 @@ from meshctl.regdb import SHIPPED, DfsRegion, Flag, FrequencyRule, RegdbError, d
 _DATA = SHIPPED.read_bytes()
 
 
-def test_the_shipped_database_holds_the_rules_the_paper_needs() -> None:
+def test_the_shipped_database_has_the_expected_us_and_de_rules() -> None:
     regdb = load(SHIPPED)
     us = regdb.countries["US"]
     assert us.dfs_region is DfsRegion.FCC
@@ -32,7 +32,7 @@ def _minimal(rule: bytes) -> bytes:
     return header + struct.pack(">BBBxHxx", 3, 1, 1, 7) + rule
 
 
-def test_longer_rules_than_known_are_read_by_their_known_part() -> None:
+def test_unknown_trailing_fields_of_a_rule_are_ignored() -> None:
     rule = struct.pack(">BBHIII", 20, 0b1000, 1234, 5_170_000, 5_250_000, 80_000) + b"\1\2\3\4"
     country = decode(_minimal(rule), "x").countries["XA"]
     assert country.rules == (FrequencyRule(5_170_000, 5_250_000, 80_000, 12.34, Flag.NO_IR),)
@@ -52,22 +52,22 @@ def test_longer_rules_than_known_are_read_by_their_known_part() -> None:
         (_minimal(struct.pack(">BBHIII", 16, 0, 0, 9, 2, 3)), "a rising frequency range at byte 28, found 9-2"),
     ],
 )
-def test_a_damaged_database_is_refused_with_its_place(data: bytes, message: str) -> None:
+def test_a_damaged_database_is_rejected_with_the_reason(data: bytes, message: str) -> None:
     with pytest.raises(RegdbError, match=message):
         decode(data, "x")
 
 
 @given(st.integers(0, len(_DATA) - 1), st.binary(min_size=1, max_size=8), st.integers(0, len(_DATA)))
-def test_any_bytes_give_a_database_or_a_regdb_error(offset: int, patch: bytes, end: int) -> None:
+def test_arbitrary_bytes_decode_or_raise_a_regdb_error(offset: int, patch: bytes, end: int) -> None:
     damaged = (_DATA[:offset] + patch + _DATA[offset + len(patch) :])[: max(end, offset)]
     with contextlib.suppress(RegdbError):
         assert decode(damaged, "fuzzed").source == "fuzzed"
 
 
-def test_the_shipped_database_says_where_it_comes_from() -> None:
+def test_the_shipped_database_states_its_source_version() -> None:
     assert shipped_version().startswith("wireless-regdb ")
 
 
-def test_an_unreadable_path_is_named(tmp_path: Path) -> None:
+def test_an_unreadable_database_is_reported_by_path(tmp_path: Path) -> None:
     with pytest.raises(RegdbError, match=r"absent\.db: cannot be read"):
         load(tmp_path / "absent.db")

@@ -52,7 +52,9 @@ def test_frequencies_between_channels_belong_to_none() -> None:
         (Band.G5, 100, "VHT160", 5490, 5650),
     ],
 )
-def test_a_wide_channel_occupies_its_group(band: Band, channel: int, htmode: str, low: int, high: int) -> None:
+def test_a_wide_channel_occupies_its_whole_channel_group(
+    band: Band, channel: int, htmode: str, low: int, high: int
+) -> None:
     assert occupied_span(band, channel, htmode) == Span(low, high)
 
 
@@ -68,28 +70,28 @@ def test_a_wide_channel_occupies_its_group(band: Band, channel: int, htmode: str
         (Band.G5, 40, "HT40+"),
     ],
 )
-def test_a_width_without_its_other_half_does_not_exist(band: Band, channel: int, htmode: str) -> None:
+def test_a_wide_channel_without_its_other_half_is_invalid(band: Band, channel: int, htmode: str) -> None:
     assert occupied_span(band, channel, htmode) is None
 
 
-def test_an_unknown_htmode_is_an_error_of_the_caller() -> None:
+def test_an_unknown_htmode_raises_a_value_error() -> None:
     with pytest.raises(ValueError, match="unknown htmode"):
         width_mhz("HT30")
 
 
-def test_the_united_states_end_at_channel_11() -> None:
+def test_the_us_allows_2_4_ghz_channels_only_up_to_11() -> None:
     assert legal_channels(_US, Band.G2, "HT20", forbidden=_ADHOC) == tuple(range(1, 12))
     assert legal_channels(_DE, Band.G2, "HT20", forbidden=_ADHOC) == tuple(range(1, 14))
     assert legal_channels(_US, Band.G2, "HT40+", forbidden=_ADHOC) == tuple(range(1, 8))
 
 
-def test_adhoc_has_no_radar_and_no_passive_channels() -> None:
+def test_ad_hoc_mode_excludes_radar_and_no_ir_channels() -> None:
     assert legal_channels(_US, Band.G5, "HT20", forbidden=_ADHOC) == (36, 40, 44, 48, 149, 153, 157, 161, 165)
     assert 52 in legal_channels(_US, Band.G5, "HT20", forbidden=Flag.NO_IR)
     assert legal_channels(_US, Band.G5, "VHT80", forbidden=_ADHOC) == (36, 40, 44, 48, 149, 153, 157, 161)
 
 
-def test_the_least_power_of_joined_rules_counts() -> None:
+def test_a_span_over_several_rules_has_their_lowest_power_limit() -> None:
     verdict = check_span(_US, Span(5170, 5330))
     assert verdict.covered
     assert verdict.max_eirp_dbm == 23.0
@@ -103,7 +105,7 @@ def test_a_range_outside_every_rule_is_not_covered() -> None:
     assert not verdict.allows(20)
 
 
-def test_channel_14_is_for_the_old_rates_in_japan_only() -> None:
+def test_channel_14_is_allowed_only_without_ofdm_in_japan() -> None:
     japan = _REGDB.countries["JP"]
     assert not check_span(japan, Span(2474, 2494)).covered
     assert check_span(japan, Span(2474, 2494), ofdm=False).covered

@@ -11,7 +11,7 @@ from tests.meshctl.render import fleets
 FLEET = fleets.fleet(fleets.node(name="a"), fleets.node(name="b"))
 
 
-def test_a_fleet_does_not_differ_from_itself() -> None:
+def test_a_fleet_has_no_differences_from_itself() -> None:
     assert list(compare_fleets(FLEET, FLEET)) == []
 
 
@@ -46,7 +46,7 @@ def test_packages_and_releases_are_compared() -> None:
     assert difference.packages_removed == ()
 
 
-def test_files_that_are_no_uci_are_compared_by_lines() -> None:
+def test_non_uci_files_are_compared_by_line() -> None:
     after = fleets.fleet(operators=replace(FLEET.operators, ssh_keys=(fleets.RSA,)))
     (difference,) = compare_fleets(fleets.fleet(), after)
     (file,) = difference.files
@@ -64,7 +64,7 @@ def test_new_files_are_reported() -> None:
     assert back.files[0].lines == ("- lldpd.config (lldpd)",)
 
 
-def test_a_key_in_an_option_of_any_name_is_masked() -> None:
+def test_a_key_is_masked_in_any_option() -> None:
     fleet = fleets.fleet(
         fleets.node(label=f"the key is {fleets.KEY}"), meshes=(fleets.mesh(encryption=Encryption.PSK2),)
     )
@@ -75,6 +75,6 @@ def test_a_key_in_an_option_of_any_name_is_masked() -> None:
     assert "mode 0600 -> 0644" in lines
 
 
-def test_nothing_compared_with_nothing_is_no_difference() -> None:
+def test_comparing_nothing_with_nothing_gives_no_difference() -> None:
     assert compare_nodes(None, None) is None
     assert list(compare_files(None, None)) == []

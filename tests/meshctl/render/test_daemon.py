@@ -56,7 +56,7 @@ def loaded(source: Fleet, robot: str, folder: Path) -> Configuration:
     return load(folder / "udp-mesh.toml")
 
 
-def test_the_daemon_loads_what_the_inventory_says(tmp_path: Path) -> None:
+def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:
     found = loaded(fleet(ESTOP, MAPS, VIDEO, port=8701, heartbeat_s=0.5, metrics_port=9871), "uav", tmp_path)
     settings = found.settings
     assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("uav", 8701, "adaptive", 1400)
@@ -81,7 +81,7 @@ def test_the_daemon_loads_what_the_inventory_says(tmp_path: Path) -> None:
     assert topics["video"] == core.Topic("video", 9, reliable=False, destinations=("base",), repair=True)
 
 
-def test_without_broadcast_every_other_robot_is_a_neighbour(tmp_path: Path) -> None:
+def test_without_broadcast_all_other_robots_are_neighbors(tmp_path: Path) -> None:
     found = loaded(fleet(broadcast=False, window=3), "base", tmp_path)
     assert found.settings.window == 3
     assert found.links == (LinkConfig(None, "10.42.0.100", broadcast=False),)
@@ -92,7 +92,7 @@ def test_without_broadcast_every_other_robot_is_a_neighbour(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("robot", ["base", "spot"])
-def test_every_daemon_of_a_mixed_fleet_knows_the_fielded_robots(robot: str, tmp_path: Path) -> None:
+def test_daemons_in_a_mixed_fleet_know_the_legacy_robots(robot: str, tmp_path: Path) -> None:
     source = fleet(robots=("base", "spot"))
     robots = {**source.robots, "husky2": Robot("husky2", (), fielded=IPv4Address("10.42.0.120"))}
     found = loaded(replace(source, robots=robots), robot, tmp_path)
@@ -100,27 +100,27 @@ def test_every_daemon_of_a_mixed_fleet_knows_the_fielded_robots(robot: str, tmp_
     assert found.links == (LinkConfig(None, f"10.42.0.{100 if robot == 'base' else 101}", broadcast=True),)
 
 
-def test_a_robot_does_not_send_to_itself_but_never_broadcasts_instead(tmp_path: Path) -> None:
+def test_a_robot_is_not_its_own_destination_unless_it_is_the_only_one(tmp_path: Path) -> None:
     topics = {topic.name: topic for topic in loaded(fleet(MAPS, VIDEO), "base", tmp_path).settings.topics}
     assert topics["maps/difference"].destinations == ("spot",)
     assert topics["video"].destinations == ("base",)
 
 
-def test_a_fleet_without_keys_says_so(tmp_path: Path) -> None:
+def test_a_fleet_without_keys_configures_the_daemon_as_unkeyed(tmp_path: Path) -> None:
     bench = fleet(keys=())
     assert daemon_keys(bench, lambda ref: Secret(KEYS[ref])) is None
     assert loaded(bench, "base", tmp_path).settings.unkeyed
 
 
 @pytest.mark.parametrize(("heartbeat_s", "offline_s"), [(1, 10), (5, 30), (0.1, 1), (2, 600)])
-def test_three_heartbeats_may_be_missed(heartbeat_s: float, offline_s: float, tmp_path: Path) -> None:
+def test_the_offline_timeout_exceeds_three_heartbeats(heartbeat_s: float, offline_s: float, tmp_path: Path) -> None:
     rates = loaded(fleet(heartbeat_s=heartbeat_s, offline_after_s=offline_s), "base", tmp_path).settings.rates
     assert rates.heartbeat_s <= rates.heartbeat_sparse_s
     assert 3 * rates.heartbeat_sparse_s < rates.offline_s <= rates.peer_lost_s
 
 
 @given(st.text(max_size=12), st.text(st.sampled_from("ab é\"\\'\x7f\n/~[].#=中"), max_size=12))
-def test_any_name_is_loaded_unchanged_or_refused_at_its_place(
+def test_any_name_is_loaded_unchanged_or_rejected(
     tmp_path_factory: pytest.TempPathFactory, robot: str, topic: str
 ) -> None:
     source = fleet(Topic(topic, 5), robots=(robot,))
@@ -141,7 +141,7 @@ def test_any_name_is_loaded_unchanged_or_refused_at_its_place(
         ({"keys": (NEW, OLD, NEW)}, "udp_mesh.keys"),
     ],
 )
-def test_what_the_daemon_would_refuse_is_refused(changes: dict[str, Any], path: str) -> None:
+def test_settings_the_daemon_would_reject_are_rejected(changes: dict[str, Any], path: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         daemon_config(fleet(**changes), "base")
     assert [item.path for item in caught.value.diagnostics] == [path]
@@ -157,13 +157,13 @@ def test_unknown_robots_and_those_without_a_computer_are_refused() -> None:
 
 
 @pytest.mark.parametrize("key", ["", "short", "zz" * 32, "11" * 31, "é" * 64])
-def test_what_is_no_key_is_refused_unseen(key: str) -> None:
+def test_an_invalid_key_is_rejected_without_being_shown(key: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         daemon_keys(fleet(keys=(NEW,)), lambda _: Secret(key))
     assert not key or key not in str(caught.value)
 
 
-def test_a_missing_key_is_refused_at_its_place() -> None:
+def test_a_missing_key_is_reported_at_its_position() -> None:
     def none(ref: SecretRef) -> Secret:
         raise InputError(f"secret {ref}: not set")
 
@@ -171,6 +171,6 @@ def test_a_missing_key_is_refused_at_its_place() -> None:
         daemon_keys(fleet(), none)
 
 
-def test_the_same_inventory_gives_the_same_bytes() -> None:
+def test_the_daemon_configuration_is_deterministic() -> None:
     source = fleet(ESTOP, MAPS, VIDEO)
     assert daemon_config(source, "spot") == daemon_config(source, "spot")

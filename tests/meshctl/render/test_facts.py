@@ -120,7 +120,7 @@ def sections(rendered: Rendered, name: str, *kinds: str) -> list[Section]:
 
 
 @pytest.mark.parametrize("release", Release)
-def test_a_switch_keeps_its_layout(release: Release) -> None:
+def test_a_switch_keeps_its_vlan_layout(release: Release) -> None:
     kept = sections(render(box(release), network=NETWORK), "network", "switch", "switch_vlan", "switch_port")
     assert [(section.type, section.get("vlan"), section.get("ports")) for section in kept] == [
         ("switch", "", ""),
@@ -131,24 +131,24 @@ def test_a_switch_keeps_its_layout(release: Release) -> None:
 
 
 @pytest.mark.parametrize("release", Release)
-def test_a_bridged_port_keeps_the_address_that_its_board_gave_it(release: Release) -> None:
+def test_a_bridged_port_keeps_the_mac_address_set_by_the_board(release: Release) -> None:
     devices = sections(render(box(release), network=NETWORK), "network", "device")
     assert [section.get("macaddr") for section in devices if section.get("macaddr")] == ["02:00:00:00:00:11"]
 
 
-def test_the_layout_that_the_inventory_knows_takes_the_place_of_the_nodes() -> None:
+def test_the_switch_layout_of_the_inventory_replaces_that_of_the_node() -> None:
     mine = fleets.fleet(fleets.node(hardware=replace(fleets.hardware(Release.V23_05), switch_vlans=(("1", "2 3 0t"),))))
     written = render(mine, network=NETWORK)
     assert [section.get("ports") for section in sections(written, "network", "switch_vlan")] == ["2 3 0t"]
     assert sections(written, "network", "switch_port") == []
 
 
-def test_sections_of_extra_uci_take_the_place_of_the_nodes() -> None:
+def test_extra_uci_switch_sections_replace_those_of_the_node() -> None:
     written = render(box(extra_uci={"network.switch0": "switch", "network.switch0.name": "switch0"}), network=NETWORK)
     assert [section.name for section in sections(written, "network", "switch", "switch_vlan")] == ["switch0"]
 
 
-def test_the_same_layout_in_the_inventory_and_on_the_node_is_the_same() -> None:
+def test_an_equal_switch_layout_renders_the_same_from_inventory_and_node() -> None:
     known, kept = render(fleets.fleet(), network=NETWORK), render(box(), network=NETWORK)
     both = [sections(item, "network", "switch", "switch_vlan") for item in (known, kept)]
     assert both[0] == both[1]
@@ -157,7 +157,7 @@ def test_the_same_layout_in_the_inventory_and_on_the_node_is_the_same() -> None:
 LAYOUT = (("switch0", "1", "3 0t"), ("switch0", "2", "2 0t"))
 
 
-def test_a_switch_that_lost_its_layout_gets_the_one_that_config_generate_writes() -> None:
+def test_a_missing_switch_layout_is_restored_as_config_generate_writes_it() -> None:
     stock = parse(NETWORK, "network")
     lost = Package("network", tuple(s for s in stock.sections if not s.type.startswith("switch")))
     found = with_switch(lost, LAYOUT)
@@ -166,12 +166,12 @@ def test_a_switch_that_lost_its_layout_gets_the_one_that_config_generate_writes(
     assert with_switch(lost, ()) == lost
 
 
-def test_a_switch_that_has_a_layout_keeps_it_whatever_its_board_says() -> None:
+def test_an_existing_switch_layout_overrides_the_board_layout() -> None:
     stock = parse(NETWORK, "network")
     assert with_switch(stock, (("switch0", "1", "0 1 2 3"),)) == stock
 
 
-def test_lights_and_gpio_switches_stay_and_nothing_else_of_system() -> None:
+def test_only_led_rssid_and_gpio_switch_sections_of_system_are_kept() -> None:
     written = render(box(), system=SYSTEM)
     assert [section.name for section in package(written, "system").sections] == [
         None,
@@ -182,12 +182,12 @@ def test_lights_and_gpio_switches_stay_and_nothing_else_of_system() -> None:
     ]
 
 
-def test_a_radio_that_the_inventory_leaves_out_stays_as_wifi_config_made_it() -> None:
+def test_a_radio_not_in_the_inventory_is_kept_as_wifi_config_wrote_it() -> None:
     written = package(render(box(), wireless=ADDED), "wireless")
     assert written.sections[-2:] == parse(ADDED, "wireless").sections
 
 
-def test_a_radio_switched_on_by_hand_is_switched_off_and_loses_its_interface() -> None:
+def test_a_manually_enabled_radio_is_disabled_and_loses_its_interface() -> None:
     written = package(render(box(), wireless=ADDED.replace("disabled '1'", "disabled '0'")), "wireless")
     radio = written.section("radio2")
     assert radio is not None
@@ -195,12 +195,12 @@ def test_a_radio_switched_on_by_hand_is_switched_off_and_loses_its_interface() -
     assert written.section("default_radio2") is None
 
 
-def test_a_radio_of_the_inventory_is_never_kept_under_another_name() -> None:
+def test_an_inventory_radio_is_not_kept_under_another_name() -> None:
     other = ADDED.replace("pci0000:00/0000:00:01.0", fleets.RADIO_2G.path)
     assert package(render(box(), wireless=other), "wireless").section("radio2") is None
 
 
-def test_a_radio_of_a_device_with_several_is_kept_although_it_shares_their_path() -> None:
+def test_an_extra_radio_sharing_a_device_path_is_kept() -> None:
     other = ADDED.replace("pci0000:00/0000:00:01.0", fleets.RADIO_2G.path).replace(
         "option disabled", "option radio '1'\n\toption disabled"
     )
@@ -209,7 +209,7 @@ def test_a_radio_of_a_device_with_several_is_kept_although_it_shares_their_path(
 
 
 @pytest.mark.parametrize("release", Release)
-def test_what_was_written_is_written_again_and_the_hash_does_not_know(release: Release) -> None:
+def test_rendering_with_its_own_output_as_facts_is_idempotent(release: Release) -> None:
     first = render(box(release), network=NETWORK, system=SYSTEM, wireless=ADDED)
     live = {name: package(first, name) for name in ("network", "system", "wireless")}
     again = render_node(box(release), NAME, fleets.secrets, SHARED, DeviceFacts("", live))

@@ -19,11 +19,11 @@ CASES = dict(cases())
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_node_gets_what_is_recorded(name: str) -> None:
+def test_rendered_output_matches_the_golden_file(name: str) -> None:
     assert render_case(CASES[name]) == (FOLDER / f"{name}.txt").read_text(encoding="utf-8")
 
 
-def test_no_golden_file_is_left_over() -> None:
+def test_no_golden_file_is_unused() -> None:
     assert {path.stem for path in FOLDER.glob("*.txt")} == set(CASES)
 
 

@@ -38,9 +38,7 @@ def option(rendered: Rendered, package: str, section: str, name: str) -> str:
 
 
 @given(hostile, hostile, hostile, hostile)
-def test_hostile_values_arrive_unchanged_or_are_refused_at_their_place(
-    ssid: str, label: str, path: str, host: str
-) -> None:
+def test_hostile_values_are_rendered_unchanged_or_rejected(ssid: str, label: str, path: str, host: str) -> None:
     radio = replace(fleets.node().radios[0], hardware=replace(fleets.RADIO_2G, path=path))
     fleet = fleets.fleet(
         fleets.node(label=label, radios=(radio,)),
@@ -64,14 +62,14 @@ def test_hostile_values_arrive_unchanged_or_are_refused_at_their_place(
 @pytest.mark.parametrize(
     "ssid", ["bob's", '"quoted" \\ back', "four    spaces", "é中", "$(reboot)", "a # b ; c", "'", "\\"]
 )
-def test_awkward_names_reach_the_radio_unchanged(ssid: str) -> None:
+def test_unusual_ssids_are_rendered_unchanged(ssid: str) -> None:
     assert option(render(fleets.fleet(meshes=(fleets.mesh(ssid=ssid),))), "wireless", "mesh0", "ssid") == ssid
 
 
 # each key costs one derivation for the hash
 @settings(max_examples=20)
 @given(st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=8, max_size=63))
-def test_no_text_for_people_shows_the_key(key: str) -> None:
+def test_the_key_is_masked_in_human_readable_text(key: str) -> None:
     fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     other = render(fleet)
     # a key that is part of public text, such as a package's name, cannot be distinguished from it
@@ -86,12 +84,12 @@ def test_no_text_for_people_shows_the_key(key: str) -> None:
     assert key not in repr(rendered)
 
 
-def test_the_same_fleet_gives_the_same_bytes() -> None:
+def test_rendering_is_deterministic() -> None:
     fleet = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     assert render(fleet) == render_node(fleet, NAME, lambda _: Secret(fleets.KEY), Templates.of(fleet))
 
 
-def test_the_hash_names_the_configuration_and_its_key() -> None:
+def test_the_hash_depends_on_the_configuration_and_the_key() -> None:
     encrypted = fleets.fleet(meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     hashes = {
         render(fleets.fleet()).config_hash,
@@ -103,7 +101,7 @@ def test_the_hash_names_the_configuration_and_its_key() -> None:
     assert render(encrypted).config_hash in hashes
 
 
-def test_the_device_keeps_its_compat_version_and_the_hash_does_not_know() -> None:
+def test_compat_version_is_kept_and_does_not_affect_the_hash() -> None:
     fleet = fleets.fleet()
     plain = render(fleet)
     kept = render_node(fleet, NAME, fleets.secrets, SHARED, DeviceFacts(compat_version="1.1"))
@@ -112,14 +110,14 @@ def test_the_device_keeps_its_compat_version_and_the_hash_does_not_know() -> Non
     assert kept.config_hash == plain.config_hash
 
 
-def test_the_marker_tells_fleet_node_and_hash() -> None:
+def test_the_marker_file_contains_fleet_node_and_hash() -> None:
     rendered = render(fleets.fleet())
     marker = rendered.file("etc/meshctl/node")
     assert marker is not None
     assert marker.content.decode() == f"fleet=test-fleet\nnode={NAME}\nconfig={rendered.config_hash}\n"
 
 
-def test_what_logs_in_is_roots_alone() -> None:
+def test_authorized_keys_is_readable_by_root_only() -> None:
     keys = render(fleets.fleet()).file("etc/dropbear/authorized_keys")
     assert keys is not None
     assert keys.mode == 0o600
@@ -139,19 +137,19 @@ def test_unknown_and_lost_nodes_are_refused() -> None:
         render_node(fleet, "b99", fleets.secrets)
 
 
-def test_passwords_are_allowed_only_when_the_inventory_says_so() -> None:
+def test_password_login_is_enabled_only_by_the_inventory() -> None:
     open_fleet = fleets.fleet(operators=Operators((), password_login=True))
     assert option(render(open_fleet), "dropbear", "@dropbear[0]", "PasswordAuth") == "on"
     assert option(render(fleets.fleet()), "dropbear", "@dropbear[0]", "RootPasswordAuth") == "off"
 
 
-def test_a_radio_without_a_mesh_is_off() -> None:
+def test_a_radio_without_a_mesh_is_disabled() -> None:
     rendered = render(fleets.fleet())
     assert option(rendered, "wireless", "radio0", "disabled") == "0"
     assert option(rendered, "wireless", "radio1", "disabled") == "1"
 
 
-def test_an_802_11s_mesh_does_not_forward_itself() -> None:
+def test_an_802_11s_mesh_disables_mesh_forwarding() -> None:
     rendered = render(fleets.fleet(meshes=(fleets.mesh(mode=MeshMode.MESH),)))
     assert option(rendered, "wireless", "mesh0", "mesh_fwding") == "0"
     assert option(rendered, "wireless", "mesh0", "mesh_id") == "fleet"
@@ -164,7 +162,7 @@ class TestExtraOptions:
     def render(extra: dict[str, str]) -> Rendered:
         return render(fleets.fleet(fleets.node(extra_uci=extra)))
 
-    def test_set_change_and_remove_options(self) -> None:
+    def test_options_are_set_changed_and_removed(self) -> None:
         rendered = self.render(
             {"wireless.radio0.rts": "500", "wireless.radio0.htmode": "HT40", "system.@system[0].ttylogin": ""}
         )
@@ -172,7 +170,7 @@ class TestExtraOptions:
         assert option(rendered, "wireless", "radio0", "htmode") == "HT40"
         assert option(rendered, "system", "@system[0]", "ttylogin") == ""
 
-    def test_make_sections_and_packages_in_any_order(self) -> None:
+    def test_sections_and_packages_are_created_in_any_order(self) -> None:
         rendered = self.render(
             {"lldpd.config.lldp_class": "4", "lldpd.config": "lldpd", "network.sw.vlan": "1", "network.sw": "switch"}
         )
@@ -181,7 +179,7 @@ class TestExtraOptions:
         assert dump(lldpd) == "\nconfig lldpd 'config'\n\toption lldp_class '4'\n\n"
         assert option(rendered, "network", "sw", "vlan") == "1"
 
-    def test_hide_a_password_written_in_plain_text(self) -> None:
+    def test_a_plain_text_password_is_masked(self) -> None:
         rendered = self.render({"wireless.mesh0.sae_password": "open sesame", "wireless.mesh0.key1": "1"})
         wireless = rendered.file("etc/config/wireless")
         assert wireless is not None
@@ -197,7 +195,7 @@ class TestExtraOptions:
             ({"wireless.x": "wifi iface"}, "section type: expected printable ASCII without spaces"),
         ],
     )
-    def test_are_refused_with_their_place(self, extra: dict[str, str], words: str) -> None:
+    def test_invalid_options_are_rejected_with_their_position(self, extra: dict[str, str], words: str) -> None:
         with pytest.raises(InvalidInput) as caught:
             self.render(extra)
         assert words in str(caught.value)
@@ -214,13 +212,13 @@ class TestTemplates:
         template.write_text(text)
         return render_node(fleets.fleet(base=str(folder)), NAME, fleets.secrets)
 
-    def test_come_before_the_shipped_ones_file_by_file(self, tmp_path: Path) -> None:
+    def test_a_template_overrides_the_shipped_file_of_the_same_path(self, tmp_path: Path) -> None:
         rendered = self.render(tmp_path, "config system\noption hostname {{ intent.hostname | uci }}\n")
         assert option(rendered, "system", "@system[0]", "hostname") == NAME
         assert option(rendered, "system", "@system[0]", "timezone") == ""
         assert option(rendered, "wireless", "mesh0", "ssid") == "fleet"
 
-    def test_add_files_and_executables(self, tmp_path: Path) -> None:
+    def test_a_template_adds_a_file_that_is_not_uci(self, tmp_path: Path) -> None:
         rendered = self.render(tmp_path, "hello {{ intent.node }}\n", "batman-adv/etc/banner.j2")
         banner = rendered.file("etc/banner")
         assert banner is not None
@@ -245,7 +243,7 @@ class TestTemplates:
             ("option x 'y'\n", 0, "template output is not UCI: etc/config/system:1:1"),
         ],
     )
-    def test_fail_with_their_file_and_line(self, tmp_path: Path, text: str, line: int, words: str) -> None:
+    def test_template_errors_show_file_and_line(self, tmp_path: Path, text: str, line: int, words: str) -> None:
         with pytest.raises(InvalidInput) as caught:
             self.render(tmp_path, text)
         (finding,) = caught.value.diagnostics
@@ -253,7 +251,7 @@ class TestTemplates:
         assert finding.position.line == line
         assert words in str(finding)
 
-    def test_show_secrets_only_through_their_filter(self, tmp_path: Path) -> None:
+    def test_templates_show_secrets_only_through_the_reveal_filter(self, tmp_path: Path) -> None:
         template = tmp_path / "templates/common/etc/supplicant.j2"
         template.parent.mkdir(parents=True)
         template.write_text("{{ intent.secrets[0] }} {{ intent.secrets[0] | reveal }}\n")
@@ -264,17 +262,17 @@ class TestTemplates:
         assert file.content.decode() == f"{MASK} {fleets.KEY}\n"
         assert (file.masked, file.mode) == (f"{MASK} {MASK}\n", 0o600)
 
-    def test_in_a_folder_that_nothing_reads_are_refused(self, tmp_path: Path) -> None:
+    def test_templates_in_an_unknown_folder_are_rejected(self, tmp_path: Path) -> None:
         with pytest.raises(InvalidInput, match="expected one of batman-adv, common, meshmerize, found batman_adv"):
             self.render(tmp_path, "config system\n", "batman_adv/etc/config/system.j2")
 
-    def test_of_the_operator_may_stand_beside_the_others(self, tmp_path: Path) -> None:
+    def test_operator_templates_may_be_inside_the_template_folder(self, tmp_path: Path) -> None:
         (tmp_path / "templates/ours").mkdir(parents=True)
         parts = OperatorParts(templates="templates/ours", base=str(tmp_path))
         fleet = fleets.fleet(meshes=(fleets.mesh(operator_parts=parts),), base=str(tmp_path))
         assert render_node(fleet, NAME, fleets.secrets).package("network")
 
-    def test_of_the_operator_must_exist(self, tmp_path: Path) -> None:
+    def test_the_operator_template_folder_must_exist(self, tmp_path: Path) -> None:
         mesh: Any = fleets.mesh()
         parts = replace(mesh.operator_parts, templates="none", base=str(tmp_path))
         with pytest.raises(InvalidInput, match="expected a folder of templates, found none"):

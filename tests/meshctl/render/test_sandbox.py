@@ -61,7 +61,7 @@ def quick(folder: Path) -> Templates:
         ),
     ],
 )
-def test_a_template_that_does_not_end_is_refused_with_its_name(tmp_path: Path, text: str, words: str) -> None:
+def test_a_template_that_exceeds_its_limits_is_rejected(tmp_path: Path, text: str, words: str) -> None:
     source = write(tmp_path, text)
     templates = quick(tmp_path)
     with pytest.raises(InvalidInput) as caught:
@@ -81,14 +81,14 @@ def test_shipped_templates_start_no_process(tmp_path: Path, monkeypatch: pytest.
     assert render(tmp_path)
 
 
-def test_a_rendering_process_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rendering_process_that_fails_to_start_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path, GOOD)
     monkeypatch.setattr("sys.executable", "/bin/false")
     with pytest.raises(InvalidInput, match="the rendering process ended with status 1"):
         render(tmp_path)
 
 
-def test_links_out_of_the_tree_pipes_and_folders_elsewhere_are_refused(
+def test_symlinks_and_folders_outside_the_tree_and_pipes_are_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet = tmp_path / "fleet"
@@ -120,7 +120,7 @@ def test_links_out_of_the_tree_pipes_and_folders_elsewhere_are_refused(
         render_node(fleets.fleet(meshes=(mesh,), base=str(fleet)), NAME, fleets.secrets)
 
 
-def test_the_tree_is_the_git_work_tree_without_git_s_own_files(tmp_path: Path) -> None:
+def test_the_allowed_tree_is_the_git_work_tree_without_the_git_directory(tmp_path: Path) -> None:
     (tmp_path / "repository/.git").mkdir(parents=True)
     (tmp_path / "repository/fleets/a").mkdir(parents=True)
     boundary = Boundary.of(tmp_path / "repository/fleets/a", {})

@@ -38,7 +38,7 @@ def test_exactly_the_files_of_the_node_are_written_with_their_modes(tmp_path: Pa
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
-def test_the_folders_have_the_modes_of_a_device_whatever_the_umask(tmp_path: Path) -> None:
+def test_folder_modes_do_not_depend_on_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o077)
     try:
         folder = write_node(rendered(), tmp_path)
@@ -49,7 +49,7 @@ def test_the_folders_have_the_modes_of_a_device_whatever_the_umask(tmp_path: Pat
     assert folders == {"etc": 0o755, "etc/config": 0o755, "etc/dropbear": 0o700, "etc/meshctl": 0o755}
 
 
-def test_a_later_rendering_replaces_the_earlier_one_whole(tmp_path: Path) -> None:
+def test_rendering_again_replaces_the_whole_folder(tmp_path: Path) -> None:
     item = rendered()
     folder = write_node(item, tmp_path)
     (folder / "etc/config/stale").write_text("left over")
@@ -58,7 +58,7 @@ def test_a_later_rendering_replaces_the_earlier_one_whole(tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == [item.node]
 
 
-def test_a_folder_that_is_not_ours_is_never_replaced(tmp_path: Path) -> None:
+def test_a_folder_not_rendered_by_meshctl_is_never_replaced(tmp_path: Path) -> None:
     item = rendered()
     own = tmp_path / item.node
     own.mkdir()
@@ -68,7 +68,7 @@ def test_a_folder_that_is_not_ours_is_never_replaced(tmp_path: Path) -> None:
     assert tree(own) == {"thesis.txt": (stat.S_IMODE((own / "thesis.txt").stat().st_mode), b"years of work")}
 
 
-def test_a_link_or_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
+def test_a_symlink_or_file_at_the_output_path_is_rejected(tmp_path: Path) -> None:
     item = rendered()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / item.node).symlink_to(tmp_path / "elsewhere")
@@ -79,7 +79,7 @@ def test_a_link_or_a_file_in_its_place_is_refused(tmp_path: Path) -> None:
         write_node(item, tmp_path / "file")
 
 
-def test_a_place_where_others_may_write_is_refused(tmp_path: Path) -> None:
+def test_a_world_writable_output_folder_is_rejected(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     out.chmod(0o777)
@@ -89,7 +89,9 @@ def test_a_place_where_others_may_write_is_refused(tmp_path: Path) -> None:
     write_node(rendered(), out)
 
 
-def test_a_file_system_without_modes_gets_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_secret_is_not_written_to_a_file_system_without_modes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fat(handle: int, mode: int) -> None:
         os.chmod(handle, 0o755)
 
@@ -100,7 +102,7 @@ def test_a_file_system_without_modes_gets_no_secret(tmp_path: Path, monkeypatch:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_or_failing_disk_leaves_what_stood_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_previous_output_intact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     item = rendered()
     folder = write_node(item, tmp_path)
     before = tree(folder)
@@ -127,7 +129,7 @@ class TestImageBuilder:
         ]
         return fleets.fleet(*nodes, meshes=(fleets.mesh(encryption=Encryption.PSK2),), **changes)
 
-    def test_groups_by_hardware_and_release(self) -> None:
+    def test_image_folders_are_grouped_by_hardware_and_release(self) -> None:
         fleet = self.fleet()
         folders = image_folders(fleet, render_fleet(fleet, fleets.secrets))
         assert [(item.name, [node.node for node in item.overlays]) for item in folders] == [
@@ -143,7 +145,7 @@ class TestImageBuilder:
             "-wpad-basic-mbedtls",
         ]
 
-    def test_the_script_makes_exactly_the_calls(self, tmp_path: Path) -> None:
+    def test_the_build_script_runs_the_expected_make_commands(self, tmp_path: Path) -> None:
         """Run by a real shell, with a `make` that writes down how it was called."""
         profile: HardwareProfile = fleets.hardware(Release.V23_05, package_files=("local.ipk",))
         fleet = fleets.fleet(

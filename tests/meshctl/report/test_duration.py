@@ -20,5 +20,5 @@ from meshctl.report.duration import duration
         (20 * 31557600.0, "20 years"),
     ],
 )
-def test_the_unit_follows_the_length(seconds: float, text: str) -> None:
+def test_the_unit_depends_on_the_duration(seconds: float, text: str) -> None:
     assert duration(seconds) == text

@@ -39,7 +39,7 @@ _FINDINGS = Findings(
 _NOTHING = Findings((), {"fleet.yaml": "a: 1\n"}, files=("fleet.yaml",))
 
 
-def test_text_shows_the_line_with_a_caret_the_remedy_and_a_summary() -> None:
+def test_text_shows_the_line_with_a_caret_the_fix_and_a_summary() -> None:
     assert text(_FINDINGS) == (
         "inventory/fleet.yaml:2:20: error: meshes.main.channel: not allowed: expected one of 1-11 (country US),"
         " found 13 [MC323]\n"
@@ -54,18 +54,18 @@ def test_text_shows_the_line_with_a_caret_the_remedy_and_a_summary() -> None:
     assert text(_NOTHING) == "nothing found in 1 file\n"
 
 
-def test_text_leaves_out_lines_that_are_unknown_or_endless() -> None:
+def test_text_omits_unavailable_and_overlong_source_lines() -> None:
     endless = Findings((_CHANNEL,), {"inventory/fleet.yaml": "a\n" + "x" * 5000})
     assert "xxx" not in text(endless)
     assert text(Findings((_UNREADABLE,))).startswith("absent.yaml: error: cannot be read")
 
 
-def test_text_cannot_move_the_terminals_cursor() -> None:
+def test_text_contains_no_terminal_escapes() -> None:
     bad = Diagnostic("MC111", Severity.ERROR, Position("f.yaml", 1, 1), "", "nodes.b", "", "\x1b[2J\r")
     assert "\x1b" not in text(Findings((bad,), {"f.yaml": "\x1b[31mred"}))
 
 
-def test_json_holds_everything_a_script_needs() -> None:
+def test_json_contains_every_field_of_a_finding_and_the_summary() -> None:
     document = json.loads(as_json(_FINDINGS))
     assert document["version"] == 1
     first = document["findings"][0]
@@ -116,7 +116,7 @@ def _check_sarif(log: dict[str, Any]) -> None:
                 assert region.get("startColumn", 1) >= 1
 
 
-def test_sarif_has_the_required_structure_and_all_that_was_found() -> None:
+def test_sarif_has_the_required_structure_and_all_findings() -> None:
     log = json.loads(sarif(_FINDINGS))
     _check_sarif(log)
     (run,) = log["runs"]
@@ -131,7 +131,7 @@ def test_sarif_has_the_required_structure_and_all_that_was_found() -> None:
     _check_sarif(json.loads(sarif(Findings((_UNREADABLE,)))))
 
 
-def test_sarif_names_files_relative_to_the_working_directory_or_absolutely(
+def test_sarif_file_uris_are_relative_to_the_working_directory_or_absolute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -175,7 +175,7 @@ _STRICT = {
 
 
 @pytest.mark.parametrize("findings", [_FINDINGS, _NOTHING, Findings((_NOTE,))])
-def test_junit_is_valid_by_the_strict_schema(findings: Findings) -> None:
+def test_junit_is_valid_under_the_strict_schema(findings: Findings) -> None:
     root = ElementTree.fromstring(junit(findings, datetime(2026, 1, 2, 3, 4, 5)).encode())
     assert root.tag == "testsuites"
     for element in root.iter():
@@ -188,7 +188,7 @@ def test_junit_is_valid_by_the_strict_schema(findings: Findings) -> None:
         assert [child.tag for child in suite if child.tag != "testcase"] == ["properties", "system-out", "system-err"]
 
 
-def test_junit_names_the_moment_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_junit_uses_source_date_epoch_as_timestamp(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert 'timestamp="1970-01-02T00:00:00"' in junit(_NOTHING)
 
@@ -199,7 +199,7 @@ def test_junit_has_a_passed_case_for_a_clean_file() -> None:
     assert (case.get("classname"), len(case)) == ("fleet.yaml", 0)
 
 
-def test_github_escapes_what_would_start_another_command() -> None:
+def test_github_output_escapes_workflow_commands() -> None:
     bad = Diagnostic("MC111", Severity.WARNING, Position("a,b:c%.yaml", 1, 2), "50 %\n::stop-commands::x", hint="so")
     assert github(Findings((bad,))) == (
         "::warning file=a%2Cb%3Ac%25.yaml,line=1,col=2,title=meshctl MC111::50 %25%0A::stop-commands::x%0Aso\n"

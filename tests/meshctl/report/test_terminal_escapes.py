@@ -50,7 +50,7 @@ def event(kind: EventKind, words: str) -> Event:
 
 
 @given(st.text())
-def test_what_is_clean_steers_nothing_keeps_its_width_and_is_clean_already(words: str) -> None:
+def test_cleaning_removes_escapes_keeps_the_width_and_is_idempotent(words: str) -> None:
     shown = clean(words)
     assert steering(shown) == []
     assert len(shown) == len(words)
@@ -59,24 +59,24 @@ def test_what_is_clean_steers_nothing_keeps_its_width_and_is_clean_already(words
 
 
 @given(st.text(st.characters(categories=("L", "N", "P", "S"))))
-def test_letters_of_any_script_pass(words: str) -> None:
+def test_letters_of_any_script_are_kept(words: str) -> None:
     assert clean(words) == words
 
 
 @given(st.text())
-def test_json_stays_the_same_value_and_steers_nothing(words: str) -> None:
+def test_json_keeps_its_value_and_contains_no_terminal_escapes(words: str) -> None:
     written = json_safe(json.dumps({words: words}, ensure_ascii=False))
     assert json.loads(written) == {words: words}
     assert steering(written) == []
 
 
-def test_our_colors_pass_and_nothing_else() -> None:
+def test_only_our_own_color_escapes_are_kept() -> None:
     shown = clean_styled(f"{paint('ok', 'ok')} \x1b[2J\x1b]0;t\x07")
     assert shown.startswith("\x1b[32mok\x1b[0m")
     assert steering(shown.replace("\x1b[32m", "").replace("\x1b[0m", "")) == []
 
 
-def test_a_plan_of_a_hostile_device_steers_nothing() -> None:
+def test_a_plan_for_a_hostile_device_contains_no_terminal_escapes() -> None:
     files = (FileChange("etc/config/system", "changed", f"--- a\n+++ b\n-option x '{HOSTILE}'\n"),)
     node = NodePlan("b01", Verdict.CHANGE, files=files, notes=(HOSTILE,))
     refused = NodePlan("b02", Verdict.REFUSED, reason=HOSTILE, hint=HOSTILE)
@@ -86,7 +86,7 @@ def test_a_plan_of_a_hostile_device_steers_nothing() -> None:
     assert [steering(line.text) for line in plan_lines(plan) if steering(line.text)] == []
 
 
-def test_progress_of_a_hostile_device_steers_nothing_and_forges_no_line() -> None:
+def test_the_progress_of_a_hostile_device_has_no_escapes_and_forges_no_line() -> None:
     out, json_out, screen = io.StringIO(), io.StringIO(), io.StringIO()
     console = Console(file=screen, force_terminal=True, width=200, color_system=None)
     live = LiveProgress(console, 1)
@@ -103,7 +103,7 @@ def test_progress_of_a_hostile_device_steers_nothing_and_forges_no_line() -> Non
     assert "[red]" in screen.getvalue(), "markup is text"
 
 
-def test_a_status_of_hostile_devices_steers_nothing(tmp_path: Path) -> None:
+def test_the_status_of_hostile_devices_contains_no_terminal_escapes(tmp_path: Path) -> None:
     fleet: Fleet = trio(tmp_path)
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")})
     node = replace(status.nodes[0], version=HOSTILE, via=HOSTILE, alarms=(Alarm(Level.ERROR, "x", HOSTILE, HOSTILE),))
@@ -118,7 +118,7 @@ def test_a_status_of_hostile_devices_steers_nothing(tmp_path: Path) -> None:
     assert steering("\n".join(table_lines([{"health": TableCell("ok"), "name": TableCell(HOSTILE)}]))) == []
 
 
-def test_history_of_a_hostile_device_steers_nothing(
+def test_the_history_of_a_hostile_device_contains_no_terminal_escapes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     from meshctl.cli.main import main
@@ -153,7 +153,7 @@ def test_colors_of_status_and_preflight_are_kept(
     assert json.loads(capsys.readouterr().out)["checks"][1]["reason"] == HOSTILE
 
 
-def test_every_command_prints_through_the_one_place_that_cleans() -> None:
+def test_every_command_prints_through_the_sanitizing_output_module() -> None:
     """New output goes through `meshctl.cli.output`; pages and live lines clean what they draw themselves."""
     own_sequences = {"output.py", "live_screen.py", "fleet_view.py"}
     found = []

@@ -22,12 +22,12 @@ def test_the_longest_interval_that_heals_in_time_is_chosen(reconnect_s: float, i
     assert batman_intervals(fleets.mesh(reconnect_s=reconnect_s)).orig_interval_ms == interval_ms
 
 
-def test_a_time_that_nothing_reaches_is_refused() -> None:
+def test_an_unreachable_reconnect_time_is_rejected() -> None:
     with pytest.raises(UnreachableTarget, match=r"at least 0\.6 s, found 0\.5 s"):
         batman_intervals(fleets.mesh(reconnect_s=0.5))
 
 
-def test_a_written_interval_stands() -> None:
+def test_an_explicit_interval_is_used_as_given() -> None:
     mesh = fleets.mesh(reconnect_s=0.1, batman=Batman(orig_interval_ms=3000, elp_interval_ms=77))
     intervals = batman_intervals(mesh)
     assert (intervals.orig_interval_ms, intervals.elp_interval_ms) == (3000, 77)
@@ -47,18 +47,18 @@ def test_a_longer_interval_never_heals_sooner(one: int, other: int) -> None:
 
 
 @pytest.mark.parametrize(("interval_ms", "seconds"), MEASURED_HEAL_S.items())
-def test_the_measured_times_are_given_as_measured(interval_ms: int, seconds: float) -> None:
+def test_measured_intervals_return_the_measured_healing_time(interval_ms: int, seconds: float) -> None:
     assert heal_s(interval_ms) == seconds
 
 
-def test_frame_airtime_by_hand() -> None:
+def test_frame_airtime_matches_a_manual_calculation() -> None:
     # 52 + 36 bytes at 12 Mbit/s: (88 x 8 + 22) bits / 48 bits a symbol = 16 symbols of 4 us
     assert frame_airtime_us(52, 12_000) == pytest.approx(95.5 + 26 + 64)
     # at 1 Mbit/s a bit takes a microsecond
     assert frame_airtime_us(52, 1000) == pytest.approx(360 + 192 + 704)
 
 
-def test_a_lone_node_sends_its_own_message_only() -> None:
+def test_a_lone_node_sends_only_its_own_originator_message() -> None:
     assert originator_airtime(1, 1000, 12_000) == pytest.approx(frame_airtime_us(52, 12_000) / 1e6)
     assert originator_airtime(0, 1000, 12_000) == 0
 
@@ -69,7 +69,9 @@ def test_without_aggregation_every_node_repeats_every_message() -> None:
 
 
 @given(st.integers(1, 200), st.sampled_from([100, 250, 500, 1000]), st.sampled_from([1000, 6000, 12_000, 24_000]))
-def test_more_nodes_or_a_shorter_interval_or_a_slower_rate_cost_more(nodes: int, interval_ms: int, rate: int) -> None:
+def test_more_nodes_shorter_intervals_and_slower_rates_cost_more_airtime(
+    nodes: int, interval_ms: int, rate: int
+) -> None:
     cost = originator_airtime(nodes, interval_ms, rate)
     assert originator_airtime(nodes + 1, interval_ms, rate) > cost
     assert originator_airtime(nodes, interval_ms * 2, rate) < cost
@@ -78,6 +80,6 @@ def test_more_nodes_or_a_shorter_interval_or_a_slower_rate_cost_more(nodes: int,
 
 
 @pytest.mark.parametrize(("interval_ms", "rate"), [(0, 12_000), (1000, 0), (-1, 1)])
-def test_no_interval_and_no_rate_have_no_cost(interval_ms: int, rate: int) -> None:
+def test_a_non_positive_interval_or_rate_is_rejected(interval_ms: int, rate: int) -> None:
     with pytest.raises(ValueError, match="positive"):
         originator_airtime(2, interval_ms, rate)

@@ -51,21 +51,21 @@ def test_two_radios_of_one_mesh_share_one_batman_interface() -> None:
     assert found.lan.ports == ("eth0.1", "bat0")
 
 
-def test_meshes_of_one_network_share_a_batman_interface_with_the_shorter_interval() -> None:
+def test_meshes_of_one_network_share_a_batman_interface_and_shortest_interval() -> None:
     wide = fleets.mesh(name="wide", band=Band.G5, channel=36, reconnect_s=1.5)
     found = intent(fleets.fleet(fleets.node(radios=BOTH), meshes=(fleets.mesh(), wide)))
     assert [(item.mesh, item.master) for item in found.interfaces] == [("main", "bat0"), ("wide", "bat0")]
     assert [(item.mesh, item.orig_interval_ms) for item in found.batman] == [("main", 250)]
 
 
-def test_a_mesh_of_another_network_relays_beside_the_bridge() -> None:
+def test_a_mesh_of_another_network_is_not_bridged() -> None:
     wide = fleets.mesh(name="wide", network=IPv4Network("10.43.0.0/24"))
     found = intent(fleets.fleet(fleets.node(radios=BOTH), meshes=(fleets.mesh(), wide)))
     assert [item.master for item in found.interfaces] == ["bat0", "bat1"]
     assert found.lan.ports == ("eth0.1", "bat0")
 
 
-def test_the_mesh_that_holds_the_address_is_bridged() -> None:
+def test_the_mesh_that_contains_the_node_address_is_bridged() -> None:
     wide = fleets.mesh(name="wide", network=IPv4Network("10.43.0.0/24"), lan_mtu=1400)
     node = fleets.node(radios=BOTH, address=IPv4Interface("10.43.0.5/24"))
     found = intent(fleets.fleet(node, meshes=(fleets.mesh(), wide)))
@@ -73,14 +73,14 @@ def test_the_mesh_that_holds_the_address_is_bridged() -> None:
     assert found.lan.mtu == 1400
 
 
-def test_a_node_in_no_mesh_keeps_its_wired_side() -> None:
+def test_a_node_without_a_mesh_keeps_its_lan_ports() -> None:
     found = intent(fleets.fleet(fleets.node(radios=(Radio(fleets.RADIO_2G, None, 20),))))
     assert found.batman == ()
     assert found.lan.ports == ("eth0.1",)
     assert found.packages == ()
 
 
-def test_the_elp_interval_is_batman_vs_alone() -> None:
+def test_the_elp_interval_is_set_only_for_batman_v() -> None:
     five = fleets.mesh(batman=Batman(routing_algo="BATMAN_V"), reconnect_s=1.4)
     assert [item.elp_interval_ms for item in intent(fleets.fleet(meshes=(five,))).interfaces] == [125]
     assert [item.elp_interval_ms for item in intent(fleets.fleet()).interfaces] == [None]
@@ -94,7 +94,7 @@ def test_an_open_mesh_asks_for_no_secret() -> None:
     assert resolve(fleet, fleets.node(), none).secrets == ()
 
 
-def test_a_secret_that_is_not_there_is_refused_at_its_place() -> None:
+def test_a_missing_secret_is_reported_at_its_position() -> None:
     def none(ref: SecretRef) -> Secret:
         raise InputError(f"secret {ref}: not set", hint="export MESH_KEY")
 
@@ -120,7 +120,7 @@ def test_a_secret_that_is_not_there_is_refused_at_its_place() -> None:
         ({"reconnect_s": 0.1}, "meshes.main.reconnect_s RND004"),
     ],
 )
-def test_a_mesh_that_cannot_be_is_refused(changes: dict[str, Any], found: str) -> None:
+def test_an_invalid_mesh_is_rejected(changes: dict[str, Any], found: str) -> None:
     assert refusals(fleets.fleet(meshes=(fleets.mesh(**changes),))) == [found]
 
 
@@ -134,14 +134,14 @@ def test_a_mesh_that_cannot_be_is_refused(changes: dict[str, Any], found: str) -
         ("y" * 129, MeshMode.MESH, Encryption.SAE),
     ],
 )
-def test_a_key_that_the_encryption_cannot_take_is_refused_unseen(
+def test_a_key_invalid_for_the_encryption_is_rejected_without_being_shown(
     key: str, mode: MeshMode, encryption: Encryption
 ) -> None:
     fleet = fleets.fleet(meshes=(fleets.mesh(mode=mode, encryption=encryption),))
     assert refusals(fleet, key) == ["meshes.main.key RND001"]
 
 
-def test_the_newest_release_takes_no_encrypted_cell_and_no_quote_in_its_name() -> None:
+def test_openwrt_25_12_rejects_encrypted_ad_hoc_and_quotes_in_names_or_keys() -> None:
     node = fleets.node(Release.V25_12)
     encrypted = fleets.fleet(node, meshes=(fleets.mesh(encryption=Encryption.PSK2),))
     assert refusals(encrypted) == ["meshes.main.encryption RND002"]
@@ -151,7 +151,7 @@ def test_the_newest_release_takes_no_encrypted_cell_and_no_quote_in_its_name() -
     assert intent(fleets.fleet(fleets.node(Release.V24_10), meshes=(fleets.mesh(ssid="bob's"),))).node
 
 
-def test_the_newest_release_is_never_asked_for_no_power_which_it_takes_for_full_power() -> None:
+def test_openwrt_25_12_rejects_a_tx_power_of_0_dbm() -> None:
     quiet = (Radio(fleets.RADIO_2G, "main", 0),)
     assert refusals(fleets.fleet(fleets.node(Release.V25_12, radios=quiet))) == [
         "nodes.husky1-front.radios.radio0.tx_power_dbm RND001"
@@ -179,7 +179,7 @@ def test_the_newest_release_is_never_asked_for_no_power_which_it_takes_for_full_
         ),
     ],
 )
-def test_a_node_that_cannot_be_written_is_refused(changes: dict[str, Any], found: str) -> None:
+def test_an_invalid_node_is_rejected(changes: dict[str, Any], found: str) -> None:
     assert refusals(fleets.fleet(fleets.node(**changes))) == [found]
 
 
@@ -191,7 +191,7 @@ def test_a_node_that_cannot_be_written_is_refused(changes: dict[str, Any], found
         (SystemSettings(ntp_servers=("a", "")), "system.ntp_servers.1 RND001"),
     ],
 )
-def test_system_settings_of_more_than_a_line_are_refused(system: SystemSettings, found: str) -> None:
+def test_empty_or_multi_line_system_settings_are_rejected(system: SystemSettings, found: str) -> None:
     assert refusals(fleets.fleet(system=system)) == [found]
 
 
@@ -199,7 +199,7 @@ def test_system_settings_of_more_than_a_line_are_refused(system: SystemSettings,
     ("release", "keys"),
     [(Release.V24_10, ()), (Release.V19_07, (fleets.ED25519,))],
 )
-def test_every_operator_can_log_in(release: Release, keys: tuple[str, ...]) -> None:
+def test_without_a_usable_operator_key_password_login_is_required(release: Release, keys: tuple[str, ...]) -> None:
     fleet = fleets.fleet(fleets.node(release), operators=Operators(keys))
     assert refusals(fleet) == ["operators.ssh_keys RND003"]
     assert intent(replace(fleet, operators=Operators(keys, password_login=True))).login.is_password_allowed
@@ -208,20 +208,20 @@ def test_every_operator_can_log_in(release: Release, keys: tuple[str, ...]) -> N
 @pytest.mark.parametrize(
     ("ssh", "port"), [(SshSettings(), 22), (SshSettings(port=2222), 2222), (SshSettings(host="gate", port=10022), 22)]
 )
-def test_dropbear_listens_where_we_log_in_unless_another_host_stands_in_front(ssh: SshSettings, port: int) -> None:
+def test_dropbear_listens_on_the_ssh_port_unless_another_host_forwards_it(ssh: SshSettings, port: int) -> None:
     assert intent(fleets.fleet(fleets.node(ssh=ssh))).login.port == port
 
 
-def test_a_country_that_is_no_word_is_refused() -> None:
+def test_an_invalid_country_is_rejected() -> None:
     assert refusals(fleets.fleet(country="U S")) == ["country RND001"]
 
 
-def test_keys_of_more_than_a_line_are_refused() -> None:
+def test_multi_line_and_invalid_ssh_keys_are_rejected() -> None:
     fleet = fleets.fleet(operators=Operators((fleets.RSA, "ssh-rsa AAAA a\nssh-rsa BBBB b", "no key")))
     assert refusals(fleet) == ["operators.ssh_keys.1 RND001", "operators.ssh_keys.2 RND001"]
 
 
-def test_meshes_of_two_back_ends_on_one_node_are_refused() -> None:
+def test_two_mesh_backends_on_one_node_are_rejected() -> None:
     wide = fleets.mesh(name="wide", backend=Backend.MESHMERIZE)
     fleet = fleets.fleet(fleets.node(radios=BOTH), meshes=(fleets.mesh(), wide))
     assert refusals(fleet) == ["nodes.husky1-front.radios RND002"]

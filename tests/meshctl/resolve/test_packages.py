@@ -34,20 +34,22 @@ def test_an_open_mesh_needs_batman_and_the_tools() -> None:
         (Release.V25_12, "wpad-mesh-mbedtls", "wpad-basic-mbedtls"),
     ],
 )
-def test_an_encrypted_mesh_takes_a_full_supplicant_for_the_stock_one(release: Release, full: str, stock: str) -> None:
+def test_an_encrypted_mesh_replaces_the_stock_supplicant_with_a_full_one(
+    release: Release, full: str, stock: str
+) -> None:
     found = plan(fleets.mesh(mode=MeshMode.MESH, encryption=Encryption.SAE), fleets.node(release))
     assert full in found.install
     assert found.remove == (stock,)
 
 
-def test_what_the_inventory_names_is_taken_instead() -> None:
+def test_packages_in_the_inventory_replace_the_defaults() -> None:
     node = fleets.node(packages=("wpad-openssl", "batctl-full", "tcpdump", "-ppp"))
     found = plan(fleets.mesh(encryption=Encryption.PSK2), node)
     assert found.install == ("batctl-full", "iw", "kmod-batman-adv", "tcpdump", "wpad-openssl")
     assert found.remove == ("ppp", "wpad-basic-mbedtls")
 
 
-def test_meshmerize_needs_what_its_operator_names() -> None:
+def test_meshmerize_needs_the_packages_of_its_operator() -> None:
     mesh = replace(
         fleets.mesh(), backend=Backend.MESHMERIZE, operator_parts=OperatorParts(packages=("operator-daemon",))
     )
@@ -63,7 +65,7 @@ def test_older_releases_are_not_offered_mbedtls() -> None:
 
 
 @pytest.mark.parametrize("release", list(Release))
-def test_only_a_supplicant_with_a_tls_library_joins_an_encrypted_802_11s_mesh(release: Release) -> None:
+def test_encrypted_802_11s_needs_a_supplicant_with_a_tls_library(release: Release) -> None:
     ad_hoc = supplicant_need(fleets.mesh(encryption=Encryption.PSK2), release)
     mesh = supplicant_need(fleets.mesh(mode=MeshMode.MESH, encryption=Encryption.SAE), release)
     assert ad_hoc is not None

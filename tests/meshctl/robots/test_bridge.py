@@ -42,7 +42,7 @@ def _pid(fleet: RobotFleet) -> str:
     return fleet.shell("husky1", "systemctl show -p MainPID --value udp-mesh-ros1.service").strip()
 
 
-def test_the_bridge_is_deployed_watched_and_taken_away_with_the_daemon(fleet: RobotFleet) -> None:
+def test_the_bridge_is_deployed_monitored_and_removed_with_the_daemon(fleet: RobotFleet) -> None:
     _robot_with_ros(fleet)
     fleet.shell("husky1", "mv /opt/ros /opt/sor")
     assert "ROS is not installed: /opt/ros/noetic/setup.bash is missing" in fleet.deploy(exit_code=1)
@@ -70,7 +70,7 @@ def test_the_bridge_is_deployed_watched_and_taken_away_with_the_daemon(fleet: Ro
 
 
 @pytest.mark.proof
-def test_a_bridge_that_fails_brings_the_release_before_back_and_one_that_is_no_more_wanted_goes(
+def test_a_failing_bridge_is_rolled_back_and_an_unwanted_bridge_is_removed(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _robot_with_ros(fleet)

@@ -32,7 +32,7 @@ def _pair(fleet: RobotFleet) -> dict[str, str]:
     return _boots(fleet)
 
 
-def test_a_topic_is_added_set_and_removed_everywhere_at_once_without_a_restart(fleet: RobotFleet) -> None:
+def test_topics_are_added_set_and_removed_everywhere_without_a_restart(fleet: RobotFleet) -> None:
     boots = _pair(fleet)
     output = fleet.meshctl("topic", "add", "video", "priority=9", "reliable=false", "destinations=[husky1]")
     assert "+  video:" in output
@@ -52,7 +52,7 @@ def test_a_topic_is_added_set_and_removed_everywhere_at_once_without_a_restart(f
     assert fleet.file.read_text() == text
 
 
-def test_a_dry_run_shows_the_change_and_leaves_inventory_and_robots_as_they_are(fleet: RobotFleet) -> None:
+def test_a_dry_run_shows_the_change_without_applying_it(fleet: RobotFleet) -> None:
     boots = _pair(fleet)
     fleet.meshctl("topic", "set", "status", "priority=6")
     text = fleet.file.read_text()
@@ -94,7 +94,7 @@ def test_a_dry_run_names_the_robots_that_would_refuse(fleet: RobotFleet) -> None
     assert "husky1: " in fleet.meshctl("stop", "--dry-run", exit_code=3)
 
 
-def test_a_key_is_rotated_without_an_interruption_and_waits_for_robots_that_are_away(fleet: RobotFleet) -> None:
+def test_key_rotation_restarts_nothing_and_waits_for_unreachable_robots(fleet: RobotFleet) -> None:
     boots = _pair(fleet)
     fleet.machines["husky2"].stop()
     output = fleet.meshctl("rotate-key", "file:keys.yaml#new", exit_code=3)

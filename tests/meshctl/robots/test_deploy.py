@@ -19,7 +19,7 @@ _EVERYTHING = (
 )
 
 
-def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: RobotFleet) -> None:
+def test_the_first_deploy_installs_and_starts_and_the_second_is_a_no_op(fleet: RobotFleet) -> None:
     fleet.add("husky1", fresh=True)
     fleet.write()
     assert "not installed" in fleet.meshctl("diff", exit_code=1, wheels=True)
@@ -38,7 +38,7 @@ def test_a_first_deploy_installs_and_starts_and_a_second_changes_nothing(fleet: 
     assert key.split()[:2] == ["600", "udp-mesh"]
 
 
-def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
+def test_a_failed_upgrade_is_rolled_back_automatically(
     fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet.add("husky1")
@@ -73,7 +73,7 @@ def test_an_upgrade_switches_and_one_that_fails_goes_back_by_itself(
     assert fleet.status()["husky1"]["status"]["version"] == first["status"]["version"]
 
 
-def test_a_first_release_that_does_not_run_is_removed_again(
+def test_a_first_release_that_fails_to_start_is_removed(
     fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet.add("husky1")
@@ -86,7 +86,7 @@ def test_a_first_release_that_does_not_run_is_removed_again(
     )
 
 
-def test_changes_by_hand_and_interruptions_are_seen_and_fixed(fleet: RobotFleet) -> None:
+def test_manual_changes_and_interruptions_are_detected_and_fixed(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()
@@ -128,7 +128,7 @@ with MeshClient() as mesh:
 
 
 @pytest.mark.proof
-def test_a_release_that_peers_see_and_whose_topics_no_longer_flow_goes_back(
+def test_a_release_whose_topics_stop_flowing_is_rolled_back(
     fleet: RobotFleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("husky1", "husky2"):

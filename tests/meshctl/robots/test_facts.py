@@ -100,7 +100,7 @@ def test_one_answer_has_service_release_daemon_and_computer() -> None:
     assert json.loads(json.dumps(facts_object(facts)))["peers"][0]["name"] == "base"
 
 
-def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_hand() -> None:
+def test_drift_lists_inventory_differences_and_manual_changes() -> None:
     text = ANSWER.replace("wheel=9999", "wheel=7777").replace("== computer", "damaged=etc/udp-mesh.toml\n== computer")
     text = text.replace("file=2222", "file=3333").replace("UnitFileState=enabled", "UnitFileState=disabled")
     facts = _facts(text)
@@ -114,7 +114,7 @@ def test_drift_names_what_differs_from_the_inventory_and_what_was_changed_by_han
     assert "4 differ" in facts.remark
 
 
-def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
+def test_a_robot_without_its_wanted_bridge_running_is_unhealthy() -> None:
     wanted = ExpectedRelease({**WANTED.files, "udp-mesh-ros1.service": "e" * 64}, WANTED.wheel)
     facts = _facts(wanted=wanted)
     assert facts.bridge is not None
@@ -127,7 +127,7 @@ def test_a_bridge_that_is_wanted_and_does_not_run_makes_the_robot_ill() -> None:
     assert _facts(up).bridge is not None, "an installed one is reported even if the inventory has none"
 
 
-def test_a_daemon_that_does_not_answer_is_not_well_and_says_so() -> None:
+def test_a_daemon_that_does_not_answer_is_reported_as_unhealthy() -> None:
     silent = _facts(f"{_SERVICES}== status\n== topics\n")
     assert not silent.is_healthy
     assert silent.remark == "the daemon does not answer"
@@ -147,7 +147,7 @@ def test_the_table_shows_queues_by_priority_and_the_latest_message() -> None:
     assert "1/2" in output
 
 
-def test_a_narrow_terminal_shows_fewer_columns_and_names_them_and_every_error() -> None:
+def test_a_narrow_terminal_lists_hidden_columns_and_keeps_every_error() -> None:
     away = RobotFacts("husky9", error="husky9 (10.42.0.19): no answer to connect within 5 s: is it on?")
     for width in (60, 80, 100, 200):
         lines = table([_facts(), away], width).splitlines()

@@ -35,7 +35,7 @@ def _ill(look: HealthSnapshot, before: Baseline = NOTHING, wanted: tuple[str, ..
     return problems(look, list(wanted), before, NOW_S)
 
 
-def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
+def test_a_robot_with_its_previous_peers_and_topics_is_healthy() -> None:
     assert _ill(_look()) == ""
     before = Baseline(["base"], {"video": 700}, "a")
     assert _ill(_look(DAEMON, BRIDGE, online=("base", "husky2"), received=1), before) == ""
@@ -57,11 +57,11 @@ def test_all_that_ran_and_was_seen_before_makes_it_well() -> None:
         (_look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S)), NOTHING, "the ROS bridge has just started"),
     ],
 )
-def test_what_is_not_well_is_said_in_one_line(look: HealthSnapshot, before: Baseline, reason: str) -> None:
+def test_a_health_problem_is_described_by_its_reason(look: HealthSnapshot, before: Baseline, reason: str) -> None:
     assert reason in _ill(look, before)
 
 
-def test_a_bridge_that_came_through_to_the_daemon_needs_no_longer_than_that() -> None:
+def test_a_bridge_connected_to_the_daemon_is_healthy_without_a_longer_wait() -> None:
     seen = _look(DAEMON, BRIDGE._replace(started_s=NOW_S - STEADY_S))
     assert _ill(seen._replace(topics=[*seen.topics, _topic(BRIDGE_TOPIC)])) == ""
     assert _ill(_look(DAEMON, BRIDGE._replace(started_s=NOW_S - BRIDGE_STEADY_S))) == "", (
@@ -69,23 +69,23 @@ def test_a_bridge_that_came_through_to_the_daemon_needs_no_longer_than_that() ->
     )
 
 
-def test_a_topic_that_is_lacking_or_only_arrives_is_not_there() -> None:
+def test_a_topic_absent_or_not_configured_is_missing() -> None:
     assert _ill(_look(), wanted=("estop", "lidar")) == "topics are missing: lidar"
     seen = _look()._replace(topics=[_topic("estop"), _topic("video", configured=False)])
     assert _ill(seen) == "topics are missing: video"
 
 
-def test_after_a_reload_the_same_process_must_count_on() -> None:
+def test_after_a_reload_message_counts_must_keep_increasing() -> None:
     before = Baseline([], {"video": 5}, "b")
     assert "receive nothing" in _ill(_look(boot="b", received=5), before)
     assert _ill(_look(boot="b", received=6), before) == ""
 
 
-def test_a_topic_that_was_taken_out_needs_not_flow_any_more() -> None:
+def test_a_removed_topic_need_not_flow() -> None:
     assert _ill(_look(), Baseline([], {"gone": 5}, "a")) == ""
 
 
-def test_a_single_message_is_no_flow() -> None:
+def test_a_single_message_does_not_count_as_flow() -> None:
     first = [_topic("status", 10), _topic("video", 10)]
     then = [_topic("status", 11), _topic("video", 40), _topic("new", 2)]
     assert flowing(first, then) == {"video": 40, "new": 2}

@@ -17,7 +17,7 @@ def _address_of(fleet: RobotFleet, name: str, *, on: str) -> str:
     return fleet.shell(on, f"getent ahostsv4 {name} | awk 'NR == 1 {{ print $1 }}'").strip()
 
 
-def test_peers_have_names_on_a_robot_while_its_daemon_runs(fleet: RobotFleet) -> None:
+def test_peer_names_resolve_on_a_robot_while_its_daemon_runs(fleet: RobotFleet) -> None:
     for name in ("husky1", "husky2"):
         fleet.add(name)
     fleet.write()

@@ -49,7 +49,7 @@ class Finger:
         self._thread.join()
 
 
-def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_left(
+def test_an_interrupted_deploy_is_recorded_and_resume_continues_it(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fleet.add("husky1", fresh=True)
@@ -74,9 +74,7 @@ def test_an_interrupted_deploy_is_in_the_history_and_resume_takes_up_what_is_lef
 
 
 @pytest.mark.proof
-def test_a_second_ctrl_c_leaves_the_robot_intact_and_robots_that_were_off_are_resumed(
-    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_ctrl_c_leaves_robots_intact_and_resumable(fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("husky1", "husky2"):
         fleet.add(name)
     fleet.write()
@@ -93,7 +91,7 @@ def test_a_second_ctrl_c_leaves_the_robot_intact_and_robots_that_were_off_are_re
     assert "husky2: done: runs " in output
 
 
-def test_two_operators_on_one_robot_exclude_each_other_and_a_dead_claim_does_not_block(fleet: RobotFleet) -> None:
+def test_a_live_lock_blocks_other_operators_and_a_stale_lock_does_not(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'

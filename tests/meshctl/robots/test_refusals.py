@@ -12,7 +12,7 @@ pytestmark = pytest.mark.timeout(600)
 _NOTHING = "ls -A /opt /etc/systemd/system"
 
 
-def test_nothing_is_changed_on_a_computer_that_cannot_take_it(fleet: RobotFleet) -> None:
+def test_an_incompatible_computer_is_refused_and_left_unchanged(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     before = fleet.shell("husky1", _NOTHING)
@@ -35,7 +35,7 @@ def test_nothing_is_changed_on_a_computer_that_cannot_take_it(fleet: RobotFleet)
     assert fleet.shell("husky1", _NOTHING) == before
 
 
-def test_a_full_disk_is_found_before_and_survived_in_the_middle(fleet: RobotFleet) -> None:
+def test_a_full_disk_is_detected_before_and_handled_during_a_deploy(fleet: RobotFleet) -> None:
     fleet.add("husky1", opt_kib=20_000)
     fleet.write()
     output = fleet.deploy(exit_code=1)
@@ -53,7 +53,7 @@ def test_a_full_disk_is_found_before_and_survived_in_the_middle(fleet: RobotFlee
     assert fleet.status()["husky1"]["service"]["active"] != "active"
 
 
-def test_a_robot_that_is_off_or_not_trusted_does_not_stop_the_others(fleet: RobotFleet) -> None:
+def test_an_unreachable_or_untrusted_robot_does_not_block_the_others(fleet: RobotFleet) -> None:
     for name in ("husky1", "husky2"):
         fleet.add(name)
     fleet.write()

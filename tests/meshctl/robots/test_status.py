@@ -32,7 +32,7 @@ def checks(fleet: RobotFleet) -> dict[str, dict[str, Any]]:
     return {check["check"]: check for check in document(fleet, "preflight")["checks"]}
 
 
-def test_a_deployed_crew_is_well_talks_and_a_daemon_that_stops_is_reported_with_its_reason(fleet: RobotFleet) -> None:
+def test_a_deployed_team_is_healthy_and_a_stopped_daemon_is_reported(fleet: RobotFleet) -> None:
     for name in ("alpha", "bravo"):
         fleet.add(name)
     fleet.write()

@@ -31,7 +31,7 @@ echo 'Welcome!' >&2
 
 
 @pytest.mark.proof
-def test_a_half_deleted_installation_is_seen_and_made_whole_by_one_deploy(fleet: RobotFleet) -> None:
+def test_one_deploy_repairs_a_half_deleted_installation(fleet: RobotFleet) -> None:
     fleet.add("husky1")
     fleet.write()
     fleet.deploy()
@@ -102,7 +102,7 @@ def test_masked_units_are_refused_and_stay_masked(fleet: RobotFleet) -> None:
     assert fleet.status()["husky1"]["previous"] == before
 
 
-def test_a_computer_that_does_not_resolve_or_has_no_user_for_us_is_reported_as_that(
+def test_an_unresolvable_host_and_a_missing_user_are_reported(
     fleet: RobotFleet,
 ) -> None:
     fleet.add("husky1")

@@ -10,7 +10,7 @@ from tests.meshctl.robots.fleets import USER_PASSWORD, RobotFleet, give_user
 pytestmark = pytest.mark.timeout(600)
 
 
-def test_sudo_serves_with_and_without_a_password_and_a_wrong_one_changes_nothing(
+def test_sudo_works_with_or_without_a_password_and_a_wrong_one_is_harmless(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = fleet.key.with_suffix(".pub").read_text()

@@ -23,7 +23,7 @@ def _show(fleet: RobotFleet, *properties: str, unit: str = "udp-mesh.service") -
     return dict(line.partition("=")[::2] for line in output.splitlines())
 
 
-def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it_hangs_and_after_a_boot(
+def test_the_daemon_service_is_sandboxed_and_restarts_after_hang_and_boot(
     fleet: RobotFleet,
 ) -> None:
     machine = fleet.add("husky1")
@@ -63,7 +63,7 @@ def test_the_daemon_is_a_notifying_service_that_may_do_little_comes_back_when_it
     assert "husky1: unchanged" in fleet.deploy()
 
 
-def test_power_lost_in_the_middle_of_a_switch_is_seen_and_fixed_by_the_next_deploy(fleet: RobotFleet) -> None:
+def test_a_power_cut_during_a_switch_is_detected_and_resumed(fleet: RobotFleet) -> None:
     machine = fleet.add("husky1")
     fleet.write()
     fleet.deploy()
@@ -96,7 +96,7 @@ def test_power_lost_in_the_middle_of_a_switch_is_seen_and_fixed_by_the_next_depl
 
 
 @pytest.mark.proof
-def test_a_clock_that_is_years_off_misleads_nothing(fleet: RobotFleet) -> None:
+def test_a_clock_years_off_does_not_affect_deploy_or_status(fleet: RobotFleet) -> None:
     machine = fleet.add("husky1", start=False)
     library = next(iter((fleet.base / "usr/lib").glob("*/faketime/libfaketime.so.1"))).relative_to(fleet.base)
     faked = f"LD_PRELOAD=/{library} FAKETIME=-20y FAKETIME_DONT_FAKE_MONOTONIC=1 DONT_FAKE_MONOTONIC=1"

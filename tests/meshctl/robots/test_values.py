@@ -45,13 +45,13 @@ ALPINE = Target((3, 12), "x86_64", "musl", (1, 2))
         ("cryptography-44.0.0-pp310-pypy310_pp73-manylinux_2_28_x86_64.whl", set()),
     ],
 )
-def test_a_wheel_is_taken_by_the_computers_that_pip_would_install_it_on(file: str, takers: set[Target]) -> None:
+def test_wheel_compatibility_matches_pip(file: str, takers: set[Target]) -> None:
     wheel = parse_wheel(file)
     assert wheel is not None
     assert {target for target in (BOOKWORM, PI, ALPINE) if is_compatible(target, wheel)} == takers
 
 
-def test_pip_is_asked_for_the_targets_python_and_platforms_and_nothing_newer() -> None:
+def test_pip_options_match_the_target_python_and_platforms() -> None:
     options = pip_options(PI)
     assert options[:2] == ("--python-version", "3.12")
     assert "manylinux_2_39_aarch64" in options
@@ -59,7 +59,7 @@ def test_pip_is_asked_for_the_targets_python_and_platforms_and_nothing_newer() -
     assert "manylinux_2_40_aarch64" not in options
 
 
-def test_our_wheel_holds_udp_mesh_alone_and_its_unit_starts_the_current_release() -> None:
+def test_own_wheel_contains_only_udp_mesh_and_the_unit_starts_the_current_release() -> None:
     with zipfile.ZipFile(BytesIO(own_wheel().content)) as archive:
         tops = {name.split("/")[0] for name in archive.namelist()}
     assert {top.split("-")[0] for top in tops} == {"udp_mesh"}
@@ -70,7 +70,7 @@ def test_our_wheel_holds_udp_mesh_alone_and_its_unit_starts_the_current_release(
         service_unit("[Service]\n", "x")
 
 
-def test_a_bundle_is_named_by_its_content_and_shows_no_secret() -> None:
+def test_a_bundle_id_depends_on_its_content_and_its_repr_hides_secrets() -> None:
     key = File("etc/fleet.key", b"0123456789", 0o600)
     one, same = (Bundle("husky1", "tree", (), (key, File("topics", b"estop\n"))) for _ in range(2))
     other = Bundle("husky1", "tree", (), (File("etc/fleet.key", b"9876543210", 0o600), File("topics", b"estop\n")))
@@ -109,7 +109,7 @@ def _reasons(facts: HostFacts) -> list[str]:
     return [reason for reason, _ in unmet_preconditions(facts, robot="r", arch="x86_64", python="python3")]
 
 
-def test_a_fitting_computer_meets_all_preconditions_and_every_misfit_is_reported_at_once() -> None:
+def test_all_unmet_preconditions_are_reported_at_once() -> None:
     facts = parse_facts(PROBED)
     assert facts.is_sound
     assert facts.target == BOOKWORM
@@ -129,7 +129,7 @@ def test_a_fitting_computer_meets_all_preconditions_and_every_misfit_is_reported
     assert _reasons(parse_facts("")) != [], "a probe that says nothing is no consent"
 
 
-def test_a_clock_that_is_years_off_is_reported_and_is_no_obstacle() -> None:
+def test_a_clock_far_off_is_reported_but_does_not_block() -> None:
     facts = parse_facts(PROBED)
     assert clock_warning(facts, 1e9) == ("", "")
     assert clock_warning(facts, 1.2e9)[0] == "its clock is 6 years behind ours"
@@ -137,21 +137,21 @@ def test_a_clock_that_is_years_off_is_reported_and_is_no_obstacle() -> None:
     assert _reasons(facts) == []
 
 
-def test_room_is_asked_for_what_is_unpacked_and_something_to_spare() -> None:
+def test_required_disk_space_includes_a_reserve() -> None:
     facts = parse_facts(PROBED)
     assert not list(unmet_disk_space(facts, 100 << 20))
     ((reason, _),) = unmet_disk_space(facts, 1 << 30)
     assert reason.startswith("disk full: expected 1057 MiB in /opt")
 
 
-def test_changed_files_are_those_whose_hash_differs_or_that_one_side_lacks() -> None:
+def test_files_with_a_different_hash_or_missing_on_one_side_are_changed() -> None:
     facts = parse_facts(PROBED)
     assert changed_files(facts, [("etc/udp-mesh.toml", "1111"), ("python", "2222"), ("udp-mesh.service", "3333")]) == ()
     wanted = [("etc/udp-mesh.toml", "3333"), ("udp-mesh.service", "3333"), ("new", "1")]
     assert changed_files(facts, wanted) == ("etc/udp-mesh.toml", "new", "python")
 
 
-def test_what_a_switch_says_becomes_one_outcome() -> None:
+def test_switch_output_is_parsed_into_an_outcome() -> None:
     assert parse_switch("r", "id", "result=switched\nonline=base husky2\n").reason == "runs id, 2 peers online"
     back = parse_switch("r", "id", "result=rolled-back\nreason=the daemon does not run\nlog=a=b\nlog=c\n")
     assert back.result is Result.ROLLED_BACK
@@ -162,7 +162,7 @@ def test_what_a_switch_says_becomes_one_outcome() -> None:
 OLD, NEW, OTHER = (SecretRef(SecretKind.ENV, name) for name in ("OLD", "NEW", "OTHER"))
 
 
-def test_a_rotation_goes_on_from_wherever_the_inventory_says_it_is() -> None:
+def test_key_rotation_continues_from_the_stage_in_the_inventory() -> None:
     every = [(OLD, NEW), (NEW, OLD), (NEW,)]
     assert [stage.keys for stage in rotation_stages((OLD,), NEW)] == every
     assert [stage.keys for stage in rotation_stages((OLD, NEW), NEW)] == every
@@ -175,18 +175,18 @@ def test_a_rotation_goes_on_from_wherever_the_inventory_says_it_is() -> None:
 
 
 @pytest.mark.parametrize("text", ["env:NAME", "file:a/b.yaml#new", "age:keys.age#x"])
-def test_a_reference_reads_back_as_it_is_printed(text: str) -> None:
+def test_a_secret_reference_round_trips(text: str) -> None:
     assert str(parse_ref(text)) == text
     assert parse_ref(text).kind.value in dict(inventory_value(parse_ref(text)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("text", ["NAME", "env:", "vault:x", ""])
-def test_what_is_no_reference_is_refused(text: str) -> None:
+def test_an_invalid_secret_reference_is_rejected(text: str) -> None:
     with pytest.raises(InputError, match="expected env:NAME"):
         parse_ref(text)
 
 
-def test_a_robot_that_has_not_moved_over_is_passed_by_and_named_with_the_way_to_take_it_in() -> None:
+def test_a_robot_without_a_computer_is_skipped_or_rejected_with_a_hint() -> None:
     moved = Robot("husky1", (), Computer(IPv4Interface("10.42.0.10/24")))
     fleet = fleets.fleet(
         robots={

@@ -13,7 +13,7 @@ from tests.meshctl.robots.machine import Machine
 pytestmark = pytest.mark.timeout(600)
 
 
-def test_a_robot_behind_its_radio_gets_packages_that_pip_fetched_once(
+def test_a_robot_behind_its_radio_is_deployed_from_cached_pip_packages(
     fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inner = Lan("10.42.1.1")

@@ -19,7 +19,7 @@ def vanish() -> object:
     raise Unreachable("no answer")
 
 
-def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
+def test_answers_and_errors_are_returned_in_query_order() -> None:
     progress: list[tuple[int, int]] = []
     jobs = {"a": lambda: 1, "b": refuse, "c": vanish, "d": lambda: None}
     found = run_parallel(jobs, 2, lambda done, count: progress.append((done, count)))
@@ -30,23 +30,23 @@ def test_answers_come_in_the_order_asked_and_errors_beside_them() -> None:
     assert progress == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_a_bug_is_raised_to_the_caller() -> None:
+def test_unexpected_exceptions_propagate_to_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
         run_parallel({"a": lambda: 1 // 0}, 1)
 
 
-def test_without_devices_there_is_no_wait() -> None:
+def test_without_devices_the_result_is_empty() -> None:
     assert run_parallel({}, 8) == {}
 
 
-def test_the_silent_do_not_keep_others_from_being_asked() -> None:
+def test_stalled_queries_do_not_block_the_others() -> None:
     """With one at a time, and everyone waiting for the last: only those asked beside the silent can let it end."""
     barrier = threading.Barrier(12)
     found = run_parallel(dict.fromkeys(range(12), barrier.wait), 1, stall_timeout_s=0.001)
     assert sorted(str(place) for place in found.values()) == sorted(str(place) for place in range(12))
 
 
-def test_those_asked_at_once_are_no_more_than_allowed_while_answers_come() -> None:
+def test_concurrent_queries_stay_within_the_limit_while_answers_arrive() -> None:
     running, most, lock = 0, 0, threading.Lock()
 
     def work() -> None:

@@ -139,7 +139,7 @@ def bench(standing: Bench) -> Iterator[Bench]:
         standing.fleet.node(name).wait_up()
 
 
-def test_a_whole_fleet_is_all_well_and_compared_with_the_inventory(bench: Bench) -> None:
+def test_a_healthy_fleet_is_reported_as_all_well_without_drift(bench: Bench) -> None:
     output = bench.status()
     assert {name: node["drift"] for name, node in output["by_name"].items()} == {name: [] for name in NAMES}
     assert (output["by_name"]["b02"]["hops"], output["by_name"]["b02"]["via"]) == (2, "b01")
@@ -156,7 +156,7 @@ def alarm_of(bench: Bench, name: str) -> str:
     return str(alarm["text"])
 
 
-def test_a_node_without_power_is_shown_as_it_was(bench: Bench) -> None:
+def test_a_powered_off_node_is_shown_with_its_last_known_state(bench: Bench) -> None:
     bench.fleet.inject_fault("b02", "off")
     until(lambda: "no node hears it" in alarm_of(bench, "b02"), "b01 to have heard nothing of it for a while")
     output = bench.status()
@@ -177,20 +177,20 @@ def test_a_node_with_another_host_key_is_reported_while_the_others_are_queried(b
     assert bench.status()["by_name"]["b01"]["answers"]
 
 
-def test_filters_show_less_and_only_asks_less(bench: Bench) -> None:
+def test_filters_limit_the_output_and_only_limits_the_queries(bench: Bench) -> None:
     assert set(bench.status("--role", "beacon")["by_name"]) == {"b01", "b02"}
     only = bench.status("b02", "--only")
     assert (set(only["by_name"]), only["by_name"]["b02"]["hops"]) == ({"b02"}, None)
 
 
-def test_a_fleet_is_shown_without_its_secrets(bench: Bench) -> None:
+def test_status_works_without_the_secrets(bench: Bench) -> None:
     output = bench.status(inventory="secret.yaml")
     assert all(node["answers"] and node["drift"] is None for node in output["nodes"])
     (alarm,) = [alarm for alarm in output["alarms"] if alarm["code"] == "not-compared"]
     assert "NOT_SET_HERE" in alarm["text"]
 
 
-def test_preflight_is_a_go_for_a_whole_fleet_and_a_no_go_with_its_reason_for_a_broken_one(bench: Bench) -> None:
+def test_preflight_is_go_for_a_healthy_fleet_and_no_go_for_a_broken_one(bench: Bench) -> None:
     output = bench.run("preflight").stdout
     assert output.splitlines()[-1] == "GO (radios only)", output
     bench.fleet.inject_fault("base", "off")
@@ -200,7 +200,7 @@ def test_preflight_is_a_go_for_a_whole_fleet_and_a_no_go_with_its_reason_for_a_b
     assert "base does not answer" in next(check["reason"] for check in broken["checks"] if check["check"] == "base")
 
 
-def test_topology_draws_the_line(bench: Bench) -> None:
+def test_topology_draws_a_line_mesh(bench: Bench) -> None:
     done = bench.run("topology")
     assert done.exit_code == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()[:3]] == ["base", "`-", "`-"]
@@ -224,7 +224,7 @@ def test_an_interrupt_need_not_wait_for_unreachable_devices(bench: Bench) -> Non
     assert (process.returncode, output.splitlines()[-1:]) == (130, ["interrupted"])
 
 
-def test_watch_draws_what_fits_follows_the_window_and_leaves_the_screen_as_it_was(bench: Bench) -> None:
+def test_watch_follows_the_window_size_and_restores_the_screen(bench: Bench) -> None:
     watch = bench.command("status", "--watch", "1", "--timeout", "60")
     with Terminal(watch, bench.environ, lines=60, columns=160) as terminal:
         shown = terminal.shows("looked-at: .*all well.*Ctrl-C to quit", "a page")

@@ -63,13 +63,13 @@ def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
     assert [line for line in lines if len(line) > width] == []
 
 
-def test_a_preflight_ends_with_its_verdict_and_what_stands_against_it(fleet: Fleet) -> None:
+def test_a_preflight_ends_with_its_verdict_and_the_failed_checks(fleet: Fleet) -> None:
     output = preflight_text(preflight(fleet, broken(fleet)))
     assert output.splitlines()[-1].startswith("NO-GO: robot radios, beacons, configuration, ")
     assert preflight_text([Check("base", True, "answers")]).splitlines()[-1] == "GO"
 
 
-def test_what_has_no_room_is_named(fleet: Fleet) -> None:
+def test_hidden_columns_are_listed(fleet: Fleet) -> None:
     output = " ".join(text(broken(fleet), 80).split())
     left_out = re.search(r"columns not shown: (.*?) \(use --wide", output)
     assert left_out is not None
@@ -83,7 +83,7 @@ def test_what_has_no_room_is_named(fleet: Fleet) -> None:
     st.lists(st.tuples(st.text("abc", min_size=1, max_size=12), st.text("xyz", max_size=20)), min_size=1, max_size=5),
     st.integers(20, 160),
 )
-def test_columns_give_way_by_rank_and_those_without_rank_stay(cells: list[tuple[str, str]], width: int) -> None:
+def test_ranked_columns_are_dropped_to_fit_and_unranked_ones_are_kept(cells: list[tuple[str, str]], width: int) -> None:
     rows = [
         {column.key: TableCell(name if column.key == "name" else other or "-", "s") for column in COLUMNS}
         for name, other in cells
@@ -106,14 +106,14 @@ def test_an_empty_column_is_left_out_silently(fleet: Fleet) -> None:
     assert "no room" not in text(status)
 
 
-def test_the_summary_comes_first_and_the_verdict_again_after_a_long_table(fleet: Fleet) -> None:
+def test_the_summary_comes_first_and_is_repeated_after_a_long_table(fleet: Fleet) -> None:
     status = status_of(fleet)
     assert text(status).splitlines()[0].startswith("trio: all well")
     long = replace(status, nodes=status.nodes * 10)
     assert text(long).splitlines()[-1] == text(long).splitlines()[0]
 
 
-def test_one_alarm_at_many_is_one_line(fleet: Fleet) -> None:
+def test_the_same_alarm_on_many_devices_is_one_line(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, silent={name: NoAnswer("no answer") for name in fleet.nodes})
     many = replace(status, robots=(), nodes=tuple(node for node in status.nodes if node.alarms) * 3)
     lines = summary_lines(many)
@@ -128,12 +128,12 @@ def test_brief_leaves_out_notes_and_advice(fleet: Fleet) -> None:
     assert "ERROR" in output
 
 
-def test_topics_are_shown_per_robot_the_most_urgent_first(fleet: Fleet) -> None:
+def test_topics_are_shown_by_urgency(fleet: Fleet) -> None:
     lines = topic_lines(status_of(fleet))
     assert [line.split()[0] for line in lines] == ["topic", *["estop"] * 2, *["commands"] * 2, *["telemetry"] * 2]
 
 
-def test_every_alarm_has_a_code_that_is_listed_and_documented() -> None:
+def test_every_alarm_code_is_listed_and_documented() -> None:
     used = set()
     for path in (ROOT / "meshctl/status").glob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
@@ -167,7 +167,7 @@ def test_every_field_of_the_json_is_documented(fleet: Fleet) -> None:
     assert missing == set()
 
 
-def test_the_json_is_as_its_schema_says(fleet: Fleet) -> None:
+def test_the_json_conforms_to_its_schema(fleet: Fleet) -> None:
     schema = json.loads((ROOT / "docs/status.schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
     is_valid = jsonschema.Draft202012Validator(schema).validate
@@ -180,7 +180,7 @@ def test_the_json_is_as_its_schema_says(fleet: Fleet) -> None:
         is_valid({**as_json(statuses[0]), "an undocumented field": 1})
 
 
-def test_a_fact_that_is_not_known_is_null_and_never_zero(fleet: Fleet) -> None:
+def test_unknown_facts_are_null_not_zero(fleet: Fleet) -> None:
     rover = next(node for node in as_json(broken(fleet))["nodes"] if node["name"] == "rover")
     assert rover["answers"] is False
     for fact in ("version", "drift", "uptime_s", "load", "memory_free", "channels", "neighbours", "hops", "quality"):
@@ -210,7 +210,7 @@ def filtered(fleet: Fleet, words: list[str], alarms: list[str], **attributes: li
         ([], {"role": ["beacon"]}, ["drift"], ["b01"]),
     ],
 )
-def test_a_filter_shows_what_it_names(
+def test_a_filter_shows_the_selected_devices(
     fleet: Fleet, words: list[str], options: dict[str, list[str]], alarms: list[str], shown: list[str]
 ) -> None:
     assert filtered(fleet, words, alarms, **options) == shown
@@ -226,7 +226,7 @@ def test_a_filter_shows_what_it_names(
         ([], {}, ["unreachble"], "did you mean 'unreachable'"),
     ],
 )
-def test_a_filter_that_can_select_nothing_is_refused_with_what_there_is(
+def test_an_invalid_filter_is_rejected_with_a_hint(
     fleet: Fleet, words: list[str], options: dict[str, list[str]], alarms: list[str], hint: str
 ) -> None:
     with pytest.raises(InputError) as raised:

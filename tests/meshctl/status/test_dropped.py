@@ -37,11 +37,11 @@ def test_a_beacon_that_its_robot_does_not_hear_has_been_dropped(fleet: Fleet) ->
 
 
 @pytest.mark.parametrize("neighbors", [heard(rover=-35), heard(rover=-35, b01=-70), heard(rover=None), ()])
-def test_a_beacon_in_the_rack_has_not(fleet: Fleet, neighbors: tuple[Neighbor, ...]) -> None:
+def test_a_beacon_still_in_the_rack_has_not_been_dropped(fleet: Fleet, neighbors: tuple[Neighbor, ...]) -> None:
     assert judged(fleet, neighbors=neighbors) == {}
 
 
-def test_without_an_answer_of_robot_or_beacon_nothing_is_known(fleet: Fleet) -> None:
+def test_without_an_answer_from_robot_and_beacon_nothing_is_inferred(fleet: Fleet) -> None:
     assert judged(fleet, neighbors=heard(b01=-55), rover=Health.UNREACHABLE) == {}
     assert judged(fleet, neighbors=heard(b01=-55), b02=Health.OFF) == {}
 

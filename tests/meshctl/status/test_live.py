@@ -39,7 +39,7 @@ def page(how: str, *, lines: int = 24, columns: int = 80, has_shell: bool = Fals
 
 
 @pytest.mark.parametrize("how", ["goes on", "hangs"])
-def test_a_page_follows_the_window_and_ctrl_c_gives_back_the_screen_whether_or_not_a_look_hangs(how: str) -> None:
+def test_a_page_follows_resizes_and_ctrl_c_restores_the_screen(how: str) -> None:
     with page(how, columns=100) as terminal:
         shown = terminal.shows(r"look \d+ in 100 x 24.*line 9", "a page")
         assert shown.startswith("before")
@@ -54,7 +54,7 @@ def test_a_page_follows_the_window_and_ctrl_c_gives_back_the_screen_whether_or_n
         assert terminal.exit_code() == 0
 
 
-def test_a_burst_of_window_changes_ends_in_a_page_of_the_last_size() -> None:
+def test_a_burst_of_resizes_ends_with_a_page_of_the_final_size() -> None:
     with page("goes on") as terminal:
         terminal.shows("line 9", "a page")
         for columns in range(80, 140):
@@ -65,7 +65,7 @@ def test_a_burst_of_window_changes_ends_in_a_page_of_the_last_size() -> None:
 
 
 @pytest.mark.parametrize("has_shell", [True, False])
-def test_ctrl_z_gives_back_the_screen_until_the_page_goes_on(has_shell: bool) -> None:
+def test_ctrl_z_restores_the_screen_until_the_page_resumes(has_shell: bool) -> None:
     # without a shell in its session it is in an orphaned process group, which the kernel does not stop
     with page("goes on", has_shell=has_shell) as terminal:
         terminal.shows("line 9", "a page")
@@ -84,7 +84,7 @@ def test_ctrl_z_gives_back_the_screen_until_the_page_goes_on(has_shell: bool) ->
         terminal.shows(LEFT, "the screen from before")
 
 
-def test_a_page_that_is_terminated_leaves_the_screen() -> None:
+def test_sigterm_restores_the_screen() -> None:
     with page("hangs") as terminal:
         terminal.shows("line 9", "a page")
         terminal.forget()
@@ -93,7 +93,7 @@ def test_a_page_that_is_terminated_leaves_the_screen() -> None:
         assert terminal.exit_code() == 128 + signal.SIGTERM
 
 
-def test_what_goes_wrong_in_a_look_is_reported_on_the_screen_from_before() -> None:
+def test_an_error_is_reported_after_the_screen_is_restored() -> None:
     with page("fails") as terminal:
         terminal.shows(f"{LEFT}.*no such radio", "the mistake")
         assert terminal.exit_code() == 1

@@ -42,7 +42,7 @@ def test_a_healthy_team_is_a_go(fleet: Fleet) -> None:
     assert preflight_json(found.values())["go"]
 
 
-def test_a_robot_that_stays_on_the_shelf_is_named_and_does_not_block(fleet: Fleet) -> None:
+def test_a_robot_left_on_the_shelf_is_listed_and_does_not_block(fleet: Fleet) -> None:
     found = checks(fleet)
     assert "not taking part: shelf (carried)" in found["robot radios"].reason
     assert "not taking part: shelf" in found["daemons"].reason
@@ -58,7 +58,7 @@ def test_a_robot_with_the_legacy_program_is_named_and_does_not_block(fleet: Flee
     assert "husky still runs the legacy program, cart has no computer" in found["daemons"].reason
 
 
-def test_a_beacon_that_was_never_seen_is_a_no_go_before_it_is_packed(fleet: Fleet) -> None:
+def test_a_carried_beacon_never_seen_is_a_no_go(fleet: Fleet) -> None:
     found = checks(fleet, known={})
     assert stopped(found) == ["beacons"]
     assert "b02: never seen" in found["beacons"].reason
@@ -76,7 +76,7 @@ def test_a_robot_whose_daemon_is_down_is_a_no_go_with_the_reason(fleet: Fleet) -
     assert {"daemons", "delivery"} <= set(stopped(found))
 
 
-def test_a_radio_without_a_path_or_with_one_that_carries_nothing_is_a_no_go(fleet: Fleet) -> None:
+def test_a_radio_with_no_path_or_a_zero_quality_path_is_a_no_go(fleet: Fleet) -> None:
     islands = {
         **HEALTHY,
         "base": seen("base", {"rover": 1}),
@@ -96,7 +96,7 @@ def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
     assert found["peers"].reason == "station does not hear rover"
 
 
-def test_a_message_that_does_not_arrive_is_a_no_go_whatever_the_daemons_say(fleet: Fleet) -> None:
+def test_an_undelivered_test_message_is_a_no_go(fleet: Fleet) -> None:
     found = checks(fleet, pings=Pings({("station", "rover"): 0.01}, {("rover", "station"): "no-answer"}))
     assert stopped(found) == ["delivery"]
     assert found["delivery"].reason == "rover to station: no-answer"
@@ -107,7 +107,7 @@ def test_an_urgent_topic_that_is_not_declared_is_a_no_go(fleet: Fleet) -> None:
     assert found["urgent topics"].reason == "rover: estop is not declared"
 
 
-def test_a_fleet_without_its_secrets_is_a_no_go_that_names_them(fleet: Fleet) -> None:
+def test_missing_secrets_are_a_no_go_with_the_reason(fleet: Fleet) -> None:
     found = checks(fleet, unrendered={"base": "env:KEY is not set"})
     assert stopped(found) == ["configuration"]
     assert "env:KEY is not set" in found["configuration"].reason
@@ -120,7 +120,7 @@ def test_a_check_without_any_answer_is_a_no_go(fleet: Fleet) -> None:
     assert found["radios"].reason == "cannot check: no device answers"
 
 
-def test_a_check_with_some_answers_says_how_many(fleet: Fleet) -> None:
+def test_a_check_with_partial_answers_shows_their_number(fleet: Fleet) -> None:
     status = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, DELIVERED)}
     assert found["identity"].reason == "every radio is the expected device (2 of 3 answer)"
@@ -132,7 +132,7 @@ def test_a_busy_computer_is_a_note_and_does_not_block(fleet: Fleet) -> None:
     assert stopped(checks(fleet, {**CREW, "rover": busy})) == []
 
 
-def test_robots_that_were_not_asked_are_shown_and_not_judged(fleet: Fleet) -> None:
+def test_unqueried_robots_are_shown_as_not_checked(fleet: Fleet) -> None:
     status = replace(
         status_of(fleet, robots={}, known=KNOWN), robots=(), alarms=(Alarm(Level.NOTE, "robots-unasked", "not asked"),)
     )
@@ -156,7 +156,7 @@ def test_an_unmeasured_path_is_neither_go_nor_no_go(fleet: Fleet) -> None:
     assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: links)"
 
 
-def test_pings_are_read_line_by_line_and_what_is_missing_has_no_answer() -> None:
+def test_pings_are_parsed_by_line_and_missing_results_are_failures() -> None:
     text = '{"peer": "a", "round_trip_s": 0.5}\nnoise\n{"peer": "b", "error": "no-answer"}\n[1]\n{"peer": "c"}\n'
     answers = parse_pings(text, ("a", "b", "c", "d"))
     assert answers == {"a": 0.5, "b": "no-answer", "c": "no answer", "d": "not sent"}
@@ -173,7 +173,7 @@ def selected(fleet: Fleet, *words: str) -> tuple[Check, ...]:
     return preflight(fleet, chosen, DELIVERED, left_out)
 
 
-def test_a_selection_is_a_go_that_names_what_was_left_out(fleet: Fleet) -> None:
+def test_a_go_for_a_selection_lists_what_was_not_checked(fleet: Fleet) -> None:
     found = {check.name: check for check in selected(fleet, "base", "b01")}
     assert stopped(found) == []
     assert "not selected: station, b02, rover" in found["others"].reason

@@ -26,13 +26,13 @@ def with_rover(**change: Any) -> dict[str, RobotFacts]:
     return {**CREW, "rover": replace(CREW["rover"], **change)}
 
 
-def test_a_healthy_crew_has_no_alarm_and_the_one_on_the_shelf_is_off(fleet: Fleet) -> None:
+def test_a_healthy_team_is_ok_and_a_shelved_robot_is_off(fleet: Fleet) -> None:
     status = status_of(fleet, silent_robots={"shelf": DOWN})
     assert robot_health(status) == {"station": Health.OK, "rover": Health.OK, "shelf": Health.OFF}
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_silent_robot_whose_daemon_others_hear_is_reported_so(fleet: Fleet) -> None:
+def test_an_unreachable_robot_heard_by_its_peers_is_reported_as_such(fleet: Fleet) -> None:
     status = status_of(fleet, robots={"station": CREW["station"]}, silent_robots={"rover": DOWN})
     assert robot_health(status)["rover"] is Health.UNREACHABLE
     assert (
@@ -68,7 +68,7 @@ def test_an_unpinned_computer_is_reported_with_the_command_that_pins_it(fleet: F
         ({"computer": replace(COMPUTER, load=(40.0, 9.0, 3.0))}, "load", Level.NOTE),
     ],
 )
-def test_what_is_wrong_with_a_robot_has_a_code_and_a_level(
+def test_each_robot_problem_has_an_alarm_code_and_level(
     fleet: Fleet, change: dict[str, Any], code: str, level: Level
 ) -> None:
     status = status_of(fleet, robots=with_rover(**change))
@@ -86,11 +86,11 @@ def test_what_is_wrong_with_a_robot_has_a_code_and_a_level(
         {"computer": replace(COMPUTER, clock_ahead_s=2.0)},
     ],
 )
-def test_what_is_as_it_should_be_or_was_not_reported_is_no_alarm(fleet: Fleet, change: dict[str, Any]) -> None:
+def test_normal_or_unreported_values_raise_no_alarm(fleet: Fleet, change: dict[str, Any]) -> None:
     assert alarms(status_of(fleet, robots=with_rover(**change)), "rover", robot=True) == {}
 
 
-def test_the_version_that_most_run_is_the_right_one(fleet: Fleet) -> None:
+def test_the_most_common_version_is_the_expected_one(fleet: Fleet) -> None:
     crew = {
         name: robot_facts(name, version=version) for name, version in (("station", "2"), ("rover", "2"), ("shelf", "1"))
     }
@@ -99,7 +99,7 @@ def test_the_version_that_most_run_is_the_right_one(fleet: Fleet) -> None:
     assert "most others 2" in alarms(status, "shelf", robot=True)["version"].text
 
 
-def test_a_robot_that_is_off_is_not_missed_by_its_peers(fleet: Fleet) -> None:
+def test_peers_do_not_report_a_robot_that_is_off(fleet: Fleet) -> None:
     status = status_of(fleet, robots={"station": robot_facts("station")}, silent_robots={"rover": DOWN})
     assert "peers" not in alarms(status, "station", robot=True)
 
@@ -126,24 +126,24 @@ def topics(robot: str, **change: TopicFacts) -> dict[str, RobotFacts]:
     return {**CREW, robot: replace(CREW[robot], topics=(*mine, *change.values()))}
 
 
-def test_the_silence_a_topic_allows_follows_from_its_rate_and_deadline(fleet: Fleet) -> None:
+def test_the_silence_limit_of_a_topic_depends_on_its_rate_and_deadline(fleet: Fleet) -> None:
     limits = {topic.name: limit_s(topic) for topic in fleet.topics}
     assert limits == {"estop": 50.0, "commands": None, "telemetry": 10.0}
 
 
-def test_a_source_that_sends_nothing_for_too_long_is_silent(fleet: Fleet) -> None:
+def test_a_topic_not_sent_for_too_long_is_reported_as_silent(fleet: Fleet) -> None:
     crew = topics("rover", telemetry=TopicFacts("telemetry", 3, 10, 10, 40.0, 0.3))
     alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-silent"]
     assert alarm.text == "telemetry: nothing sent for 40 s"
 
 
-def test_a_topic_that_others_send_and_that_does_not_arrive_names_them(fleet: Fleet) -> None:
+def test_a_topic_that_does_not_arrive_is_reported_with_its_senders(fleet: Fleet) -> None:
     crew = topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 90.0))
     alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-not-arriving"]
     assert (alarm.level, alarm.text) == (Level.ERROR, "estop: nothing received for 90 s, although station sends")
 
 
-def test_nothing_is_said_of_receivers_while_the_source_is_silent(fleet: Fleet) -> None:
+def test_receivers_are_not_reported_while_the_source_is_silent(fleet: Fleet) -> None:
     crew = topics("station", estop=TopicFacts("estop", 0, 10, 0, 300.0, None))
     crew = {**crew, "rover": topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 300.0))["rover"]}
     status = status_of(fleet, robots=crew)
@@ -151,14 +151,14 @@ def test_nothing_is_said_of_receivers_while_the_source_is_silent(fleet: Fleet) -
     assert alarms(status, "rover", robot=True) == {}
 
 
-def test_a_daemon_younger_than_the_limit_is_not_silent_yet(fleet: Fleet) -> None:
+def test_a_recently_started_daemon_is_not_yet_silent(fleet: Fleet) -> None:
     crew = with_rover(
         daemon_uptime_s=4.0, topics=(TopicFacts("estop", 0), TopicFacts("commands", 1), TopicFacts("telemetry", 3))
     )
     assert alarms(status_of(fleet, robots=crew), "rover", robot=True) == {}
 
 
-def test_an_urgent_topic_that_a_daemon_lacks_is_an_error(fleet: Fleet) -> None:
+def test_an_urgent_topic_missing_from_a_daemon_is_an_error(fleet: Fleet) -> None:
     crew = with_rover(topics=CREW["rover"].topics[1:])
     assert alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-undeclared"].level is Level.ERROR
     other = topics("rover", telemetry=TopicFacts("telemetry", 7, 10, 10, 0.1, 0.1))
@@ -166,6 +166,6 @@ def test_an_urgent_topic_that_a_daemon_lacks_is_an_error(fleet: Fleet) -> None:
     assert (alarm.level, alarm.text) == (Level.WARNING, "telemetry: expected priority 3, found 7")
 
 
-def test_the_computer_stands_below_its_radio(fleet: Fleet) -> None:
+def test_a_computer_is_listed_below_its_radio(fleet: Fleet) -> None:
     rows = [line.split()[:2] for line in text(status_of(fleet)).splitlines() if line.startswith(("rover", "station"))]
     assert rows == [["station", "computer"], ["rover", "robot"], ["rover", "computer"]]

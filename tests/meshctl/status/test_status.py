@@ -33,21 +33,21 @@ from tests.meshctl.status.fleets import HEALTHY, MACS, NOW, alarms, health, seen
 WITHOUT_ROVER = {name: HEALTHY[name] for name in ("base", "b01")}
 
 
-def test_what_is_carried_and_off_is_fine(fleet: Fleet) -> None:
+def test_carried_devices_that_are_off_raise_no_alarm(fleet: Fleet) -> None:
     status = status_of(fleet)
     off = {"b02": Health.OFF, "shelf": Health.OFF}
     assert health(status) == {"base": Health.OK, "b01": Health.OK, "rover": Health.OK, **off}
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_carried_beacon_that_others_hear_and_that_does_not_answer_is_worth_a_look(fleet: Fleet) -> None:
+def test_a_carried_beacon_heard_by_others_without_an_answer_is_reported(fleet: Fleet) -> None:
     b01 = seen("b01", {"base": 250, "rover": 200, "b02": 240})
     status = status_of(fleet, {**HEALTHY, "b01": b01}, silent={"b02": NoAnswer("no answer to connect within 5 s")})
     assert "b01 hears it" in alarms(status, "b02")["mute"].text
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_a_deployed_node_that_is_silent_is_missed_and_shown_by_whom_it_is_heard(fleet: Fleet) -> None:
+def test_an_unreachable_deployed_node_is_shown_with_who_hears_it(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"version": "23.05.5"})}
     status = status_of(fleet, WITHOUT_ROVER, known=known)
     assert health(status)["rover"] is Health.UNREACHABLE
@@ -56,7 +56,7 @@ def test_a_deployed_node_that_is_silent_is_missed_and_shown_by_whom_it_is_heard(
     assert status.exit_code is ExitCode.UNREACHABLE
 
 
-def test_who_is_gone_for_good_is_reported_with_the_place_it_was_at(fleet: Fleet) -> None:
+def test_an_unreachable_node_is_reported_with_its_last_position(fleet: Fleet) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {"hops": "2", "via": "b01"})}
     status = status_of(fleet, {"base": seen("base", {})}, known=known)
     assert alarms(status, "rover")["unreachable"].hint.startswith("it was 2 hops away, behind b01")
@@ -73,7 +73,7 @@ def test_who_is_gone_for_good_is_reported_with_the_place_it_was_at(fleet: Fleet)
         (NodeError("b01 (10.42.0.2): odd"), "failed"),
     ],
 )
-def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: NodeError, code: str) -> None:
+def test_each_reason_for_no_answer_has_its_own_code(fleet: Fleet, error: NodeError, code: str) -> None:
     silence = no_answer_of(error)
     assert not silence.reason.startswith("b01")
     status = status_of(fleet, WITHOUT_ROVER, silent={"rover": silence})
@@ -81,7 +81,7 @@ def test_why_a_node_gave_no_answer_has_a_code_of_its_own(fleet: Fleet, error: No
     assert found.code == code
 
 
-def test_a_carried_node_that_keeps_us_out_is_reported_though_it_may_be_off(fleet: Fleet) -> None:
+def test_a_carried_node_that_refuses_login_is_reported(fleet: Fleet) -> None:
     status = status_of(fleet, silent={"b02": NoAnswer("the host key changed", "host-key")})
     assert "meshctl trust b02 --replace" in alarms(status, "b02")["host-key"].hint
     assert health(status)["b02"] is Health.DEGRADED
@@ -106,7 +106,7 @@ def test_a_node_without_a_path_to_a_base_that_answers_is_reported(fleet: Fleet) 
     assert "alone" in alarms(status, "base")
 
 
-def test_a_node_that_holds_others_is_named_as_a_cut_vertex_without_degrading_it(fleet: Fleet) -> None:
+def test_a_cut_vertex_is_reported_without_degrading_the_node(fleet: Fleet) -> None:
     status = status_of(fleet)
     assert list(alarms(status, "b01")) == ["cut-vertex"]
     assert health(status)["b01"] is Health.OK
@@ -127,7 +127,7 @@ def test_a_node_that_holds_others_is_named_as_a_cut_vertex_without_degrading_it(
         ({"neighbours": (), "originators": (), "stations": ()}, "alone"),
     ],
 )
-def test_what_is_wrong_with_a_node_degrades_it(fleet: Fleet, change: dict[str, Any], code: str) -> None:
+def test_a_node_problem_degrades_the_node(fleet: Fleet, change: dict[str, Any], code: str) -> None:
     status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, **change)})
     assert code in alarms(status, "rover")
     assert health(status)["rover"] is Health.DEGRADED
@@ -138,7 +138,7 @@ def test_what_is_wrong_with_a_node_degrades_it(fleet: Fleet, change: dict[str, A
     ("change", "code"),
     [({"clock_s": 10.0}, "clock"), ({"uptime_s": 20.0}, "rebooted"), ({"load": Load(9.0, 2)}, "load")],
 )
-def test_what_only_informs_does_not_degrade(fleet: Fleet, change: dict[str, Any], code: str) -> None:
+def test_informational_alarms_do_not_degrade_a_node(fleet: Fleet, change: dict[str, Any], code: str) -> None:
     known = {"rover": LastKnown("rover", NOW - 600, {})}
     status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, **change)}, known=known)
     assert code in alarms(status, "rover")
@@ -150,7 +150,7 @@ def test_a_factory_device_has_no_change_under_way(fleet: Fleet) -> None:
     assert alarms(status_of(fleet, {**HEALTHY, "rover": rover}), "rover") == {}
 
 
-def test_drift_names_the_files_and_the_commands_that_fix_it(fleet: Fleet) -> None:
+def test_drift_is_reported_with_the_files_and_the_command_that_fixes_it(fleet: Fleet) -> None:
     plan = NodePlan("rover", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
     output = text(status_of(fleet, plans={"rover": plan}))
     assert "rover: configuration differs: wireless" in output
@@ -165,14 +165,14 @@ def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_what_could_not_be_compared_is_reported_once_for_all(fleet: Fleet) -> None:
+def test_nodes_that_could_not_be_compared_are_one_alarm(fleet: Fleet) -> None:
     status = status_of(fleet, unrendered={"base": "env:KEY is not set", "b01": "env:KEY is not set"})
     (alarm,) = status.alarms
     assert alarm.text == "base, b01 not compared with the inventory: env:KEY is not set"
     assert status.exit_code is ExitCode.FINDINGS
 
 
-def test_what_is_kept_of_a_node_comes_back_when_it_is_silent(fleet: Fleet) -> None:
+def test_recorded_facts_are_shown_for_an_unreachable_node(fleet: Fleet) -> None:
     kept = facts_to_record(status_of(fleet))
     known = {"rover": LastKnown("rover", NOW - 90, {"version": "23.05.4", "macs": MACS["rover"]})}
     known |= {name: LastKnown(name, NOW - 60, facts) for name, facts in kept.items()}
@@ -185,7 +185,7 @@ def test_what_is_kept_of_a_node_comes_back_when_it_is_silent(fleet: Fleet) -> No
     assert "(2 hops)" in text(status)
 
 
-def test_a_fact_that_another_version_wrote_otherwise_is_no_error() -> None:
+def test_facts_in_the_format_of_another_version_are_not_an_error() -> None:
     assert typed({"hops": "two", "quality": "", "later": "x"}) == {"hops": None, "quality": None, "later": "x"}
 
 
@@ -198,7 +198,7 @@ _DROPPED = {
 }
 
 
-def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -> None:
+def test_a_carried_beacon_that_relays_for_others_is_reported_as_dropped(fleet: Fleet) -> None:
     status = status_of(fleet, _DROPPED)
     alarm = alarms(status, "b02")["dropped"]
     assert alarm.text == "marked as carried, but relays to the base for rover"
@@ -207,7 +207,7 @@ def test_a_carried_beacon_that_others_need_is_said_to_be_dropped(fleet: Fleet) -
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_dropped_beacon_that_dies_is_an_alarm_although_it_was_not_marked(fleet: Fleet) -> None:
+def test_an_unmarked_dropped_beacon_that_dies_raises_an_alarm(fleet: Fleet) -> None:
     kept = facts_to_record(status_of(fleet, _DROPPED))
     known = merge_by_device({name: LastKnown(name, NOW - 600, facts) for name, facts in kept.items()})
     status = status_of(fleet, known=known, silent={"b02": NoAnswer("no answer to connect within 5 s")})
@@ -226,7 +226,7 @@ def test_a_carried_beacon_without_relays_may_be_switched_off(fleet: Fleet) -> No
     assert status.exit_code is ExitCode.OK
 
 
-def test_a_beacon_that_was_picked_up_and_switched_on_once_is_no_longer_missed(fleet: Fleet) -> None:
+def test_a_beacon_seen_without_relays_after_a_drop_is_not_missed(fleet: Fleet) -> None:
     first = facts_to_record(status_of(fleet, _DROPPED))
     again = facts_to_record(status_of(fleet, {**HEALTHY, "b02": seen("b02", {"b01": 220})}))
     # the journal keeps the newest facts of each device

@@ -20,7 +20,7 @@ from tests.meshctl.status.fleets import HEALTHY, INVENTORY, MACS, NAMES, alarms,
 
 
 @pytest.mark.parametrize("form", list(FORMATS))
-def test_each_picture_shows_every_node_and_marks_the_cut_vertex(form: str) -> None:
+def test_each_format_shows_every_node_and_marks_the_cut_vertex(form: str) -> None:
     reports = {name: report_of(name, one) for name, one in HEALTHY.items()}
     picture = TopologyView(
         "main",
@@ -90,7 +90,7 @@ def relays(tmp_path: Path) -> tuple[Fleet, dict[str, Observation], dict[str, str
     return load_fleet(tmp_path), observations, {**NAMES, **{mac: name for name, mac in _BACK.items()}}
 
 
-def test_a_mesh_of_relays_with_two_radios_is_drawn_by_its_own_links(
+def test_each_mesh_of_dual_radio_relays_is_drawn_with_its_own_links(
     relays: tuple[Fleet, dict[str, Observation], dict[str, str]],
 ) -> None:
     fleet, observations, names = relays
@@ -103,7 +103,7 @@ def test_a_mesh_of_relays_with_two_radios_is_drawn_by_its_own_links(
 
 
 @pytest.mark.parametrize("form", ["table", "tree", "json"])
-def test_a_link_names_the_cells_that_it_runs_through(
+def test_a_link_shows_the_cells_it_uses(
     form: str, relays: tuple[Fleet, dict[str, Observation], dict[str, str]]
 ) -> None:
     fleet, observations, names = relays
@@ -132,7 +132,7 @@ def test_a_link_names_the_cells_that_it_runs_through(
     assert "back" not in one.replace("back  ", "")
 
 
-def test_the_interfaces_are_named_as_they_are_rendered(
+def test_mesh_interface_names_match_the_rendered_ones(
     relays: tuple[Fleet, dict[str, Observation], dict[str, str]],
 ) -> None:
     fleet, _, _ = relays
@@ -142,7 +142,7 @@ def test_the_interfaces_are_named_as_they_are_rendered(
     assert fleet.nodes["b01"].mesh_interfaces == {"mesh0": "back", "mesh1": "main"}
 
 
-def test_a_relay_whose_radios_have_changed_places_is_on_two_wrong_channels(
+def test_swapped_radios_are_reported_as_two_wrong_channels(
     relays: tuple[Fleet, dict[str, Observation], dict[str, str]],
 ) -> None:
     fleet, observations, _ = relays

@@ -18,12 +18,12 @@ from meshctl.topology import alternate_macs, with_alternates
         ("02:18:d6:11:22:33", "06:18:d6:11:22:33"),
     ],
 )
-def test_the_address_after_a_restart_is_an_alternate_of_the_one_before_and_back(first: str, second: str) -> None:
+def test_macs_before_and_after_a_radio_restart_are_alternates_of_each_other(first: str, second: str) -> None:
     assert second in alternate_macs(first)
     assert first in alternate_macs(second)
 
 
-def test_a_node_that_is_heard_by_its_other_address_is_known() -> None:
+def test_a_node_is_recognized_by_its_alternate_mac() -> None:
     names = with_alternates({"04:18:d6:11:22:33": "b01", "04:18:d6:11:22:34": "b02"})
     assert names["06:18:d6:11:22:33"] == "b01"
     assert names["04:18:d6:11:22:34"] == "b02"
@@ -41,5 +41,5 @@ def test_a_known_mac_takes_precedence_over_an_alternate(names: dict[str, str]) -
     assert names.items() <= with_alternates(names).items()
 
 
-def test_what_is_no_address_has_no_alternates() -> None:
+def test_an_invalid_mac_has_no_alternates() -> None:
     assert [alternate_macs(text) for text in ("", "base", "zz:00", "123:00")] == [()] * 4

@@ -25,7 +25,7 @@ def line(length: int) -> Graph:
     return graph_of(names, [Link(a, b, 0.9) for a, b in itertools.pairwise(names)])
 
 
-def test_in_a_line_every_inner_node_cuts_off_all_behind_it() -> None:
+def test_each_inner_node_of_a_chain_cuts_off_every_node_behind_it() -> None:
     assert line(5).cut_off_by("n0") == {"n1": ("n2", "n3", "n4"), "n2": ("n3", "n4"), "n3": ("n4",)}
 
 
@@ -36,7 +36,7 @@ def test_a_ring_has_no_cut_vertex() -> None:
 
 
 @given(graphs())
-def test_cut_off_is_what_a_search_without_the_node_does_not_reach(graph: Graph) -> None:
+def test_cut_off_nodes_match_a_reachability_search_without_the_removed_node(graph: Graph) -> None:
     entry = "n0"
     whole = graph.reachable(entry)
     slow = {
@@ -48,14 +48,14 @@ def test_cut_off_is_what_a_search_without_the_node_does_not_reach(graph: Graph) 
 
 
 @given(graphs())
-def test_one_node_down_cuts_off_the_same_as_a_set_of_one(graph: Graph) -> None:
+def test_cut_off_by_all_with_one_node_matches_cut_off_by(graph: Graph) -> None:
     cut = graph.cut_off_by("n0")
     for name in NAMES[1:]:
         assert graph.cut_off_by_all("n0", [name]) == frozenset(cut.get(name, ()))
 
 
 @given(graphs())
-def test_a_path_is_one_hop_longer_than_that_of_its_next_node(graph: Graph) -> None:
+def test_a_path_is_one_hop_longer_than_the_path_of_its_next_hop(graph: Graph) -> None:
     paths = graph.paths("n0")
     assert set(paths) == graph.reachable("n0")
     for name, path in paths.items():
@@ -68,7 +68,7 @@ def test_a_path_is_one_hop_longer_than_that_of_its_next_node(graph: Graph) -> No
 
 
 @given(graphs())
-def test_farthest_first_names_every_node_once_and_never_a_nearer_before_a_farther(graph: Graph) -> None:
+def test_farthest_first_lists_every_node_once_in_descending_hop_count(graph: Graph) -> None:
     order = graph.farthest_first("n0")
     paths = graph.paths("n0")
     assert sorted(order) == sorted(graph.nodes)
@@ -87,11 +87,11 @@ def test_a_wire_wins_over_a_radio_link() -> None:
     assert graph.links == (Link("front", "rear", 1.0, wired=True),)
 
 
-def test_a_long_line_needs_no_recursion() -> None:
+def test_a_long_chain_does_not_exceed_the_recursion_limit() -> None:
     assert len(line(3000).cut_off_by("n0")) == 2998
 
 
-def test_an_unknown_entry_reaches_nothing() -> None:
+def test_an_unknown_entry_node_reaches_no_nodes() -> None:
     assert EMPTY.paths("base") == {}
     assert EMPTY.cut_off_by("base") == {}
     assert line(2).reachable("base") == frozenset()

@@ -17,16 +17,16 @@ def test_a_link_has_the_worse_quality_of_its_two_directions() -> None:
     assert graph.neighbours["base"]["b01"].quality == graph.neighbours["b01"]["base"].quality == 0.7
 
 
-def test_a_node_that_does_not_answer_is_in_the_graph_by_its_known_mac() -> None:
+def test_an_unresponsive_node_is_identified_in_the_graph_by_its_known_mac() -> None:
     graph = observed_graph([BASE, B01], known_macs={"02:00:00:00:00:03": "b02"})
     assert graph.neighbours["b02"]["b01"].quality == 0.5
 
 
-def test_a_stranger_stands_under_its_mac() -> None:
+def test_an_unknown_node_is_listed_by_its_mac() -> None:
     assert "02:00:00:00:00:03" in observed_graph([BASE, B01])
 
 
-def test_a_neighbor_not_heard_for_long_is_no_link() -> None:
+def test_a_stale_neighbor_is_not_a_link() -> None:
     stale = Report("b01", ("02:00:00:00:00:02",), (HeardNeighbor("02:00:00:00:00:01", 60_000, 1.0),))
     assert observed_graph([stale], known_macs={"02:00:00:00:00:01": "base"}).links == ()
 
@@ -40,7 +40,7 @@ def test_the_nodes_that_hear_an_unreachable_one_are_listed_with_age() -> None:
     assert seen_by([BASE, B01], {"02:00:00:00:00:03": "b02"})["b02"] == (Sighting("b01", 4000, -71),)
 
 
-def test_the_best_of_a_neighbors_radios_counts() -> None:
+def test_the_best_measured_radio_of_a_neighbor_is_used() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky", "02:00:00:00:00:03": "husky"}
     front, rear = HeardNeighbor("02:00:00:00:00:01", 100, 0.4, -60), HeardNeighbor("02:00:00:00:00:02", 900, 0.8, -75)
     unmeasured = HeardNeighbor("02:00:00:00:00:03", 10, None, -40)
@@ -48,7 +48,7 @@ def test_the_best_of_a_neighbors_radios_counts() -> None:
     assert neighbours_of(Report("base", (), (unmeasured, front)), names) == {"husky": front}
 
 
-def test_without_measured_quality_the_stronger_signal_counts_then_the_later_sighting() -> None:
+def test_without_quality_the_strongest_signal_wins_then_the_latest_sighting() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky"}
     weak, strong = HeardNeighbor("02:00:00:00:00:01", 10, None, -80), HeardNeighbor("02:00:00:00:00:02", 900, None, -60)
     assert neighbours_of(Report("base", (), (weak, strong)), names) == {"husky": strong}

@@ -37,7 +37,7 @@ config rule 'c'
 """
 
 
-def test_a_difference_reads_line_by_line_with_secrets_masked() -> None:
+def test_a_diff_is_printed_line_by_line_with_secrets_masked() -> None:
     lines = list(diff(parse(OLD, "x"), parse(NEW, "x")).lines())
     assert lines == [
         "- x.@rule[0] (rule)",
@@ -50,19 +50,19 @@ def test_a_difference_reads_line_by_line_with_secrets_masked() -> None:
     ]
 
 
-def test_a_section_that_jumps_over_others_is_moved() -> None:
+def test_a_section_that_changes_position_is_reported_as_moved() -> None:
     before = parse("config t a\nconfig t b\nconfig t c\n", "x")
     after = parse("config t c\nconfig t a\nconfig t b\n", "x")
     assert list(diff(before, after).lines()) == ["~ x.c: place 2 -> 0"]
 
 
-def test_the_order_of_options_is_no_difference() -> None:
+def test_option_order_does_not_produce_a_diff() -> None:
     assert not diff(
         parse("config t n\noption a 1\noption b 2\n", "x"), parse("config t n\noption b 2\noption a 1\n", "x")
     )
 
 
-def test_a_difference_is_refused_by_any_other_package() -> None:
+def test_a_diff_cannot_be_applied_to_another_package() -> None:
     change = diff(parse(OLD, "x"), parse(NEW, "x"))
     with pytest.raises(ValueError, match="differs from the base of the diff"):
         apply(change, parse(NEW, "x"))

@@ -18,7 +18,7 @@ CASES: list[tuple[str, str | None]] = json.loads((Path(__file__).parent / "libuc
 
 
 @pytest.mark.parametrize(("text", "exported"), CASES)
-def test_every_text_reads_as_libuci_reads_it(text: str, exported: str | None) -> None:
+def test_every_text_parses_as_in_libuci(text: str, exported: str | None) -> None:
     if exported is None:
         with pytest.raises(InvalidInput):
             parse(text, "x")

@@ -23,13 +23,13 @@ from meshctl.uci import Package, Section, parse, parse_export
         ("config '' n\n", 1, 8, "expected a section type, found nothing"),
     ],
 )
-def test_what_is_rejected_is_named_with_line_and_column(text: str, line: int, column: int, words: str) -> None:
+def test_a_syntax_error_reports_its_line_and_column(text: str, line: int, column: int, words: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         parse(text, "etc/config/x")
     assert str(caught.value) == f"etc/config/x:{line}:{column}: {words} [UCI001]"
 
 
-def test_the_name_of_the_package_is_the_files() -> None:
+def test_the_package_is_named_after_its_file() -> None:
     assert parse("package other\n", "etc/config/network") == Package("network")
 
 
@@ -42,11 +42,11 @@ def test_an_export_holds_its_packages_in_order() -> None:
 
 
 @pytest.mark.parametrize("text", ["config t\n", "package a\npackage a\n"])
-def test_an_export_without_a_package_line_or_with_one_twice_is_rejected(text: str) -> None:
+def test_an_export_with_a_missing_or_duplicate_package_line_is_rejected(text: str) -> None:
     with pytest.raises(InvalidInput):
         parse_export(text, "-")
 
 
-def test_sections_are_addressed_as_uci_does() -> None:
+def test_section_keys_match_uci_addressing() -> None:
     tree = parse("config t\nconfig t n\nconfig u\nconfig t\n", "x")
     assert tree.keys() == ("@t[0]", "n", "@u[0]", "@t[2]")

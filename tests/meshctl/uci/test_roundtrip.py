@@ -42,7 +42,7 @@ def test_applying_a_difference_gives_the_other_tree(before: Package, after: Pack
 
 
 @given(packages(few_types), st.randoms(use_true_random=False))
-def test_a_reordered_package_is_only_moved(before: Package, random: Random) -> None:
+def test_a_diff_of_reordered_sections_applies_exactly(before: Package, random: Random) -> None:
     sections = list(before.sections)
     random.shuffle(sections)
     after = Package(before.name, tuple(sections))
@@ -50,7 +50,7 @@ def test_a_reordered_package_is_only_moved(before: Package, random: Random) -> N
 
 
 @given(st.text(st.sampled_from("colp ntigs'\"\\#;\n\t\rax1_é"), max_size=60))
-def test_any_text_gives_a_tree_or_a_located_error(text: str) -> None:
+def test_any_text_parses_or_raises_an_error_with_a_position(text: str) -> None:
     try:
         tree = parse(text, "fuzz")
     except InvalidInput as error:
@@ -63,7 +63,7 @@ def test_any_text_gives_a_tree_or_a_located_error(text: str) -> None:
 
 
 @given(st.binary(max_size=80))
-def test_any_bytes_give_a_tree_or_a_located_error(raw: bytes) -> None:
+def test_any_bytes_parse_or_raise_invalid_input(raw: bytes) -> None:
     with suppress(InvalidInput):
         parse(raw.decode("utf-8", "surrogateescape"), "fuzz")
 

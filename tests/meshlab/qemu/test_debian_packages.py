@@ -21,13 +21,11 @@ def release(tmp_path: Path, text: str) -> Path:
     return file
 
 
-def test_bookworm_has_the_machines_packages_in_its_own_sources(tmp_path: Path) -> None:
+def test_bookworm_uses_its_own_apt_sources(tmp_path: Path) -> None:
     assert apt.sources(tmp_path / "cache", {}, release(tmp_path, BOOKWORM)) == {}
 
 
-def test_another_distribution_gets_a_list_of_bookworms_packages_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_distributions_use_only_a_bookworm_source_list(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apt, "KEYRING", release(tmp_path, NOBLE))
     options = apt.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
     listed = Path(options["Dir::Etc::sourcelist"]).read_text()
@@ -49,14 +47,14 @@ def test_a_configured_mirror_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "http://mirror.example/debian bookworm main" in Path(options["Dir::Etc::sourcelist"]).read_text()
 
 
-def test_unverifiable_packages_are_rejected_with_the_fix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_keyring_is_rejected_with_a_hint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(apt, "KEYRING", tmp_path / "nothing")
     with pytest.raises(LabError, match=r"Ubuntu 24\.04\.1 LTS has no .*nothing") as caught:
         apt.sources(tmp_path / "cache", {}, release(tmp_path, NOBLE))
     assert "setup-lab" in caught.value.hint
 
 
-def test_setup_says_what_it_cannot_do_without_apt(tmp_path: Path) -> None:
+def test_setup_lab_fails_with_an_error_without_apt(tmp_path: Path) -> None:
     script = Path(__file__).parents[3] / "scripts" / "setup-lab"
     shell = shutil.which("sh")
     assert shell is not None

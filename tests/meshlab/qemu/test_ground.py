@@ -47,7 +47,7 @@ def written(folder: Path, text: str) -> str:
     return str(file)
 
 
-def test_a_loss_one_way_shows_in_that_direction_of_the_kernel_s_quality(lab: Lab, field: Path) -> None:
+def test_one_way_loss_lowers_the_kernel_tq_in_that_direction_only(lab: Lab, field: Path) -> None:
     until(lambda: min(quality(lab, "b01", "b02"), quality(lab, "b02", "b01")) > 220, "a link without losses")
     lab.meshctl("lab", "link", "b01", "b02", "--loss", "60%", "--one-way")
     # 255 * 0.4 there; back nothing is lost, but b02 hears little of b01: 255 * (1 - 0.6 ** 3)

@@ -34,7 +34,7 @@ class SlowHost:
         await self.reads.wait()
 
 
-def test_what_a_process_wrote_last_arrives_before_its_status_however_late_the_host_reads() -> None:
+def test_final_output_arrives_before_the_exit_status_even_if_the_host_reads_late() -> None:
     async def run() -> list[tuple[int, bytes]]:
         host = SlowHost()
 
@@ -57,7 +57,7 @@ def test_what_a_process_wrote_last_arrives_before_its_status_however_late_the_ho
     ]
 
 
-def test_a_process_that_stays_behind_and_goes_on_writing_does_not_hold_up_the_status() -> None:
+def test_a_background_process_that_keeps_writing_does_not_delay_the_exit_status() -> None:
     async def run() -> int:
         host = SlowHost()
         host.reads.set()

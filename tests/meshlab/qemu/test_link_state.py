@@ -14,7 +14,7 @@ from meshlab.spec import FleetSpec, NodeSpec
 from meshlab.state import NodeState, Power
 
 
-def test_a_cable_that_could_not_be_laid_is_laid_again_without_another_change(
+def test_a_failed_cable_connection_is_retried_without_another_change(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = FleetSpec("x", (NodeSpec("b01"),))

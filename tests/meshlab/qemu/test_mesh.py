@@ -42,7 +42,7 @@ cat /tmp/heard
 """
 
 
-def test_what_was_provisioned_is_a_mesh_of_three_hops_with_lans_behind_it(lab: Lab) -> None:
+def test_the_provisioned_mesh_spans_three_hops_and_connects_lans(lab: Lab) -> None:
     # the kernel's own routes: each hop only hears the next
     assert lab.originators("base") == {"b01": "b01", "b02": "b01", "husky-front": "b01", "husky-rear": "b01"}
     assert lab.originators("b01")["husky-front"] == "b02"
@@ -52,7 +52,7 @@ def test_what_was_provisioned_is_a_mesh_of_three_hops_with_lans_behind_it(lab: L
     assert lab.answers("husky", "10.42.0.2")
 
 
-def test_the_rendered_files_are_what_configured_the_radios(lab: Lab) -> None:
+def test_radios_run_with_the_rendered_configuration(lab: Lab) -> None:
     for name in NODES:
         info = lab.on(name, "iw dev mesh0 info; iw dev mesh0 link; cat /sys/class/net/mesh0/mtu")
         channel = lab.on(name, "uci get wireless.radio0.channel").strip()
@@ -80,7 +80,7 @@ def test_two_radios_on_one_switch_pass_a_broadcast_once_and_make_no_storm(lab: L
     assert int(lab.computer("husky", frames)) - before < 200
 
 
-def test_topology_says_what_the_kernels_tables_say(lab: Lab) -> None:
+def test_topology_matches_the_kernel_neighbor_tables(lab: Lab) -> None:
     drawn = _topology_of_one_moment(lab)
     linked: dict[str, set[str]] = {name: set() for name in NODES}
     for link in drawn["links"]:
@@ -109,7 +109,7 @@ def _topology_of_one_moment(lab: Lab) -> Any:
     return drawn
 
 
-def test_status_says_what_the_radios_hear(lab: Lab) -> None:
+def test_status_lists_the_stations_heard_by_each_radio(lab: Lab) -> None:
     names = lab.names()
 
     def agrees() -> bool:

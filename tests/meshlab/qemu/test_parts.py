@@ -57,7 +57,7 @@ def test_an_archive_holds_every_file_folder_and_link(
     assert len(out.getvalue()) % 512 == 0
 
 
-def test_modules_come_after_what_they_need(tmp_path: Path) -> None:
+def test_kernel_modules_are_loaded_after_their_dependencies(tmp_path: Path) -> None:
     for name, needs in {
         "mac80211_hwsim": "mac80211",
         "mac80211": "cfg80211,libarc4",
@@ -81,7 +81,7 @@ def test_a_frame_header_has_stream_and_length(stream: int, content: bytes) -> No
     assert sent[guest_protocol.HEADER_BYTES :] == content
 
 
-def test_unicast_is_lost_only_when_every_attempt_is() -> None:
+def test_unicast_loss_accounts_for_retries() -> None:
     lines = traffic_control.batch(
         "mesh0", {"02:00:00:00:00:01": Impairment(loss=0.5, delay_ms=5, rate_kbps=1000)}
     ).splitlines()
@@ -93,7 +93,7 @@ def test_unicast_is_lost_only_when_every_attempt_is() -> None:
     assert groups[1].endswith("classid 1:3")
 
 
-def test_nothing_is_configured_where_nothing_is_lost() -> None:
+def test_no_qdisc_is_configured_without_an_impairment() -> None:
     assert traffic_control.batch("mesh0", {}) == ""
     assert Impairment().is_none
 
@@ -105,7 +105,7 @@ def fleet() -> FleetSpec:
     return FleetSpec("x", nodes, lans=lans)
 
 
-def test_radios_are_counted_through_and_each_node_knows_its_lan() -> None:
+def test_radios_are_numbered_consecutively_and_each_node_has_its_lan() -> None:
     places = hwsim_devices.node_hardware(fleet())
     assert [place.phys for place in places.values()] == [("phy0",), ("phy1", "phy2"), ("phy3",)]
     assert [place.lan.name if place.lan else None for place in places.values()] == ["station", "husky", None]
@@ -114,12 +114,12 @@ def test_radios_are_counted_through_and_each_node_knows_its_lan() -> None:
     assert operator.name == "station"
 
 
-def test_a_spec_with_lans_survives_its_text() -> None:
+def test_a_spec_with_lans_round_trips_through_dump_and_load() -> None:
     assert load(dump(fleet())) == fleet()
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(8, 29), st.integers(0, 40))
-def test_the_operators_address_on_a_bench_is_in_the_nodes_network_and_not_the_nodes(
+def test_the_operators_bench_address_is_in_the_nodes_network_but_differs_from_its_address(
     ip: int, prefix: int, number: int
 ) -> None:
     node = IPv4Interface((ip, prefix))
@@ -195,7 +195,7 @@ def planned(run: Path, config: str) -> list[list[str]]:
     return [line.split("\t") for line in (run / "kernel.new").read_text().splitlines()]
 
 
-def test_the_files_become_the_kernels_devices_in_the_order_of_making(tmp_path: Path) -> None:
+def test_kernel_devices_are_planned_from_uci_files_in_creation_order(tmp_path: Path) -> None:
     plan = planned(tmp_path / "run", CONFIG.format(channel=6))
     assert [line[:2] for line in plan] == [
         ["soft", "bat0"], ["radio", "mesh0"], ["tune", "mesh0"], ["bridge", "br-lan"], ["port", "br-lan"],
@@ -208,7 +208,7 @@ def test_the_files_become_the_kernels_devices_in_the_order_of_making(tmp_path: P
     assert plan[7][2] == "10.42.0.11/24"
 
 
-def test_another_channel_recreates_the_radio_and_its_dependents_and_nothing_else(tmp_path: Path) -> None:
+def test_a_channel_change_recreates_only_the_radio_and_its_dependents(tmp_path: Path) -> None:
     before = planned(tmp_path / "run", CONFIG.format(channel=6))
     assert planned(tmp_path / "run", CONFIG.format(channel=6)) == before
     after = planned(tmp_path / "run", CONFIG.format(channel=11))
@@ -220,14 +220,14 @@ def test_another_channel_recreates_the_radio_and_its_dependents_and_nothing_else
     ]  # fmt: skip
 
 
-def test_another_power_is_set_in_place(tmp_path: Path) -> None:
+def test_a_tx_power_change_is_applied_in_place(tmp_path: Path) -> None:
     before = planned(tmp_path / "run", CONFIG.format(channel=6))
     after = planned(tmp_path / "run", CONFIG.format(channel=6).replace("txpower '24'", "txpower '10'"))
     assert [line[:5] for line in after if line not in before] == [["tune", "mesh0", "0", "10", "-"]]
 
 
 @pytest.mark.parametrize("script", sorted(path.name for path in (REAL_ROOT / "lab").iterdir() if path.is_file()))
-def test_the_nodes_shell_reads_every_stand_in(script: str) -> None:
+def test_busybox_ash_parses_every_stand_in_script(script: str) -> None:
     path = REAL_ROOT / "lab" / script
     if path.read_bytes().startswith(b"#!/bin/sh"):
         subprocess.run((rootfs.find_program("busybox", "busybox-static"), "ash", "-n", path), check=True, timeout=60)

@@ -14,7 +14,7 @@ from tests.meshlab.qemu.conftest import WAIT_S, Lab
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 
-def test_a_node_comes_back_while_something_keeps_its_old_network(lab: Lab) -> None:
+def test_a_node_boots_while_its_old_network_namespace_is_still_in_use(lab: Lab) -> None:
     """A connection that retransmits its FIN keeps a dead node's network namespace for up to two minutes."""
     (pid,) = (node["pid"] for node in lab.fleet.status()["nodes"] if node["name"] == "b02")
     keep = f"sleep 1000 </proc/{pid}/ns/net >/dev/null 2>&1 & echo $!"
@@ -35,6 +35,6 @@ def test_a_node_comes_back_while_something_keeps_its_old_network(lab: Lab) -> No
 
 @pytest.mark.proof
 @pytest.mark.timeout(7200)
-def test_every_node_of_a_machine_comes_back_two_hundred_times(lab: Lab) -> None:
+def test_every_node_survives_two_hundred_power_cycles(lab: Lab) -> None:
     cycle(lab.fleet, lab.NODES, 200, random.Random(1), wait_s=WAIT_S)
     lab.settle()

@@ -28,7 +28,7 @@ def config_of(mode: str, width: str = "HT20", key: str = KEY) -> tuple[list[str]
     return head.splitlines(), options
 
 
-def test_an_ad_hoc_cell_is_joined_where_it_is_configured_and_not_where_one_is_found() -> None:
+def test_an_ad_hoc_network_uses_the_configured_bssid_and_frequency_without_scanning() -> None:
     head, options = config_of("adhoc")
     assert "ap_scan=2" in head
     assert options["bssid"] == "02:ca:fe:00:00:21"
@@ -39,7 +39,7 @@ def test_an_ad_hoc_cell_is_joined_where_it_is_configured_and_not_where_one_is_fo
     assert (options["ssid"], options["psk"]) == ('"a crew"', f'"{KEY}"')
 
 
-def test_a_mesh_authenticates_by_the_password_and_leaves_forwarding_to_batman() -> None:
+def test_mesh_mode_uses_sae_and_leaves_forwarding_to_batman_adv() -> None:
     head, options = config_of("mesh")
     assert "ap_scan=2" not in head
     assert (options["mode"], options["key_mgmt"], options["ieee80211w"]) == ("5", "SAE", "2")
@@ -47,13 +47,13 @@ def test_a_mesh_authenticates_by_the_password_and_leaves_forwarding_to_batman() 
     assert "bssid" not in options
 
 
-def test_a_key_of_64_digits_is_not_a_word() -> None:
+def test_a_64_digit_hex_key_is_written_as_a_raw_psk() -> None:
     assert config_of("adhoc", key="0f" * 32)[1]["psk"] == "0f" * 32
 
 
 @pytest.mark.parametrize(
     ("width", "off"), [("NOHT", {"disable_ht"}), ("HT20", {"disable_ht40"}), ("HT40+", set()), ("HT40", set())]
 )
-def test_a_cell_is_as_wide_as_it_is_configured(width: str, off: set[str]) -> None:
+def test_the_supplicant_uses_the_configured_channel_width(width: str, off: set[str]) -> None:
     options = config_of("adhoc", width)[1]
     assert {name for name in ("disable_ht", "disable_ht40") if name in options} == off

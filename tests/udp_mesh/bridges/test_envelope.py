@@ -33,12 +33,12 @@ TOKEN = "@ros2_lv/0/ab/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/
 
 
 @given(SAMPLES)
-def test_a_sample_is_opened_as_it_was_sealed(sample: Envelope) -> None:
+def test_an_envelope_round_trips_through_seal_and_open(sample: Envelope) -> None:
     assert open_envelope(seal(sample)) == sample
 
 
 @given(st.binary(max_size=100) | SAMPLES.map(seal), st.integers(0, 100))
-def test_any_bytes_are_a_sample_or_an_error(data: bytes, cut: int) -> None:
+def test_any_bytes_decode_to_a_sample_or_raise_an_error(data: bytes, cut: int) -> None:
     data = data[:cut]
     try:
         sample = open_envelope(data)
@@ -47,12 +47,12 @@ def test_any_bytes_are_a_sample_or_an_error(data: bytes, cut: int) -> None:
     assert seal(sample) == data
 
 
-def test_an_expression_is_no_key() -> None:
+def test_a_key_expression_is_not_accepted_as_a_key() -> None:
     with pytest.raises(EnvelopeError, match="one key"):
         open_envelope(seal(Envelope("demo/**", b"", "", None, 5, False, False, False)))
 
 
-def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:
+def test_topic_keys_and_tokens_match_rmw_zenoh() -> None:
     assert topic_keys("/ns/chatter", 7) == "7/ns/chatter/*/*"
     assert publisher_tokens("/ns/chatter", 7) == "@ros2_lv/7/*/*/*/MP/*/*/*/%ns%chatter/*/*/*"
 
@@ -70,24 +70,24 @@ def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:
         ("nonsense", 0),
     ],
 )
-def test_a_tokens_quality_says_how_many_samples_are_kept(quality: str, depth: int) -> None:
+def test_token_qos_determines_how_many_samples_are_kept(quality: str, depth: int) -> None:
     token = f"@ros2_lv/7/ab/0/10/MP/%/%ns/talker/%ns%chatter/a::B_/RIHS01_df/{quality}"
     assert kept_samples(token) == ("7/ns/chatter/a::B_/RIHS01_df", depth)
 
 
-def test_a_token_of_anything_but_a_publisher_keeps_nothing() -> None:
+def test_only_transient_local_publisher_tokens_keep_samples() -> None:
     assert kept_samples("@ros2_lv/0/ab/0/0/NN/%/%/talker") == ("", 0)
     assert kept_samples(TOKEN.replace("/MP/", "/MS/").replace("1:2:", ":1:"))[1] == 0
 
 
-def test_a_repeated_sample_is_new_once() -> None:
+def test_a_duplicate_sample_is_new_only_once() -> None:
     kept = SampleDeduplicator()
     assert [kept.is_new("k", b"a", b"p") for _ in range(2)] == [True, False]
     assert kept.is_new("k", b"", b"ap")
     assert kept.is_new("ka", None, b"p")
 
 
-def test_a_token_is_set_up_once_and_withdrawn_with_its_last_announcer() -> None:
+def test_a_token_is_declared_once_and_withdrawn_with_its_last_announcer() -> None:
     alice, carol, bob = TokenExchange(), TokenExchange(), TokenExchange()
     alice.on_token(TOKEN, True)
     carol.on_token(TOKEN, True)
@@ -98,7 +98,7 @@ def test_a_token_is_set_up_once_and_withdrawn_with_its_last_announcer() -> None:
     assert bob.on_announcement("carol", carol.announcement())[0] == ([], [TOKEN])
 
 
-def test_what_a_bridge_set_up_is_announced_by_none() -> None:
+def test_tokens_declared_by_a_bridge_are_not_announced_again() -> None:
     alice, bob, twin = TokenExchange(), TokenExchange(), TokenExchange()
     alice.on_token(TOKEN, True)
     change, _ = bob.on_announcement("alice", alice.announcement())
@@ -111,7 +111,7 @@ def test_what_a_bridge_set_up_is_announced_by_none() -> None:
 
 
 @given(st.binary(max_size=100))
-def test_any_bytes_are_an_announcement_or_an_error(data: bytes) -> None:
+def test_any_bytes_decode_to_an_announcement_or_raise_an_error(data: bytes) -> None:
     exchange = TokenExchange()
     try:
         exchange.on_announcement("alice", data)
@@ -119,7 +119,7 @@ def test_any_bytes_are_an_announcement_or_an_error(data: bytes) -> None:
         assert exchange.on_robot_gone("alice") == ([], [])
 
 
-def test_an_announcement_sets_up_nothing_but_publishers_tokens() -> None:
+def test_an_announcement_with_an_invalid_token_is_rejected() -> None:
     for token in ("demo/x", "@ros2_lv/**", "@ros2_lv//x", "@ros2_lv/x/", "@ros2_lv/" + "x" * 2000):
         with pytest.raises(AnnouncementError):
             TokenExchange().on_announcement("alice", b'{"tokens": ["' + token.encode() + b'"]}')

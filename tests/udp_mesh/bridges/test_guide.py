@@ -40,7 +40,7 @@ def connect(port: int) -> socket.socket:
     return poll(connected, f"a listener at port {port}")
 
 
-def test_the_example_is_short_and_carries_lines(tmp_path: Path) -> None:
+def test_the_example_bridge_is_short_and_relays_lines(tmp_path: Path) -> None:
     assert example().count("\n") < 100
     script = tmp_path / "text_bridge.py"
     script.write_text(example())

@@ -53,7 +53,7 @@ print(" ".join(sorted({name.partition(".")[0] for name in set(sys.modules) - bef
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_bridges_and_client_are_python_3_8(path: Path) -> None:
+def test_bridges_and_client_use_python_3_8_syntax(path: Path) -> None:
     tree: ast.Module = ast.parse(path.read_text(), feature_version=(3, 8))
     assert not list(newer(tree))
 
@@ -110,7 +110,7 @@ def test_bridges_and_client_need_nothing_but_the_middleware(path: Path) -> None:
 
 
 @pytest.mark.parametrize("interpreter", [sys.executable, *older_interpreters()])
-def test_the_bridges_pure_parts_run_with_the_standard_library_alone(interpreter: str) -> None:
+def test_the_bridges_pure_modules_run_with_only_the_standard_library(interpreter: str) -> None:
     environment = {"PYTHONPATH": str(PACKAGE.parent), "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(
         [interpreter, "-S", "-W", "error", "-c", RUNS], env=environment, capture_output=True, text=True, check=False

@@ -72,7 +72,7 @@ class Topic:
         self._graph.withdrawn.append(self._type)
 
 
-def test_a_master_that_does_not_answer_holds_up_new_topics_and_no_others() -> None:
+def test_an_unresponsive_master_delays_only_new_topics() -> None:
     graph = Graph()
     with graph.running():
         graph.publish("/old", b"1")
@@ -87,7 +87,7 @@ def test_a_master_that_does_not_answer_holds_up_new_topics_and_no_others() -> No
         poll(lambda: graph.got("/new") == [b"waits", b"in order"], "what waited")
 
 
-def test_what_waits_is_bounded_and_the_newest_of_it_stays() -> None:
+def test_the_waiting_queue_is_bounded_and_keeps_the_newest_messages() -> None:
     graph = Graph()
     graph.answers.clear()
     for number in range(MAX_WAITING_MESSAGES + 7):
@@ -102,7 +102,7 @@ def test_what_waits_is_bounded_and_the_newest_of_it_stays() -> None:
         assert [payload[:1] for payload in graph.got("/large")] == [b"b", b"c"]
 
 
-def test_a_change_of_type_withdraws_the_last_one_and_keeps_the_order() -> None:
+def test_a_type_change_withdraws_the_previous_publisher_and_keeps_message_order() -> None:
     graph = Graph()
     with graph.running():
         for number, key in enumerate((STRING, STRING, INT, STRING)):
@@ -113,7 +113,7 @@ def test_a_change_of_type_withdraws_the_last_one_and_keeps_the_order() -> None:
     assert graph.withdrawn == [STRING.name, INT.name]
 
 
-def test_first_messages_wait_for_who_subscribed_before_but_not_for_ever() -> None:
+def test_first_messages_wait_for_existing_subscribers_up_to_a_timeout() -> None:
     graph = Graph()
     graph.subscribers = 1
     with graph.running():

@@ -17,11 +17,11 @@ QUALITIES = st.builds(
 
 
 @given(QUALITIES)
-def test_a_quality_of_service_is_read_as_it_was_written(quality: Quality) -> None:
+def test_a_qos_profile_round_trips_through_its_text(quality: Quality) -> None:
     assert parse_quality(quality_text(quality)) == quality
 
 
-def test_an_invalid_quality_is_none() -> None:
+def test_an_invalid_qos_profile_is_none() -> None:
     good = quality_text(Quality())
     assert parse_quality(good) is not None
     for text in (
@@ -36,11 +36,11 @@ def test_an_invalid_quality_is_none() -> None:
 
 
 @given(st.lists(QUALITIES, min_size=1, max_size=5))
-def test_a_subscription_asks_for_no_more_than_every_publisher_offers(qualities: list[Quality]) -> None:
+def test_a_subscription_requests_only_qos_that_every_publisher_offers(qualities: list[Quality]) -> None:
     asked = common(qualities)
     assert (asked.reliability == "reliable") == all(quality.reliability == "reliable" for quality in qualities)
     assert asked.latched == all(quality.latched for quality in qualities)
 
 
-def test_names_are_those_ros_2_allows() -> None:
+def test_names_are_converted_to_valid_ros_2_names() -> None:
     assert ros2_name("/ugv__1/mesh_comm/a___b/x_y") == "/ugv_1/mesh_comm/a_b/x_y"

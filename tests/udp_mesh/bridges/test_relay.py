@@ -61,7 +61,7 @@ def test_the_definition_goes_first_and_only_once() -> None:
     assert carry(second, "alice", bob) == [ToRos(name, STRING, "string data", False, b"2")]
 
 
-def test_messages_wait_in_order_for_a_lost_definition_which_is_asked_for() -> None:
+def test_messages_wait_in_order_while_a_lost_definition_is_requested() -> None:
     alice, bob = relay("alice"), relay("bob")
     asked = carry(to_bob(alice, b"1")[1:], "alice", bob, now=0.0)
     assert carry(to_bob(alice, b"2"), "alice", bob, now=0.1) == []
@@ -73,14 +73,14 @@ def test_messages_wait_in_order_for_a_lost_definition_which_is_asked_for() -> No
     assert bob.tick(10.0) == []
 
 
-def test_what_waits_is_bounded_and_the_rest_counted() -> None:
+def test_the_waiting_queue_is_bounded_and_dropped_messages_are_counted() -> None:
     alice, bob = relay("alice"), relay("bob")
     for number in range(MAX_WAITING_MESSAGES + 5):
         carry(to_bob(alice, bytes([number]))[-1:], "alice", bob)
     assert bob.dropped == 5
 
 
-def test_a_robot_that_comes_late_gets_what_was_latched_and_only_what_it_lacks() -> None:
+def test_a_late_robot_receives_only_the_latched_messages_it_lacks() -> None:
     alice, bob = relay("alice"), relay("bob")
     to_bob(alice, b"old", latched=True)
     to_bob(alice, b"new", latched=True)
@@ -105,7 +105,7 @@ def test_a_latched_message_that_is_repeated_is_published_once() -> None:
     assert [effect for effect in carry(list(repeated), "alice", bob) if isinstance(effect, ToRos)] == []
 
 
-def test_the_last_latched_message_stays_whatever_the_order_they_arrive_in() -> None:
+def test_the_newest_latched_message_is_kept_when_messages_arrive_out_of_order() -> None:
     alice, bob = relay("alice"), relay("bob")
     carry(to_bob(alice, b"0"), "alice", bob)
     stop, go = to_bob(alice, b"stop", latched=True), to_bob(alice, b"go", latched=True)
@@ -117,7 +117,7 @@ def test_the_last_latched_message_stays_whatever_the_order_they_arrive_in() -> N
     assert len(carry(to_bob(again, b"stop", latched=True)[-1:], "alice", bob)) == 1
 
 
-def test_programs_that_latched_and_went_do_not_outlive_who_came_after() -> None:
+def test_latched_messages_of_former_publishers_are_evicted_before_newer_ones() -> None:
     alice, bob = relay("alice"), relay("bob")
     for number in range(3 * MAX_LATCHED_PER_ROUTE):
         carry(to_bob(alice, b"%d" % number, latched=True, publisher=f"/rostopic_{number}"), "alice", bob)
@@ -130,7 +130,7 @@ def test_programs_that_latched_and_went_do_not_outlive_who_came_after() -> None:
     assert sent[-1] == b"%d" % (3 * MAX_LATCHED_PER_ROUTE - 1)
 
 
-def test_a_definition_that_never_comes_blocks_its_topic_for_a_while_only() -> None:
+def test_a_missing_definition_blocks_its_topic_only_until_a_timeout() -> None:
     alice, bob = relay("alice"), relay("bob")
     carry(to_bob(alice, b"known"), "alice", bob)
     assert bob.from_mesh("alice", "status", "made/Up 0123", b"x", 0.0) != []
@@ -141,13 +141,13 @@ def test_a_definition_that_never_comes_blocks_its_topic_for_a_while_only() -> No
     assert bob.dropped == 1
 
 
-def test_a_publisher_of_no_type_is_named_once_and_not_carried() -> None:
+def test_a_publisher_without_a_type_is_reported_once_and_not_relayed() -> None:
     alice = relay("alice")
     found = [alice.from_ros(Route("any", None), "/node", TypeKey("*", "*"), "", False, b"x") for _ in range(3)]
     assert [[type(effect) for effect in effects] for effects in found] == [[Note], [], []]
 
 
-def test_a_publisher_without_a_definition_does_not_blot_out_one_that_has_it() -> None:
+def test_a_publisher_without_a_definition_does_not_overwrite_a_known_definition() -> None:
     alice = relay("alice")
     to_bob(alice, b"1")
     alice.from_ros(Route("status", "bob"), "/rosserial", STRING, "", False, b"2")
@@ -157,7 +157,7 @@ def test_a_publisher_without_a_definition_does_not_blot_out_one_that_has_it() ->
     ]
 
 
-def test_latched_messages_go_to_whom_they_were_for() -> None:
+def test_latched_messages_are_sent_only_to_their_destinations() -> None:
     alice = relay("alice")
     alice.set_destinations({"map": ("base",)})
     to_bob(alice, b"for bob", latched=True)
@@ -189,7 +189,7 @@ def test_messages_of_other_bridges_are_left_alone() -> None:
     )
 
 
-def test_a_robot_whose_name_reads_like_ours_is_reported_and_not_published() -> None:
+def test_a_robot_whose_ros_name_equals_ours_is_reported_and_not_published() -> None:
     found = relay("ugv-1").from_mesh("ugv_1", "status", "std_msgs/String", b"x", 0.0)
     assert [type(effect) for effect in found] == [Note]
 
@@ -203,7 +203,7 @@ def test_ros_2_messages_need_no_definition() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -> None:
+def test_any_bytes_on_the_bridge_topic_decode_or_are_reported(data: bytes) -> None:
     try:
         decode(data)
     except ProtocolError:
@@ -215,12 +215,12 @@ def test_any_bytes_on_the_bridges_topic_are_a_message_or_an_error(data: bytes) -
     WORDS,
     st.none() | st.builds(LatchMark, st.from_regex("[0-9a-f]{8}", fullmatch=True), st.integers(0, 1 << 50)),
 )
-def test_a_type_field_is_read_as_it_was_written(name: str, checksum: str, mark: LatchMark | None) -> None:
+def test_a_type_field_round_trips_through_its_text(name: str, checksum: str, mark: LatchMark | None) -> None:
     kind = MessageKind(TypeKey("pkg/" + name, checksum), mark)
     assert parse_kind(kind_text(kind)) == kind
 
 
-def test_messages_between_bridges_are_read_as_they_were_written() -> None:
+def test_bridge_messages_round_trip_through_encode_and_decode() -> None:
     for message in (Hello({"t": {"ab": 7}}, True), Want([STRING]), Definition(STRING, "string data")):
         assert decode(encode(message)) == message
 

@@ -93,7 +93,7 @@ def team() -> Iterator[tuple[Side, Side]]:
         yield sides[0], sides[1]
 
 
-def test_a_message_to_one_robot_comes_out_typed_under_the_legacy_name(team: tuple[Side, Side]) -> None:
+def test_a_unicast_message_is_published_with_its_type_under_the_legacy_name(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.robot.subscribe("/alice/mesh_comm/bob/status")
     heard = alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "ready", bob.robot)
@@ -101,14 +101,14 @@ def test_a_message_to_one_robot_comes_out_typed_under_the_legacy_name(team: tupl
     assert heard["definition"].strip() == "string data"
 
 
-def test_a_message_to_all_comes_out_per_receiver(team: tuple[Side, Side]) -> None:
+def test_a_broadcast_is_published_under_a_per_receiver_name(team: tuple[Side, Side]) -> None:
     alice, bob = team
     name = "/bob/mesh_comm/alice/map"
     alice.robot.subscribe(name)
     bob.robot.publish_until_received("/bob/mesh_comm/map", "a map", alice.robot, received_as=name)
 
 
-def test_a_type_installed_nowhere_crosses_with_checksum_and_definition(team: tuple[Side, Side]) -> None:
+def test_an_uninstalled_type_is_relayed_with_its_md5sum_and_definition(team: tuple[Side, Side]) -> None:
     alice, bob = team
     made = {"type_name": "made_up/Thing", "md5sum": "0123456789abcdef" * 2, "definition": "uint8[] thing\n"}
     bob.robot.subscribe("/alice/mesh_comm/bob/any", "*")
@@ -126,7 +126,7 @@ def test_a_type_installed_nowhere_crosses_with_checksum_and_definition(team: tup
     )
 
 
-def test_the_first_message_of_a_topic_reaches_who_subscribed_before(team: tuple[Side, Side]) -> None:
+def test_the_first_message_of_a_topic_reaches_an_existing_subscriber(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.robot.subscribe("/alice/mesh_comm/bob/listed")
     # Latched at the source, so that only the receiving side can lose it.
@@ -134,7 +134,7 @@ def test_the_first_message_of_a_topic_reaches_who_subscribed_before(team: tuple[
     bob.robot.expect("data", "first")
 
 
-def test_a_latched_message_waits_for_late_subscribers_and_for_a_bridge_that_starts_again(
+def test_a_latched_message_reaches_late_subscribers_even_after_a_bridge_restart(
     team: tuple[Side, Side],
 ) -> None:
     alice, bob = team
@@ -166,7 +166,7 @@ def test_a_topic_may_change_its_type(team: tuple[Side, Side]) -> None:
     came("std_msgs/Int32", 7)
 
 
-def test_a_topic_added_while_everything_runs_is_carried(team: tuple[Side, Side]) -> None:
+def test_a_topic_added_at_runtime_is_relayed(team: tuple[Side, Side]) -> None:
     alice, bob = team
     for side in team:
         with side.daemon.client() as client:
@@ -190,7 +190,7 @@ def test_the_legacy_status_messages_and_service_need_no_package(team: tuple[Side
     poll(lambda: alice.robot.call("/alice/getHosts") == bob_alone, "bob from the service")
 
 
-def test_the_networks_conditions_are_a_topic(team: tuple[Side, Side]) -> None:
+def test_network_conditions_are_published_as_a_topic(team: tuple[Side, Side]) -> None:
     alice, _ = team
     alice.robot.subscribe("/alice/mesh_conditions")
     conditions = json.loads(alice.robot.expect("name", "/alice/mesh_conditions")["data"])
@@ -215,7 +215,7 @@ def test_the_legacy_settings_message_sets_the_window(team: tuple[Side, Side]) ->
     poll(lambda: window() != 3, "an adaptive window")
 
 
-def test_rostopic_knows_what_came(team: tuple[Side, Side]) -> None:
+def test_rostopic_reports_the_type_of_a_relayed_topic(team: tuple[Side, Side]) -> None:
     alice, bob = team
     alice.robot.publish_until_received("/alice/mesh_comm/bob/status", "for rostopic", bob.robot)
     command = ["/usr/bin/rostopic", "type", "/alice/mesh_comm/bob/status"]
@@ -237,7 +237,7 @@ def test_both_directions_survive_a_restart_of_a_master(team: tuple[Side, Side]) 
     fresh.close()
 
 
-def test_a_restart_of_the_daemon_is_survived(team: tuple[Side, Side]) -> None:
+def test_a_daemon_restart_is_survived(team: tuple[Side, Side]) -> None:
     alice, bob = team
     alice.daemon.kill()
     alice.daemon.start()

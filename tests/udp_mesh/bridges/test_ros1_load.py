@@ -37,7 +37,7 @@ def flows(alice: Member, bob: Member, text: str) -> None:
     alice.node.publish_until_received(STATUS, text, bob.node)
 
 
-def test_urgent_messages_pass_thirty_images_a_second_on_a_link_for_less_than_one() -> None:
+def test_urgent_messages_are_not_delayed_by_images_that_exceed_the_link_rate() -> None:
     with team("alice", "bob", link=SLOW) as (_, (alice, bob)):
         bob.node.subscribe(IMAGE, "sensor_msgs/Image")
         bob.node.subscribe(STATUS)
@@ -71,7 +71,7 @@ def test_urgent_messages_pass_thirty_images_a_second_on_a_link_for_less_than_one
         assert max(most) < MEMORY_BYTES
 
 
-def test_a_subscriber_that_does_not_keep_up_costs_bounded_memory_and_delays_no_other(
+def test_a_slow_subscriber_uses_bounded_memory_and_delays_no_others(
     pair: tuple[Member, Member],
 ) -> None:
     alice, bob = pair
@@ -94,7 +94,7 @@ def test_a_subscriber_that_does_not_keep_up_costs_bounded_memory_and_delays_no_o
     slow.kill()
 
 
-def test_killed_daemons_and_bridges_come_back_into_service(pair: tuple[Member, Member]) -> None:
+def test_messages_flow_again_after_daemons_and_bridges_are_killed_and_restarted(pair: tuple[Member, Member]) -> None:
     alice, bob = pair
     bob.node.subscribe(STATUS)
     for member in pair:
@@ -108,7 +108,7 @@ def test_killed_daemons_and_bridges_come_back_into_service(pair: tuple[Member, M
     flows(alice, bob, "killed bridges")
 
 
-def test_a_daemon_that_hangs_for_a_while_is_waited_for(pair: tuple[Member, Member]) -> None:
+def test_the_bridge_recovers_from_a_daemon_that_hangs_temporarily(pair: tuple[Member, Member]) -> None:
     alice, bob = pair
     bob.node.subscribe(STATUS)
     alice.daemon.signal(signal.SIGSTOP)
@@ -118,7 +118,7 @@ def test_a_daemon_that_hangs_for_a_while_is_waited_for(pair: tuple[Member, Membe
     flows(alice, bob, "after it hung")
 
 
-def test_a_message_that_is_too_long_is_refused_and_takes_no_other_with_it(pair: tuple[Member, Member]) -> None:
+def test_an_oversized_message_is_rejected_without_losing_others(pair: tuple[Member, Member]) -> None:
     alice, bob = pair
     bob.node.subscribe(STATUS)
     flows(alice, bob, "before the giant")
@@ -148,7 +148,7 @@ def test_a_message_that_is_too_long_is_refused_and_takes_no_other_with_it(pair: 
     assert log_text().count("messages-refused") < 20
 
 
-def test_ten_thousand_messages_at_once_are_delivered_or_refused_aloud(pair: tuple[Member, Member]) -> None:
+def test_a_burst_of_ten_thousand_messages_is_delivered_or_the_refusal_is_logged(pair: tuple[Member, Member]) -> None:
     alice, bob = pair
     bob.node.subscribe(MAP)
     alice.node.publish_until_received(MAP, "there", bob.node)
@@ -166,7 +166,7 @@ def test_ten_thousand_messages_at_once_are_delivered_or_refused_aloud(pair: tupl
     assert log_text.count("\n") < 20
 
 
-def test_without_a_master_what_flows_goes_on_and_what_is_new_waits(pair: tuple[Member, Member]) -> None:
+def test_without_a_master_existing_topics_flow_and_new_topics_wait(pair: tuple[Member, Member]) -> None:
     # The last test: a program that was there before its master's restart is unknown to the new one.
     alice, bob = pair
     bob.node.subscribe(STATUS)

@@ -19,7 +19,7 @@ STRING = TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
 MADE = TypeKey("made_up/Thing", "0123456789abcdef" * 2)
 
 
-def test_a_real_ros_publishes_into_the_mesh_and_hears_what_comes_of_it_typed_and_opaque() -> None:
+def test_a_real_ros_node_sends_and_receives_mesh_messages_of_known_and_unknown_types() -> None:
     with two_daemons() as (alice, bob), ExitStack() as kept:
         master = Master(alice.folder, "alice")
         kept.callback(master.stop)

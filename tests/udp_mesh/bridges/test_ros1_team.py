@@ -68,7 +68,7 @@ def test_a_broadcast_reaches_the_whole_team(members: list[Member]) -> None:
         )
 
 
-def test_a_burst_arrives_whole_and_once_through_the_losses(members: list[Member]) -> None:
+def test_a_burst_over_a_lossy_link_arrives_complete_and_without_duplicates(members: list[Member]) -> None:
     base, ugv1, *_ = members
     base.node.subscribe(to(ugv1, base, "map"))
     ugv1.node.publish_until_received(to(ugv1, base, "map"), "there", base.node)
@@ -81,7 +81,7 @@ def test_a_burst_arrives_whole_and_once_through_the_losses(members: list[Member]
     assert sorted(burst()) == sorted(f"burst {number}" for number in range(500))
 
 
-def test_a_robot_that_was_away_gets_what_was_latched_meanwhile(members: list[Member]) -> None:
+def test_a_returning_robot_receives_messages_latched_while_it_was_offline(members: list[Member]) -> None:
     base, _, _, _, uav1 = members
     uav1.daemon.stop()
     wait_online(base.daemon, "uav1", online=False)
@@ -93,7 +93,7 @@ def test_a_robot_that_was_away_gets_what_was_latched_meanwhile(members: list[Mem
     late.close()
 
 
-def test_masters_restart_on_the_senders_and_on_the_receivers_side(members: list[Member]) -> None:
+def test_messages_flow_after_master_restarts_on_both_sides(members: list[Member]) -> None:
     base, ugv1, ugv2, *_ = members
     for member in (ugv1, base):
         member.master.stop()
@@ -108,7 +108,7 @@ def test_masters_restart_on_the_senders_and_on_the_receivers_side(members: list[
     sender.close()
 
 
-def test_rostopic_echoes_and_measures_what_came(members: list[Member]) -> None:
+def test_rostopic_echo_info_and_hz_work_on_a_relayed_topic(members: list[Member]) -> None:
     base, ugv1, *_ = members
     ugv1.node.stream(to(ugv1, base, "odometry"), "std_msgs/String", rate_hz=20.0)
     name = to(ugv1, base, "odometry")
@@ -120,7 +120,7 @@ def test_rostopic_echoes_and_measures_what_came(members: list[Member]) -> None:
     assert ugv1.node.stop_streams()[name] > 0
 
 
-def test_what_was_recorded_is_played_through_the_bridge(members: list[Member]) -> None:
+def test_a_recorded_bag_is_played_back_through_the_bridge(members: list[Member]) -> None:
     base, ugv1, ugv2, *_ = members
     bag = base.master.folder / "run.bag"
     name = to(ugv1, base, "bagged")
@@ -149,7 +149,7 @@ def test_what_was_recorded_is_played_through_the_bridge(members: list[Member]) -
     poll(played, "what was recorded")
 
 
-def test_topic_tools_relay_and_throttle_what_came(members: list[Member]) -> None:
+def test_topic_tools_relay_and_throttle_work_on_a_relayed_topic(members: list[Member]) -> None:
     base, ugv1, *_ = members
     name, relayed, throttled = to(ugv1, base, "status"), "/relayed", "/throttled"
     with (
@@ -166,7 +166,7 @@ def test_topic_tools_relay_and_throttle_what_came(members: list[Member]) -> None
         poll(lambda: came() >= {relayed, throttled}, "both")
 
 
-def test_a_tool_that_relays_on_the_senders_side_is_carried(members: list[Member]) -> None:
+def test_messages_from_a_sender_side_topic_tools_relay_are_forwarded(members: list[Member]) -> None:
     base, _, ugv2, *_ = members
     name = to(ugv2, base, "status")
     base.node.subscribe(name)
@@ -174,7 +174,7 @@ def test_a_tool_that_relays_on_the_senders_side_is_carried(members: list[Member]
         ugv2.node.publish_until_received("/local/status", "by a relay", base.node, received_as=name)
 
 
-def test_the_autonomy_sees_every_peer(members: list[Member]) -> None:
+def test_mesh_conditions_list_every_online_peer(members: list[Member]) -> None:
     base, *others = members
     base.node.subscribe("/base/mesh_conditions")
 

@@ -50,7 +50,7 @@ def test_messages_cross_in_both_directions(team: tuple[Side, Side]) -> None:
     bob.node.publish_until_received(TO_ALICE, "from bob", alice.node)
 
 
-def test_a_subscriber_that_comes_late_gets_the_last_transient_local_message(team: tuple[Side, Side]) -> None:
+def test_a_late_subscriber_receives_the_last_transient_local_message(team: tuple[Side, Side]) -> None:
     alice, bob = team
     with bob.daemon.client() as client:
         client.subscribe("map")
@@ -60,7 +60,7 @@ def test_a_subscriber_that_comes_late_gets_the_last_transient_local_message(team
     assert bob.node.expect("data", "the map")["name"] == TO_BOB_MAP
 
 
-def test_a_bridge_that_was_killed_carries_on_after_its_restart(team: tuple[Side, Side]) -> None:
+def test_a_killed_bridge_resumes_after_a_restart(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.node.subscribe(TO_BOB)
     for side, data in ((alice, "sender restarted"), (bob, "receiver restarted")):
@@ -70,7 +70,7 @@ def test_a_bridge_that_was_killed_carries_on_after_its_restart(team: tuple[Side,
 
 
 @pytest.mark.parametrize("name", ["made_up/msg/Thing", "os/path/join", "../msg/String", "std_msgs/msg/Nothing"])
-def test_a_type_that_is_not_installed_is_reported_and_ends_nothing(team: tuple[Side, Side], name: str) -> None:
+def test_an_uninstalled_type_is_reported_and_does_not_stop_the_bridge(team: tuple[Side, Side], name: str) -> None:
     alice, bob = team
     kind = kind_text(MessageKind(TypeKey(name, "reliable:volatile:10:")))
     with alice.daemon.client() as client:

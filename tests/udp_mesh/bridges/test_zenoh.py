@@ -131,7 +131,7 @@ def test_a_sample_arrives_with_key_encoding_attachment_and_quality_of_service(te
     assert sample.express
 
 
-def test_both_directions_are_carried_and_a_deletion_is_one(team: tuple[Side, Side]) -> None:
+def test_samples_and_deletions_are_also_relayed_in_the_reverse_direction(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.put_until_seen(alice, "demo/back", b"from bob")
 
@@ -144,7 +144,7 @@ def test_both_directions_are_carried_and_a_deletion_is_one(team: tuple[Side, Sid
     poll(deleted, "the deletion")
 
 
-def test_what_came_from_the_mesh_is_not_sent_back(team: tuple[Side, Side]) -> None:
+def test_samples_from_the_mesh_are_not_sent_back(team: tuple[Side, Side]) -> None:
     alice, bob = team
     alice.put_until_seen(bob, "demo/loop", b"settled")
     before = len(alice.saw(b"once"))
@@ -156,7 +156,7 @@ def test_what_came_from_the_mesh_is_not_sent_back(team: tuple[Side, Side]) -> No
     assert len(bob.saw(b"once")) == 1
 
 
-def test_a_second_bridge_beside_the_first_sends_nothing_back(team: tuple[Side, Side]) -> None:
+def test_a_second_bridge_on_the_same_network_does_not_echo_samples(team: tuple[Side, Side]) -> None:
     alice, bob = team
     # The twin is on bob's network and uses alice's daemon: whatever it sends would reach bob again.
     twin = Side(alice.daemon, bob.port, None)
@@ -182,7 +182,7 @@ def test_a_second_bridge_beside_the_first_sends_nothing_back(team: tuple[Side, S
         twin.stop_bridge()
 
 
-def test_a_ros_2_message_keeps_its_cdr_type_hash_and_attachment(team: tuple[Side, Side]) -> None:
+def test_a_ros_2_message_keeps_its_key_payload_and_attachment(team: tuple[Side, Side]) -> None:
     alice, bob = team
     attached = attachment(7, bytes(range(16)))
     sample = alice.put_until_seen(bob, CHATTER, CDR_HELLO, attachment=attached)
@@ -190,7 +190,7 @@ def test_a_ros_2_message_keeps_its_cdr_type_hash_and_attachment(team: tuple[Side
     assert bytes(sample.attachment) == attached
 
 
-def test_a_ros_2_publisher_is_in_the_other_graph_with_its_qos_for_as_long_as_it_lives(team: tuple[Side, Side]) -> None:
+def test_a_ros_2_publisher_is_visible_in_the_remote_graph_while_it_exists(team: tuple[Side, Side]) -> None:
     alice, bob = team
     token = alice.session.liveliness().declare_token(TOKEN)
     poll(lambda: bob.tokens.get(TOKEN), "the publisher at bob")
@@ -224,7 +224,7 @@ def late_subscriber(side: Side, seen: list[bytes]) -> Any:
     )
 
 
-def test_late_subscribers_and_late_robots_get_what_transient_local_publishers_keep(team: tuple[Side, Side]) -> None:
+def test_late_subscribers_and_robots_receive_cached_transient_local_samples(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.stop_bridge()
     token = alice.session.liveliness().declare_token(KEPT_TOKEN)

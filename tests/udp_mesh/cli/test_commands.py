@@ -32,7 +32,7 @@ pytestmark = pytest.mark.xdist_group("udp_mesh_cli")
 
 
 @pytest.mark.parametrize("command", ["status", "peers", "topics"])
-def test_what_is_can_be_read_by_people_and_by_scripts(run: Run, command: str) -> None:
+def test_state_is_printed_as_text_and_json(run: Run, command: str) -> None:
     code, text, _ = run(command)
     assert code == Exit.OK
     assert ("bob" if command != "topics" else "map") in text
@@ -75,7 +75,7 @@ def test_a_watch_waits_for_a_daemon_that_restarts() -> None:
             assert program.wait(WAIT_S) == Exit.OK
 
 
-def test_a_watched_page_keeps_to_its_terminal() -> None:
+def test_watch_output_is_clipped_to_the_terminal_size() -> None:
     page = "\n".join(f"{number:03} " + "x" * 100 for number in range(60))
     shown = screen_text(page, 40, 24).removeprefix("\x1b[H").removesuffix("\x1b[J").split("\x1b[K\n")
     assert len(shown) == 24
@@ -87,7 +87,7 @@ def test_a_watched_page_keeps_to_its_terminal() -> None:
 
 
 @pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "soon"])
-def test_a_watch_has_a_finite_period(period: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_watch_interval_is_a_usage_error(period: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["status", f"--watch={period}"])
     assert ended.value.code == Exit.USAGE
@@ -95,7 +95,7 @@ def test_a_watch_has_a_finite_period(period: str, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.parametrize("words", [["status"], ["status", "--json"], ["metrics"], ["ping", "bob", "-c", "1"]])
-def test_an_output_that_takes_no_more_is_a_complaint(pair: Pair, words: list[str]) -> None:
+def test_a_full_output_device_is_reported_as_an_error(pair: Pair, words: list[str]) -> None:
     with open("/dev/full", "w") as full:
         program = subprocess.run(
             [sys.executable, "-m", "udp_mesh.cli.main", *words, "--socket", str(pair[0].socket)],
@@ -111,7 +111,7 @@ def test_an_output_that_takes_no_more_is_a_complaint(pair: Pair, words: list[str
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
-def test_a_closed_standard_stream_is_no_error_of_ours(pair: Pair, closed: str) -> None:
+def test_closed_standard_streams_are_tolerated_unless_needed(pair: Pair, closed: str) -> None:
     words = shlex.join([sys.executable, "-m", "udp_mesh.cli.main", "status", "--socket", str(pair[0].socket)])
     program = subprocess.run(["sh", "-c", f"{words} {closed}"], capture_output=True, text=True, timeout=WAIT_S)
     assert (program.returncode, program.stderr) == (Exit.OK, "")
@@ -122,7 +122,7 @@ def test_a_closed_standard_stream_is_no_error_of_ours(pair: Pair, closed: str) -
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
-def test_characters_that_the_terminal_lacks_are_shown_by_their_numbers(
+def test_unencodable_characters_are_shown_as_escapes(
     pair: Pair, form: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alice, _ = pair
@@ -139,7 +139,7 @@ def test_characters_that_the_terminal_lacks_are_shown_by_their_numbers(
     assert main(["drop", "topic", "gr\u00fc\u00df", "--socket", str(alice.socket)]) == Exit.OK
 
 
-def test_the_environment_names_the_socket(
+def test_the_socket_path_is_read_from_the_environment(
     pair: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("UDP_MESH_SOCKET", str(pair[0].socket))
@@ -148,13 +148,13 @@ def test_the_environment_names_the_socket(
     assert main(["peers", "--socket", str(pair[0].socket) + "x"]) == Exit.UNREACHABLE
 
 
-def test_a_command_that_only_asks_loads_no_transport() -> None:
+def test_the_cli_module_does_not_import_the_transport() -> None:
     code = "import sys, udp_mesh.cli.main; print('udp_mesh.core.endpoint' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S).stdout
     assert found == "False\n"
 
 
-def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
+def test_set_and_drop_take_effect(run: Run) -> None:
     assert run("set", "topic", "video", "priority=10", "outbox=last", 'destinations=["bob"]')[0] == Exit.OK
     topics: dict[str, Any] = {topic["name"]: topic for topic in json.loads(run("topics", "--json")[1])["topics"]}
     assert (topics["video"]["priority"], topics["video"]["outbox"]) == (10, "last")
@@ -170,7 +170,7 @@ def test_what_is_set_shows_and_what_is_dropped_is_gone(run: Run) -> None:
     assert run("reload")[1] == "no changes\n"
 
 
-def test_a_bound_that_was_set_can_be_taken_away(run: Run) -> None:
+def test_a_topic_limit_can_be_removed(run: Run) -> None:
     assert run("set", "topic", "bound", "deadline_s=2", "keep_last=3", "outbox=last")[0] == Exit.OK
     code, text, _ = run("set", "topic", "bound", "deadline_s=none", "outbox=none")
     assert (code, text) == (Exit.OK, "topic bound: deadline_s 2.0 -> none\ntopic bound: outbox last -> none\n")
@@ -204,7 +204,7 @@ def test_a_mistake_is_explained_in_one_line(run: Run, words: list[str], code: in
     ("seconds", "text"),
     [(None, "-"), (0.000842, "0.842 ms"), (0.34, "340 ms"), (0.9994, "999 ms"), (0.9996, "1.0 s"), (18.19, "18.2 s")],
 )
-def test_a_time_is_shown_in_a_unit_that_suits_it(seconds: float | None, text: str) -> None:
+def test_a_duration_is_shown_in_a_suitable_unit(seconds: float | None, text: str) -> None:
     assert milliseconds(seconds) == text
 
 
@@ -225,21 +225,21 @@ def test_metrics_are_printed(run: Run) -> None:
         ["echo", "map", "--count", "\uff13"],
     ],
 )
-def test_a_number_that_would_do_nothing_is_wrong_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_number_is_a_usage_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == Exit.USAGE
     assert f"{words[-2]}: expected a" in capsys.readouterr().err
 
 
-def test_no_daemon_has_an_exit_code_of_its_own(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_missing_daemon_has_its_own_exit_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
     complaint = capsys.readouterr().err
     assert "cannot connect to the daemon at" in complaint
     assert "start it with `udp-mesh run`" in complaint
 
 
-def test_a_socket_for_others_is_not_called_a_missing_daemon(
+def test_a_socket_without_permission_is_not_reported_as_a_missing_daemon(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Root may use every socket, so the kernel's error is simulated."""
@@ -252,7 +252,9 @@ def test_a_socket_for_others_is_not_called_a_missing_daemon(
     assert "Permission denied (run as root or as a member of the group" in capsys.readouterr().err
 
 
-def test_a_key_is_made_once_for_its_owner_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_keygen_writes_an_owner_only_key_and_never_overwrites_it(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     path = tmp_path / "fleet.key"
     assert main(["keygen", str(path)]) == Exit.OK
     (key,) = read_keys(path)
@@ -262,7 +264,7 @@ def test_a_key_is_made_once_for_its_owner_only(capsys: pytest.CaptureFixture[str
     assert main(["keygen", str(path)]) == Exit.FAILED
 
 
-def test_a_configuration_is_checked_for_people_and_for_scripts(
+def test_check_reports_configuration_errors_as_text_and_json(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     main(["keygen", str(tmp_path / "fleet.key")])
@@ -302,9 +304,7 @@ def _commands(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[st
 
 
 @pytest.mark.parametrize("words", sorted(_commands(build_parser())))
-def test_every_command_shows_an_example_that_it_would_take(
-    words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_help_shows_a_valid_example(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main([*words, "--help"])
     assert caught.value.code == 0
@@ -321,7 +321,7 @@ def test_every_command_shows_an_example_that_it_would_take(
         ('socket_group = "no-such-group"', "daemon.socket_group: no such group"),
     ],
 )
-def test_a_daemon_that_cannot_start_says_why(
+def test_a_daemon_startup_failure_reports_the_reason(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, daemon: str, complaint: str
 ) -> None:
     path = tmp_path / "mesh.toml"
@@ -333,9 +333,7 @@ def test_a_daemon_that_cannot_start_says_why(
     assert f"udp-mesh: cannot start: {complaint}" in capsys.readouterr().err
 
 
-def test_a_directory_that_is_not_ours_is_named_with_the_way_out(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_an_inaccessible_directory_is_reported_with_a_hint(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "mesh.toml"
     (tmp_path / "file").touch()
     path.write_text(f'unkeyed = true\n[daemon]\nsocket = "{tmp_path}/file/s"\nstate_directory = "{tmp_path}"\n')

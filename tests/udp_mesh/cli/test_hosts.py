@@ -24,7 +24,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_block_is_written_with_the_mode_of_the_file_and_nothing_is_left_beside_it(file: Path) -> None:
+def test_writing_the_block_keeps_the_file_mode_and_leaves_no_temporary_file(file: Path) -> None:
     before = file.read_bytes()
     HostsBlock(file).write((SPOT,))
     assert b"10.42.0.12 spot1\n" in file.read_bytes()
@@ -43,7 +43,7 @@ def test_an_unchanged_block_does_not_touch_the_file(file: Path) -> None:
     assert (file.stat().st_ino, file.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
-def test_a_link_stays_a_link_to_the_file(file: Path) -> None:
+def test_a_symlinked_hosts_file_stays_a_symlink(file: Path) -> None:
     link = file.with_name("link")
     link.symlink_to(file)
     HostsBlock(link).write((SPOT,))
@@ -51,7 +51,7 @@ def test_a_link_stays_a_link_to_the_file(file: Path) -> None:
     assert b"spot1" in file.read_bytes()
 
 
-def test_a_line_that_another_program_adds_meanwhile_survives(file: Path) -> None:
+def test_a_line_added_concurrently_by_another_program_is_kept(file: Path) -> None:
     def merge_while_another_program_writes(text: str, hosts: Iterable[HostEntry]) -> MergedHosts:
         if "printer" not in text:
             other = file.with_name("new")
@@ -64,9 +64,7 @@ def test_a_line_that_another_program_adds_meanwhile_survives(file: Path) -> None
     assert b"10.42.0.12 spot1\n" in file.read_bytes()
 
 
-def test_a_mounted_file_that_cannot_be_renamed_over_is_written_in_place(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bind_mounted_file_is_written_in_place(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def busy(self: Path, target: Path) -> Path:
         raise OSError(16, os.strerror(16), str(target))
 

@@ -18,7 +18,7 @@ def _peer(name: str, address: str | None = "10.42.0.12:8700", **fields: object) 
     return {"name": name, "address": address, "legacy": False, **fields}
 
 
-def test_peers_become_hosts_in_the_order_of_their_names() -> None:
+def test_hosts_are_sorted_by_peer_name() -> None:
     peers = [_peer("spot1"), _peer("base", "10.42.0.1:8700"), _peer("uav", "[fd00::2]:8700")]
     assert hosts_of(peers) == (BASE, SPOT, HostEntry("uav", "fd00::2"))
 
@@ -43,7 +43,7 @@ def test_peers_become_hosts_in_the_order_of_their_names() -> None:
         _peer("s" * 64),
     ],
 )
-def test_a_peer_that_no_other_program_could_use_or_trust_is_left_out(peer: Mapping[str, object]) -> None:
+def test_a_peer_with_an_unusable_or_unsafe_name_or_address_is_omitted(peer: Mapping[str, object]) -> None:
     assert hosts_of([peer]) == ()
 
 
@@ -56,14 +56,14 @@ def test_a_block_is_appended_replaced_and_removed_and_the_rest_stays() -> None:
     assert merge(second, []).text == without_block(second) == f"{DEBIAN}10.9.9.9 printer\n"
 
 
-def test_a_name_that_another_line_defines_is_a_conflict_and_not_written() -> None:
+def test_a_name_defined_by_another_line_is_reported_as_conflict_and_not_written() -> None:
     merged = merge(DEBIAN, [HostEntry("Husky1", "10.42.0.10"), SPOT])
     assert merged.conflicts == (HostEntry("Husky1", "10.42.0.10"),)
     assert "10.42.0.10" not in merged.text
     assert "10.42.0.12 spot1" in merged.text
 
 
-def test_a_block_without_its_last_line_ends_before_the_lines_of_others() -> None:
+def test_a_block_without_its_end_marker_ends_before_foreign_lines() -> None:
     cut = f"{DEBIAN}{BEGIN}\n10.42.0.1 base\n10.9.9.9 printer printer.example.com\n# a comment\n"
     assert without_block(cut) == f"{DEBIAN}10.9.9.9 printer printer.example.com\n# a comment\n"
 

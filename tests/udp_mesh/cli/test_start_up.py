@@ -12,7 +12,7 @@ from tests.start_up import imported_modules, packages
 @pytest.mark.parametrize(
     "words", [["--help"], ["--version"], ["status"], ["pub", "t", "x"], ["echo", "t"], ["run", "--help"]], ids=" ".join
 )
-def test_a_command_imports_no_transport_and_nothing_outside_the_standard_library(
+def test_a_command_imports_only_stdlib_and_no_transport_modules(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UDP_MESH_SOCKET", str(tmp_path / "no daemon"))

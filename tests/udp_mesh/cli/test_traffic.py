@@ -24,7 +24,7 @@ pytestmark = pytest.mark.xdist_group("udp_mesh_traffic")
 
 
 @pytest.mark.parametrize("words", [["ping", "bob", "-c", "1000"], ["bench", "bob", "--seconds", "1000", "--size", "1"]])
-def test_a_measurement_that_is_interrupted_says_what_it_has(pair: Pair, words: list[str]) -> None:
+def test_an_interrupted_measurement_prints_its_partial_result(pair: Pair, words: list[str]) -> None:
     before = messages_received(pair[1])
     command = [sys.executable, "-m", "udp_mesh.cli.main", *words, "--socket", str(pair[0].socket)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
@@ -44,7 +44,7 @@ def messages_received(daemon: RunningDaemon) -> int:
         return int(client.request("status")["conditions"]["counters"]["messages_received"])
 
 
-def test_a_wait_that_is_interrupted_is_no_success(pair: Pair) -> None:
+def test_an_interrupted_ping_exits_with_interrupted(pair: Pair) -> None:
     words = ["ping", "bob", "-c", "1000", "--json", "--socket", str(pair[0].socket)]
     program = subprocess.Popen([sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE)
     with program:
@@ -63,7 +63,7 @@ def test_a_message_is_sent_and_its_outcome_decides_the_exit_code(run: Run, pair:
         assert collect(receiver, 1)[0].payload == b"hello"
 
 
-def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
+def test_pub_wait_waits_for_the_outcome_of_every_destination(run: Run) -> None:
     assert run("set", "topic", "orders", 'destinations=["bob", "carol"]', "deadline_s=0.2", "outbox=all")[0] == Exit.OK
     code, text, _ = run("pub", "orders", "go", "--wait", str(WAIT_S), "--json")
     outcomes = {line["peer"]: line["outcome"] for line in map(json.loads, text.splitlines())}
@@ -72,7 +72,7 @@ def test_the_outcome_at_every_destination_is_waited_for(run: Run) -> None:
     assert (code, json.loads(text)["peer"]) == (Exit.OK, "bob")
 
 
-def test_what_has_no_outcome_says_so(run: Run) -> None:
+def test_waiting_for_a_message_without_an_outcome_is_reported(run: Run) -> None:
     code, text, complaint = run("pub", "video", "x", "--to", "bob", "--wait")
     assert (code, text) == (Exit.USAGE, "")
     assert "video is best effort" in complaint
@@ -83,7 +83,7 @@ def test_what_has_no_outcome_says_so(run: Run) -> None:
     assert expected in complaint
 
 
-def test_a_message_is_the_bytes_of_the_command_line(run: Run, pair: Pair) -> None:
+def test_a_non_utf8_message_argument_is_sent_as_raw_bytes(run: Run, pair: Pair) -> None:
     with pair[1].client() as receiver:
         receiver.subscribe("status")
         assert run("pub", "status", os.fsdecode(b"\xff\xfe"), "--to", "bob", "--wait")[0] == Exit.OK
@@ -103,7 +103,7 @@ def test_a_file_is_sent_several_times(run: Run, pair: Pair, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("words", [["--file", "/dev/zero"], ["-"]])
-def test_a_file_without_end_is_no_message(run: Run, monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
+def test_an_endless_file_is_rejected_as_a_message(run: Run, monkeypatch: pytest.MonkeyPatch, words: list[str]) -> None:
     monkeypatch.setattr(traffic, "MAX_PAYLOAD_BYTES", 1000)
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(bytes(2000))))
     code, _, complaint = run("pub", "status", *words, "--to", "bob")
@@ -111,12 +111,12 @@ def test_a_file_without_end_is_no_message(run: Run, monkeypatch: pytest.MonkeyPa
     assert (code, complaint) == (Exit.FAILED, f"udp-mesh: {name}: expected at most 1000 bytes, found more\n")
 
 
-def test_a_script_learns_that_its_message_was_accepted(run: Run) -> None:
+def test_pub_json_reports_accepted_messages(run: Run) -> None:
     code, text, _ = run("pub", "map", "x", "--to", "bob", "--count", "2", "--rate", "100", "--json")
     assert (code, json.loads(text)) == (Exit.OK, {"topic": "map", "accepted": 2})
 
 
-def test_an_undeliverable_message_has_an_exit_code_of_its_own(run: Run) -> None:
+def test_an_undeliverable_message_has_its_own_exit_code(run: Run) -> None:
     assert run("set", "topic", "brief", "deadline_s=0.05", "rate_limit_bytes_per_s=1000")[0] == Exit.OK
     code, text, _ = run("pub", "brief", "x" * 900, "--to", "bob", "--count", "4", "--rate", "1000", "--wait")
     assert code == Exit.NOT_DELIVERED
@@ -162,11 +162,11 @@ def test_a_message_is_read_from_standard_input(pair: Pair, monkeypatch: pytest.M
     assert message.payload == b"piped"
 
 
-def test_silence_ends_an_echo_with_a_timeout(run: Run) -> None:
+def test_echo_times_out_without_messages(run: Run) -> None:
     assert run("echo", "nothing", "--timeout", "0.05")[0] == Exit.FAILED
 
 
-def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
+def test_ping_succeeds_for_a_peer_and_fails_for_an_unknown_one(run: Run) -> None:
     code, text, _ = run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50", "--json")
     assert code == Exit.OK
     assert all(json.loads(line)["round_trip_s"] > 0 for line in text.splitlines())
@@ -178,7 +178,7 @@ def test_a_peer_answers_a_ping_and_a_stranger_does_not(run: Run) -> None:
     assert (code, json.loads(text)) == (Exit.FAILED, {"peer": "nobody", "error": "unknown-peer"})
 
 
-def test_a_ping_whose_daemon_ends_says_what_it_has(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ping_prints_its_partial_result_when_the_daemon_exits(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     replies = iter([{"round_trip_s": 0.002}, {"round_trip_s": 0.004}])
 
     def request(*_: object, **__: object) -> dict[str, float]:
@@ -193,7 +193,7 @@ def test_a_ping_whose_daemon_ends_says_what_it_has(run: Run, monkeypatch: pytest
     assert text.splitlines()[-1] == "2 of 3 answered, min 2 ms, mean 3 ms, max 4 ms"
 
 
-def test_a_benchmark_says_what_arrived(run: Run) -> None:
+def test_a_benchmark_reports_delivered_messages_and_throughput(run: Run) -> None:
     code, text, _ = run("bench", "bob", "--seconds", "0.3", "--size", "200000", "--json")
     assert code == Exit.OK
     result = json.loads(text)
@@ -210,7 +210,7 @@ def test_a_recording_is_started_and_stopped(run: Run, tmp_path: Path) -> None:
     assert run("record", "start", str(path))[::2] == (Exit.FAILED, f"udp-mesh: {path}: File exists\n")
 
 
-def test_a_recording_that_cannot_be_written_or_seen_is_reported(
+def test_a_recording_that_cannot_be_written_or_found_is_reported(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code, _, complaint = run("record", "start", str(tmp_path / "none" / "run.jsonl"))
@@ -227,7 +227,7 @@ def test_a_recording_that_cannot_be_written_or_seen_is_reported(
     ("size_bytes", "delivered_per_s", "messages"),
     [(200_000, 0.0, 4), (200_000, 0.6, 4), (200_000, 5.0, 10), (200_000, 600.0, 83), (100_000_000, 1.0, 4)],
 )
-def test_a_benchmark_keeps_little_more_under_way_than_soon_arrives(
+def test_a_benchmark_backlog_scales_with_the_delivery_rate(
     size_bytes: int, delivered_per_s: float, messages: int
 ) -> None:
     assert traffic._backlog(size_bytes, delivered_per_s) == messages

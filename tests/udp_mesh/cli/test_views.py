@@ -22,7 +22,9 @@ from udp_mesh.daemon.status import peer_json
         (False, False, 14.0, "OFFLINE"),
     ],
 )
-def test_a_peer_s_state_is_one_word(online: bool, one_way: bool, unanswered_for_s: float | None, word: str) -> None:
+def test_peers_view_shows_one_state_per_peer(
+    online: bool, one_way: bool, unanswered_for_s: float | None, word: str
+) -> None:
     both = pair()
     (found,) = both.a.conditions(both.now).peers
     peer = replace(found, online=online, one_way=one_way, unanswered_for_s=unanswered_for_s)
@@ -34,7 +36,7 @@ def test_a_peer_s_state_is_one_word(online: bool, one_way: bool, unanswered_for_
 HOSTILE = "\x1b[2J\x1b]52;c;aGk=\x07\x9b2J\u202egnp.exe\nbob  online\x7f"
 
 
-def test_a_name_or_type_that_steers_terminals_is_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_control_sequences_in_names_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
     lines = output.table(("peer", "state"), [(HOSTILE, "online")]).splitlines()
     assert len(lines) == 2, "a line end in a name begins no row"
     output.print_text(HOSTILE)

@@ -16,7 +16,7 @@ headers = st.dictionaries(st.text(max_size=5), st.one_of(st.integers(), st.text(
 
 
 @given(st.lists(st.tuples(headers, st.binary(max_size=50)), max_size=5), st.data())
-def test_frames_survive_any_cutting(frames: list[Frame], data: st.DataObject) -> None:
+def test_frames_are_reassembled_from_arbitrary_chunks(frames: list[Frame], data: st.DataObject) -> None:
     stream = b"".join(encode_frame(header, payload) for header, payload in frames)
     reader, found, place = FrameReader(), list[Frame](), 0
     while place < len(stream):
@@ -27,7 +27,7 @@ def test_frames_survive_any_cutting(frames: list[Frame], data: st.DataObject) ->
 
 
 @given(st.binary(max_size=60))
-def test_any_bytes_give_frames_or_an_error(raw: bytes) -> None:
+def test_any_bytes_decode_to_frames_or_raise_bad_frame(raw: bytes) -> None:
     try:
         FrameReader().feed(raw)
     except MeshError as error:
@@ -44,18 +44,18 @@ def test_any_bytes_give_frames_or_an_error(raw: bytes) -> None:
         b"\x00\x00\x00\x02\x00\x00\x00\x00\xff\xfe",
     ],
 )
-def test_a_length_or_header_that_is_none_is_an_error(raw: bytes) -> None:
+def test_an_invalid_frame_length_or_header_is_an_error(raw: bytes) -> None:
     with pytest.raises(MeshError):
         FrameReader().feed(raw)
 
 
-def test_no_daemon_is_an_error_that_names_the_socket(tmp_path: Path) -> None:
+def test_a_missing_daemon_error_names_the_socket(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"cannot connect to the daemon at .*mesh.sock: No such file") as caught:
         MeshClient(str(tmp_path / "mesh.sock"))
     assert caught.value.code == "unreachable"
 
 
-def test_what_is_no_socket_is_called_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_is_not_a_socket_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # a socket's path has at most 107 bytes
     monkeypatch.chdir(tmp_path)
     for path in (tmp_path, tmp_path / "file"):
@@ -69,7 +69,7 @@ def test_what_is_no_socket_is_called_so(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("path", [Path(mesh_client.__file__), Path(mesh_client.__file__).parents[1] / "__init__.py"])
-def test_the_client_keeps_to_the_syntax_of_python_3_8_and_to_the_standard_library(path: Path) -> None:
+def test_the_client_uses_python_3_8_syntax_and_only_the_standard_library(path: Path) -> None:
     tree = ast.parse(path.read_text(), feature_version=(3, 8))
     imported = {
         name.split(".")[0]

@@ -11,7 +11,7 @@ from udp_mesh.core.events import MessageDelivered, MessageId, MessageReceived, R
 from udp_mesh.core.settings import Limits, Neighbour, Outbox, Rates, Settings, Topic
 
 
-def test_every_kind_of_change_in_the_middle_of_transfers_loses_nothing() -> None:
+def test_changing_settings_during_transfers_loses_no_messages() -> None:
     world = World(seed=4)
     base = settings("a", Topic("one", priority=5), Topic("two", priority=9))
     world.add(base)
@@ -57,7 +57,7 @@ def test_a_new_priority_reaches_messages_already_waiting() -> None:
     assert order[:3] == ["video"] * 3
 
 
-def test_each_change_is_named() -> None:
+def test_apply_lists_each_change() -> None:
     both = pair(Topic("map", priority=5))
     lines = both.a.apply(
         settings("a", Topic("map", priority=6), Topic("video"), window=3, rates=Rates(heartbeat_s=2.0)), both.now
@@ -71,7 +71,7 @@ def test_each_change_is_named() -> None:
     assert both.a.apply(both.a.settings, both.now) == []
 
 
-def test_a_change_is_named_in_the_words_of_the_configuration() -> None:
+def test_changes_are_described_with_configuration_keys_and_values() -> None:
     old, new = Topic("map"), Topic("map", outbox=Outbox.ALL, keep_last=3, destinations=("b", "c"), compression=True)
     both = pair(old, undeclared=None, neighbours=(Neighbour(("10.0.0.7", 8700)), Neighbour(("10.0.0.8", 8700))))
     settings_now = settings("a", new, undeclared=old, neighbours=(Neighbour(("10.0.0.7", 8700), "c"),))
@@ -99,7 +99,7 @@ def test_an_undeclared_topic_is_refused_unless_all_are_allowed() -> None:
     assert isinstance(both.a.send("newer", b"x", destination="b", now=both.now), int)
 
 
-def test_name_and_port_need_a_new_run() -> None:
+def test_changing_the_node_name_requires_a_restart() -> None:
     both = pair()
     with pytest.raises(ValueError, match="restart the node"):
         both.a.apply(replace(both.a.settings, name="z"), both.now)
@@ -119,7 +119,7 @@ def test_a_fixed_window_is_never_exceeded_by_bulk(window: int) -> None:
     assert most == window
 
 
-def test_a_rate_limit_is_kept_and_holds_no_other_topic_back() -> None:
+def test_a_rate_limit_is_enforced_without_delaying_other_topics() -> None:
     world = World()
     topics = (Topic("slow", priority=1, rate_limit_bytes_per_s=50_000), Topic("fast", priority=9))
     for name in ("a", "b"):
@@ -156,7 +156,7 @@ def test_a_rate_limit_is_kept_and_holds_no_other_topic_back() -> None:
         (lambda: Limits(peers=0), "limits.peers"),
     ],
 )
-def test_a_bad_setting_is_named_with_what_was_expected(make: object, message: str) -> None:
+def test_an_invalid_setting_error_states_what_was_expected(make: object, message: str) -> None:
     assert callable(make)
     with pytest.raises(ValueError, match=message):
         make()

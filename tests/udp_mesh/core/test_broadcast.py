@@ -37,7 +37,7 @@ def payloads(world: World, name: str) -> list[bytes]:
     return [event.payload for event in world.events_of(name, MessageReceived) if isinstance(event, MessageReceived)]
 
 
-def test_a_message_to_all_that_fits_is_one_datagram_for_everyone() -> None:
+def test_a_broadcast_that_fits_is_sent_as_a_single_datagram() -> None:
     world = team()
     sent: list[Datagram] = []
     world.tap = lambda name, datagram, now: sent.append(datagram) if name == "a" and len(datagram.data) > 900 else None
@@ -47,7 +47,7 @@ def test_a_message_to_all_that_fits_is_one_datagram_for_everyone() -> None:
     assert [payloads(world, name) for name in "bcd"] == [[bytes(1000)]] * 3
 
 
-def test_a_message_to_all_that_does_not_fit_goes_to_each_peer_with_an_outcome_each() -> None:
+def test_an_oversized_broadcast_is_sent_to_each_peer_with_one_outcome_per_peer() -> None:
     world = team()
     world.send("a", "any", bytes(5000))
     world.run(1.0)
@@ -61,7 +61,7 @@ def test_a_message_to_all_that_does_not_fit_goes_to_each_peer_with_an_outcome_ea
     ]
 
 
-def test_destinations_of_a_topic_are_the_only_ones_to_get_it() -> None:
+def test_a_topic_with_destinations_is_sent_only_to_them() -> None:
     world = team(Topic("t", destinations=("b", "d")))
     world.send("a", "t", b"for two")
     world.run(0.5)
@@ -69,7 +69,7 @@ def test_destinations_of_a_topic_are_the_only_ones_to_get_it() -> None:
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3])
-def test_a_lost_broadcast_with_repair_arrives_after_all_and_once(loss: float) -> None:
+def test_a_lost_broadcast_with_repair_is_received_exactly_once(loss: float) -> None:
     world = team(Topic("t", repair=True))
     for pipe in world.pipes.values():
         pipe.loss = loss
@@ -81,7 +81,7 @@ def test_a_lost_broadcast_with_repair_arrives_after_all_and_once(loss: float) ->
         assert sorted(payloads(world, name)) == [bytes([number]) for number in range(40)]
 
 
-def test_broadcasts_without_repair_ask_for_nothing() -> None:
+def test_broadcasts_without_repair_trigger_no_repair_requests() -> None:
     world = team(Topic("t"))
     for pipe in world.pipes.values():
         pipe.loss = 0.3
@@ -92,7 +92,7 @@ def test_broadcasts_without_repair_ask_for_nothing() -> None:
     assert world.nodes["b"].conditions(world.now).counters.repairs_asked == 0
 
 
-def test_a_repair_no_longer_kept_is_called_off() -> None:
+def test_a_repair_request_stops_when_the_broadcast_is_no_longer_kept() -> None:
     world = team(Topic("t", repair=True))
     world.nodes["a"]._state.broadcasts._repairable.clear()
     world.pipes[("a", "b")].up = False
@@ -106,7 +106,7 @@ def test_a_repair_no_longer_kept_is_called_off() -> None:
     assert payloads(world, "b") == []
 
 
-def test_urgent_broadcasts_leave_twice_once_loss_is_seen() -> None:
+def test_urgent_broadcasts_are_sent_redundantly_on_a_lossy_link() -> None:
     world = team(Topic("stop", priority=0))
     for pipe in world.pipes.values():
         pipe.loss = 0.2
@@ -131,7 +131,9 @@ def out_of_reach(world: World, up: bool) -> None:
     ("outbox", "expected"),
     [(Outbox.NONE, []), (Outbox.LAST, [b"2"]), (Outbox.ALL, [b"0", b"1", b"2"])],
 )
-def test_an_outbox_keeps_for_an_absent_peer_what_its_topic_says(outbox: Outbox, expected: list[bytes]) -> None:
+def test_the_topic_sets_which_messages_an_outbox_keeps_for_an_offline_peer(
+    outbox: Outbox, expected: list[bytes]
+) -> None:
     world = team(Topic("t", outbox=outbox))
     out_of_reach(world, up=False)
     assert world.run(10.0, until=lambda: bool(world.events_of("a", PeerOffline)))
@@ -144,7 +146,7 @@ def test_an_outbox_keeps_for_an_absent_peer_what_its_topic_says(outbox: Outbox, 
     assert payloads(world, "b") == expected
 
 
-def test_an_outbox_is_bounded_and_the_oldest_goes_first() -> None:
+def test_a_full_outbox_drops_the_oldest_messages() -> None:
     world = team(Topic("t", outbox=Outbox.ALL, outbox_bytes=2500))
     out_of_reach(world, up=False)
     assert world.run(10.0, until=lambda: bool(world.events_of("a", PeerOffline)))
@@ -195,7 +197,7 @@ def test_an_outbox_on_disk_survives_a_restart_until_its_messages_are_delivered()
     assert disk.kept == {}
 
 
-def test_a_message_for_a_peer_never_heard_of_needs_an_outbox() -> None:
+def test_a_message_to_an_unknown_peer_requires_an_outbox() -> None:
     both = pair(Topic("t"), Topic("kept", outbox=Outbox.ALL))
     answer = both.a.send("t", b"x", destination="nobody", now=both.now)
     assert isinstance(answer, Rejected)
@@ -213,7 +215,9 @@ def test_a_message_for_a_peer_never_heard_of_needs_an_outbox() -> None:
         ),
     ],
 )
-def test_what_cannot_be_kept_is_refused_at_once(send: Callable[[object], object], reason: RejectReason) -> None:
+def test_a_message_over_the_size_or_queue_limit_is_rejected_immediately(
+    send: Callable[[object], object], reason: RejectReason
+) -> None:
     from udp_mesh.core.settings import Limits
 
     both = pair(Topic("t"), limits=Limits(message_bytes=1_000_000, queue_bytes_per_peer=2_000_000))
@@ -222,7 +226,7 @@ def test_what_cannot_be_kept_is_refused_at_once(send: Callable[[object], object]
     assert answer.reason is reason
 
 
-def test_a_closed_node_takes_nothing_and_ends_what_was_open() -> None:
+def test_a_closed_node_rejects_messages_and_expires_open_ones() -> None:
     both = pair()
     both.a.send("any", bytes(100_000), destination="b", now=both.now)
     both.a.close(both.now)
@@ -232,7 +236,7 @@ def test_a_closed_node_takes_nothing_and_ends_what_was_open() -> None:
     assert both.a.next_timer() is None
 
 
-def test_a_robot_ferries_data_between_two_that_never_meet() -> None:
+def test_an_outbox_delivers_to_a_peer_first_met_after_the_send() -> None:
     world = World(seed=3)
     dice = random.Random(3)
     topic = Topic("log", outbox=Outbox.ALL)

@@ -35,7 +35,7 @@ def world(**changes: object) -> World:
 
 
 @given(st.binary(max_size=2000), st.integers(1, 200))
-def test_a_body_made_in_steps_is_what_zlib_reads(unit: bytes, times: int) -> None:
+def test_incremental_compression_is_compatible_with_zlib(unit: bytes, times: int) -> None:
     payload = unit * times
     body = compress(payload)
     assert body is None or zlib.decompress(body) == payload
@@ -45,13 +45,13 @@ def test_a_body_made_in_steps_is_what_zlib_reads(unit: bytes, times: int) -> Non
 
 
 @given(st.binary(min_size=1, max_size=300), st.integers(0, 300))
-def test_what_is_cut_short_or_carries_a_tail_is_refused(payload: bytes, cut: int) -> None:
+def test_truncated_input_and_trailing_data_are_rejected(payload: bytes, cut: int) -> None:
     packed = zlib.compress(payload * 50)
     assert decompress(packed[: min(cut, len(packed) - 1)], 1 << 20) is None
     assert decompress(packed + b"x", 1 << 20) is None
 
 
-def test_a_step_is_short_however_large_the_message() -> None:
+def test_compression_step_size_does_not_depend_on_message_size() -> None:
     compression_queue = Compression(MAP)
     steps = 1
     while not compression_queue.step():
@@ -66,7 +66,7 @@ def test_a_step_is_short_however_large_the_message() -> None:
     assert inflating.payload == MAP
 
 
-def test_a_bomb_grows_no_further_than_a_step_beyond_the_limit() -> None:
+def test_a_zip_bomb_inflates_at_most_a_step_beyond_the_limit() -> None:
     inflating = Decompression(zlib.compress(bytes(100 * INFLATE_STEP_BYTES)), INFLATE_STEP_BYTES)
     while not inflating.step():
         pass
@@ -102,13 +102,13 @@ def test_messages_of_one_topic_keep_their_order_behind_one_that_is_being_compres
     assert len(made.events_of("b", MessageReceived)) == 5
 
 
-def test_what_waits_to_be_compressed_is_bounded() -> None:
+def test_the_compression_queue_is_bounded() -> None:
     made = world(limits=Limits(queue_bytes_per_peer=len(MAP) + 100))
     assert not isinstance(made.nodes["a"].send("map", MAP, destination="b", now=made.now), Rejected)
     assert isinstance(made.nodes["a"].send("map", MAP, destination="b", now=made.now), Rejected)
 
 
-def test_a_node_that_closes_ends_what_it_has_not_compressed() -> None:
+def test_closing_a_node_expires_messages_waiting_for_compression() -> None:
     made = world()
     for _ in range(2):
         made.nodes["a"].send("map", MAP, destination="b", now=made.now)

@@ -32,7 +32,7 @@ def receipts(made: World) -> list[Receipt]:
 
 
 @pytest.mark.parametrize("size", [10, 50_000])
-def test_a_message_is_delivered_when_it_is_confirmed_and_not_before(size: int) -> None:
+def test_a_message_counts_as_delivered_only_once_confirmed(size: int) -> None:
     made = world()
     made.send("a", "kept", bytes(size), destination="b")
     made.run(20.0)
@@ -46,7 +46,7 @@ def test_a_message_is_delivered_when_it_is_confirmed_and_not_before(size: int) -
     assert len(made.events_of("a", MessageDelivered)) == 1
 
 
-def test_other_topics_and_peers_that_do_not_confirm_are_served_as_before() -> None:
+def test_topics_and_peers_without_confirmations_deliver_on_acknowledgement() -> None:
     for made, topic in ((world(), "any"), (world(confirms=False), "kept")):
         made.send("a", topic, b"x", destination="b")
         made.run(2.0)
@@ -72,7 +72,7 @@ def test_a_lost_confirmation_is_repeated_and_nothing_arrives_twice() -> None:
     assert len(made.events_of("a", MessageDelivered)) == 200
 
 
-def test_a_receiver_killed_before_it_kept_a_message_gets_it_again() -> None:
+def test_a_receiver_killed_before_confirming_gets_the_message_again() -> None:
     made = world()
     made.send("a", "kept", b"x", destination="b")
     made.run(1.0)
@@ -85,7 +85,7 @@ def test_a_receiver_killed_before_it_kept_a_message_gets_it_again() -> None:
     assert len(made.events_of("a", MessageDelivered)) == 1
 
 
-def test_an_unconfirmed_message_outlives_an_absence_and_arrives_once() -> None:
+def test_an_unconfirmed_message_survives_a_disconnect_and_arrives_once() -> None:
     made = world()
     made.send("a", "kept", b"x", destination="b")
     made.run(1.0)
@@ -100,7 +100,7 @@ def test_an_unconfirmed_message_outlives_an_absence_and_arrives_once() -> None:
     assert len(made.events_of("a", MessageDelivered)) == 1
 
 
-def test_a_confirmation_that_comes_right_after_an_absence_counts() -> None:
+def test_a_confirmation_right_after_a_peer_returns_is_accepted() -> None:
     """Before the maintenance round that would forget the withdrawn message."""
     made = world()
     made.send("a", "kept", b"x", destination="b")
@@ -116,7 +116,7 @@ def test_a_confirmation_that_comes_right_after_an_absence_counts() -> None:
     assert len(made.events_of("a", MessageDelivered)) == 1
 
 
-def test_what_the_receiver_could_not_keep_comes_again() -> None:
+def test_a_message_the_receiver_could_not_store_is_resent_on_request() -> None:
     made = world()
     made.send("a", "kept", b"x", destination="b")
     made.run(1.0)
@@ -141,7 +141,7 @@ def test_a_message_that_is_not_confirmed_in_its_lifetime_expires() -> None:
     assert sender.unconfirmed == {}
 
 
-def test_an_application_that_confirms_nothing_holds_a_bounded_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unconfirmed_messages_at_the_receiver_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiver, "MAX_UNCONFIRMED", 10)
     made = world()
     for _ in range(30):

@@ -83,14 +83,14 @@ def play(
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_legacy_sender_loses_what_the_link_loses_and_no_more(seed: int) -> None:
+def test_a_legacy_sender_loses_only_what_the_link_loses(seed: int) -> None:
     urgent, bulk, program = play(0.01, 20.0, seed=seed)
     assert urgent >= 192
     assert bulk >= 370
     assert program.flushed == 0
 
 
-def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
+def test_a_legacy_sender_loses_nothing_and_frees_every_slot_without_loss() -> None:
     urgent, bulk, program = play(0.0, 10.0)
     assert urgent >= 100
     assert bulk >= 200
@@ -101,14 +101,14 @@ def test_without_loss_nothing_is_lost_and_no_place_stays_taken() -> None:
 
 @pytest.mark.parametrize("seed", range(1, 5))
 @pytest.mark.parametrize("saved_before_s", [0.0, 1.0])
-def test_a_restart_of_ours_stalls_a_legacy_sender_for_no_ten_seconds(seed: int, saved_before_s: float) -> None:
+def test_our_restart_does_not_stall_a_legacy_sender(seed: int, saved_before_s: float) -> None:
     """Fragments sent while our node was down take all of its three slots. A killed node knows an older position."""
     urgent, _, program = play(0.02, 15.0, seed=seed, restart_at=7.0, down_s=2.0, saved_before_s=saved_before_s)
     assert urgent >= 125
     assert program.flushed == 0
 
 
-def test_a_restored_position_is_searched_from_until_something_arrives() -> None:
+def test_a_restored_position_is_probed_forward_until_a_fragment_arrives() -> None:
     """The more was sent after it was saved, the further; each heartbeat starts again."""
     old = OldRobot(positions={"old": ReceivePosition(17, ((16, 2, 2), (17, 1, 9)))})
     found: set[int] = set()
@@ -128,7 +128,7 @@ def test_a_restored_position_is_searched_from_until_something_arrives() -> None:
     assert len([answer for answer in old.hear() if isinstance(answer, LegacyAck)]) <= 20
 
 
-def test_acknowledgements_besides_stay_few_without_loss() -> None:
+def test_extra_acknowledgements_stay_few_without_loss() -> None:
     """One repetition each and some predictions per second: no more airtime than that."""
     acks, now, more = LegacyAcks(), 0.0, 0
     for sequence in range(1, 1001):
@@ -143,7 +143,7 @@ def legacy(*topics: Topic) -> OldRobot:
     return OldRobot(topics=(Topic("map", priority=9), *topics))
 
 
-def test_what_an_outbox_keeps_waits_until_a_legacy_robot_has_started() -> None:
+def test_outbox_messages_wait_until_a_legacy_robot_has_started() -> None:
     """It acknowledges before its reader has subscribed: what arrives before that is lost."""
     old = legacy(Topic("kept", priority=8, outbox=Outbox.ALL))
     old.now += 20.0
@@ -179,14 +179,14 @@ def test_a_bridges_own_messages_are_not_sent_to_legacy_robots() -> None:
 @pytest.mark.parametrize(
     ("topic", "kind"), [("~mesh/ping", "a/B"), ("a b", "a/B"), ("chat", "B"), ("1", "a/B"), ("a//b", "a/B")]
 )
-def test_only_names_of_ros_are_taken_from_legacy_robots(topic: str, kind: str) -> None:
+def test_only_valid_ros_names_are_accepted_from_legacy_robots(topic: str, kind: str) -> None:
     old = OldRobot()
     body = encode_mesh_data(PriorityMeshData("old", kind, 1, topic, b"x"))
     old.say(LegacyPayload(1, 0, 1, body, wants_ack=True))
     assert old.received() == []
 
 
-def test_a_legacy_robot_names_so_many_topics_and_no_more() -> None:
+def test_topics_created_by_a_legacy_robot_are_capped() -> None:
     old = OldRobot()
     for number in range(MAX_TOPICS + 50):
         body = encode_mesh_data(PriorityMeshData("old", "a/B", 1, f"t{number}", b"x"))
@@ -196,7 +196,7 @@ def test_a_legacy_robot_names_so_many_topics_and_no_more() -> None:
     assert old.node.conditions(old.now).counters.dropped_over_limit == 51
 
 
-def test_another_port_of_a_legacy_robot_is_not_believed() -> None:
+def test_datagrams_from_another_port_of_a_legacy_robot_are_ignored() -> None:
     old = OldRobot()
     old.node.receive(encode_legacy(fragments(1, b"forged")[0]), "mesh", (OLD[0], 4444), old.now)
     assert old.received() == []
@@ -204,7 +204,7 @@ def test_another_port_of_a_legacy_robot_is_not_believed() -> None:
     assert len(old.hear_messages()) == 1
 
 
-def test_the_status_of_a_legacy_robot_and_our_own_rate_say_what_goes_to_it() -> None:
+def test_status_reports_the_rates_to_and_from_a_legacy_robot() -> None:
     world = World(seed=1)
     config = replace(settings("new"), neighbours=(Neighbour(OLD, name="old", legacy=True),))
     world.add(config, address="10.0.0.1")
@@ -233,7 +233,7 @@ def test_the_status_of_a_legacy_robot_and_our_own_rate_say_what_goes_to_it() -> 
     assert 0.8e6 < conditions.sent_bits_per_s < 1.5e6
 
 
-def test_answers_that_come_too_soon_after_a_resend_teach_patience() -> None:
+def test_spurious_resends_raise_the_resend_timeout() -> None:
     """The legacy program answers when its interpreter is scheduled."""
     old = OldRobot()
     rng = random.Random(2)
@@ -262,7 +262,7 @@ def test_answers_that_come_too_soon_after_a_resend_teach_patience() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_lost_acknowledgement_brings_no_second_copy_to_a_legacy_robot(seed: int) -> None:
+def test_a_lost_acknowledgement_rarely_delivers_duplicates_to_a_legacy_robot(seed: int) -> None:
     """It does not remember finished messages: with one fragment per message, over a hundred arrived twice."""
     rng, old, program = random.Random(seed), OldRobot(), LegacyProgram()
     wire: deque[tuple[float, LegacyPayload]] = deque()

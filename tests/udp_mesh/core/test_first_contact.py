@@ -41,7 +41,7 @@ def one_way() -> tuple[World, list[Datagram]]:
 
 
 @pytest.mark.parametrize("echoes", [True, False])
-def test_a_recording_of_a_boot_never_heard_raises_no_peer(echoes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replayed_recording_of_an_unknown_boot_creates_no_peer(echoes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not echoes:
         without_echoes(monkeypatch)
     world, recorded = one_way()
@@ -55,7 +55,7 @@ def test_a_recording_of_a_boot_never_heard_raises_no_peer(echoes: bool, monkeypa
 
 
 @pytest.mark.parametrize("echoes", [True, False])
-def test_nothing_is_delivered_over_a_path_that_was_always_too_late(
+def test_nothing_is_delivered_over_a_path_delayed_beyond_the_limit_from_the_start(
     echoes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An attacker that forwards everything late from the first datagram on leaves no earlier one to compare with."""
@@ -72,7 +72,7 @@ def test_nothing_is_delivered_over_a_path_that_was_always_too_late(
     assert world.run(30.0, until=lambda: bool(world.events_of("b", PeerOnline)))
 
 
-def test_a_first_contact_takes_no_challenge() -> None:
+def test_a_first_contact_needs_no_challenge() -> None:
     """The answer to a hello proves itself: nothing waits a round trip, and no ping is sent."""
     world = world_of("a", "b", "c")
     assert world.run(5.0, until=lambda: all(len(world.events_of(name, PeerOnline)) == 2 for name in "abc"))
@@ -81,7 +81,7 @@ def test_a_first_contact_takes_no_challenge() -> None:
     assert all(session.challenged_at == float("-inf") for session in sessions)
 
 
-def test_a_version_that_echoes_no_clock_is_believed_after_a_ping(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_version_without_clock_echo_is_accepted_after_a_ping(monkeypatch: pytest.MonkeyPatch) -> None:
     without_echoes(monkeypatch)
     world = world_of("a", "b")
     assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline)))
@@ -92,7 +92,7 @@ def test_a_version_that_echoes_no_clock_is_believed_after_a_ping(monkeypatch: py
     assert all(world.events_of(name, PeerOnline) for name in "ab")
 
 
-def test_what_is_held_is_bounded_and_all_of_it_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_datagrams_are_bounded_and_every_message_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
     without_echoes(monkeypatch)
     world = world_of("a", "b")
     b = world.nodes["b"]
@@ -115,7 +115,7 @@ def test_what_is_held_is_bounded_and_all_of_it_arrives(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("now", [5.0, 1e6, 4294967.296 + 3.0, 4294967.296 - 0.001])
-def test_an_echoed_clock_ages_across_its_wrap(now: float) -> None:
+def test_echo_age_is_correct_across_the_clock_wraparound(now: float) -> None:
     for age_s in (0.0, 1.0, 4.0, 100.0):
         echo = clock_echo(clock_ms(now - age_s))
         assert age_s <= echo_age_s(echo, now) + 0.256

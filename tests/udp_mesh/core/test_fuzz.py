@@ -19,11 +19,11 @@ INPUTS = int(os.environ.get("UDP_MESH_FUZZ_INPUTS", "100000000"))
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-def test_any_bytes_are_taken_or_counted(surface: str) -> None:
+def test_arbitrary_bytes_are_accepted_or_counted_as_dropped(surface: str) -> None:
     Chunk(surface, tuple(SURFACES).index(surface), 4_000).run()
 
 
-def test_after_any_bytes_the_pair_still_talks() -> None:
+def test_a_pair_still_communicates_after_fuzzed_input() -> None:
     fuzzer = Fuzzer(seed=77)
     for surface in (random_bytes, mutated_datagrams, legacy):
         fuzzer.run(surface, 1000)

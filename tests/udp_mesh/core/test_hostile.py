@@ -73,7 +73,7 @@ def test_mutated_datagrams_of_a_real_session_change_nothing() -> None:
     assert still_works(both)
 
 
-def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
+def test_a_flood_of_invented_senders_cannot_grow_state_without_bound() -> None:
     both = pair(limits=Limits(strangers=8, peers=16))
     rng = random.Random(1)
     for number in range(100):
@@ -88,7 +88,7 @@ def test_a_flood_of_invented_senders_holds_bounded_state() -> None:
 
 @pytest.mark.parametrize("name", ["b", "ghost", "ghost{}"])
 @pytest.mark.parametrize("versions", [(1, 1), (2, 3)])
-def test_a_flood_of_boots_that_a_key_holder_invents_holds_bounded_state(name: str, versions: tuple[int, int]) -> None:
+def test_a_key_holder_inventing_boot_ids_cannot_grow_state_without_bound(name: str, versions: tuple[int, int]) -> None:
     """They hear our boot, so each is verified at once: under one name, under the victim's own, under many."""
     both = pair(limits=Limits(strangers=8, peers=16))
     state = both.b._state
@@ -116,7 +116,7 @@ def insider(both: Pair, frames: list[Frame]) -> None:
     both.b.receive(data, "mesh", A, both.now)
 
 
-def test_an_insider_who_begins_messages_without_end_meets_the_cap() -> None:
+def test_partial_messages_from_an_insider_are_capped() -> None:
     limits = Limits(partial_bytes_per_peer=50_000, partials_per_peer=40)
     both = pair(limits=limits)
     for number in range(3000):
@@ -126,7 +126,7 @@ def test_an_insider_who_begins_messages_without_end_meets_the_cap() -> None:
     assert conditions.counters.dropped_over_limit > 0
 
 
-def test_an_insider_who_announces_topics_without_end_meets_the_cap() -> None:
+def test_topics_announced_by_an_insider_are_capped() -> None:
     both = pair(limits=Limits(topics_per_peer=10))
     for number in range(200):
         insider(both, [TopicAnnounce(number, f"t{number}")])
@@ -161,7 +161,7 @@ frames = st.lists(
 
 
 @given(st.lists(frames, max_size=25))
-def test_whatever_an_insider_says_nothing_crashes_and_little_is_owed(datagrams: list[list[Frame]]) -> None:
+def test_arbitrary_insider_frames_cause_no_crash_and_bounded_control_backlog(datagrams: list[list[Frame]]) -> None:
     both = pair()
     both.b.send("any", bytes(5000), destination="a", now=both.now)
     both.drop(both.b)
@@ -191,7 +191,7 @@ def test_a_message_larger_than_the_limit_is_refused_and_its_sender_notified() ->
 
 
 @pytest.mark.parametrize("flood_per_s", [2000])
-def test_a_flood_of_garbage_delays_no_urgent_message(flood_per_s: int) -> None:
+def test_a_flood_of_garbage_does_not_delay_urgent_messages(flood_per_s: int) -> None:
     world = World()
     for name in ("a", "b"):
         world.add(settings(name, Topic("stop", priority=0)))
@@ -213,7 +213,7 @@ def test_a_flood_of_garbage_delays_no_urgent_message(flood_per_s: int) -> None:
     assert max(latencies) < 0.012
 
 
-def test_waiting_levels_claimed_without_end_hold_no_node_back_for_good() -> None:
+def test_endless_false_waiting_reports_do_not_block_a_node() -> None:
     world = World()
     for name in ("a", "b"):
         world.add(settings(name, Topic("bulk", priority=9)))

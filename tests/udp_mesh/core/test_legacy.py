@@ -122,13 +122,13 @@ def test_messages_of_a_legacy_peer_arrive_and_are_acknowledged() -> None:
     assert (event.source, event.topic, event.payload, event.priority) == ("old", "chat", b"x" * 4000, 4)
 
 
-def test_where_a_legacy_peer_was_heard_is_reported() -> None:
+def test_the_address_and_link_of_a_legacy_peer_are_reported() -> None:
     old = OldRobot()
     (peer,) = old.node.conditions(old.now + 2).peers
     assert (peer.name, peer.online, peer.address, peer.link, peer.last_heard) == ("old", True, OLD, "mesh", old.now)
 
 
-def test_a_neighbor_no_longer_named_is_forgotten_unless_it_was_heard_or_something_waits_for_it() -> None:
+def test_a_removed_neighbor_is_forgotten_unless_heard_or_with_queued_messages() -> None:
     old = OldRobot()
     named = old.node._state.settings
     others = tuple(
@@ -159,7 +159,7 @@ def test_three_fragments_are_in_flight_to_a_legacy_peer_and_urgent_ones_go_first
     assert decode_mesh_data(urgent.data).topic == "stop"
 
 
-def test_a_message_to_all_reaches_legacy_peers_too() -> None:
+def test_a_broadcast_reaches_legacy_peers() -> None:
     old = OldRobot()
     old.node.send("stop", b"all", now=old.now)
     assert [decode_mesh_data(fragment.data).data for fragment in old.hear_messages()] == [b"all"]
@@ -168,7 +168,7 @@ def test_a_message_to_all_reaches_legacy_peers_too() -> None:
 # The defects, in the order listed in the facts about the legacy system.
 
 
-def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
+def test_defect_1_a_lost_fragment_is_retransmitted_without_a_stall() -> None:
     old = OldRobot()
     old.node.send("map", bytes(6000), destination="old", now=old.now)
     seen: set[int] = set()
@@ -187,7 +187,7 @@ def test_defect_1_a_lost_fragment_is_sent_again_and_stalls_nothing() -> None:
     assert seen == {0, 1, 2, 3, 4}
 
 
-def test_defect_2_nothing_is_allocated_from_a_number_on_the_wire() -> None:
+def test_defect_2_memory_is_not_allocated_from_a_claimed_fragment_count() -> None:
     reassembly = LegacyReassembly(Limits())
     reassembly.add(LegacyPayload(1, 0, 65_536, b"x", wants_ack=True), 0.0)
     assert reassembly.bytes < 1000
@@ -213,7 +213,7 @@ def test_defect_4_an_unknown_type_is_counted_and_dropped(kind: int) -> None:
     assert [event.payload for event in old.received()] == [b"fine"]
 
 
-def test_defect_4_nothing_that_is_sent_to_all_ends_a_legacy_program() -> None:
+def test_defect_4_broadcasts_do_not_crash_a_legacy_program() -> None:
     world = World(seed=9)
     legacy = Neighbour(("10.0.0.50", 8700), name="old", legacy=True)
     topic = Topic("cast", repair=True)
@@ -249,7 +249,7 @@ def test_defect_4_nothing_that_is_sent_to_all_ends_a_legacy_program() -> None:
     assert world.events_of("b", PeerOffline)
 
 
-def test_defect_5_a_name_is_not_believed_as_announced() -> None:
+def test_defect_5_an_announced_name_is_not_trusted() -> None:
     old = OldRobot()
     old.say(Host("base", "10.0.0.9"))
     old.say(fragments(2, b"who")[0])
@@ -261,7 +261,7 @@ def test_defect_5_a_name_is_not_believed_as_announced() -> None:
     assert old.node.conditions(old.now).counters.dropped_unauthenticated == 2
 
 
-def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
+def test_defect_5_a_name_conflict_between_our_own_nodes_is_reported() -> None:
     world = World()
     world.add(settings("a"))
     world.add(settings("b"))
@@ -284,7 +284,7 @@ def test_defect_5_among_our_own_nodes_a_taken_name_is_reported() -> None:
 
 
 @pytest.mark.parametrize("broadcast", ["10.0.15.255", "10.0.0.15", "192.168.255.255"])
-def test_defect_6_the_broadcast_address_is_the_one_given_never_guessed(broadcast: str) -> None:
+def test_defect_6_the_configured_broadcast_address_is_used(broadcast: str) -> None:
     both = pair()
     both.a.link_up(LinkInfo("mesh", LinkKind.BROADCAST, ("10.0.0.1", 8700), (broadcast, 8700)), both.now)
     both.now += 2.0
@@ -301,7 +301,7 @@ def test_defect_7_each_partial_message_is_purged_by_its_own_age() -> None:
     assert whole is not None
 
 
-def test_defect_8_a_number_that_comes_around_does_not_meet_an_old_partial_message() -> None:
+def test_defect_8_a_reused_sequence_number_is_not_merged_with_an_old_partial_message() -> None:
     reassembly = LegacyReassembly(Limits())
     reassembly.add(fragments(7, b"a" * 2000)[0], 0.0)
     fresh = fragments(7, b"b" * 3000)
@@ -335,7 +335,7 @@ def test_defect_9_priority_order_survives_the_wrap_of_the_sequence_numbers() -> 
     assert order == sorted(order)
 
 
-def test_defect_10_a_send_to_a_host_never_heard_of_is_refused_and_the_node_goes_on() -> None:
+def test_defect_10_a_send_to_an_unknown_host_is_rejected_and_the_node_keeps_running() -> None:
     old = OldRobot()
     answer = old.node.send("map", b"x", destination="nobody", now=old.now)
     assert isinstance(answer, Rejected)
@@ -366,7 +366,7 @@ def test_defect_11_the_legacy_receiver_still_gets_the_empty_fragment_it_counts_o
     assert [len(fragment.data) for fragment in old.hear_payloads()] == [1300, 0]
 
 
-def test_a_repeated_fragment_of_a_finished_message_is_acknowledged_and_opens_no_new_one() -> None:
+def test_a_duplicate_fragment_of_a_finished_message_is_only_acknowledged() -> None:
     old = OldRobot()
     for fragment in fragments(5, b"x" * 2000) * 2:
         old.say(fragment)
@@ -392,20 +392,20 @@ def test_a_silent_legacy_peer_is_probed_gently_and_loses_nothing() -> None:
     assert delivered
 
 
-def test_without_legacy_neighbors_their_format_is_dropped() -> None:
+def test_legacy_datagrams_are_dropped_without_legacy_neighbors() -> None:
     both = pair()
     both.b.receive(encode_legacy(Host("x", "10.0.0.9")), "mesh", OLD, both.now)
     assert both.events(both.b) == []
 
 
-def test_settings_of_a_legacy_neighbor_need_its_name() -> None:
+def test_a_legacy_neighbor_requires_a_name() -> None:
     with pytest.raises(ValueError, match="requires a name"):
         Neighbour(OLD, legacy=True)
     assert isinstance(settings("x"), Settings)
     assert PeerOnline is not None
 
 
-def test_a_legacy_program_that_restarts_is_understood_although_its_numbers_restart() -> None:
+def test_a_restarted_legacy_program_that_reuses_sequence_numbers_is_received() -> None:
     old = OldRobot()
     for sequence in (1, 2):
         for fragment in fragments(sequence, b"x" * 2000):
@@ -422,7 +422,7 @@ def test_a_legacy_program_that_restarts_is_understood_although_its_numbers_resta
     assert [event.payload[:1] for event in old.received()] == [b"y", b"z", b"z"]
 
 
-def test_a_message_above_the_limit_stalls_no_legacy_sender() -> None:
+def test_a_message_above_the_limit_does_not_stall_a_legacy_sender() -> None:
     old = OldRobot(limits=Limits(message_bytes=5000))
     for fragment in [*fragments(1, bytes(20_000)), *fragments(2, b"small")]:
         old.say(fragment)
@@ -432,7 +432,7 @@ def test_a_message_above_the_limit_stalls_no_legacy_sender() -> None:
     )
 
 
-def test_a_run_of_ours_starts_at_a_number_of_its_own() -> None:
+def test_each_run_starts_at_a_random_legacy_sequence_number() -> None:
     numbers = set()
     for seed in range(5):
         rng = random.Random(seed)

@@ -46,7 +46,7 @@ def play(seed: int, duration_s: float) -> tuple[list[float], int]:
     return sorted(took.values()), len(bulk)
 
 
-def test_urgent_messages_and_bulk_to_a_legacy_peer_stand_a_fifth_of_loss() -> None:
+def test_urgent_messages_and_bulk_to_a_legacy_peer_survive_twenty_percent_loss() -> None:
     took, bulk = play(5, 40.0)
     assert len(took) >= 395
     assert took[len(took) * 99 // 100] <= 0.35

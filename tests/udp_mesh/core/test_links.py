@@ -96,7 +96,7 @@ def settled(seconds: float = 4.0, *, urgent: bool = True, seed: int = 1, **link:
     return run.measure(seconds)
 
 
-def test_on_a_short_path_an_urgent_message_waits_for_a_shorter_queue() -> None:
+def test_urgent_latency_is_lower_on_a_short_path() -> None:
     assert settled(15.0, delay_s=0.001).latency(0.99) <= 0.008
 
 
@@ -116,7 +116,7 @@ def test_an_urgent_message_overtakes_the_bulk_that_fills_the_link(loss: float, m
 @pytest.mark.parametrize(
     ("rate", "delay", "share"), [(1e6, 0.01, 0.93), (20e6, 0.01, 0.94), (10e6, 0.001, 0.94), (10e6, 0.05, 0.90)]
 )
-def test_bulk_fills_other_links_too(rate: float, delay: float, share: float) -> None:
+def test_bulk_fills_links_of_various_rates_and_delays(rate: float, delay: float, share: float) -> None:
     run = Run(urgent=False)
     run.link(rate_bits_per_s=rate, delay_s=delay)
     run.start()
@@ -138,7 +138,7 @@ def bursts(mean_loss: float, burst_s: float) -> Callable[[random.Random, float],
     return lost
 
 
-def test_bursts_of_loss_cost_little_more_than_what_they_lose() -> None:
+def test_burst_loss_costs_little_beyond_the_lost_packets() -> None:
     run = Run(urgent=False, seed=3)
     for pipe in run.world.pipes.values():
         pipe.lost = bursts(0.05, 0.03)
@@ -147,7 +147,7 @@ def test_bursts_of_loss_cost_little_more_than_what_they_lose() -> None:
     assert run.measure(10.0).goodput_bits_per_s >= 0.93 * 0.95 * 10e6
 
 
-def test_little_is_sent_beyond_what_must_be() -> None:
+def test_retransmission_overhead_is_low() -> None:
     assert settled(urgent=False, loss=0.2).wire_ratio <= 1.32
     assert settled(urgent=False, loss=0.0).wire_ratio <= 1.05
 
@@ -160,7 +160,7 @@ def test_nothing_is_sent_twice_without_loss() -> None:
     assert run.world.nodes["a"].conditions(run.world.now).counters.fragments_retransmitted == 0
 
 
-def test_a_longer_route_is_filled_soon() -> None:
+def test_throughput_recovers_soon_after_a_route_gets_longer() -> None:
     goodputs = []
     for seed in (1, 2, 3):
         run = Run(urgent=False, seed=seed)
@@ -172,7 +172,7 @@ def test_a_longer_route_is_filled_soon() -> None:
     assert fmean(goodputs) >= 0.88 * 10e6
 
 
-def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds() -> None:
+def test_throughput_recovers_within_seconds_when_latency_grows_eighty_fold() -> None:
     run = Run()
     run.link(rate_bits_per_s=20e6, delay_s=0.005)
     run.start()
@@ -184,7 +184,7 @@ def test_a_route_that_became_eighty_times_longer_is_filled_within_some_seconds()
     assert figures.latency(0.5) <= 0.47
 
 
-def test_the_queue_that_a_long_route_left_is_not_taken_for_the_short_one() -> None:
+def test_a_standing_queue_from_a_long_route_is_drained_on_a_short_one() -> None:
     # A window for the long route keeps the queue of the short one full permanently, and half of what is sent is lost.
     run = Run()
     run.link(rate_bits_per_s=20e6, delay_s=0.005)
@@ -214,7 +214,7 @@ def test_a_slower_link_is_not_flooded() -> None:
     assert figures.goodput_bits_per_s >= 0.83 * 2e6
 
 
-def test_a_link_without_room_to_queue_is_filled_and_overrun_no_more_than_the_rate_model_allows() -> None:
+def test_a_link_with_a_shallow_queue_is_filled_with_bounded_overrun() -> None:
     # Its losses look like a radio's, which must not slow us down: only the cap on compensated loss limits what is sent.
     figures = settled(urgent=False, queue_packets=6)
     assert figures.wire_ratio <= 2.0
@@ -222,7 +222,7 @@ def test_a_link_without_room_to_queue_is_filled_and_overrun_no_more_than_the_rat
 
 
 @pytest.mark.parametrize(("cut_s", "seed"), [(0.2, 1), (1.0, 2), (5.0, 3), (30.0, 4)])
-def test_a_fresh_urgent_message_arrives_soon_after_a_cut_and_nothing_is_lost(cut_s: float, seed: int) -> None:
+def test_urgent_messages_arrive_promptly_after_an_outage_and_none_are_lost(cut_s: float, seed: int) -> None:
     run = Run(seed=seed)
     run.link(loss=0.05)
     run.start()

@@ -77,7 +77,7 @@ def test_messages_continue_after_a_legacy_robot_was_upgraded_without_reconfigura
     assert not world.nodes["a"].conditions(world.now).peers[0].legacy
 
 
-def test_a_robot_that_has_moved_over_stays_online() -> None:
+def test_an_upgraded_robot_stays_online() -> None:
     move = Move()
     move.move()
     move.world.run(60.0)
@@ -87,7 +87,7 @@ def test_a_robot_that_has_moved_over_stays_online() -> None:
     assert [(peer.online, peer.legacy) for peer in with_b] == [(True, False)]
 
 
-def test_nothing_is_taken_in_the_old_format_from_a_robot_that_has_moved_over() -> None:
+def test_legacy_datagrams_from_an_upgraded_robot_are_dropped() -> None:
     move = Move()
     move.move()
     world = move.world

@@ -29,7 +29,7 @@ def peer(world: World, name: str) -> tuple[bool, bool]:
     return found.online, found.one_way
 
 
-def test_a_peer_that_is_heard_and_does_not_hear_us_goes_offline_and_returns() -> None:
+def test_a_peer_that_cannot_hear_us_goes_offline_and_returns() -> None:
     world = met(1)
     world.pipes[("a", "b")].up = False
     world.send("a", "map", bytes(5000), "b")
@@ -61,7 +61,7 @@ def carry_broadcasts_alone(world: World, source: str, target: str) -> None:
     world.pipes[(source, target)].lost = lambda rng, now: to_one
 
 
-def test_a_peer_that_hears_our_broadcasts_alone_is_reported_as_one_that_does_not_answer() -> None:
+def test_a_peer_that_receives_only_our_broadcasts_is_reported_as_not_answering() -> None:
     world = met(5)
     (before,) = world.nodes["a"].conditions(world.now).peers
     assert before.unanswered_for_s is None
@@ -75,7 +75,7 @@ def test_a_peer_that_hears_our_broadcasts_alone_is_reported_as_one_that_does_not
     assert world.now - started - 2.0 < found.unanswered_for_s <= world.now - started + 2.0
 
 
-def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_reported_as_lost() -> None:
+def test_messages_without_an_outbox_to_a_peer_lost_for_good_end_as_peer_lost() -> None:
     world = met(2)
     world.pipes[("a", "b")].up = False
     world.send("a", "map", bytes(5000), "b")
@@ -84,7 +84,7 @@ def test_what_no_outbox_keeps_for_a_peer_that_never_hears_us_again_is_reported_a
     assert not world.events_of("a", MessageDelivered)
 
 
-def test_a_node_that_never_heard_us_is_no_peer_and_is_reported_as_unverified() -> None:
+def test_a_node_that_never_heard_us_is_reported_as_unverified_and_not_as_a_peer() -> None:
     world = World(seed=3)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
@@ -99,7 +99,7 @@ def test_a_node_that_never_heard_us_is_no_peer_and_is_reported_as_unverified() -
     assert not world.nodes["a"].conditions(world.now).strangers
 
 
-def test_losses_of_half_of_all_datagrams_take_no_peer_offline() -> None:
+def test_fifty_percent_loss_takes_no_peer_offline() -> None:
     world = met(4)
     for path in world.pipes.values():
         path.loss = 0.5

@@ -77,7 +77,7 @@ class Calls:
 @pytest.mark.parametrize(
     "topic", [LOG, Topic("log", outbox=Outbox.LAST), Topic("log", outbox=Outbox.ALL, deadline_s=900.0)]
 )
-def test_a_message_costs_the_same_however_many_are_held(topic: Topic) -> None:
+def test_the_cost_of_a_send_does_not_depend_on_outbox_size(topic: Topic) -> None:
     world = away(topic)
     send(world, "log", range(300))
     with Calls() as few:
@@ -88,7 +88,7 @@ def test_a_message_costs_the_same_however_many_are_held(topic: Topic) -> None:
     assert many.count < 1.2 * few.count
 
 
-def test_returning_messages_in_flight_to_an_outbox_costs_the_same_per_message() -> None:
+def test_returning_in_flight_messages_to_an_outbox_takes_linear_time() -> None:
     counts = []
     for messages in (500, 2000):
         world = met(LOG)
@@ -101,7 +101,7 @@ def test_returning_messages_in_flight_to_an_outbox_costs_the_same_per_message() 
     assert counts[1] < 8 * counts[0]
 
 
-def test_a_full_outbox_is_emptied_in_steps_in_order_and_once() -> None:
+def test_a_large_outbox_is_drained_in_batches_in_order_without_duplicates() -> None:
     world = away(LOG)
     send(world, "log", range(3 * RELEASE_BATCH))
     reach(world, up=True)
@@ -126,7 +126,7 @@ def test_urgent_messages_do_not_wait_for_the_outbox() -> None:
     assert len(arrived(world, "log")) < RELEASE_BATCH
 
 
-def test_what_a_second_absence_takes_back_stands_in_front_of_what_was_still_held() -> None:
+def test_messages_returned_to_the_outbox_are_sent_before_those_still_held() -> None:
     world = away(LOG)
     send(world, "log", range(3 * RELEASE_BATCH))
     reach(world, up=True)
@@ -142,9 +142,7 @@ def test_what_a_second_absence_takes_back_stands_in_front_of_what_was_still_held
 
 @pytest.mark.parametrize("deadline_s", [None, 3600.0])
 @pytest.mark.parametrize("keep_last", [None, 1])
-def test_what_has_ended_is_not_kept_in_memory_until_its_deadline(
-    deadline_s: float | None, keep_last: int | None
-) -> None:
+def test_finished_messages_are_freed_before_their_deadline(deadline_s: float | None, keep_last: int | None) -> None:
     world = met(Topic("t", deadline_s=deadline_s, keep_last=keep_last), LOG)
     payloads = [b"%d" % number * 10 for number in range(600)]
     for payload in payloads:
@@ -154,7 +152,7 @@ def test_what_has_ended_is_not_kept_in_memory_until_its_deadline(
     assert sum(sys.getrefcount(payload) > 3 for payload in payloads) < 150
 
 
-def test_what_an_outbox_no_longer_holds_is_not_kept_in_memory_until_its_deadline() -> None:
+def test_messages_dropped_from_an_outbox_are_freed_before_their_deadline() -> None:
     world = away(Topic("t", outbox=Outbox.LAST, deadline_s=3600.0))
     payloads = [b"%d" % number * 10 for number in range(600)]
     for payload in payloads:
@@ -195,7 +193,7 @@ class FailingDisk(Disk):
 
 @pytest.mark.parametrize("online", [True, False])
 @pytest.mark.parametrize("disk", [FullDisk, FailingDisk])
-def test_a_message_the_disk_had_no_room_for_ends_with_the_node(online: bool, disk: type[Disk]) -> None:
+def test_a_message_not_written_to_disk_expires_when_the_node_closes(online: bool, disk: type[Disk]) -> None:
     topic = Topic("t", outbox=Outbox.ALL, outbox_on_disk=True)
     world = met(topic, store=disk())
     reach(world, up=False)

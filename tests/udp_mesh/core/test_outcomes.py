@@ -88,7 +88,7 @@ def test_every_reliable_message_has_one_outcome_over_long_soaks(seed: int) -> No
     soak(seed, 600.0)
 
 
-def test_what_is_delivered_arrived_once_and_whole() -> None:
+def test_delivered_messages_arrive_complete_and_exactly_once() -> None:
     world = World(seed=5)
     world.add(settings("a"))
     world.add(settings("b"))
@@ -104,7 +104,7 @@ def test_what_is_delivered_arrived_once_and_whole() -> None:
     assert sorted(received) == sorted(payloads)
 
 
-def test_a_message_past_its_deadline_expires_and_says_so() -> None:
+def test_a_message_past_its_deadline_expires_with_reason_deadline() -> None:
     both = pair(Topic("t", deadline_s=0.1))
     both.a.send("t", b"late", destination="b", now=both.now)
     for _ in range(150):
@@ -144,7 +144,7 @@ def test_a_message_that_did_not_arrive_expires_soon_after_its_deadline() -> None
     assert 0.299 <= expired_at - sent_at <= 1.31
 
 
-def test_of_a_topic_that_keeps_the_last_only_the_newest_waits() -> None:
+def test_keep_last_1_queues_only_the_newest_message() -> None:
     both = pair(Topic("pose", keep_last=1))
     ids = [both.a.send("pose", bytes([number]), destination="b", now=both.now) for number in range(5)]
     both.roundtrip(times=10)
@@ -155,7 +155,7 @@ def test_of_a_topic_that_keeps_the_last_only_the_newest_waits() -> None:
     assert [end.message_id for end in ends] == ids
 
 
-def test_a_peer_that_stays_silent_is_lost_and_its_messages_with_it() -> None:
+def test_messages_to_a_peer_that_stays_silent_end_as_peer_lost() -> None:
     world = World()
     world.add(settings("a", rates=QUICK))
     world.add(settings("b", rates=QUICK))
@@ -169,7 +169,7 @@ def test_a_peer_that_stays_silent_is_lost_and_its_messages_with_it() -> None:
     assert not outcomes(world, "a") - Counter({(1, "b"): 1})
 
 
-def test_a_receiver_that_restarts_in_the_middle_gets_the_whole_message_in_its_new_run() -> None:
+def test_a_receiver_restarted_mid_transfer_gets_the_whole_message() -> None:
     world = World()
     for name in ("a", "b"):
         world.add(settings(name))
@@ -186,7 +186,7 @@ def test_a_receiver_that_restarts_in_the_middle_gets_the_whole_message_in_its_ne
 
 
 @pytest.mark.parametrize("type_name", ["a\nb", "\x1b[2J", "\ud800", "x" * 256])
-def test_a_type_that_no_receiver_takes_is_refused_and_holds_up_nothing(type_name: str) -> None:
+def test_an_invalid_type_name_is_rejected_without_blocking_later_messages(type_name: str) -> None:
     two = pair(Topic("status", priority=0))
     assert isinstance(two.a.send("status", b"x", destination="b", type_name=type_name, now=two.now), Rejected)
     assert not isinstance(two.a.send("status", b"after", destination="b", now=two.now), Rejected)

@@ -86,7 +86,7 @@ def test_a_refused_fragment_leaves_nothing_behind_and_is_taken_when_there_is_roo
     assert reassembly.add(other, 0.0) is FragmentStatus.KEPT
 
 
-def test_a_best_effort_message_that_stops_is_purged_by_its_own_age() -> None:
+def test_an_incomplete_best_effort_message_is_purged_by_its_own_age() -> None:
     reassembly = Reassembly(Limits())
     head = MessageHead(100, 2, 0, 3, 0)
     reassembly.add(Fragment(1, 0, bytes(50), head), 0.0)
@@ -105,7 +105,7 @@ MARK = SendSnapshot(0.0, 0, 0.0, 0.0, False)
         st.tuples(st.sampled_from(["send", "skip", "arrive", "ack", "give up"]), st.integers(0, 400)), max_size=120
     )
 )
-def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[tuple[str, int]]) -> None:
+def test_packet_outcomes_match_a_simple_model(plan: list[tuple[str, int]]) -> None:
     in_flight, state = SentPackets(), AckState()
     sent: dict[int, Packet] = {}
     ended: dict[int, str] = {}
@@ -145,7 +145,7 @@ def test_every_packet_is_acknowledged_or_lost_as_a_plain_model_says(plan: list[t
 URGENT = SendSnapshot(0.0, 0, 0.0, 0.0, False, urgent=True)
 
 
-def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() -> None:
+def test_urgent_packets_overtaking_bulk_do_not_indicate_loss() -> None:
     in_flight = SentPackets()
     bulk = [Packet(MARK, outgoing(1, 1), 0), Packet(MARK, outgoing(1, 1), 1)]
     for number in range(2):
@@ -161,14 +161,14 @@ def test_urgent_packets_that_overtake_others_in_the_radio_are_no_sign_of_loss() 
     assert in_flight.acknowledge(11, 0b1111111111)[1] == bulk
 
 
-def test_a_lost_urgent_packet_is_noticed_by_the_urgent_ones_behind_it() -> None:
+def test_a_lost_urgent_packet_is_detected_from_later_urgent_packets() -> None:
     in_flight = SentPackets()
     for number in range(5):
         in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
     assert [packet.position for packet in in_flight.acknowledge(4, 0b1111)[1]] == [0]
 
 
-def test_urgent_packets_that_timed_out_count_as_lost_once_an_acknowledgement_says_so() -> None:
+def test_timed_out_urgent_packets_count_as_lost_once_an_acknowledgement_confirms_it() -> None:
     in_flight = SentPackets()
     for number in range(8):
         in_flight.add(number, Packet(URGENT, outgoing(1, 1), number))
@@ -183,7 +183,7 @@ def received(state: AckState, number: int) -> bool:
     return behind >= 0 and bool(state.received >> behind & 1)
 
 
-def test_an_acknowledgement_of_what_was_never_sent_says_nothing() -> None:
+def test_an_acknowledgement_of_unsent_packets_is_ignored() -> None:
     in_flight = SentPackets()
     in_flight.add(0, Packet(MARK, outgoing(1, 1), 0))
     assert in_flight.acknowledge(7, 0xFF) == ([], [], None)
@@ -209,7 +209,7 @@ def test_anything_that_is_not_zlib_is_refused(body: bytes) -> None:
     assert result is None or zlib.compress(result)
 
 
-def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -> None:
+def test_pacing_debt_from_a_slow_path_is_bounded_on_a_fast_one() -> None:
     pacer, now = Pacer(0.003), 10.0
     # Ten bursts to an unresponsive peer, when a packet took ten seconds.
     for _ in range(10):
@@ -222,7 +222,7 @@ def test_what_left_at_the_pace_of_a_slow_path_holds_nothing_up_on_a_fast_one() -
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.5), st.integers(1, 3000)), max_size=50))
-def test_a_bucket_lets_no_more_through_than_its_rate_and_burst(visits: list[tuple[float, int]]) -> None:
+def test_a_token_bucket_never_exceeds_its_rate_and_burst(visits: list[tuple[float, int]]) -> None:
     bucket, now, spent = TokenBucket(10_000, 0.0), 0.0, 0
     for wait, size in visits:
         now += wait

@@ -10,14 +10,14 @@ from udp_mesh.core.settings import Rates, Topic
 from udp_mesh.wire.frames import Waiting
 
 
-def test_levels_less_urgent_than_the_one_waiting_elsewhere_hold_back_for_a_while() -> None:
+def test_lower_priority_levels_back_off_briefly_for_a_level_waiting_at_another_node() -> None:
     priority_backoff = PriorityBackoff(Rates(), 0.0)
     priority_backoff.on_waiting((Waiting(2, 50),), 1.0)
     assert priority_backoff.allowed_levels(1.05) == 0b111
     assert priority_backoff.allowed_levels(1.2) == ALL_LEVELS
 
 
-def test_bulk_waiting_elsewhere_holds_no_node_back() -> None:
+def test_bulk_waiting_at_another_node_causes_no_backoff() -> None:
     priority_backoff = PriorityBackoff(Rates(), 0.0)
     priority_backoff.on_waiting((Waiting(9, 60_000),), 1.0)
     assert priority_backoff.allowed_levels(1.0) == ALL_LEVELS
@@ -33,7 +33,7 @@ def test_no_level_is_held_back_for_more_than_its_share_of_the_time(reports: list
     assert priority_backoff.held_total_s <= rates.yield_share * (now + BUDGET_S) + 1e-6
 
 
-def test_a_node_whose_urgent_messages_wait_is_given_way_by_another_ones_bulk() -> None:
+def test_bulk_backs_off_while_another_node_has_urgent_messages_waiting() -> None:
     world = World(seed=6)
     topics = (Topic("stop", priority=0), Topic("bulk", priority=9))
     for name in ("a", "b", "c"):

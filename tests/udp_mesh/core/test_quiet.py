@@ -30,7 +30,7 @@ class Watched(World):
         assert not node.has_datagrams
 
 
-def test_a_quiet_node_misses_nothing_when_it_is_left_alone() -> None:
+def test_skipping_a_quiet_node_misses_nothing() -> None:
     world = Watched(seed=3)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))
@@ -48,7 +48,7 @@ def test_a_quiet_node_misses_nothing_when_it_is_left_alone() -> None:
     assert world.quiet > 0.2 * world.looks
 
 
-def test_taking_in_a_bulk_calls_for_hardly_more_timers_than_lying_idle() -> None:
+def test_receiving_bulk_needs_few_more_timers_than_idling() -> None:
     """Each wake-up costs ten times what a datagram costs: acknowledgements already sent need no timer."""
     world = World(seed=5)
     for name in ("a", "b"):

@@ -80,7 +80,7 @@ def test_a_lost_command_is_not_delivered_late(topic: Topic) -> None:
     assert both.b.conditions(both.now).peers[0].address == A
 
 
-def test_a_lost_command_is_not_delivered_late_where_nothing_has_come_since() -> None:
+def test_a_lost_command_is_rejected_when_replayed_with_no_traffic_since() -> None:
     both = acquainted(BEST)
     recorded = overheard(both, "pose", b"old")
     for _ in range(90):
@@ -93,7 +93,7 @@ def test_a_lost_command_is_not_delivered_late_where_nothing_has_come_since() -> 
 
 
 @pytest.mark.parametrize("held_s", [0.8, 4.0])
-def test_what_a_slow_route_or_a_short_cut_holds_back_arrives(held_s: float) -> None:
+def test_datagrams_delayed_by_a_slow_route_or_short_outage_are_accepted(held_s: float) -> None:
     both = acquainted(BEST)
     held = overheard(both, "pose", b"slow")
     both.roundtrip(times=int(held_s / 0.1), step_s=0.1)
@@ -102,7 +102,7 @@ def test_what_a_slow_route_or_a_short_cut_holds_back_arrives(held_s: float) -> N
     assert payloads(both) == [b"slow"]
 
 
-def test_a_message_whose_life_is_over_is_not_put_together() -> None:
+def test_an_expired_message_is_not_reassembled() -> None:
     """Its last fragment was lost and recorded; its sender knows that the message expired."""
     both = acquainted(Topic("plan", priority=6, deadline_s=1.0))
     both.a.send("plan", bytes(5000), destination="b", now=both.now)
@@ -117,7 +117,7 @@ def test_a_message_whose_life_is_over_is_not_put_together() -> None:
     assert payloads(both) == []
 
 
-def test_messages_outlive_cuts_of_several_seconds_and_routes_that_become_slow() -> None:
+def test_messages_survive_outages_of_several_seconds_and_slowed_routes() -> None:
     world = World(seed=3)
     for name in "ab":
         world.add(settings(name, Topic("map", priority=7)))
@@ -152,7 +152,7 @@ def silent_world() -> tuple[World, list[Datagram]]:
 
 
 @pytest.mark.parametrize("with_timestamp", [True, False])
-def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_replayed_hello_brings_no_peer_online(with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not with_timestamp:
         without_dates(monkeypatch)
     world, recorded = silent_world()
@@ -166,7 +166,7 @@ def test_an_old_hello_raises_no_peer(with_timestamp: bool, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("with_timestamp", [True, False])
-def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
+def test_a_returning_peer_is_online_within_a_round_trip_of_its_hello(
     with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not with_timestamp:
@@ -185,7 +185,7 @@ def test_a_peer_that_was_away_comes_back_within_a_round_trip_of_its_hello(
     assert world.now - heard[0] < 0.010 + 0.020 + 0.005
 
 
-def test_a_peer_whose_computer_slept_is_believed_again_within_a_second() -> None:
+def test_a_peer_whose_computer_slept_is_accepted_again_within_a_second() -> None:
     """Its clock stood still: its timestamps are an hour old until it answers a challenge."""
     world = World(seed=5)
     for name in "ab":
@@ -212,7 +212,9 @@ def roaming(seed: int, loss: float) -> World:
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("with_timestamp", [True, False])
-def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replayed_datagrams_do_not_change_the_peer_address(
+    seed: int, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An attacker that replays recorded datagrams from its own address wins the race if the original is lost."""
     if not with_timestamp:
         without_dates(monkeypatch)
@@ -236,7 +238,7 @@ def test_resent_datagrams_move_no_path(seed: int, with_timestamp: bool, monkeypa
     assert len(world.events_of("b", MessageReceived)) > 100
 
 
-def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> None:
+def test_an_address_change_is_detected_within_a_few_heartbeats() -> None:
     world = roaming(1, 0.0)
     moves: list[float] = []
     world.addresses["b"] = ("10.0.0.99", 8700)
@@ -249,7 +251,7 @@ def test_a_robot_that_moved_is_followed_a_round_trip_after_it_was_missed() -> No
     assert world.run(1.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
 
 
-def test_two_peers_whose_tags_collide_are_both_heard() -> None:
+def test_messages_from_two_peers_with_colliding_tags_are_received() -> None:
     world = World(seed=4)
     base = world.add(settings("base"))
     rng = random.Random(8)
@@ -288,7 +290,7 @@ def test_two_peers_whose_tags_collide_are_both_heard() -> None:
     assert (heard.count("one"), heard.count("two")) == (40, 40)
 
 
-def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_name() -> None:
+def test_packet_numbers_are_never_reused_between_a_pair_of_boots() -> None:
     world = World(seed=6)
     world.add(settings("base"))
     first = world.add(settings("r"))
@@ -328,7 +330,7 @@ def test_no_number_is_used_twice_for_a_pair_of_boots_however_many_runs_took_the_
 
 @pytest.mark.parametrize("away_s", [15.0, 200.0])
 @pytest.mark.parametrize("with_timestamp", [True, False])
-def test_a_robot_replaced_for_a_while_is_believed_again(
+def test_a_temporarily_replaced_robot_is_accepted_again(
     away_s: float, with_timestamp: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not with_timestamp:
@@ -361,7 +363,7 @@ def test_a_robot_replaced_for_a_while_is_believed_again(
     assert world.run(10.0, until=lambda: bool(world.events_of("base", MessageDelivered)))
 
 
-def test_keys_rotated_away_and_back_open_no_recording_again() -> None:
+def test_replays_stay_rejected_after_rotating_keys_away_and_back() -> None:
     other = Key(bytes(range(1, 33)))
     both = acquainted()
     recorded: list[Datagram] = []
@@ -387,7 +389,7 @@ def test_keys_rotated_away_and_back_open_no_recording_again() -> None:
     assert payloads(both) == [b"new"]
 
 
-def test_a_clock_that_wraps_or_drifts_makes_nothing_old() -> None:
+def test_clock_wraparound_and_drift_do_not_make_datagrams_stale() -> None:
     freshness = Freshness()
     for minute in range(60 * 24 * 60):
         now = minute * 60.0
@@ -396,7 +398,7 @@ def test_a_clock_that_wraps_or_drifts_makes_nothing_old() -> None:
     assert freshness.lateness_s(clock_ms(theirs), now + 2 * ACCEPT_AGE_S) > ACCEPT_AGE_S
 
 
-def test_an_empty_datagram_of_a_key_holder_is_malformed() -> None:
+def test_an_authenticated_empty_datagram_is_malformed() -> None:
     both = acquainted()
     session = both.a._state.peer_table.peers["b"].session
     assert session is not None

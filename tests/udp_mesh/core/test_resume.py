@@ -33,7 +33,7 @@ def heal(world: World) -> None:
 
 @examples(max_examples=15)
 @given(st.integers(1, 60_000), st.floats(0.0, 0.08))
-def test_a_cut_at_any_moment_delivers_a_message_once(size_bytes: int, after_s: float) -> None:
+def test_an_outage_at_any_moment_still_delivers_a_message_once(size_bytes: int, after_s: float) -> None:
     world = met(ART)
     world.send("a", "art", bytes(size_bytes), "b")
     world.run(after_s)
@@ -49,7 +49,7 @@ def test_a_cut_at_any_moment_delivers_a_message_once(size_bytes: int, after_s: f
     assert len(world.events_of("b", MessageReceived)) == 1
 
 
-def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
+def test_received_fragments_of_a_large_message_are_not_resent() -> None:
     world = met(ART)
     world.send("a", "art", bytes(2_000_000), "b")
     world.run(1.0)
@@ -62,7 +62,7 @@ def test_what_had_arrived_of_a_large_message_is_not_sent_again() -> None:
     )  # with the probes of ten seconds; all of it again would be 3.2 MB
 
 
-def test_one_that_had_left_whole_arrives_once_although_the_link_became_narrower() -> None:
+def test_a_fully_sent_message_arrives_once_after_the_link_mtu_shrinks() -> None:
     world = met(ART)
     cut(world, ("b", "a"))
     world.send("a", "art", bytes(4_000), "b")
@@ -103,7 +103,7 @@ def test_a_peer_that_lost_its_fragments_meanwhile_gets_the_message_again() -> No
     assert len(world.events_of("b", MessageReceived)) == 1
 
 
-def test_a_message_that_expires_in_the_outbox_frees_what_the_peer_had_of_it() -> None:
+def test_a_message_expired_in_the_outbox_frees_its_fragments_at_the_peer() -> None:
     world = met(Topic("art", outbox=Outbox.ALL, deadline_s=40.0), limits=Limits())
     world.send("a", "art", bytes(500_000), "b")
     world.run(0.2)

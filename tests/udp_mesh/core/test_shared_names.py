@@ -49,7 +49,7 @@ def exchange(world: World, name: str) -> None:
         assert len(world.events_of(who, MessageDelivered)) == ended[who] + 1
 
 
-def test_each_of_them_is_reported_as_long_as_it_lasts_and_once_a_minute_whatever_boots_are_invented() -> None:
+def test_a_lasting_name_conflict_is_reported_once_a_minute_despite_new_boot_ids() -> None:
     world = conflict()
     for number in range(20):
         again = Endpoint(settings("a", MAP), boot_id=world.rng.randbytes(16), rng=world.rng, now=world.now)
@@ -65,7 +65,7 @@ def test_each_of_them_is_reported_as_long_as_it_lasts_and_once_a_minute_whatever
 
 @pytest.mark.parametrize("how", ["says good-bye", "is killed"])
 @pytest.mark.parametrize("meanwhile_s", [1.0, 100.0])
-def test_when_one_of_them_goes_the_other_is_served_again(how: str, meanwhile_s: float) -> None:
+def test_when_one_node_leaves_the_other_is_served_again(how: str, meanwhile_s: float) -> None:
     world = conflict()
     world.run(meanwhile_s)
     if how == "says good-bye":
@@ -79,7 +79,7 @@ def test_when_one_of_them_goes_the_other_is_served_again(how: str, meanwhile_s: 
     assert world.run(10.0, until=lambda: all(peer.online for peer in world.nodes["a"].conditions(world.now).peers))
 
 
-def test_the_first_one_is_served_again_although_it_was_silent_for_long() -> None:
+def test_the_first_node_is_served_again_after_a_long_silence() -> None:
     world = conflict()
     world.run(5.0)
     first = world.nodes.pop("a")
@@ -91,14 +91,14 @@ def test_the_first_one_is_served_again_although_it_was_silent_for_long() -> None
     exchange(world, "a")
 
 
-def test_what_the_one_not_served_sends_ends_too() -> None:
+def test_messages_from_the_unserved_node_end_as_peer_lost() -> None:
     world = conflict()
     world.send("a", "map", bytes(20_000), "c")
     assert world.run(15.0, until=lambda: bool(world.events_of("a", PeerOffline)))
     assert world.run(60.0, until=lambda: bool(world.events_of("a", MessagePeerLost)))
 
 
-def test_what_waited_for_the_name_goes_to_who_is_there() -> None:
+def test_messages_queued_for_a_shared_name_go_to_the_remaining_node() -> None:
     world = conflict()
     del world.nodes["a2"]
     world.send("c", "map", bytes(20_000), "a")

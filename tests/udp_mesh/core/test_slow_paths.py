@@ -63,7 +63,7 @@ def test_urgent_messages_stay_urgent_on_a_path_that_became_slow(
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("loss", [0.0, 0.1])
-def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_back(seed: int, loss: float) -> None:
+def test_in_flight_packets_on_a_path_that_became_slow_do_not_block_urgent_messages(seed: int, loss: float) -> None:
     """Hundreds of packets may be in the path's queue, or lost without notice: urgent ones join them."""
     world = World(seed=seed)
     for name in "ab":
@@ -84,7 +84,7 @@ def test_what_is_on_its_way_on_a_path_that_became_slow_holds_no_urgent_message_b
         assert not waiting or sender.state is SendState.UNRESPONSIVE
 
 
-def test_what_a_silent_and_then_slow_peer_was_sent_holds_nothing_up_when_its_path_is_well_again() -> None:
+def test_pacing_debt_from_a_slow_path_does_not_delay_messages_after_recovery() -> None:
     """Probes and bursts are sent ahead of the pace; that debt once blocked for a minute at the pace of a slow path."""
     world = World(seed=1)
     for name in "ab":

@@ -29,7 +29,7 @@ def delivered_once(world: World, within_s: float) -> None:
 @pytest.mark.parametrize("stopped_s", [2.0, 20.0, 120.0, 1000.0])
 @pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_team_that_stood_still_goes_on_where_it_was(stopped_s: float, lost: bool, seed: int) -> None:
+def test_a_suspended_team_resumes_its_transfer(stopped_s: float, lost: bool, seed: int) -> None:
     world = met(seed)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)
@@ -61,7 +61,7 @@ def test_a_suspended_sender_declares_no_peer_lost(stopped_s: float) -> None:
 
 
 @pytest.mark.parametrize("stopped_s", [5.0, 45.0])
-def test_a_stopped_receiver_gets_the_message_when_it_goes_on(stopped_s: float) -> None:
+def test_a_suspended_receiver_gets_the_message_after_resuming(stopped_s: float) -> None:
     world = met(4)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     world.run(0.3)
@@ -71,7 +71,7 @@ def test_a_stopped_receiver_gets_the_message_when_it_goes_on(stopped_s: float) -
     assert bool(world.events_of("a", PeerOffline)) == (stopped_s > 10)
 
 
-def test_a_peer_that_is_silent_afterwards_is_lost_all_the_same() -> None:
+def test_a_peer_silent_after_a_suspension_is_still_declared_lost() -> None:
     world = met(5)
     world.send("a", "map", bytes(MAP_BYTES), "b")
     del world.nodes["b"]

@@ -34,7 +34,7 @@ def open_datagram(channel: ReceiveChannel, data: bytes) -> bytes:
 
 
 @given(st.binary(max_size=100), st.booleans())
-def test_what_is_sealed_opens(frames: bytes, long: bool) -> None:
+def test_sealed_datagrams_can_be_opened(frames: bytes, long: bool) -> None:
     sender, receiver = SendChannel(KEY, ALICE, BOB), ReceiveChannel(KEY, ALICE, BOB)
     number, data = sender.seal_long(frames) if long else sender.seal(frames)
     assert number == 0
@@ -43,7 +43,7 @@ def test_what_is_sealed_opens(frames: bytes, long: bool) -> None:
 
 
 @given(st.booleans(), st.data())
-def test_a_changed_byte_opens_nowhere(long: bool, data: st.DataObject) -> None:
+def test_a_modified_datagram_is_rejected(long: bool, data: st.DataObject) -> None:
     sender = SendChannel(KEY, ALICE, BOB)
     raw = bytearray(sender.seal_long(b"frames")[1] if long else sender.seal(b"frames")[1])
     place = data.draw(st.integers(1, len(raw) - 1))
@@ -74,7 +74,7 @@ def test_a_datagram_opens_only_in_its_own_channel(key: Key, sender: bytes, recei
         channel.open(data, header.number_low)
 
 
-def test_broadcasts_and_unicasts_have_kinds_of_their_own() -> None:
+def test_broadcasts_and_unicasts_use_distinct_kinds() -> None:
     to_all, to_bob = SendChannel(KEY, ALICE), SendChannel(KEY, ALICE, BOB)
     kinds = [parse_header(data).kind for _, data in (to_all.seal_long(b"x"), to_all.seal(b"x"))]
     assert kinds == [Kind.HELLO, Kind.BROADCAST]
@@ -108,7 +108,7 @@ def test_the_same_frames_never_give_the_same_bytes_not_even_after_a_restart() ->
     assert len(set(sealed)) == len(sealed)
 
 
-def test_packet_numbers_end_rather_than_repeat() -> None:
+def test_packet_number_exhaustion_raises_instead_of_wrapping() -> None:
     sender = SendChannel(KEY, ALICE, BOB)
     sender.next_number = MAX_PACKET_NUMBER
     sender.seal(b"last")
@@ -117,13 +117,13 @@ def test_packet_numbers_end_rather_than_repeat() -> None:
 
 
 @given(st.integers(-1, 1 << 47), st.integers(-(1 << 30), 1 << 30))
-def test_a_number_near_the_expected_one_is_recovered_from_its_low_half(largest: int, offset: int) -> None:
+def test_a_packet_number_is_expanded_from_its_low_half(largest: int, offset: int) -> None:
     number = largest + 1 + offset
     if number >= 0:
         assert expand_number(number & 0xFFFFFFFF, largest) == number
 
 
-def test_numbers_beyond_the_low_half_open() -> None:
+def test_packet_numbers_beyond_32_bits_are_accepted() -> None:
     sender, receiver = SendChannel(KEY, ALICE, BOB), ReceiveChannel(KEY, ALICE, BOB)
     for start in (0, 1 << 31, (1 << 32) - 1, (1 << 32) + 5):
         sender.next_number = start
@@ -133,7 +133,7 @@ def test_numbers_beyond_the_low_half_open() -> None:
         assert receiver.open(data, header.number_low)[0] == number
 
 
-def test_a_keyring_opens_with_both_live_keys_and_names_an_unknown_one() -> None:
+def test_a_keyring_finds_live_keys_and_reports_an_unknown_one() -> None:
     old, new, foreign = KEY, Key(bytes(32)), Key(b"f" * 32)
     ring = Keyring((new, old))
     assert ring.sealing is new

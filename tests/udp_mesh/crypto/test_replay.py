@@ -25,7 +25,7 @@ def test_the_window_equals_a_plain_set(start: int, steps: list[int], floor: int)
         seen.add(number)
 
 
-def test_a_long_random_walk_never_accepts_twice() -> None:
+def test_no_number_is_accepted_twice_in_a_long_random_walk() -> None:
     source, window, accepted, number = random.Random(4), ReplayWindow(), set[int](), 0
     for _ in range(20_000):
         number = max(0, number + source.choice((1, 1, 1, 2, 70, -3, -64, -200, 300)))

@@ -80,7 +80,7 @@ async def read(program: socket.socket, wanted: Callable[[list[Header]], bool]) -
     return found
 
 
-def test_the_largest_message_reaches_a_program_that_has_read_everything() -> None:
+def test_the_largest_message_reaches_a_client_without_backlog() -> None:
     async def work(server: LocalServer, path: Path) -> None:
         (program,) = await connected(server, path, 1)
         (client,) = server.clients
@@ -93,7 +93,7 @@ def test_the_largest_message_reaches_a_program_that_has_read_everything() -> Non
     serve(work)
 
 
-def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_one_that_does(
+def test_the_total_backlog_of_slow_clients_is_bounded_without_affecting_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(api, "MAX_TOTAL_BACKLOG_BYTES", 10_000_000)
@@ -121,7 +121,7 @@ def test_programs_that_do_not_read_hold_little_together_and_take_nothing_from_on
     serve(work)
 
 
-def test_programs_that_send_half_of_their_requests_hold_little_together_and_take_nothing_from_one_that_sends_all(
+def test_partial_requests_are_bounded_in_total_without_affecting_other_clients(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(api, "MAX_PARTIAL_REQUEST_BYTES", 4_000_000)
@@ -158,7 +158,7 @@ def test_programs_that_send_half_of_their_requests_hold_little_together_and_take
     serve(work)
 
 
-def test_one_program_too_many_gets_the_reason() -> None:
+def test_a_client_beyond_the_limit_is_rejected_with_a_reason() -> None:
     async def work(server: LocalServer, path: Path) -> None:
         programs = await connected(server, path, api.MAX_CLIENTS)
 

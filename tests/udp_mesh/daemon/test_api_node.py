@@ -46,7 +46,7 @@ def run(body: Callable[[Node, Node], Coroutine[Any, Any, None]]) -> None:
     asyncio.run(main())
 
 
-def test_a_message_is_delivered_and_its_sender_waits_for_that() -> None:
+def test_deliver_waits_for_the_outcome_of_a_message() -> None:
     async def body(alice: Node, bob: Node) -> None:
         payload = bytes(3_000_000)
         outcome = await alice.deliver("map", payload, to="bob", type_name="bytes")
@@ -58,7 +58,7 @@ def test_a_message_is_delivered_and_its_sender_waits_for_that() -> None:
     run(body)
 
 
-def test_a_message_to_all_reaches_the_peer() -> None:
+def test_a_broadcast_reaches_the_peer() -> None:
     async def body(alice: Node, bob: Node) -> None:
         await alice.send("status", b"to all")
         message = await anext(bob.messages())
@@ -90,7 +90,7 @@ def test_leaving_is_reported_at_once_and_a_message_to_a_peer_that_left_expires()
     run(body)
 
 
-def test_settings_change_while_it_runs() -> None:
+def test_settings_can_be_changed_at_run_time() -> None:
     async def body(alice: Node, bob: Node) -> None:
         settings = alice.driver.node.settings
         assert alice.apply(replace(settings, topics=(*settings.topics, Topic("extra", priority=1))))
@@ -104,7 +104,7 @@ def test_settings_change_while_it_runs() -> None:
     run(body)
 
 
-def test_a_node_outside_its_block_says_so() -> None:
+def test_a_node_used_outside_its_context_raises_runtime_error() -> None:
     node = make("alice", 1, 2, 9)
     with pytest.raises(RuntimeError, match="async with"):
         node.conditions()

@@ -38,7 +38,9 @@ def alice() -> Iterator[RunningDaemon]:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "directory", "socket", "device", "link to a pipe"])
-def test_a_key_file_that_is_none_is_refused_at_once(alice: RunningDaemon, kind: str, tmp_path: Path) -> None:
+def test_a_key_file_that_is_not_a_regular_file_is_rejected_immediately(
+    alice: RunningDaemon, kind: str, tmp_path: Path
+) -> None:
     path = tmp_path / "fleet.key"
     if kind == "directory":
         path.mkdir()
@@ -59,14 +61,14 @@ def test_a_key_file_that_is_none_is_refused_at_once(alice: RunningDaemon, kind: 
         assert client.request("status")["ok"]
 
 
-def test_a_file_behind_a_link_is_read(tmp_path: Path) -> None:
+def test_a_file_is_read_through_a_symlink(tmp_path: Path) -> None:
     (tmp_path / "real").write_bytes(b"x" * 10)
     (tmp_path / "link").symlink_to(tmp_path / "real")
     assert read_regular(tmp_path / "link", 5) == b"x" * 6
 
 
 @pytest.mark.parametrize(("text", "found"), [("00" * 32, "only zeros"), (f"{KEY}\n{KEY}", "the same key twice")])
-def test_keys_that_protect_nothing_are_refused(tmp_path: Path, text: str, found: str) -> None:
+def test_all_zero_and_duplicate_keys_are_rejected(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "fleet.key"
     path.write_text(text)
     with pytest.raises(ConfigurationError, match=found):
@@ -88,20 +90,20 @@ def test_a_world_readable_key_file_is_reported(tmp_path: Path, caplog: pytest.Lo
     assert not caplog.text
 
 
-def test_brackets_without_end_are_a_problem_and_no_traceback() -> None:
+def test_deeply_nested_brackets_are_a_configuration_error() -> None:
     with pytest.raises(ConfigurationError, match="brackets"):
         parse("a = " + "[" * 20_000 + "]" * 20_000, "udp-mesh.toml")
 
 
 @pytest.mark.parametrize("odd", ["NaN", "Infinity", "-Infinity", "1e999", "true", "[1]"])
-def test_an_id_that_json_cannot_send_back_is_refused(odd: str) -> None:
+def test_an_invalid_request_id_is_rejected(odd: str) -> None:
     head = b'{"op": "status", "id": ' + odd.encode() + b"}"
     (found,) = RequestReader(lambda: 100).feed(len(head).to_bytes(4, "big") + bytes(4) + head)
     assert isinstance(found, BadFrame)
     assert found.request_id is None
 
 
-def test_a_long_number_is_an_id_like_any_other() -> None:
+def test_a_very_large_integer_is_a_valid_request_id() -> None:
     frame = encode_frame({"op": "status", "id": 10**400}, b"")
     (found,) = RequestReader(lambda: 100).feed(frame)
     assert not isinstance(found, BadFrame)
@@ -155,9 +157,7 @@ def test_metrics_are_served_despite_idle_connections(alice: RunningDaemon) -> No
             one.close()
 
 
-def test_neighbours_topics_and_patterns_are_so_many_and_no_more(
-    alice: RunningDaemon, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_neighbors_and_subscription_patterns_are_limited(alice: RunningDaemon, monkeypatch: pytest.MonkeyPatch) -> None:
     with alice.client() as client:
         with pytest.raises(MeshError, match="at most 1024 patterns"):
             client.request("subscribe", topics=[f"p{number}" for number in range(2000)])
@@ -172,7 +172,7 @@ def test_neighbours_topics_and_patterns_are_so_many_and_no_more(
         client.request("reload")
 
 
-def test_other_users_record_below_the_state_directory_only(tmp_path: Path) -> None:
+def test_paths_outside_the_state_directory_are_detected(tmp_path: Path) -> None:
     state, outside = tmp_path / "state", tmp_path / "outside"
     (state / "runs").mkdir(parents=True)
     outside.mkdir()
@@ -183,7 +183,7 @@ def test_other_users_record_below_the_state_directory_only(tmp_path: Path) -> No
         assert not is_below(path, state)
 
 
-def test_a_request_that_stops_coming_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_incomplete_request_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api, "PARTIAL_REQUEST_TIMEOUT_S", 0.05)
 
     class Handler:
@@ -230,7 +230,7 @@ except MeshError as error:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to act as another user")
-def test_another_user_makes_the_daemon_record_below_its_state_directory_only() -> None:
+def test_another_user_can_record_only_inside_the_state_directory() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder = Path(path)
         folder.chmod(0o755)

@@ -90,7 +90,7 @@ def problems(folder: Path, text: str) -> list[str]:
     return [str(problem).removeprefix(str(folder) + "/") for problem in caught.value.problems]
 
 
-def test_every_part_of_the_file_arrives(tmp_path: Path) -> None:
+def test_every_setting_in_the_file_is_loaded(tmp_path: Path) -> None:
     configuration = load(write(tmp_path, FULL))
     settings = configuration.settings
     assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("ugv1", 8701, 3, 1200)
@@ -121,7 +121,7 @@ def test_every_part_of_the_file_arrives(tmp_path: Path) -> None:
     assert configuration.daemon.metrics_address == ("127.0.0.1", 9871)
 
 
-def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
+def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
     configuration = load(write(tmp_path, 'key_file = "fleet.key"\n'))
     assert isinstance(configuration, Configuration)
     assert configuration.links == EVERY_INTERFACE
@@ -252,29 +252,31 @@ def test_a_key_file_is_all_that_is_needed(tmp_path: Path) -> None:
         ("unkeyed = true", "udp-mesh.toml:2: unkeyed: expected either key_file or unkeyed, found both"),
     ],
 )
-def test_a_mistake_is_named_by_file_line_expectation_and_finding(tmp_path: Path, text: str, expected: str) -> None:
+def test_a_mistake_is_reported_with_file_line_expected_and_found_value(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     assert problems(tmp_path, f'key_file = "fleet.key"\n{text}\n') == [expected]
 
 
-def test_every_mistake_is_named_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_are_reported_at_once(tmp_path: Path) -> None:
     found = problems(tmp_path, 'key_file = "fleet.key"\nport = 0\n[topics]\na = { priority = 99 }\nb = { x = 1 }\n')
     assert [problem.split(":")[1] for problem in found] == ["2", "4", "5"]
 
 
-def test_a_missing_key_is_named_with_the_way_out(tmp_path: Path) -> None:
+def test_a_missing_key_error_suggests_the_unkeyed_option(tmp_path: Path) -> None:
     assert problems(tmp_path, 'name = "a"\n') == [
         "udp-mesh.toml:1: key_file: expected a file with the fleet's key, found none "
         "(set unkeyed = true to run without protection)"
     ]
 
 
-def test_a_missing_key_file_is_named_at_the_line_that_names_it(tmp_path: Path) -> None:
+def test_a_missing_key_file_is_reported_at_the_line_that_references_it(tmp_path: Path) -> None:
     (problem,) = problems(tmp_path, 'name = "a"\nkey_file = "other.key"\n')
     assert problem.startswith("udp-mesh.toml:2: key_file: expected a readable file, found ")
     assert problem.endswith("other.key: No such file or directory")
 
 
-def test_a_bad_key_is_named_by_its_line_and_never_shown(tmp_path: Path) -> None:
+def test_an_invalid_key_is_reported_by_line_and_never_shown(tmp_path: Path) -> None:
     path = tmp_path / "fleet.key"
     path.write_text(f"# the fleet's keys\n{KEY.secret.hex()}\nsecretsecret\n")
     with pytest.raises(ConfigurationError) as caught:
@@ -291,7 +293,7 @@ def test_a_key_file_holds_one_or_two_keys(tmp_path: Path, count: int) -> None:
         read_keys(path)
 
 
-def test_a_configuration_that_cannot_be_read_is_one_problem(tmp_path: Path) -> None:
+def test_an_unreadable_configuration_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"missing\.toml: expected a readable file"):
         load(tmp_path / "missing.toml")
     with pytest.raises(ConfigurationError, match=r"^[^:]*: expected a readable file, found Is a directory$"):
@@ -311,12 +313,12 @@ def test_a_command_changes_only_the_fields_it_names() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "~mesh/ping", "x" * 256])
-def test_a_topic_name_that_cannot_travel_is_refused(name: str) -> None:
+def test_an_invalid_topic_name_is_rejected(name: str) -> None:
     with pytest.raises(ConfigurationError):
         topic_from_values(name, {}, None)
 
 
-def test_lines_are_found_behind_strings_comments_and_brackets_that_look_like_keys() -> None:
+def test_keys_are_located_by_line_despite_strings_comments_and_brackets() -> None:
     text = "\n".join(
         [
             'a = """',

@@ -50,7 +50,7 @@ def test_messages_arrive_as_they_were_sent_and_their_outcome_is_reported(pair: P
     assert ends == dict.fromkeys(numbers, "delivered")
 
 
-def test_a_program_of_its_own_with_the_client_copied_alone_talks_both_ways(pair: Pair, tmp_path: Path) -> None:
+def test_a_standalone_copy_of_the_client_module_sends_and_receives(pair: Pair, tmp_path: Path) -> None:
     alice, bob = pair
     shutil.copy(mesh_client.__file__, tmp_path / "mesh_client.py")
     script = f"""
@@ -99,7 +99,7 @@ with MeshClient({str(bob.socket)!r}) as mesh:
         ("record-start", {"path": "run\0.jsonl"}, "bad-request"),
     ],
 )
-def test_a_request_that_cannot_be_met_is_refused_with_a_word_and_a_reason(
+def test_an_invalid_request_is_rejected_with_a_code_and_a_reason(
     pair: Pair, op: str, fields: dict[str, Any], code: str
 ) -> None:
     with pair[0].client() as client:
@@ -113,7 +113,7 @@ def test_a_request_that_cannot_be_met_is_refused_with_a_word_and_a_reason(
 @pytest.mark.parametrize(
     "raw", [b"\xff" * 100, encode_frame({})[:-1] + b"x", b"GET / HTTP/1.1\r\n\r\n", encode_frame({"op": "publish"}) * 3]
 )
-def test_a_program_that_sends_anything_disturbs_no_other(pair: Pair, raw: bytes) -> None:
+def test_a_client_that_sends_garbage_does_not_disturb_others(pair: Pair, raw: bytes) -> None:
     with socket.socket(socket.AF_UNIX) as hostile:
         hostile.connect(str(pair[0].socket))
         hostile.sendall(raw)
@@ -141,7 +141,7 @@ def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: P
         assert collect(receiver, 1)[0].payload == b"fits"
 
 
-def test_a_program_that_asks_without_reading_stops_being_answered_until_it_reads(pair: Pair) -> None:
+def test_a_client_that_does_not_read_replies_is_throttled(pair: Pair) -> None:
     # Replies contain the id: a long id makes long replies.
     request, taken = encode_frame({"op": "neighbours", "id": "x" * 60_000}), 0
     with socket.socket(socket.AF_UNIX) as hostile:
@@ -172,7 +172,7 @@ def poll_writable(program: socket.socket) -> bool:
     return bool(select.select([], [program], [], 1.0)[1])
 
 
-def test_a_subscriber_that_does_not_read_loses_messages_and_gets_their_number(pair: Pair) -> None:
+def test_a_slow_subscriber_loses_messages_and_gets_the_count(pair: Pair) -> None:
     alice, bob = pair
     payload = bytes(1_000_000)
     with alice.client() as sender, bob.client() as lazy:
@@ -215,7 +215,7 @@ def test_topics_are_added_changed_and_dropped_while_messages_flow(pair: Pair) ->
         assert names["map"]["priority"] == 7
 
 
-def test_the_conditions_are_a_topic_for_local_programs(pair: Pair) -> None:
+def test_local_programs_can_subscribe_to_conditions(pair: Pair) -> None:
     with pair[0].client() as client:
         client.subscribe(CONDITIONS_TOPIC)
         frame = client.next_frame(WAIT_S)
@@ -277,7 +277,7 @@ def test_prometheus_reads_metrics_over_tcp_and_over_the_local_socket() -> None:
         assert "# TYPE udp_mesh_datagrams_sent_total counter" in text
 
 
-def test_any_bytes_on_the_udp_port_neither_stop_the_daemon_nor_its_urgent_messages(pair: Pair) -> None:
+def test_garbage_on_the_udp_port_stops_neither_the_daemon_nor_urgent_messages(pair: Pair) -> None:
     alice, bob = pair
     source = random.Random(11)
     with (

@@ -19,7 +19,7 @@ from udp_mesh.links.udp import Deliver, OutgoingDatagram, UdpLink
 PAYLOAD = bytes(range(256)) * 2000
 
 
-def test_a_socket_that_is_full_for_a_while_costs_nothing_but_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_temporarily_full_socket_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, bob: Node) -> None:
         real, full_for = UdpLink.send, 200
 
@@ -38,7 +38,7 @@ def test_a_socket_that_is_full_for_a_while_costs_nothing_but_time(monkeypatch: p
     run(body)
 
 
-def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses(
+def test_a_full_socket_has_a_bounded_queue_and_counts_losses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def body(alice: Node, bob: Node) -> None:
@@ -55,7 +55,7 @@ def test_a_socket_that_stays_full_holds_a_bounded_queue_and_counts_what_it_loses
     run(body)
 
 
-def test_urgent_datagrams_go_first_where_the_socket_is_full_and_are_not_what_is_lost(
+def test_a_full_socket_sends_urgent_datagrams_first_and_drops_bulk(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def body(alice: Node, bob: Node) -> None:
@@ -102,7 +102,7 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     run(body)
 
 
-def test_links_that_are_no_longer_configured_close_and_return() -> None:
+def test_a_removed_link_closes_and_reopens_when_configured_again() -> None:
     async def body(alice: Node, bob: Node) -> None:
         wishes = alice.driver.hub.configs
         alice.driver.apply_links(())
@@ -114,7 +114,7 @@ def test_links_that_are_no_longer_configured_close_and_return() -> None:
     run(body)
 
 
-def test_an_interfaces_address_that_another_process_uses_is_reported_and_tried_again() -> None:
+def test_an_address_in_use_is_reported_and_retried() -> None:
     async def main() -> None:
         port = free_port()
         async with asyncio.timeout(WAIT_S), make("first", 1, 2, port) as first, make("second", 1, 2, port) as second:
@@ -198,7 +198,7 @@ def test_continuous_notices_do_not_postpone_the_refresh_of_interfaces(monkeypatc
     run(body)
 
 
-def test_nothing_is_left_on_the_loop_after_the_end() -> None:
+def test_closing_a_node_leaves_no_timers_on_the_event_loop() -> None:
     async def main() -> None:
         async with make("alice", 1, 2, free_port()) as node:
             await node.send("status", b"to nobody yet")

@@ -36,7 +36,7 @@ def example(page: str, wanted: str) -> str:
 @pytest.mark.parametrize(
     ("page", "wanted"), [("README.md", "async with Node"), ("docs/udp-mesh.md", "async with Node")]
 )
-def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted: str) -> None:
+def test_the_library_example_reaches_a_base_started_later(page: str, wanted: str) -> None:
     port = free_port()
 
     def settings(name: str, **fields: Any) -> Settings:
@@ -75,7 +75,7 @@ def test_the_librarys_example_reaches_a_base_that_comes_later(page: str, wanted:
     asyncio.run(main())
 
 
-def test_two_robots_on_one_machine_find_each_other_as_the_guide_says(tmp_path: Path) -> None:
+def test_the_guide_example_with_two_robots_on_one_machine_works(tmp_path: Path) -> None:
     shown = example("docs/udp-mesh.md", "udp-mesh run robot2.toml")
     # With a port and addresses of this test's own
     shown = shown.replace("127.0.0.", "127.0.7.").replace('key_file = "', f'port = {free_port()}\nkey_file = "')

@@ -18,7 +18,7 @@ from udp_mesh.links.udp import Deliver, UdpLink
 STRANGER = "127.0.4.66"
 
 
-def test_datagrams_of_an_online_peer_arrive_at_the_socket_of_the_peers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_datagrams_from_an_online_peer_arrive_on_the_peer_socket(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, bob: Node) -> None:
         from_strangers = 0
         real = UdpLink.receive_from_strangers
@@ -84,7 +84,7 @@ def test_a_flood_is_read_a_few_at_a_time_with_pauses_and_logged_once(
     assert len([record for record in caplog.records if record.message.startswith("flood ")]) == 1
 
 
-def test_a_new_peer_is_met_during_a_flood_from_its_own_computer() -> None:
+def test_a_new_peer_is_discovered_during_a_flood_from_its_own_host() -> None:
     async def main() -> None:
         port = free_port()
         async with asyncio.timeout(WAIT_S), make("alice", 1, 2, port) as alice:

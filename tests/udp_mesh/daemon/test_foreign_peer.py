@@ -50,7 +50,7 @@ def online(client: MeshClient) -> list[str]:
     return [peer["name"] for peer in client.request("peers")["peers"] if peer["online"]]
 
 
-def test_published_datagrams_and_frames_are_what_another_make_writes_and_reads() -> None:
+def test_an_independent_implementation_matches_the_published_vectors() -> None:
     kinds = ("hello", "broadcast", "introduction", "data")
     for vector in json.loads((FOLDER / "sealed.json").read_text()):
         boots = [bytes.fromhex(vector[name] or "00" * 16) for name in ("sender_boot", "receiver_boot")]
@@ -61,7 +61,9 @@ def test_published_datagrams_and_frames_are_what_another_make_writes_and_reads()
         assert len(Parser(bytes.fromhex(vector["hex"])).frames()) == len(vector["frames"])
 
 
-def test_it_takes_messages_of_any_size_and_the_daemon_knows(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+def test_a_foreign_node_receives_and_acknowledges_messages_of_any_size(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
     noise = random.Random(1).randbytes(60_000)
     payloads = {"status": b"", "map": noise, "packed": b"again and " * 3000}
     with daemon.client() as client:
@@ -77,7 +79,9 @@ def test_it_takes_messages_of_any_size_and_the_daemon_knows(daemon: RunningDaemo
     assert bool(packed.flags & COMPRESSED) == bool(foreign.features & ZLIB)
 
 
-def test_what_it_sends_arrives_once_and_is_acknowledged(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+def test_messages_from_a_foreign_node_arrive_once_and_are_acknowledged(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
     alice = foreign.peer("alice")
     assert alice is not None
     payloads = [b"", b"x", random.Random(2).randbytes(50_000)]
@@ -103,7 +107,7 @@ def test_what_it_sends_arrives_once_and_is_acknowledged(daemon: RunningDaemon, f
         assert collect(client, 1)[0].payload == b"last"
 
 
-def test_messages_to_all_go_both_ways(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+def test_broadcasts_work_in_both_directions(daemon: RunningDaemon, foreign: ForeignNode) -> None:
     with daemon.client() as client:
         client.subscribe("*")
         foreign.broadcast("shout", b"hear me")

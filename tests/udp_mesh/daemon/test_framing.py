@@ -36,9 +36,7 @@ def frame(head: bytes, payload: bytes = b"") -> bytes:
         (frame(json.dumps({"op": "peers", "id": [1]}).encode()), None, "bad-frame"),
     ],
 )
-def test_what_cannot_be_taken_is_answered_and_the_next_request_is_served(
-    raw: bytes, request_id: int | None, code: str
-) -> None:
+def test_a_bad_frame_is_reported_and_the_next_request_is_parsed(raw: bytes, request_id: int | None, code: str) -> None:
     whole = taken(raw + encode_frame(GOOD, b"payload"))
     assert [type(found) for found in whole] == [BadFrame, tuple]
     assert whole[0][:2] == (request_id, code)
@@ -48,7 +46,7 @@ def test_what_cannot_be_taken_is_answered_and_the_next_request_is_served(
 
 
 @given(st.lists(st.sampled_from([0, 1, LIMIT_BYTES, LIMIT_BYTES + 1, 3 * LIMIT_BYTES]), max_size=5), st.data())
-def test_a_payload_of_the_limit_is_taken_and_one_more_byte_is_not(sizes: list[int], data: st.DataObject) -> None:
+def test_a_payload_at_the_limit_is_accepted_and_a_larger_one_is_rejected(sizes: list[int], data: st.DataObject) -> None:
     stream = b"".join(encode_frame({"id": number}, bytes(size)) for number, size in enumerate(sizes))
     cuts = sorted(data.draw(st.sets(st.integers(0, len(stream)), max_size=5)))
     pieces = [stream[start:end] for start, end in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
@@ -59,12 +57,12 @@ def test_a_payload_of_the_limit_is_taken_and_one_more_byte_is_not(sizes: list[in
 
 
 @given(st.lists(st.binary(max_size=40), max_size=5))
-def test_any_bytes_give_requests_or_refusals(pieces: list[bytes]) -> None:
+def test_arbitrary_bytes_parse_as_requests_or_bad_frames(pieces: list[bytes]) -> None:
     for found in taken(*pieces):
         assert len(found) in (2, 3)
 
 
-def test_what_is_passed_over_takes_no_memory() -> None:
+def test_a_skipped_payload_is_not_buffered() -> None:
     reader = RequestReader(lambda: LIMIT_BYTES)
     (refused,) = reader.feed(frame(b"{}")[:4] + b"\xff\xff\xff\xff{}")
     assert isinstance(refused, BadFrame)
@@ -74,7 +72,7 @@ def test_what_is_passed_over_takes_no_memory() -> None:
 
 
 @pytest.mark.parametrize("at", [8, 20, 60])
-def test_a_frame_that_is_given_up_in_the_middle_is_read_past_and_the_next_one_served(at: int) -> None:
+def test_a_discarded_partial_frame_is_skipped_and_the_next_one_is_parsed(at: int) -> None:
     stream = encode_frame({"op": "publish", "id": 3}, bytes(LIMIT_BYTES)) + encode_frame(GOOD, b"payload")
     reader = RequestReader(lambda: LIMIT_BYTES)
     assert reader.feed(stream[:at]) == []

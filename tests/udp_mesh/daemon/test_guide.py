@@ -27,7 +27,7 @@ def test_every_request_and_refusal_is_in_the_local_apis_page() -> None:
     assert [word for word in (*COMMANDS, *REJECTION_CODES) if f"`{word}`" not in page] == []
 
 
-def test_the_guides_examples_of_configuration_load(tmp_path: Path) -> None:
+def test_configuration_examples_in_the_guide_load(tmp_path: Path) -> None:
     guide = (DOCS / "udp-mesh.md").read_text()
     blocks = re.findall(r"(?:^    .*\n|^\n(?=    ))+", guide, re.MULTILINE)
     examples = [re.sub(r"^    ", "", block, flags=re.MULTILINE) for block in blocks]

@@ -42,7 +42,7 @@ def held(daemon: RunningDaemon) -> int:
     return len(list((daemon.folder / daemon.name / "inbox").glob("*.message")))
 
 
-def test_what_was_delivered_while_no_program_ran_outlives_a_killed_daemon(
+def test_messages_delivered_without_a_subscriber_survive_a_daemon_kill(
     pair: tuple[RunningDaemon, RunningDaemon],
 ) -> None:
     alice, bob = pair
@@ -62,7 +62,7 @@ def test_what_was_delivered_while_no_program_ran_outlives_a_killed_daemon(
     wait_online(alice, "bob")
 
 
-def test_a_program_that_reads_takes_messages_at_once(pair: tuple[RunningDaemon, RunningDaemon]) -> None:
+def test_a_subscribed_program_receives_messages_immediately(pair: tuple[RunningDaemon, RunningDaemon]) -> None:
     alice, bob = pair
     with bob.client() as program:
         program.subscribe("kept")
@@ -109,7 +109,7 @@ def with_a_full_disk() -> Iterator[tuple[RunningDaemon, RunningDaemon]]:
             yield alice, bob
 
 
-def test_what_neither_disk_nor_program_took_is_not_delivered_and_comes_again() -> None:
+def test_a_message_neither_stored_nor_read_is_not_delivered_until_resent() -> None:
     with with_a_full_disk() as (alice, bob), alice.client() as sender:
         sender.publish("kept", bytes(500), to="bob", notify=True)
         poll(lambda: "outbox-full" in bob.log.read_text(), "bob has no room")

@@ -44,7 +44,7 @@ def test_a_receiver_killed_in_the_middle_gets_the_message_after_its_restart() ->
             assert collect(receiver, 1)[0].payload == ARTIFACT
 
 
-def test_what_waited_on_disk_when_the_sender_was_killed_is_delivered_after_its_restart() -> None:
+def test_messages_on_disk_are_delivered_after_a_killed_sender_restarts() -> None:
     topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
     with two_daemons(topics) as (alice, bob):
         bob.stop()
@@ -99,7 +99,7 @@ def test_a_reload_under_load_drops_nothing() -> None:
         assert len(collect(receiver, len(numbers))) == 41
 
 
-def test_a_reload_of_a_broken_file_changes_nothing_and_names_the_line() -> None:
+def test_reloading_an_invalid_file_changes_nothing_and_reports_the_line() -> None:
     with two_daemons() as (alice, _), alice.client() as operator:
         before = operator.request("topics")["topics"]
         text = alice.file.read_text()
@@ -128,7 +128,7 @@ def test_keys_are_rotated_through_two_live_keys_without_losing_a_message() -> No
         assert len(collect(receiver, len(numbers))) == len(numbers)
 
 
-def test_nodes_with_different_keys_say_so_and_exchange_nothing() -> None:
+def test_nodes_with_different_keys_report_a_key_mismatch_and_do_not_peer() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder, port = Path(path), free_port()
         alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], port))
@@ -139,7 +139,7 @@ def test_nodes_with_different_keys_say_so_and_exchange_nothing() -> None:
                 assert client.request("peers")["peers"] == []
 
 
-def test_systemd_hears_of_readiness_life_reload_and_the_end() -> None:
+def test_systemd_is_notified_of_readiness_watchdog_reload_and_stop() -> None:
     with (
         tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd,

@@ -20,7 +20,7 @@ from udp_mesh.wire.legacy import Host, LegacyAck, decode_legacy, encode_legacy
 SOME = {"old": ReceivePosition(17, ((16, 2, 2), (17, 1, 9))), "older": ReceivePosition(1, ())}
 
 
-def test_what_is_saved_is_loaded_and_a_shorter_state_replaces_a_longer_one(tmp_path: Path) -> None:
+def test_saved_positions_are_loaded_and_a_shorter_state_replaces_a_longer_one(tmp_path: Path) -> None:
     path = tmp_path / "state" / "positions.json"
     assert load_positions(path) == {}
     save_positions(path, SOME)

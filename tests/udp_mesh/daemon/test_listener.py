@@ -40,7 +40,7 @@ def listening(work: Callable[[Listener, Path, list[socket.socket]], Awaitable[No
 
 
 @pytest.mark.parametrize("what", ["file", "directory"])
-def test_what_is_no_socket_is_left_alone_and_named(tmp_path: Path, what: str) -> None:
+def test_a_path_that_is_not_a_socket_is_left_alone_and_reported(tmp_path: Path, what: str) -> None:
     path = tmp_path / "api.sock"
     if what == "file":
         path.write_text("kept")
@@ -72,7 +72,7 @@ async def accepted(path: Path, taken: list[socket.socket]) -> None:
     await asyncio.to_thread(poll, lambda: len(taken) > before, "the program is accepted")
 
 
-def test_a_deleted_socket_is_made_again_with_its_mode(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_deleted_socket_is_recreated_with_its_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listener, "FILE_CHECK_S", 0.02)
 
     async def work(_: Listener, path: Path, taken: list[socket.socket]) -> None:
@@ -84,7 +84,7 @@ def test_a_deleted_socket_is_made_again_with_its_mode(monkeypatch: pytest.Monkey
     listening(work)
 
 
-def test_a_socket_that_became_another_daemons_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socket_replaced_by_another_daemon_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listener, "FILE_CHECK_S", 0.02)
 
     async def work(first: Listener, path: Path, taken: list[socket.socket]) -> None:
@@ -103,7 +103,7 @@ def test_a_socket_that_became_another_daemons_is_left_alone(monkeypatch: pytest.
     listening(work)
 
 
-def test_a_socket_that_cannot_be_given_its_group_leaves_no_file() -> None:
+def test_an_unknown_socket_group_leaves_no_socket_file() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
         path = Path(folder) / "api.sock"
         with pytest.raises(OSError, match="no such group"):
@@ -111,7 +111,7 @@ def test_a_socket_that_cannot_be_given_its_group_leaves_no_file() -> None:
         assert not path.exists()
 
 
-def test_without_descriptors_accepting_rests_instead_of_trying_without_end(
+def test_accepting_pauses_when_file_descriptors_run_out(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(listener, "ACCEPT_RETRY_S", 0.02)
@@ -142,7 +142,7 @@ def test_without_descriptors_accepting_rests_instead_of_trying_without_end(
     listening(work)
 
 
-def test_more_programs_than_the_process_has_descriptors_are_refused_and_stop_nothing() -> None:
+def test_clients_beyond_the_file_descriptor_limit_are_refused_without_disruption() -> None:
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path:
         folder, port = Path(path), free_port()
         alice = RunningDaemon(folder, "alice", configuration(folder, "alice", 1, [2], port))

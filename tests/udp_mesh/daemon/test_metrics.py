@@ -52,7 +52,7 @@ def families(page: str) -> dict[str, list[tuple[str, float]]]:
     return found
 
 
-def test_the_page_keeps_to_the_formats_rules() -> None:
+def test_the_metrics_page_follows_the_prometheus_text_format() -> None:
     both = pair(Topic("map", priority=5), Topic('a"b\\c', priority=6))
     for topic in ("map", 'a"b\\c'):
         both.a.send(topic, bytes(5000), destination="b", now=both.now)
@@ -83,7 +83,7 @@ def test_the_page_keeps_to_the_formats_rules() -> None:
         ("", "404 Not Found", "GET /metrics\n"),
     ],
 )
-def test_a_scraper_is_answered_as_http_wants(request_line: str, status: str, body: str) -> None:
+def test_the_metrics_server_answers_with_valid_http(request_line: str, status: str, body: str) -> None:
     async def ask() -> bytes:
         port = free_port()
         server = MetricsServer(("127.0.0.1", port), lambda: "up 1\n")

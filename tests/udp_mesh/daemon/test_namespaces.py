@@ -10,7 +10,7 @@ from tests.udp_mesh.daemon.namespaces import SCENARIOS
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_daemons_in_namespaces(scenario: str) -> None:
+def test_daemons_follow_interface_and_address_changes(scenario: str) -> None:
     # Root needs no user namespace, and some systems forbid them.
     become_root = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     done = subprocess.run(

@@ -22,7 +22,7 @@ def message(key: int, payload: bytes = b"payload", remaining_s: float | None = N
     return StoredMessage(key, "base", "map/diff", "mesh_msgs/MapDiff", payload, remaining_s)
 
 
-def test_what_was_put_and_not_removed_is_loaded_oldest_first(tmp_path: Path) -> None:
+def test_remaining_messages_are_loaded_oldest_first(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "outbox", 1 << 20)
     for key in (3, 1, 2):
         store.put(message(key, bytes([key]) * 1000, remaining_s=key / 3))
@@ -35,7 +35,7 @@ def test_what_was_put_and_not_removed_is_loaded_oldest_first(tmp_path: Path) -> 
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans(), st.binary(max_size=50)), max_size=12))
-def test_the_directory_equals_a_dictionary(steps: list[tuple[int, bool, bytes]]) -> None:
+def test_the_store_matches_a_dictionary(steps: list[tuple[int, bool, bytes]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         store, expected = DirectoryStore(Path(folder), 1 << 20), dict[int, StoredMessage]()
         for key, put, payload in steps:
@@ -51,7 +51,7 @@ def test_the_directory_equals_a_dictionary(steps: list[tuple[int, bool, bytes]])
         assert again.bytes == store.bytes
 
 
-def test_a_full_directory_refuses_and_counts(tmp_path: Path) -> None:
+def test_a_full_directory_refuses_and_counts_messages(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 3000)
     for key in range(5):
         store.put(message(key, bytes(1000)))
@@ -73,7 +73,7 @@ def test_a_damaged_file_is_set_aside_and_the_others_load(tmp_path: Path) -> None
     assert not (tmp_path / "half.new").exists()
 
 
-def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
+def test_a_flush_skips_messages_delivered_in_the_meantime(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     store.put(message(1))
     store.put(message(2))
@@ -86,7 +86,7 @@ def test_flushing_skips_what_was_delivered_meanwhile(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [f"{2:020d}.message"]
 
 
-def test_only_the_publisher_that_asks_waits_for_a_hung_disk(tmp_path: Path) -> None:
+def test_only_a_caller_of_flush_waits_for_a_hung_disk(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     with standing_disk(tmp_path, 1) as go_on:
         for key in (1, 2, 3):
@@ -123,7 +123,7 @@ def test_a_flush_is_not_reported_to_callers_before_it_is_complete(tmp_path: Path
     asyncio.run(run())
 
 
-def test_a_disk_that_stays_full_fills_no_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_store_that_stays_full_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     store = DirectoryStore(tmp_path, 3000)
     for key in range(1000):
         store.put(message(key, bytes(1000)))
@@ -150,7 +150,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 @given(st.data())
-def test_whatever_a_torn_write_or_a_bad_disk_leaves_of_a_file_it_is_set_aside_and_the_others_load(
+def test_any_corrupted_file_is_set_aside_and_the_others_load(
     data: st.DataObject,
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -177,7 +177,7 @@ def test_whatever_a_torn_write_or_a_bad_disk_leaves_of_a_file_it_is_set_aside_an
         assert len(loaded) == 3 or victim.with_suffix(".damaged").exists()
 
 
-def test_a_file_under_anothers_name_is_set_aside(tmp_path: Path) -> None:
+def test_a_file_with_a_mismatched_name_is_set_aside(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path, 1 << 20)
     store.put(message(1))
     store.close()
@@ -187,7 +187,7 @@ def test_a_file_under_anothers_name_is_set_aside(tmp_path: Path) -> None:
     assert copy.with_suffix(".damaged").exists()
 
 
-def test_a_disk_that_takes_no_more_refuses_counts_and_is_left_clean(tmp_path: Path) -> None:
+def test_a_failed_write_is_counted_and_leaves_no_partial_file(tmp_path: Path) -> None:
     # a limit on files' sizes fails a write in its middle, as a full disk does
     script = f"""
 import resource

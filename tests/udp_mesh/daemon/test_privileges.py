@@ -29,12 +29,12 @@ def test_an_unknown_user_is_an_error_that_names_the_key() -> None:
         drop_privileges("no-such-user", ())
 
 
-def test_being_that_user_already_needs_nothing(tmp_path: Path) -> None:
+def test_dropping_privileges_to_the_current_user_does_nothing(tmp_path: Path) -> None:
     drop_privileges(pwd.getpwuid(os.geteuid()).pw_name, (tmp_path / "state",))
     assert not (tmp_path / "state").exists()
 
 
-def test_root_becomes_the_user_for_good_and_others_may_not() -> None:
+def test_root_drops_privileges_permanently_and_other_users_are_refused() -> None:
     """Both cases: as root the process ends as nobody; as anyone else it is refused."""
     with tempfile.TemporaryDirectory() as path:
         folder = Path(path)

@@ -43,7 +43,7 @@ def test_everything_recorded_is_in_the_file_once_it_is_closed(tmp_path: Path) ->
     assert made.lines == 3001
 
 
-def test_what_became_of_the_daemons_own_messages_is_left_out(tmp_path: Path) -> None:
+def test_outcomes_of_internal_messages_are_not_recorded(tmp_path: Path) -> None:
     made = recorder(tmp_path / "run.jsonl")
     for topic in ("~mesh/ping", "status"):
         made.event(1.0, MessageDelivered(MessageId(1), "base", topic, 0.02))
@@ -82,7 +82,7 @@ def test_lines_for_a_hung_disk_are_dropped_and_the_gap_is_recorded(
     assert made.path.stat().st_size == made.bytes
 
 
-def test_a_file_that_is_there_is_never_overwritten(tmp_path: Path) -> None:
+def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     (tmp_path / "run.jsonl").write_text("of yesterday")
     with pytest.raises(FileExistsError):
         recorder(tmp_path / "run.jsonl")

@@ -34,7 +34,7 @@ def pair() -> Iterator[Pair]:
         ({"topic": "status", "type": "x" * MAX_HEADER_BYTES}, "expected at most 65536 bytes"),
     ],
 )
-def test_a_name_that_no_robot_takes_is_refused_and_what_follows_is_delivered(
+def test_an_invalid_name_is_rejected_and_later_messages_are_delivered(
     pair: Pair, fields: dict[str, Any], complaint: str
 ) -> None:
     alice, bob = pair
@@ -59,7 +59,7 @@ def test_a_name_that_no_robot_takes_is_refused_and_what_follows_is_delivered(
         ({"address": "10.0.0.1", "name": "a b"}, "neighbour.name: expected a name of 1 to 63 bytes"),
     ],
 )
-def test_a_neighbour_that_the_file_would_not_take_is_not_set_either(
+def test_a_neighbor_invalid_in_the_configuration_file_cannot_be_set(
     pair: Pair, fields: dict[str, Any], complaint: str
 ) -> None:
     with pair[0].client() as client:

@@ -35,7 +35,7 @@ def test_without_systemd_nothing_is_sent() -> None:
     assert notifier.watchdog_s is None
 
 
-def test_a_systemd_that_went_away_is_no_error(tmp_path: Path) -> None:
+def test_a_missing_notify_socket_is_not_an_error(tmp_path: Path) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": str(tmp_path / "gone")})
     notifier.alive("status")
     notifier.close()
@@ -50,5 +50,7 @@ def test_a_systemd_that_went_away_is_no_error(tmp_path: Path) -> None:
         ({"WATCHDOG_USEC": "soon"}, None),
     ],
 )
-def test_signs_of_life_come_twice_per_watchdog_period(environment: dict[str, str], period_s: float | None) -> None:
+def test_the_watchdog_interval_is_half_the_configured_timeout(
+    environment: dict[str, str], period_s: float | None
+) -> None:
     assert Notifier(environment).watchdog_s == period_s

@@ -67,7 +67,7 @@ def test_errors_of_a_link_that_goes_down_are_not_logged() -> None:
     assert not errors
 
 
-def test_a_crowd_of_destinations_is_counted_and_few_are_named() -> None:
+def test_many_destinations_are_counted_but_only_a_few_are_listed() -> None:
     errors = SendErrors()
     errors.add("mesh0", {((f"10.7.{n // 250}.{n % 250}", 8700), errno.EPERM): 1 for n in range(1000)}, 0.0)
     (logged,), _ = errors.review(REVIEW_S)

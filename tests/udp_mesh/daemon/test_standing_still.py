@@ -18,7 +18,7 @@ def under_way(client: MeshClient) -> bool:
 
 
 @pytest.mark.parametrize("still", ["sender", "receiver"])
-def test_a_daemon_that_stood_still_in_the_middle_loses_nothing_and_delivers_nothing_twice(still: str) -> None:
+def test_a_daemon_suspended_mid_transfer_loses_and_duplicates_nothing(still: str) -> None:
     with two_daemons() as (alice, bob), alice.client() as sender, bob.client() as receiver:
         receiver.subscribe("*")
         stopped, other = (alice, bob) if still == "sender" else (bob, alice)

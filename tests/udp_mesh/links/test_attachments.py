@@ -37,7 +37,7 @@ def test_by_default_every_running_interface_that_can_broadcast_is_used() -> None
     )
 
 
-def test_an_interface_created_again_under_the_same_name_and_address_is_another() -> None:
+def test_a_recreated_interface_is_a_different_attachment() -> None:
     (before,) = select_attachments((WLAN0,), EVERY_INTERFACE, 8700)
     (after,) = select_attachments((replace(WLAN0, index=9),), EVERY_INTERFACE, 8700)
     assert before != after
@@ -61,17 +61,17 @@ def test_defect_6_broadcast_addresses_are_right_for_netmasks_within_an_octet() -
         (LinkConfig(address="10.7.20.6"), []),
     ],
 )
-def test_a_wish_is_met_by_the_interfaces_that_fit(wish: LinkConfig, expected: list[str]) -> None:
+def test_a_link_config_selects_the_matching_interfaces(wish: LinkConfig, expected: list[str]) -> None:
     assert names(wish) == expected
 
 
-def test_the_first_wish_that_fits_an_interface_wins() -> None:
+def test_the_first_link_config_matching_an_interface_wins() -> None:
     (bat0, wlan0) = select_attachments(ALL, (LinkConfig("bat0", broadcast=False, mtu=1300), LinkConfig("*")), 8700)
     assert (bat0.name, bat0.broadcast, bat0.mtu) == ("bat0", None, 1300)
     assert (wlan0.name, wlan0.broadcast) == ("wlan0", ("192.168.1.31", 8700))
 
 
-def test_a_wished_mtu_never_exceeds_the_interface() -> None:
+def test_a_configured_mtu_never_exceeds_the_interface_mtu() -> None:
     assert [attachment.mtu for attachment in select_attachments(ALL, (LinkConfig("bat0", mtu=9000),), 8700)] == [1500]
 
 
@@ -88,7 +88,7 @@ ADDRESS = (
 )
 
 
-def test_the_kernels_messages_are_read() -> None:
+def test_netlink_messages_are_parsed() -> None:
     link = bytes.fromhex("34000000" + "1000" + "0200" + "01000000" + "00000000")
     link += bytes.fromhex("0000" + "0100" + "07000000" + "43100100" + "00000000")
     link += bytes.fromhex("0a000300") + b"mesh0\0\0\0" + bytes.fromhex("08000400" + "b4050000")
@@ -98,7 +98,7 @@ def test_the_kernels_messages_are_read() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, 48))
-def test_a_message_cut_short_is_an_error_not_a_guess(cut: int) -> None:
+def test_a_truncated_netlink_message_is_an_error(cut: int) -> None:
     with pytest.raises(NetlinkError):
         list(split_messages(bytes.fromhex(ADDRESS)[:cut]))
 
@@ -107,7 +107,7 @@ def test_a_message_cut_short_is_an_error_not_a_guess(cut: int) -> None:
     ("address", "prefix_length", "broadcast"),
     [("10.7.20.5", 20, "10.7.31.255"), ("192.168.1.20", 28, "192.168.1.31"), ("10.0.0.1", 31, None)],
 )
-def test_an_address_that_was_given_no_broadcast_address_has_its_networks_last(
+def test_a_missing_broadcast_address_is_derived_from_the_prefix(
     address: str, prefix_length: int, broadcast: str | None
 ) -> None:
     local = socket.inet_aton(address)
@@ -131,7 +131,7 @@ WLAN6 = Interface(
 )  # fmt: skip
 
 
-def test_where_ipv4_has_no_broadcast_address_all_ipv6_nodes_of_the_link_are_addressed() -> None:
+def test_ipv6_all_nodes_multicast_is_used_without_an_ipv4_broadcast_address() -> None:
     expected = Attachment("wlan6", "wlan6", ("fe80::6", 8700), (ALL_NODES, 8700), 1500, 6)
     assert select_attachments((LO, WLAN6), EVERY_INTERFACE, 8700) == (expected,)
     # an interface with both is used with IPv4, as ever
@@ -141,18 +141,18 @@ def test_where_ipv4_has_no_broadcast_address_all_ipv6_nodes_of_the_link_are_addr
     assert select_attachments((replace(WLAN6, can_multicast=False),), EVERY_INTERFACE, 8700) == ()
 
 
-def test_fixed_neighbours_over_ipv6_are_spoken_to_from_the_routable_address() -> None:
+def test_fixed_ipv6_neighbors_are_reached_from_the_routable_address() -> None:
     (found,) = select_attachments((WLAN6,), (LinkConfig("wlan6", broadcast=False),), 8700)
     assert (found.address, found.broadcast) == (("2001:db8::6", 8700), None)
 
 
-def test_an_ipv6_address_wished_for_reaches_all_nodes_of_its_link() -> None:
+def test_a_configured_ipv6_address_broadcasts_to_all_nodes_on_its_link() -> None:
     (found,) = select_attachments((LO, WLAN6), (LinkConfig(address="2001:db8::6"),), 8700)
     assert (found.device, found.broadcast) == ("wlan6", (ALL_NODES, 8700))
     assert select_attachments((LO, WLAN6), (LinkConfig(address="::1"),), 8700) == ()
 
 
-def test_an_address_not_yet_checked_for_duplicates_is_not_used() -> None:
+def test_tentative_and_duplicate_ipv6_addresses_are_not_used() -> None:
     def answers(flags: int) -> bytes:
         link = struct.pack("=BxHiII", 0, 1, 6, 0x1 | 0x40 | 0x1000, 0) + struct.pack("=HH8s", 10, 3, b"wlan6\0\0\0")
         address = struct.pack("=BBBBI", socket.AF_INET6, 64, flags, 253, 6)

@@ -55,7 +55,7 @@ def test_a_peer_and_a_stranger_arrive_at_different_sockets() -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
-def test_ipv6_addresses_are_distinguished_by_all_their_words() -> None:
+def test_ipv6_addresses_are_compared_in_full() -> None:
     port = free_port()
     attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
     with closing(UdpLink(attachment)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
@@ -67,7 +67,7 @@ def test_ipv6_addresses_are_distinguished_by_all_their_words() -> None:
             assert arrivals(link, 1)[place] == [b"x"]
 
 
-def test_a_large_team_fits_as_far_as_the_kernel_takes_a_program() -> None:
+def test_the_filter_for_a_large_team_stays_within_the_kernel_limit() -> None:
     port = free_port()
     team = frozenset((f"10.0.{number // 250}.{number % 250 + 1}", 8700) for number in range(1000))
     program = source_program(team, socket.AF_INET, ACCEPT, DROP)
@@ -76,7 +76,7 @@ def test_a_large_team_fits_as_far_as_the_kernel_takes_a_program() -> None:
         assert alice.set_peers(team)
 
 
-def test_where_the_kernel_refuses_the_program_everything_still_arrives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_datagram_still_arrives_if_the_kernel_rejects_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
     with closing(open_link(ALICE, port)) as alice, closing(open_link(BOB, port)) as bob:
 
@@ -91,7 +91,7 @@ def test_where_the_kernel_refuses_the_program_everything_still_arrives(monkeypat
         assert arrivals(alice, 1) == ([], [b"bob"])
 
 
-def test_a_kernel_without_such_programs_has_one_socket_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_without_socket_filters_still_receives_every_datagram(monkeypatch: pytest.MonkeyPatch) -> None:
     def attach(own: socket.socket, option: int, program: bytes) -> None:
         raise OSError(92, "Protocol not available")
 

@@ -23,7 +23,7 @@ def pair() -> Iterator[tuple[UdpLink, UdpLink]]:
         yield alice, bob
 
 
-def test_a_run_of_equal_datagrams_takes_one_call_and_arrives_in_pieces(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_equal_sized_datagrams_are_sent_with_one_system_call(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     datagrams = [Out(bytes([n]) * 1400, bob.attachment.address) for n in range(40)] + [
         Out(b"tail", bob.attachment.address)
@@ -50,14 +50,14 @@ def test_any_mixture_arrives_in_order_with_and_without_segmentation(mixture: lis
             assert [data for data, _ in found] == [datagram.data for datagram in datagrams]
 
 
-def test_more_than_a_run_is_cut_at_what_the_kernel_takes(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_long_runs_are_split_at_the_kernel_segment_limit(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     assert alice.send([Out(bytes(100), bob.attachment.address)] * (2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
     assert alice.system_calls == 3
     assert len(receive(bob, 2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
 
 
-def test_urgent_datagrams_carry_their_class_and_bulk_does_not(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_only_urgent_datagrams_carry_the_urgent_dscp(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, _ = pair
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plain:
         plain.bind((BOB, 0))
@@ -72,7 +72,7 @@ def test_urgent_datagrams_carry_their_class_and_bulk_does_not(pair: tuple[UdpLin
     assert classes == {b"urgent": 46, b"bulk": 0}
 
 
-def test_an_unreachable_destination_costs_its_datagram_only(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_an_unreachable_destination_does_not_affect_the_others(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     nowhere = ("255.255.255.255", 9)  # this socket may not broadcast
     assert alice.send([Out(b"a", nowhere), Out(b"b", nowhere), Out(b"c", bob.attachment.address)]) == 3
@@ -80,20 +80,20 @@ def test_an_unreachable_destination_costs_its_datagram_only(pair: tuple[UdpLink,
     assert receive(bob, 1) == [(b"c", alice.attachment.address)]
 
 
-def test_what_the_kernel_refuses_is_counted_by_destination_and_reason(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_send_errors_are_counted_by_destination_and_reason(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     nowhere, to = ("255.255.255.255", 9), bob.attachment.address
     alice.send([Out(b"a", nowhere), Out(b"b", nowhere), Out(bytes(70_000), to), Out(b"c", to)])
     assert alice.send_errors == {(nowhere, errno.EACCES): 2, (to, errno.EMSGSIZE): 1}
 
 
-def test_an_address_of_the_other_family_is_refused_as_such(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_a_destination_of_another_address_family_is_refused(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, _ = pair
     assert alice.send([Out(b"a", ("::1", 9))]) == 1
     assert alice.send_errors == {(("::1", 9), errno.EAFNOSUPPORT): 1}
 
 
-def test_a_destination_that_takes_nothing_at_all_does_not_end_segmentation(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_an_invalid_destination_does_not_disable_segmentation(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     absent = (BOB, 0)  # the kernel answers EINVAL, as where it cannot segment, but also to a single datagram
     assert alice.send([Out(bytes(10), absent)] * 5 + [Out(b"c", bob.attachment.address)]) == 6
@@ -102,20 +102,20 @@ def test_a_destination_that_takes_nothing_at_all_does_not_end_segmentation(pair:
     assert receive(bob, 1)[0][0] == b"c"
 
 
-def test_a_datagram_too_long_to_send_costs_itself_only(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_an_oversized_datagram_does_not_affect_the_others(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, bob = pair
     assert alice.send([Out(bytes(70_000), bob.attachment.address), Out(b"c", bob.attachment.address)]) == 2
     assert alice.datagrams_lost_on_send == 1
     assert receive(bob, 1)[0][0] == b"c"
 
 
-def test_a_broadcast_on_a_link_of_fixed_neighbours_goes_nowhere(pair: tuple[UdpLink, UdpLink]) -> None:
+def test_a_broadcast_on_a_link_with_fixed_neighbors_is_not_sent(pair: tuple[UdpLink, UdpLink]) -> None:
     alice, _ = pair
     assert alice.send([Out(b"to all", None)]) == 1
     assert alice.system_calls == 0
 
 
-def test_a_kernel_without_segmentation_is_noticed_once(
+def test_segmentation_is_disabled_when_it_is_unsupported(
     pair: tuple[UdpLink, UdpLink], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alice, bob = pair
@@ -136,7 +136,9 @@ def test_a_kernel_without_segmentation_is_noticed_once(
     assert [data[0] for data, _ in receive(bob, 5)] == [0, 1, 2, 3, 4]
 
 
-def test_a_full_socket_says_how_much_it_took(pair: tuple[UdpLink, UdpLink], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_socket_reports_how_many_datagrams_it_accepted(
+    pair: tuple[UdpLink, UdpLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
     alice, bob = pair
     real, calls = alice._socket, 0
 
@@ -165,7 +167,7 @@ def test_a_port_in_use_is_an_error_and_leaks_nothing() -> None:
         open_link(ALICE, port)
 
 
-def test_ipv6_neighbours_are_reached() -> None:
+def test_ipv6_neighbors_are_reached() -> None:
     port = free_port()
     attachment = Attachment("::1", "lo", ("::1", port), None, 65_535, 1)
     with closing(UdpLink(attachment, urgent_dscp=46)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
@@ -177,7 +179,7 @@ def test_ipv6_neighbours_are_reached() -> None:
         assert receive(link, 1)[0][0] == b"back"
 
 
-def test_a_datagram_that_came_just_now_is_taken_for_the_last_and_the_next_look_finds_the_rest(
+def test_receive_stops_after_a_recent_datagram_and_the_next_call_returns_the_rest(
     pair: tuple[UdpLink, UdpLink],
 ) -> None:
     alice, bob = pair

@@ -43,7 +43,7 @@ def lines(*items: RecordedArrival | Presence | Sample | Place) -> list[bytes]:
     return [text.encode() for text in (header("base", 0.0), *map(line, items))]
 
 
-def test_what_is_written_is_read() -> None:
+def test_recordings_round_trip() -> None:
     read_back = parse(lines(*ITEMS), "r.jsonl")
     assert (*read_back.arrivals, *read_back.presences, *read_back.samples, *read_back.places) == (
         ITEMS[1], ITEMS[0], ITEMS[4], ITEMS[2], ITEMS[3]
@@ -102,7 +102,7 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
     assert [t for t, _ in time_series(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
 
 
-def test_what_became_of_what_was_sent_is_counted_per_topic() -> None:
+def test_outcomes_of_sent_messages_are_counted_per_topic() -> None:
     entries = [
         {"t": 1, "kind": "sent", "topic": "map", "priority": 7, "bytes": 500},
         {"t": 1, "kind": "sent", "topic": "estop", "priority": 0, "bytes": 4},
@@ -131,7 +131,7 @@ def test_a_message_recorded_with_a_large_payload_is_counted(tmp_path: Path) -> N
     assert [item.size for item in read(path).arrivals] == [3 << 19]
 
 
-def test_a_line_without_end_is_one_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_overlong_line_is_a_single_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report_recording, "MAX_LINE_BYTES", 100)
     path = tmp_path / "r.jsonl"
     path.write_text("\n".join([header("a", 0.0), "x" * 1000, line(ITEMS[0])]) + "\n")
@@ -139,7 +139,7 @@ def test_a_line_without_end_is_one_problem(tmp_path: Path, monkeypatch: pytest.M
     assert (len(recording.problems), len(recording.presences)) == (1, 1)
 
 
-def test_the_pages_numbers_are_there_for_scripts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_output_contains_the_figures_of_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "base.jsonl"
     path.write_bytes(b"\n".join(lines(*ITEMS)) + b"\n{\n" * 7)
     assert main([str(path), "--out", str(tmp_path / "page.html"), "--json"]) == 0
@@ -151,9 +151,7 @@ def test_the_pages_numbers_are_there_for_scripts(tmp_path: Path, capsys: pytest.
     assert captured.err.splitlines()[-1] == "udp-mesh: warning: ... and 2 more invalid lines"
 
 
-def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_page_is_reported_and_leaves_no_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, taken = tmp_path / "base.jsonl", tmp_path / "taken"
     path.write_bytes(b"\n".join(lines(*ITEMS)))
     taken.mkdir()
@@ -165,7 +163,7 @@ def test_a_page_that_cannot_be_written_is_named_and_nothing_is_left(
     assert sorted(tmp_path.iterdir()) == [path, taken]
 
 
-def test_the_topic_with_the_most_messages_is_shown_first_with_its_punctuality() -> None:
+def test_topics_are_sorted_by_message_count_and_show_punctuality() -> None:
     often = [
         RecordedArrival(i + (0.2 if i % 10 == 0 else 0.0), "base", "spot1", "telemetry", 3, 100) for i in range(100)
     ]
@@ -177,7 +175,7 @@ def test_the_topic_with_the_most_messages_is_shown_first_with_its_punctuality() 
     assert second.punctual == 1.0
 
 
-def test_a_track_is_one_path_for_each_stretch_online_or_not() -> None:
+def test_a_track_is_split_into_online_and_offline_paths() -> None:
     track = [(float(x), 0.0, x < 50 or x > 80) for x in range(100)]
     assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
 
@@ -193,7 +191,7 @@ def test_messages_that_all_come_at_once_are_not_periodic() -> None:
     assert intervals(parse(lines(*burst), "r")) == []
 
 
-def test_what_is_no_recording_is_an_error_with_its_line(tmp_path: Path) -> None:
+def test_an_invalid_recording_is_an_error_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "r.jsonl"
     path.write_text("{}\n")
     with pytest.raises(RecordingError, match=r"r\.jsonl:1: expected"):
@@ -216,7 +214,7 @@ def test_any_lines_give_a_recording_or_a_recording_error(raw: list[bytes]) -> No
         st.none() | st.booleans() | st.floats() | st.text(), lambda c: st.lists(c) | st.dictionaries(st.text(), c)
     )
 )
-def test_any_json_in_a_known_kind_is_an_item_or_a_problem(value: object) -> None:
+def test_arbitrary_json_values_of_a_known_kind_are_handled(value: object) -> None:
     for kind in ("received", "peer-online", "conditions", "place"):
         entry = {"t": value, "kind": kind, "peer": value, "peers": value, "x": value, "y": 1, "source": value}
         parse([header("x", 0.0).encode(), json.dumps(entry).encode()], "r")
@@ -236,7 +234,7 @@ def test_intervals_have_median_deviation_and_gaps() -> None:
     assert intervals(lonely)[0].gaps == 1
 
 
-def test_connections_are_spans_with_their_share() -> None:
+def test_connections_have_online_spans_and_an_online_share() -> None:
     recording = parse(lines(*ITEMS, Presence(5.0, "base", "spot1", True), Place(9.0, "base", 0, 0)), "r")
     (spot,) = connections(recording)
     assert spot.spans_s == ((1.0, 3.0), (5.0, 9.0))
@@ -255,7 +253,7 @@ def test_a_histogram_is_a_density(values: list[float]) -> None:
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6))
-def test_ticks_are_few_and_inside(low: float, span: float) -> None:
+def test_axis_ticks_are_few_and_within_range(low: float, span: float) -> None:
     found = ticks(low, low + span)
     assert 1 <= len(found) <= 11
     assert all(low - 1e-6 * span <= value <= low + span * (1 + 1e-6) for value in found)
@@ -290,7 +288,7 @@ def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
         assert expected in text
 
 
-def test_a_disk_that_takes_no_more_leaves_the_page_before_and_nothing_half_written(tmp_path: Path) -> None:
+def test_a_failed_write_keeps_the_previous_page_and_leaves_no_partial_file(tmp_path: Path) -> None:
     path = tmp_path / "run.html"
     path.write_text("the page before")
     # a limit on files' sizes fails a write in its middle, as a full disk does

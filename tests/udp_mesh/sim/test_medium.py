@@ -87,7 +87,7 @@ def test_a_full_queue_drops_and_counts() -> None:
     assert line.medium.counts.queue_drops >= 89
 
 
-def test_routes_are_recomputed_only_after_the_mesh_layers_time() -> None:
+def test_routes_are_recomputed_only_after_the_routing_interval() -> None:
     line = Line("abc", route_s=1.0)
     line.medium.send("a", "c", b"x")
     line.event_queue.run_until(0.5)
@@ -122,7 +122,7 @@ def test_the_same_seed_gives_the_same_run() -> None:
     assert run() == run()
 
 
-def test_loss_grows_from_good_to_range_and_rock_stops_all() -> None:
+def test_loss_grows_with_distance_and_walls_block_everything() -> None:
     air = PathLoss(good_m=50, range_m=100, least_loss=0.1, walls=(Wall((0, 10), (100, 10)),))
     assert air.loss((0, 0), (20, 0)) == 0.1
     assert air.loss((0, 0), (75, 0)) == 0.55
@@ -137,7 +137,7 @@ def test_a_trajectory_consists_of_straight_lines() -> None:
     assert walked.at(99) == (100, 50)
 
 
-def test_an_urgent_frame_does_not_stand_behind_its_stations_others() -> None:
+def test_an_urgent_frame_overtakes_other_frames_of_its_station() -> None:
     line = Line("ab", rate=1e6)
     for _ in range(20):
         line.medium.send("a", "b", bytes(1000))
@@ -175,7 +175,7 @@ def test_each_stations_airtime_is_counted() -> None:
     assert sum(counts.airtime_s_of.values()) == counts.airtime_s
 
 
-def test_who_waited_while_another_sent_waits_less_the_next_time() -> None:
+def test_backoff_resumes_instead_of_restarting_after_a_busy_channel() -> None:
     line = Line("ab", rate=1e6, queue_frames=10_000)
     for _ in range(400):
         line.medium.send("a", "b", bytes(1000))

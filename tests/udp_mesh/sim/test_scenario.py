@@ -96,7 +96,7 @@ def test_any_bytes_give_a_scenario_or_a_scenario_error(raw: bytes) -> None:
 
 
 @pytest.mark.parametrize("words", [["--duration", "0"], ["--duration", "nan"], ["--duration", "inf"], ["--seed", "-1"]])
-def test_a_number_that_would_play_nothing_is_wrong_usage(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_duration_or_seed_is_a_usage_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         run_command(["final-run", *words])
     assert ended.value.code == 2
@@ -118,7 +118,7 @@ VALUES = ("0", "-1", "1", "1.5", "1e400", "nan", "inf", ".inf", "-0.0", "1e18", 
 
 
 @given(st.sampled_from(KEYS), st.sampled_from(VALUES))
-def test_any_number_is_played_or_reported(key: str, value: str) -> None:
+def test_any_setting_value_is_simulated_or_reported(key: str, value: str) -> None:
     outer, _, inner = key.partition(".")
     changed = GOOD.replace("seed: 3", f"{outer}: {{{inner}: {value}}}" if inner else f"{outer}: {value}")
     try:

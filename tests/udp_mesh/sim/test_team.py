@@ -26,7 +26,7 @@ def accounted(played: RunResult) -> None:
     assert played.ledger.ended_twice == [], f"seed {played.scenario.seed}"
 
 
-def test_every_reliable_message_ends_once_and_is_delivered_where_the_link_stays() -> None:
+def test_every_reliable_message_is_delivered_once_while_the_link_is_up() -> None:
     made = team("ab")
     made.event_queue.run_until(5.0)
     sent = [made.send("a", "map", bytes([number]) * 20_000, "b") for number in range(20)]
@@ -87,7 +87,7 @@ def test_a_crash_in_the_middle_of_a_transfer_is_survived() -> None:
     assert made.ledger.ended_twice == []
 
 
-def test_a_changed_address_is_found_without_losing_what_was_accepted() -> None:
+def test_an_address_change_loses_no_accepted_message() -> None:
     made = team("ab", rate=2e6)
     made.event_queue.run_until(5.0)
     made.send("a", "map", bytes(500_000), "b")
@@ -115,5 +115,5 @@ def test_the_same_seed_gives_the_same_recording() -> None:
 
 @pytest.mark.proof
 @pytest.mark.parametrize("seed", range(10))
-def test_hours_of_partitions_and_restarts(seed: int) -> None:
+def test_no_message_ends_twice_in_hours_of_partitions_and_restarts(seed: int) -> None:
     accounted(play(replace(load(find("partition-soak")), seed=seed)))

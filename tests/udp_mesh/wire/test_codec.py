@@ -23,7 +23,7 @@ def test_decoding_inverts_encoding(frames: list[Frame]) -> None:
 
 
 @given(st.lists(any_frame, min_size=1, max_size=3), st.data())
-def test_a_cut_datagram_gives_fewer_frames_or_an_error(frames: list[Frame], data: st.DataObject) -> None:
+def test_a_truncated_datagram_gives_no_extra_frames_or_an_error(frames: list[Frame], data: st.DataObject) -> None:
     raw = encode(frames)
     cut = raw[: data.draw(st.integers(0, len(raw) - 1))]
     try:
@@ -103,7 +103,7 @@ def test_too_many_frames_are_refused() -> None:
         (bytes((1, 3)) + b"a b" + bytes(40), "white space"),
     ],
 )
-def test_a_value_past_its_cap_is_an_error_that_names_it(raw: bytes, message: str) -> None:
+def test_an_invalid_value_is_an_error_that_names_it(raw: bytes, message: str) -> None:
     with pytest.raises(DecodeError, match=message):
         decode(raw)
 
@@ -122,7 +122,7 @@ def test_a_value_past_its_cap_is_an_error_that_names_it(raw: bytes, message: str
         Heartbeat("ugv1", 1, 1, 0, 1, 0, 0, 0, 0, (b"peerone!",), (), None, (1,)),
     ],
 )
-def test_our_own_mistakes_raise_value_error(frame: Frame) -> None:
+def test_encoding_an_invalid_frame_raises_value_error(frame: Frame) -> None:
     with pytest.raises(ValueError):
         encode([frame])
 

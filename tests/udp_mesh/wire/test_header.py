@@ -19,13 +19,13 @@ from udp_mesh.wire.header import (
 
 
 @given(st.sampled_from([Kind.BROADCAST, Kind.DATA]), st.integers(0, 65_535), st.integers(0, (1 << 48) - 1))
-def test_a_short_header_comes_back_with_the_low_half_of_its_number(kind: Kind, tag: int, number: int) -> None:
+def test_a_short_header_round_trips_with_the_low_half_of_its_packet_number(kind: Kind, tag: int, number: int) -> None:
     raw = SHORT_HEADER.pack(MARK | VERSION << 4 | kind, tag, number & NUMBER_LOW_MASK) + bytes(16)
     assert parse_header(raw) == ShortHeader(kind, tag, number & 0xFFFFFFFF)
 
 
 @given(st.sampled_from([Kind.HELLO, Kind.INTRODUCTION]), st.binary(min_size=16, max_size=16))
-def test_a_long_header_comes_back(kind: Kind, boot: bytes) -> None:
+def test_a_long_header_round_trips(kind: Kind, boot: bytes) -> None:
     raw = encode_long(kind, b"keyi", boot, 77) + b"chek" + bytes(16)
     assert parse_header(memoryview(raw)) == LongHeader(kind, b"keyi", boot, 77, b"chek")
 
@@ -46,7 +46,7 @@ def test_no_legacy_datagram_looks_like_ours(first: int) -> None:
         parse_header(raw)
 
 
-def test_another_version_is_named() -> None:
+def test_an_unknown_version_error_carries_the_version() -> None:
     with pytest.raises(UnknownVersionError) as caught:
         parse_header(bytes((0x80 | 3 << 4,)) + bytes(60))
     assert caught.value.version == 3

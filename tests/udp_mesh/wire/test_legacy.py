@@ -71,7 +71,7 @@ def test_any_bytes_give_a_datagram_or_an_error(raw: bytes) -> None:
         frame_id=words,
     )
 )
-def test_a_message_comes_back(message: PriorityMeshData) -> None:
+def test_messages_round_trip(message: PriorityMeshData) -> None:
     assert decode_mesh_data(encode_mesh_data(message)) == message
 
 
@@ -83,7 +83,7 @@ def test_any_bytes_give_a_message_or_an_error(raw: bytes) -> None:
         return
 
 
-def test_the_bytes_are_those_of_the_legacy_code() -> None:
+def test_encoded_bytes_match_the_legacy_code() -> None:
     host = encode_legacy(Host("ugv1", "10.0.0.1"))
     assert host == struct.pack("<BHIIH", 4, 0, 0, 0, 80) + struct.pack("<64p16p", b"ugv1", b"10.0.0.1") + b"\x00"
     payload = encode_legacy(LegacyPayload(0x7FFF, 2, 3, b"abc", wants_ack=True))
@@ -109,13 +109,13 @@ def test_defect_3_a_position_past_the_total_is_refused() -> None:
         decode_legacy(struct.pack("<BHIIH", 1, 1, 7, 7, 1) + b"x\x00")
 
 
-def test_defect_4_an_unknown_type_is_bad_bytes_like_any_other() -> None:
+def test_defect_4_an_unknown_type_is_a_decode_error() -> None:
     with pytest.raises(DecodeError, match="expected 1, 2, 4 or 5, found 9"):
         decode_legacy(struct.pack("<BHIIH", 9, 1, 0, 1, 1) + b"x\x00")
 
 
 @given(st.binary(max_size=1500))
-def test_an_encapsulated_datagram_is_an_acknowledgement_to_legacy_programs_and_itself_to_us(data: bytes) -> None:
+def test_an_encapsulated_datagram_looks_like_an_acknowledgement_to_legacy_programs(data: bytes) -> None:
     covered = encapsulate(data)
     assert decode_legacy(covered) == LegacyAck(0xFFFF, 0xFFFFFFFF)
     assert decapsulate(covered) == data
@@ -123,5 +123,5 @@ def test_an_encapsulated_datagram_is_an_acknowledgement_to_legacy_programs_and_i
 
 
 @given(st.binary(max_size=40))
-def test_anything_else_is_not_uncovered(data: bytes) -> None:
+def test_other_bytes_are_not_decapsulated(data: bytes) -> None:
     assert data[:11] == encapsulate(b"")[:11] or decapsulate(data) is None

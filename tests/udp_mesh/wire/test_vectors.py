@@ -12,7 +12,7 @@ from udp_mesh.wire.legacy import decode_legacy, decode_mesh_data
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_the_vectors_in_the_repository_are_what_the_code_makes(name: str) -> None:
+def test_published_vectors_match_the_generated_ones(name: str) -> None:
     assert json.loads((FOLDER / name).read_text()) == MAKERS[name]()
 
 

@@ -65,7 +65,7 @@ def all_authorized(crew: Crew) -> bool:
     )
 
 
-def test_every_cell_is_the_one_that_is_configured_and_all_in_it_have_proven_the_key(crew: Crew) -> None:
+def test_all_radios_join_their_configured_cell_and_all_neighbors_are_authorized(crew: Crew) -> None:
     for name in FIELDED:
         assert "Joined IBSS 02:ca:fe:00:00:21" in crew.on(name, "iw dev mesh0 link")
         assert "channel 6 (2437 MHz), width: 20 MHz" in crew.on(name, "iw dev mesh0 info")
@@ -76,7 +76,7 @@ def test_every_cell_is_the_one_that_is_configured_and_all_in_it_have_proven_the_
     until(lambda: all_authorized(crew), "every neighbor to be authorized")
 
 
-def test_nothing_but_handshakes_passes_the_air_in_the_clear(crew: Crew) -> None:
+def test_no_unencrypted_data_frames_are_transmitted(crew: Crew) -> None:
     words = control.run(crew.fleet.directory, _LISTEN, timeout_s=120.0).check("listen").stdout.split()
     protected, clear = map(int, words)
     assert protected > 50
@@ -92,7 +92,7 @@ def test_both_radios_of_one_node_are_in_its_mesh(crew: Crew) -> None:
 
 
 @pytest.mark.proof
-def test_who_does_not_know_the_key_stays_outside(crew: Crew) -> None:
+def test_a_node_with_the_wrong_key_cannot_join_the_mesh(crew: Crew) -> None:
     crew.on(
         "husky", "for n in 0 1; do uci set wireless.mesh$n.key='a word of its own'; done; uci commit; reload_config"
     )
@@ -108,7 +108,7 @@ def test_who_does_not_know_the_key_stays_outside(crew: Crew) -> None:
 
 # test_mesh_changes.py changes it with the channel and the BSSID, in every run
 @pytest.mark.proof
-def test_the_whole_mesh_takes_a_new_key_over_itself(crew: Crew) -> None:
+def test_a_new_key_is_rolled_out_over_the_running_mesh(crew: Crew) -> None:
     crew.write_keys(main="the new word of all")
     last = crew.provision(*FIELDED)[-1]
     assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} <= {"done", "unchanged"}

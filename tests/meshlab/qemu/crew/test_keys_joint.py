@@ -33,7 +33,7 @@ def switches(crew: Crew) -> list[list[str]]:
     return [sorted(stage["nodes"]) for stage in stages if stage["kind"] == "switch"]
 
 
-def test_the_key_of_a_mesh_with_sae_changes_alone_and_the_other_mesh_is_left_as_it_was(crew: Crew) -> None:
+def test_changing_the_key_of_the_sae_mesh_leaves_the_other_mesh_unchanged(crew: Crew) -> None:
     (main,) = keys(crew)["main"]
     crew.write_keys(main=main, fast="a new word for five gigahertz")
     assert switches(crew) == [sorted(TWINS)]
@@ -45,7 +45,7 @@ def test_the_key_of_a_mesh_with_sae_changes_alone_and_the_other_mesh_is_left_as_
     until(lambda: works(crew), "both radios of both nodes to know each other with the new key")
 
 
-def test_both_meshes_take_new_keys_at_one_moment(crew: Crew) -> None:
+def test_keys_of_both_meshes_change_simultaneously(crew: Crew) -> None:
     crew.write_keys(main="new for all of them", fast="new for the fast ones, too")
     # the two meshes share the nodes with two radios, whose files change together: so there is one simultaneous change
     assert switches(crew) == [sorted(FIELDED)]

@@ -34,7 +34,7 @@ def cells(crew: Crew) -> set[str]:
     return {" ".join(crew.on(name, command).split()) for name in FIELDED}
 
 
-def test_a_whole_mesh_changes_channel_bssid_and_key_over_itself(crew: Crew) -> None:
+def test_channel_bssid_and_key_of_a_mesh_change_over_the_mesh_itself(crew: Crew) -> None:
     assert cells(crew) == {"02:ca:fe:00:00:21 2437"}
     crew.edit("channel: 6\n", "channel: 11\n")
     crew.edit("02:ca:fe:00:00:21", "02:ca:fe:00:00:31")
@@ -47,7 +47,7 @@ def test_a_whole_mesh_changes_channel_bssid_and_key_over_itself(crew: Crew) -> N
     until(lambda: all_authorized(crew), "every neighbor to be authorized with the new key")
 
 
-def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
+def test_the_whole_mesh_rolls_back_when_some_nodes_do_not_come_back(crew: Crew) -> None:
     before = cells(crew)
     crew.edit("channel: 11\n", "channel: 1\n")
     crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
@@ -72,7 +72,7 @@ def test_the_mesh_goes_back_when_some_of_it_never_arrives(crew: Crew) -> None:
     until(lambda: crew.meshctl("provision", *FIELDED, "--check", expect=None).status == 0, "every node to be as it was")
 
 
-def test_the_running_mesh_is_changed_from_its_far_end_and_restarted_radios_are_heard_again(crew: Crew) -> None:
+def test_farthest_nodes_are_provisioned_first_and_restarted_radios_are_heard_again(crew: Crew) -> None:
     # the broadcast rate restarts a radio on every release; transmit power does not
     crew.edit(RATE_OF_MAIN.format(12000), RATE_OF_MAIN.format(6000))
     far_first = sorted(FIELDED, key=lambda name: -crew.hops()[name])
@@ -113,7 +113,7 @@ def _unanswered_by_old_entries(crew: Crew, name: str) -> list[str]:
     ]
 
 
-def test_a_configuration_that_cuts_a_node_off_is_taken_back_by_the_node_itself(crew: Crew, tmp_path: Path) -> None:
+def test_a_node_rolls_back_a_configuration_that_isolates_it(crew: Crew, tmp_path: Path) -> None:
     before = cells(crew)
     crew.meshctl("backup", "b01", "--out", str(tmp_path))
     (kept,) = tmp_path.glob("b01-*.tgz")

@@ -15,23 +15,23 @@ def channel_share(*rates: float) -> ChannelShare:
     return made
 
 
-def test_a_single_sender_keeps_the_whole_queue_whatever_its_acknowledgements_take() -> None:
+def test_a_single_sender_keeps_the_whole_queue_despite_acknowledgement_traffic() -> None:
     assert channel_share().queue_share(1e6, 0.0) == 1.0
     assert channel_share(50_000.0).queue_share(1e6, 0.0) == 1.0
 
 
-def test_the_more_senders_the_less_queue_each() -> None:
+def test_queue_share_decreases_with_the_number_of_senders() -> None:
     shares = [channel_share(*[3e5] * others).queue_share(3e5, 0.0) for others in (0, 1, 3, 7)]
     assert shares == sorted(shares, reverse=True)
     assert abs(shares[2] - 0.5) < 1e-9
 
 
-def test_who_sends_less_than_the_others_keeps_more() -> None:
+def test_a_sender_with_a_lower_rate_keeps_a_larger_queue_share() -> None:
     poor, rich = channel_share(4e5).queue_share(2e5, 0.0), channel_share(2e5).queue_share(4e5, 0.0)
     assert rich < poor <= MAX_SHARE
 
 
-def test_who_sends_next_to_nothing_or_was_not_heard_for_long_does_not_count() -> None:
+def test_idle_or_stale_senders_do_not_reduce_the_queue_share() -> None:
     assert channel_share(100.0, 200.0).queue_share(1e5, 0.0) == 1.0
     stopped = channel_share(1e5)
     stopped.on_send_rate(bytes([0]), 50.0, 1.0)
@@ -39,7 +39,7 @@ def test_who_sends_next_to_nothing_or_was_not_heard_for_long_does_not_count() ->
     assert channel_share(1e5).queue_share(1e5, RATE_VALID_S + 1.0) == 1.0
 
 
-def test_in_a_large_team_what_was_said_holds_until_the_next_heartbeat_is_overdue() -> None:
+def test_a_reported_send_rate_is_valid_until_the_next_heartbeat_is_overdue() -> None:
     made = ChannelShare()
     made.on_send_rate(b"0", 1e5, 0.0, valid_s=4 * RATE_VALID_S)
     assert made.queue_share(1e5, 3 * RATE_VALID_S) < 1.0
@@ -71,7 +71,7 @@ def settled_queue(share: float, loss: float) -> float:
     return window.cwnd - base * rate
 
 
-def test_a_shared_channel_needs_less_of_our_queue_unless_much_is_lost() -> None:
+def test_the_queue_target_shrinks_on_a_shared_channel_unless_loss_is_high() -> None:
     alone = settled_queue(1.0, 0.0)
     assert alone >= MIN_QUEUE_PACKETS * 0.9
     assert settled_queue(0.5, 0.0) <= 0.6 * alone

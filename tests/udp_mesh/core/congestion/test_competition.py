@@ -17,7 +17,7 @@ def drain(competition: Competition, *rtts_s: float, others_send: bool = False) -
         competition.on_drained(rtt_s, others_send=others_send, now=1.0 + number)
 
 
-def test_different_long_round_trips_turn_the_mode_on() -> None:
+def test_varying_long_round_trips_enable_competition() -> None:
     competition = alone()
     drain(competition, 0.08)
     assert competition.is_suspected
@@ -26,14 +26,14 @@ def test_different_long_round_trips_turn_the_mode_on() -> None:
     assert competition.is_on
 
 
-def test_a_queue_that_shrinks_without_a_drain_of_ours_turns_it_on() -> None:
+def test_a_queue_that_shrinks_without_our_drain_enables_competition() -> None:
     competition = alone()
     drain(competition, 0.10)
     competition.on_round(0.07, loss=0.0, now=2.0)
     assert competition.is_on
 
 
-def test_a_longer_route_does_not() -> None:
+def test_a_longer_route_does_not_enable_competition() -> None:
     competition = alone()
     drain(competition, *[0.15] * ROUTE_HOLDS)
     assert not competition.is_on
@@ -41,7 +41,7 @@ def test_a_longer_route_does_not() -> None:
     assert competition.base_rtt() == 0.15
 
 
-def test_the_first_empty_queue_ends_it() -> None:
+def test_the_first_empty_queue_ends_competition() -> None:
     competition = alone()
     drain(competition, 0.08, 0.10)
     drain(competition, 0.022)
@@ -49,13 +49,13 @@ def test_the_first_empty_queue_ends_it() -> None:
     assert not competition.is_suspected
 
 
-def test_nodes_that_report_their_sending_are_no_foreign_flows() -> None:
+def test_nodes_that_report_their_send_rate_are_not_foreign_flows() -> None:
     competition = alone()
     drain(competition, 0.08, 0.10, others_send=True)
     assert not competition.is_on
 
 
-def test_the_window_grows_until_losses_at_a_long_queue() -> None:
+def test_the_window_grows_until_loss_occurs_at_a_long_queue() -> None:
     competition = alone()
     drain(competition, 0.08, 0.10)
     assert competition.window(20.0, 0.1) == 20.0 + INCREASE
@@ -64,7 +64,7 @@ def test_the_window_grows_until_losses_at_a_long_queue() -> None:
     assert competition.window(20.0, 0.1) == 20.0 + INCREASE
 
 
-def test_losses_of_the_radio_do_not_shrink_it() -> None:
+def test_radio_losses_do_not_shrink_the_window() -> None:
     competition = Competition()
     for number in range(500):
         competition.on_round(0.02, loss=0.05, now=number * 0.02)

@@ -23,14 +23,14 @@ def steps(growth: Growth, min_rtt: float, capacities: list[float]) -> list[float
     ]
 
 
-def test_a_few_empty_rounds_come_first() -> None:
+def test_growth_starts_only_after_several_empty_rounds() -> None:
     growth = Growth()
     assert steps(growth, 0.02, [CAPACITY] * (GROWTH_AFTER_ROUNDS - 1)) == [None] * (GROWTH_AFTER_ROUNDS - 1)
     assert growth.packets(20.0, CAPACITY, 0.02, is_empty=False, now=0.1) is None
     assert growth.packets(20.0, CAPACITY, 0.02, is_empty=True, now=0.1) is None
 
 
-def test_on_a_long_path_the_steps_double_from_a_short_queue() -> None:
+def test_growth_steps_double_on_a_long_path() -> None:
     capacities = [CAPACITY * 1.2**number for number in range(5)]
     grown = steps(Growth(), 0.6, capacities)[GROWTH_AFTER_ROUNDS - 1 :]
     first_s = FIRST_GROWTH_ROUND_TRIPS * 0.6
@@ -39,13 +39,13 @@ def test_on_a_long_path_the_steps_double_from_a_short_queue() -> None:
     assert expected[0] < (GROWTH - 1) * 0.6 * capacities[2] / 5
 
 
-def test_on_a_short_path_a_step_is_a_fraction_of_the_window() -> None:
+def test_a_growth_step_is_a_fraction_of_the_window_on_a_short_path() -> None:
     grown = steps(Growth(), 0.01, [CAPACITY] * GROWTH_AFTER_ROUNDS)[-1]
     assert grown == pytest.approx((GROWTH - 1) * 10)
     assert (GROWTH - 1) * 0.01 < FIRST_GROWTH_S
 
 
-def test_a_full_link_ends_growth_for_a_while() -> None:
+def test_a_full_link_pauses_growth() -> None:
     growth = Growth()
     found = steps(growth, 0.02, [CAPACITY] * (GROWTH_AFTER_ROUNDS + FULL_ROUNDS))
     assert found[-1] == 0.0

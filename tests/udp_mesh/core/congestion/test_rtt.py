@@ -23,17 +23,17 @@ def stalled(rtt: RttEstimator, seconds: float) -> float:
     return rtt.windowed_rtt
 
 
-def test_without_jitter_the_shortest_window_shows_a_queue() -> None:
+def test_without_jitter_a_queue_is_detected_within_the_shortest_window() -> None:
     assert stalled(estimator(0), MIN_WINDOWED_RTT_S + 0.003) > BASE_S + 0.02
 
 
-def test_on_a_path_with_stalls_another_stall_is_no_queue() -> None:
+def test_another_stall_on_a_jittery_path_is_not_taken_for_a_queue() -> None:
     assert stalled(estimator(50), 0.030) < BASE_S + 0.005
 
 
-def test_a_queue_that_stays_shows_all_the_same() -> None:
+def test_a_persistent_queue_is_detected_despite_jitter() -> None:
     assert stalled(estimator(50), MAX_JITTER_WINDOW_S + 0.005) > BASE_S + 0.02
 
 
-def test_the_serialization_of_a_few_packets_is_no_jitter() -> None:
+def test_packet_serialization_time_is_not_counted_as_jitter() -> None:
     assert stalled(estimator(50, packet_s=0.02), MIN_WINDOWED_RTT_S + 0.003) > BASE_S + 0.02

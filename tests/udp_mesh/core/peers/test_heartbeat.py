@@ -22,9 +22,7 @@ def _session(config_name: str = "b") -> Session:
 
 
 @given(st.integers(0, 2000), st.lists(st.floats(0.0, 2.0), min_size=1, max_size=40), st.integers(0, 1 << 30))
-def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
-    team: int, waits: list[float], seed: int
-) -> None:
+def test_heartbeat_replies_never_exceed_the_nodes_rate_share(team: int, waits: list[float], seed: int) -> None:
     heartbeats, now = HeartbeatScheduler(random.Random(seed), RATES, 0.0), 0.0
     share_s = team / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)
     sent: list[float] = []
@@ -40,7 +38,7 @@ def test_whatever_asks_for_heartbeats_a_node_sends_no_more_than_its_share(
 
 
 @given(st.integers(0, 1 << 30))
-def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_in_a_large_one(seed: int) -> None:
+def test_a_new_node_is_answered_immediately_in_a_small_team_and_delayed_in_a_large_one(seed: int) -> None:
     rng = random.Random(seed)
     small, large = (HeartbeatScheduler(rng, RATES, 0.0) for _ in range(2))
     for heartbeats in (small, large):
@@ -51,7 +49,7 @@ def test_a_new_node_is_answered_at_once_in_a_small_team_and_not_by_all_at_once_i
     assert large.next_at >= 0.9
 
 
-def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
+def test_a_peer_has_no_sender_until_data_is_sent_to_it() -> None:
     world = World(seed=3)
     for name in ("a", "b", "c"):
         world.add(settings(name, Topic("map")))
@@ -67,7 +65,7 @@ def test_peers_to_whom_nothing_is_sent_have_no_sending_half() -> None:
     assert [peer.name for peer in world.nodes["a"]._state.peer_table.peers.values() if peer.sender is not None] == ["b"]
 
 
-def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later() -> None:
+def test_settings_changed_before_the_first_send_apply_to_later_messages() -> None:
     world = World(seed=3)
     for name in ("a", "b"):
         world.add(settings(name, Topic("map")))
@@ -77,7 +75,7 @@ def test_settings_changed_before_anything_was_sent_hold_for_what_is_sent_later()
     assert world.nodes["a"].conditions(world.now).peers[0].window_packets == 3
 
 
-def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_silent_peer_goes_offline_even_if_a_round_checks_only_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peer_lifecycle, "IDLE_PEERS_PER_ROUND", 1)
     world = World(seed=4)
     for name in "abcdef":
@@ -88,7 +86,7 @@ def test_every_silent_peer_goes_offline_although_a_round_looks_at_few(monkeypatc
     assert world.run(20.0, until=lambda: len(world.events_of("a", PeerOffline)) == 5)
 
 
-def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
+def test_heartbeats_report_send_and_arrival_rates() -> None:
     world = World(seed=5)
     for name in ("a", "b", "c"):
         world.add(settings(name, Topic("video", priority=9, reliable=False)))
@@ -110,7 +108,7 @@ def test_nodes_tell_each_other_what_they_send_and_what_arrives() -> None:
     assert world.nodes["c"].conditions(world.now).heard_bits_per_s < 20_000
 
 
-def test_new_nodes_that_one_heartbeat_cannot_list_are_listed_soon() -> None:
+def test_new_nodes_beyond_one_heartbeats_capacity_are_listed_soon() -> None:
     heartbeats = HeartbeatScheduler(random.Random(1), RATES, 0.0)
     rng, listed, now = random.Random(2), set[bytes](), 0.0
     strangers = [Session("b", rng.randbytes(16), bytes(16), (KEY,), settings("b")) for _ in range(300)]

@@ -10,7 +10,7 @@ from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Ping
 
 
-def test_a_flood_of_unknown_keys_is_reported_in_a_few_events_that_count_all() -> None:
+def test_a_flood_of_unknown_keys_is_reported_in_a_few_aggregated_events() -> None:
     both = pair()
     rng = random.Random(1)
     stranger = SendChannel(Key(bytes(range(7, 39))), rng.randbytes(16), TO_ALL)
@@ -28,7 +28,7 @@ def test_a_flood_of_unknown_keys_is_reported_in_a_few_events_that_count_all() ->
     assert both.b.conditions(both.now).counters.dropped_unauthenticated >= flood
 
 
-def test_a_team_that_missed_a_rotation_is_reported_robot_by_robot() -> None:
+def test_each_robot_that_missed_a_key_rotation_is_reported_individually() -> None:
     both = pair()
     for host in range(BURST):
         other = SendChannel(Key(bytes(range(9, 41))), bytes([host]) * 16, TO_ALL)

@@ -13,7 +13,7 @@ def test_every_event_is_defined_in_every_state() -> None:
 
 
 @pytest.mark.parametrize("state", PeerState)
-def test_only_a_peer_that_is_heard_comes_online(state: PeerState) -> None:
+def test_only_the_heard_event_brings_a_peer_online(state: PeerState) -> None:
     assert TRANSITIONS[state, PeerEvent.HEARD] is PeerState.ONLINE
     others = {TRANSITIONS[state, event] for event in PeerEvent if event is not PeerEvent.HEARD}
     assert (PeerState.ONLINE in others) == (state is PeerState.ONLINE)
@@ -24,7 +24,7 @@ def test_a_peer_is_lost_only_after_it_was_offline() -> None:
     assert becoming_lost == {PeerState.LOST, PeerState.OFFLINE}
 
 
-def test_a_peer_comes_goes_offline_is_lost_and_returns() -> None:
+def test_a_peer_goes_online_offline_lost_and_online_again() -> None:
     world = World()
     for name in "ab":
         world.add(settings(name))

@@ -33,7 +33,7 @@ def received(both: Pair, node: Endpoint) -> list[bytes]:
     return [event.payload for event in both.events(node) if isinstance(event, MessageReceived)]
 
 
-def test_two_nodes_meet_within_three_exchanges() -> None:
+def test_two_nodes_see_each_other_online_once() -> None:
     both = Pair(settings("a"), settings("b"))
     for _ in range(30):
         both.roundtrip()
@@ -54,7 +54,7 @@ def events_of(versions: tuple[int, int], *, times: int, apart_s: float) -> list[
     return both.events(both.b)
 
 
-def test_a_node_of_later_versions_too_is_met_and_one_of_later_ones_alone_is_reported_once_a_minute() -> None:
+def test_a_node_sharing_a_version_is_admitted_and_an_incompatible_one_reported_once_a_minute() -> None:
     assert PeerOnline in map(type, events_of((1, 2), times=3, apart_s=1.0))
     assert events_of((2, 3), times=50, apart_s=1.0) == [Incompatible("new", ("10.0.0.9", 8700), (2, 3))]
     assert len(events_of((2, 3), times=5, apart_s=61.0)) == 5
@@ -74,7 +74,7 @@ def test_a_replayed_heartbeat_brings_no_peer_online() -> None:
     assert late.next_event() is None
 
 
-def test_everything_recorded_from_an_earlier_run_is_worthless_to_the_next() -> None:
+def test_datagrams_recorded_from_an_earlier_run_are_rejected() -> None:
     both = pair()
     recorded: list[Datagram] = []
     for number in range(5):
@@ -118,7 +118,7 @@ def test_a_restart_is_detected_at_once_and_reported() -> None:
     assert not world.events_of("a", PeerOffline)
 
 
-def test_silence_takes_a_peer_offline_and_a_bye_at_once() -> None:
+def test_a_silent_peer_goes_offline_after_a_timeout_and_a_closed_one_immediately() -> None:
     world = World()
     for name in ("a", "b", "c"):
         world.add(settings(name))
@@ -134,7 +134,7 @@ def test_silence_takes_a_peer_offline_and_a_bye_at_once() -> None:
     assert world.events_of("a", PeerOffline)[1:] == [PeerOffline("c", left=True)]
 
 
-def test_a_peer_that_moves_is_followed_and_its_messages_arrive_there() -> None:
+def test_messages_follow_a_peer_to_its_new_address() -> None:
     world = World()
     world.add(settings("a"))
     world.add(settings("b"))
@@ -149,7 +149,7 @@ def test_a_peer_that_moves_is_followed_and_its_messages_arrive_there() -> None:
     assert not world.events_of("a", PeerOffline)
 
 
-def test_a_node_with_another_key_is_reported_and_not_met() -> None:
+def test_a_node_with_another_key_is_reported_and_not_admitted() -> None:
     both = Pair(settings("a"), replace(settings("b"), keys=(OTHER_KEY,)))
     both.roundtrip(times=300)
     assert both.events(both.a) == [KeyMismatch(B, "mesh")]
@@ -173,7 +173,7 @@ def test_keys_rotate_without_losing_a_message() -> None:
     assert not any(isinstance(event, PeerOffline | PeerRestarted | KeyMismatch) for event in events)
 
 
-def test_neighbors_are_met_without_any_broadcast() -> None:
+def test_configured_neighbors_connect_without_broadcast() -> None:
     rng = random.Random(2)
     nodes = {}
     for name, own, other in (("a", A, B), ("b", B, A)):

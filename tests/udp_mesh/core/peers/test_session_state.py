@@ -21,7 +21,7 @@ def test_every_reception_event_is_defined_in_every_state() -> None:
 
 
 @pytest.mark.parametrize("state", Reception)
-def test_only_a_missing_listing_of_a_peer_that_listed_us_is_one_way(state: Reception) -> None:
+def test_only_a_peer_that_stops_listing_us_becomes_one_way(state: Reception) -> None:
     becomes_one_way = {event for event in ReceptionEvent if RECEPTION_TRANSITIONS[state, event] is Reception.ONE_WAY}
     kept = {ReceptionEvent.NOT_LISTED, ReceptionEvent.ACKNOWLEDGED}
     expected = {Reception.LISTS_US: {ReceptionEvent.NOT_LISTED}, Reception.ONE_WAY: kept}
@@ -34,13 +34,13 @@ def test_a_peer_that_once_heard_us_never_becomes_unknown() -> None:
     }
 
 
-def test_a_session_is_verified_from_every_other_state_and_stays_so() -> None:
+def test_every_unverified_session_state_can_become_verified() -> None:
     verified = {state for (state, event) in SESSION_TRANSITIONS if event is SessionEvent.VERIFIED}
     assert verified == set(SessionState) - {SessionState.VERIFIED}
     assert all(SESSION_TRANSITIONS[state, SessionEvent.VERIFIED] is SessionState.VERIFIED for state in verified)
 
 
-def test_a_peer_answers_lists_us_and_no_longer_hears_us() -> None:
+def test_a_session_becomes_one_way_when_the_peer_no_longer_hears_us() -> None:
     world = World()
     for name in "ab":
         world.add(settings(name))

@@ -35,7 +35,7 @@ class Insider:
         self.both.b.receive(channel.seal(encode(frames))[1], "mesh", FORGER, self.both.now)
 
 
-def test_many_names_together_hold_no_more_than_one_bound_and_leave_room_for_a_peer() -> None:
+def test_many_peer_names_share_one_memory_limit_and_leave_room_for_a_peer() -> None:
     both = pair(limits=Limits(partial_bytes=TOTAL))
     insider = Insider(both, 8)
     for number in range(300):
@@ -50,7 +50,7 @@ def test_many_names_together_hold_no_more_than_one_bound_and_leave_room_for_a_pe
     assert any(isinstance(event, MessageReceived) for event in both.events(both.b))
 
 
-def test_topic_names_and_tiny_messages_count_too() -> None:
+def test_topic_names_and_tiny_messages_count_toward_the_memory_limit() -> None:
     both = pair(limits=Limits(partial_bytes=TOTAL))
     insider = Insider(both, 8)
     for number in range(1000):
@@ -66,7 +66,7 @@ def test_topic_names_and_tiny_messages_count_too() -> None:
     assert kept < 8 * 1000
 
 
-def test_what_a_forgotten_peer_held_is_free_again() -> None:
+def test_memory_of_a_forgotten_peer_is_released() -> None:
     both = pair(limits=Limits(partial_bytes=TOTAL))
     insider = Insider(both, 4)
     for number in range(200):
@@ -80,7 +80,7 @@ def test_what_a_forgotten_peer_held_is_free_again() -> None:
     assert peer_table.memory.holders <= 1
 
 
-def test_whole_messages_release_what_their_fragments_took() -> None:
+def test_completed_messages_release_their_fragment_memory() -> None:
     both = pair()
     for _ in range(5):
         both.a.send("any", bytes(300_000), destination="b", now=both.now)
@@ -89,7 +89,7 @@ def test_whole_messages_release_what_their_fragments_took() -> None:
     assert both.b._state.peer_table.memory.bytes < 2000
 
 
-def test_past_the_half_a_peer_gets_an_equal_part_and_past_the_whole_no_peer_gets_any() -> None:
+def test_peers_get_equal_shares_above_half_the_budget_and_nothing_above_the_limit() -> None:
     memory = MemoryBudget(1000)
     greedy, late = Account(memory), Account(memory)
     while greedy.has_room(10):

@@ -80,7 +80,7 @@ def topics(world: World, name: str, kind: type[MessageDelivered] | type[MessageR
     ("mtu", "found"), [(1499, []), (1400, [1280]), (1280, [1280]), (900, [1280, 576]), (576, [1280, 576])]
 )
 @pytest.mark.parametrize("telemetry", [True, False])
-def test_a_large_message_crosses_a_path_that_is_narrower_than_its_link(
+def test_a_large_message_crosses_a_path_with_an_mtu_below_the_link_mtu(
     mtu: int, found: list[int], telemetry: bool
 ) -> None:
     world = met(mtu)
@@ -113,9 +113,7 @@ def largest_of(world: World) -> list[int]:
 @pytest.mark.parametrize("mtu", [1300, 1400])
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 @pytest.mark.parametrize("round_trip_s", [0.02, 0.2, 1.0])
-def test_a_narrow_path_is_found_soon_although_datagrams_of_any_size_are_lost(
-    mtu: int, loss: float, round_trip_s: float
-) -> None:
+def test_a_low_path_mtu_is_detected_quickly_despite_random_loss(mtu: int, loss: float, round_trip_s: float) -> None:
     for seed in (1, 2, 3):
         world = met(mtu, loss, seed=seed, delay_s=round_trip_s / 2)
         world.send("a", "map", bytes(50_000), "b")
@@ -123,14 +121,14 @@ def test_a_narrow_path_is_found_soon_although_datagrams_of_any_size_are_lost(
 
 
 @pytest.mark.parametrize("size_bytes", [100, 400])
-def test_small_messages_that_share_datagrams_cross_a_narrow_path(size_bytes: int) -> None:
+def test_coalesced_small_messages_cross_a_low_mtu_path(size_bytes: int) -> None:
     world = met(1300)
     for _ in range(200):
         world.send("a", "map", bytes(size_bytes), "b")
     assert world.run(15.0, until=lambda: len(topics(world, "a", MessageDelivered)) == 200)
 
 
-def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragment() -> None:
+def test_coalesced_messages_do_not_exceed_the_size_of_a_full_fragment() -> None:
     # The loopback, and some tunnels, claim an MTU of 64 KiB.
     world = met(1500, 0.1, link_mtu=65_535)
     largest = largest_of(world)
@@ -151,7 +149,7 @@ def test_messages_that_share_datagrams_do_not_make_them_larger_than_a_full_fragm
         (1500, 1000, 900, [576]),
     ],
 )
-def test_a_path_is_narrowed_step_by_step_and_only_to_what_makes_fragments_smaller(
+def test_the_path_mtu_is_lowered_stepwise_only_to_sizes_that_shrink_fragments(
     link_mtu: int, fragment_bytes: int, mtu: int, found: list[int]
 ) -> None:
     world = met(mtu, link_mtu=link_mtu, fragment_bytes=fragment_bytes)
@@ -160,7 +158,7 @@ def test_a_path_is_narrowed_step_by_step_and_only_to_what_makes_fragments_smalle
     assert narrow(world) == found
 
 
-def test_a_message_to_all_is_cut_for_a_path_known_to_be_narrow() -> None:
+def test_a_broadcast_is_fragmented_for_a_path_with_a_known_low_mtu() -> None:
     world = met(1300)
     world.send("a", "map", bytes(50_000), "b")
     assert world.run(60.0, until=lambda: found_narrow(world))
@@ -168,13 +166,13 @@ def test_a_message_to_all_is_cut_for_a_path_known_to_be_narrow() -> None:
     assert world.run(10.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
 
 
-def test_a_message_to_all_is_no_larger_than_ethernet_s_packets_whatever_the_link_carries() -> None:
+def test_broadcast_packets_never_exceed_the_ethernet_mtu() -> None:
     world = met(1500, link_mtu=65_535)
     world.send("a", "seen", bytes(20_000))
     assert world.run(1.0, until=lambda: "seen" in topics(world, "b", MessageReceived))
 
 
-def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> None:
+def test_a_recovered_path_carries_full_fragments_after_some_time() -> None:
     world = met(1280)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
@@ -187,7 +185,7 @@ def test_a_path_that_is_wide_again_carries_full_fragments_after_some_time() -> N
     assert world.pipes[("a", "b")].carried - before < 80
 
 
-def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
+def test_a_partially_recovered_path_uses_the_larger_mtu() -> None:
     world = met(900)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
@@ -201,7 +199,7 @@ def test_a_path_that_is_less_narrow_than_it_was_carries_what_it_can() -> None:
     assert 1200 < largest[0] <= 1280
 
 
-def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_but_pings() -> None:
+def test_a_path_with_a_lasting_low_mtu_is_probed_less_and_less_often() -> None:
     world = met(1400)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
@@ -227,7 +225,7 @@ def test_a_path_that_stays_narrow_is_asked_ever_more_seldom_and_loses_nothing_bu
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3, 0.6])
-def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however_much_is_lost(loss: float) -> None:
+def test_a_wrongly_lowered_path_mtu_is_restored_within_minutes_under_any_loss(loss: float) -> None:
     for seed in range(4):
         world = met(1280, seed=seed)
         world.send("a", "map", bytes(20_000), "b")
@@ -245,7 +243,7 @@ def test_a_path_taken_for_narrow_by_mistake_is_wide_again_within_minutes_however
         assert largest[0] > 1280, seed
 
 
-def test_a_path_that_carries_large_pings_and_nothing_else_is_asked_ever_more_seldom_too() -> None:
+def test_probe_intervals_grow_on_a_path_that_carries_only_large_probes() -> None:
     size = PathMtu()
     now = 0.0
     asked: list[float] = []
@@ -297,14 +295,14 @@ def narrowings(hours: float, arrives: Callable[[float], bool], *, large_arrive: 
 
 
 @pytest.mark.parametrize("loss", [0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95])
-def test_hours_of_even_loss_are_not_taken_for_a_narrow_path(loss: float) -> None:
+def test_hours_of_uniform_loss_are_not_mistaken_for_a_low_mtu(loss: float) -> None:
     rng = random.Random(7)
     assert narrowings(10.0, lambda _: rng.random() >= loss) == 0
 
 
 @pytest.mark.parametrize("cut_s", [0.3, 1.0, 5.0, 60.0])
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
-def test_hours_of_cuts_are_not_taken_for_a_narrow_path(cut_s: float, share: float) -> None:
+def test_hours_of_outages_are_not_mistaken_for_a_low_mtu(cut_s: float, share: float) -> None:
     rng = random.Random(8)
     until, up = 0.0, False
 
@@ -318,21 +316,21 @@ def test_hours_of_cuts_are_not_taken_for_a_narrow_path(cut_s: float, share: floa
     assert narrowings(5.0, arrives) == 0
 
 
-def test_no_mistake_comes_of_a_path_that_loses_much_from_one_moment_to_the_next() -> None:
+def test_sudden_heavy_loss_is_not_mistaken_for_a_low_mtu() -> None:
     rng = random.Random(9)
     # A minute of each, repeatedly.
     assert narrowings(10.0, lambda now: rng.random() >= (0.0 if now % 120 < 60 else 0.84)) == 0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.36])
-def test_a_silent_peer_behind_a_narrow_path_is_known_for_one_within_seconds(loss: float) -> None:
+def test_a_silent_peer_behind_a_low_mtu_path_is_detected_within_seconds(loss: float) -> None:
     rng = random.Random(10)
     # Every reduction starts a new suspicion: the average distance between them.
     assert 3600 / narrowings(1.0, lambda _: rng.random() >= loss, large_arrive=False) < 10.0
 
 
 @pytest.mark.parametrize(("round_trip_s", "loss"), [(0.2, 0.7), (1.0, 0.6)])
-def test_a_long_path_that_loses_most_is_not_taken_for_narrow(round_trip_s: float, loss: float) -> None:
+def test_a_long_path_with_high_loss_is_not_mistaken_for_a_low_mtu(round_trip_s: float, loss: float) -> None:
     for seed in range(2):
         world = World(seed=seed)
         for name in ("a", "b"):
@@ -350,7 +348,7 @@ def test_a_long_path_that_loses_most_is_not_taken_for_narrow(round_trip_s: float
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.5])
-def test_loss_and_cuts_of_any_size_are_not_taken_for_a_narrow_path(loss: float) -> None:
+def test_size_independent_loss_and_outages_are_not_mistaken_for_a_low_mtu(loss: float) -> None:
     world = met(1500, loss)
     rng = random.Random(2)
 
@@ -382,7 +380,7 @@ def in_flight(world: World) -> list[int]:
     return sizes
 
 
-def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
+def test_messages_in_flight_are_refragmented_for_a_lower_link_mtu() -> None:
     world = met(1500)
     sizes = in_flight(world)
     link = LinkInfo("mesh", LinkKind.BROADCAST, world.addresses["a"], BROADCAST, mtu=700)
@@ -392,7 +390,7 @@ def test_what_had_begun_fits_a_link_that_became_narrower() -> None:
     assert topics(world, "b", MessageReceived) == ["map"]
 
 
-def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> None:
+def test_messages_in_flight_during_a_link_mtu_change_arrive_once() -> None:
     world = met(1500)
     for _ in range(20):
         world.send("a", "map", bytes(3_000), "b")
@@ -407,7 +405,7 @@ def test_what_had_left_whole_when_the_link_became_narrower_arrives_once() -> Non
 
 
 @pytest.mark.parametrize("change", ["link", "settings"])
-def test_what_the_path_was_found_to_carry_outlives_a_reload(change: str) -> None:
+def test_the_discovered_path_mtu_survives_a_reload(change: str) -> None:
     world = met(1280)
     world.send("a", "map", bytes(100_000), "b")
     assert world.run(30.0, until=lambda: bool(topics(world, "a", MessageDelivered)))
@@ -425,9 +423,7 @@ def test_what_the_path_was_found_to_carry_outlives_a_reload(change: str) -> None
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
 @pytest.mark.parametrize("loss", [0.05, 0.4])
-def test_a_path_that_becomes_long_and_lossy_is_not_taken_for_narrow_nor_does_anything_arrive_twice(
-    seed: int, loss: float
-) -> None:
+def test_a_path_that_becomes_long_and_lossy_keeps_its_mtu_and_causes_no_duplicates(seed: int, loss: float) -> None:
     world = World(seed=seed)
     for name in ("a", "b"):
         world.add(settings(name, *TOPICS))

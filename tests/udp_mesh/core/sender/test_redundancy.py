@@ -38,7 +38,7 @@ def sendings(message: OutgoingMessage, *, twice: bool, loss: float, answered_at:
     return times
 
 
-def test_the_more_is_lost_the_more_copies_leave_before_an_answer_can_come() -> None:
+def test_higher_loss_sends_more_early_copies_of_an_urgent_fragment() -> None:
     early = [
         sum(at < OVERDUE_S for at in sendings(fragment(), twice=twice, loss=loss))
         for twice, loss in ((False, 0.0), (True, 0.05), (True, 0.1), (True, 0.2))
@@ -48,22 +48,22 @@ def test_the_more_is_lost_the_more_copies_leave_before_an_answer_can_come() -> N
     assert sendings(fragment(), twice=True, loss=0.2)[:3] == pytest.approx(EARLY_S)
 
 
-def test_an_overdue_answer_brings_another_copy_a_bounded_number_of_times() -> None:
+def test_an_overdue_acknowledgement_triggers_a_bounded_number_of_copies() -> None:
     later = [at for at in sendings(fragment(), twice=True, loss=0.05) if at > GAP_S]
     assert later == pytest.approx([n * OVERDUE_S for n in range(1, MAX_OVERDUE_COPIES + 1)])
 
 
-def test_an_answer_ends_it() -> None:
+def test_an_acknowledgement_stops_further_copies() -> None:
     assert sendings(fragment(), twice=True, loss=0.2, answered_at=0.02) == pytest.approx(EARLY_S)
 
 
-def test_best_effort_is_copied_early_only_since_its_arrival_is_unknown() -> None:
+def test_best_effort_fragments_are_only_copied_early() -> None:
     message = fragment(reliable=False)
     message.ended = True
     assert sendings(message, twice=True, loss=0.2) == pytest.approx(EARLY_S)
 
 
-def test_the_window_does_not_go_by_urgent_packets_that_pass_the_others() -> None:
+def test_urgent_packets_are_not_used_as_rtt_samples_while_bulk_is_sent() -> None:
     run = Run(urgent=True)
     run.start()
     run.world.run(3.0)

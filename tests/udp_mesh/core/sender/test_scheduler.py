@@ -34,7 +34,7 @@ steps = st.lists(
 
 
 @given(steps)
-def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_fragment_is_sent(
+def test_every_fragment_is_sent_in_strict_priority_order(
     plan: list[tuple[str, int, int]],
 ) -> None:
     scheduler = Scheduler()
@@ -77,7 +77,7 @@ def test_no_lower_priority_leaves_while_a_higher_one_waits_and_every_fragment_is
     assert len(left) == sum(message.fragments for message in messages)
 
 
-def test_fresh_urgent_messages_overtake_those_set_aside() -> None:
+def test_fresh_urgent_messages_are_sent_before_demoted_stale_ones() -> None:
     scheduler = Scheduler()
     stale, fresh = outgoing(0, 1), outgoing(0, 1)
     scheduler.push(stale)
@@ -90,7 +90,7 @@ def test_fresh_urgent_messages_overtake_those_set_aside() -> None:
     assert order == [fresh, stale]
 
 
-def test_an_urgent_message_leaves_next_in_the_middle_of_a_map() -> None:
+def test_an_urgent_message_is_sent_next_in_the_middle_of_a_bulk_transfer() -> None:
     both = pair(Topic("stop", priority=0), Topic("map", priority=9))
     both.a.send("map", bytes(20_000_000), destination="b", now=both.now)
     both.roundtrip(times=20)
@@ -103,7 +103,7 @@ def test_an_urgent_message_leaves_next_in_the_middle_of_a_map() -> None:
     assert [event.topic for event in both.events(both.b) if isinstance(event, MessageReceived)] == ["stop"]
 
 
-def test_levels_leave_in_order_even_to_different_peers() -> None:
+def test_priority_order_holds_across_different_peers() -> None:
     world = World()
     topics = (Topic("high", priority=5), Topic("low", priority=12))
     for name in ("a", "b", "c"):
@@ -116,7 +116,7 @@ def test_levels_leave_in_order_even_to_different_peers() -> None:
     assert [datagram.destination for datagram in out] == [world.addresses["b"], world.addresses["c"]]
 
 
-def test_a_level_that_never_gets_its_turn_is_reported() -> None:
+def test_a_starved_priority_level_is_reported() -> None:
     world = World()
     topics = (Topic("hog", priority=5), Topic("starving", priority=12))
     for name in ("a", "b"):

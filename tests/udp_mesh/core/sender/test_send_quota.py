@@ -33,14 +33,14 @@ def test_late_acknowledgements_do_not_stop_the_link() -> None:
     assert 0.010 * capacity <= later <= 0.025 * capacity
 
 
-def test_what_is_presumed_is_bounded() -> None:
+def test_assumed_delivery_is_bounded() -> None:
     sender, heard = busy_outbound()
     capacity = sender.congestion.capacity_packets_per_s()
     assert capacity is not None
     assert room(sender, heard + 10.0) - room(sender, heard) <= ASSUMED_DELIVERY_S * capacity + 1
 
 
-def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
+def test_no_delivery_is_assumed_on_a_link_with_a_foreign_queue() -> None:
     sender, heard = busy_outbound()
     min_rtt = sender.rtt.min_rtt
     assert min_rtt is not None
@@ -49,18 +49,18 @@ def test_nothing_is_presumed_of_a_link_whose_queue_is_not_ours() -> None:
     assert room(sender, heard + 0.06) == room(sender, heard)
 
 
-def test_a_fixed_window_stays_what_it_is() -> None:
+def test_a_fixed_window_does_not_grow_while_acknowledgements_are_late() -> None:
     sender = Sender(Settings("a", unkeyed=True, window=3))
     assert room(sender, 100.0) == 3 + sender.rates.urgent_excess_packets
 
 
 @pytest.mark.parametrize(("loss", "fewest", "most"), [(0.0, 4, 7), (0.2, 2, 3)])
-def test_a_lossy_way_back_is_asked_more_often(loss: float, fewest: int, most: int) -> None:
+def test_acknowledgements_are_requested_more_often_on_a_lossy_link(loss: float, fewest: int, most: int) -> None:
     sender, _ = busy_outbound(loss=loss)
     assert fewest <= ack_spacing(sender) <= most
 
 
-def test_bursts_that_swallow_whole_trains_of_acknowledgements_cost_little() -> None:
+def test_bursty_loss_of_acknowledgements_barely_reduces_goodput() -> None:
     def lost_in_bursts(seed: int) -> float:
         run = Run(urgent=False, seed=seed)
         for pipe in run.world.pipes.values():

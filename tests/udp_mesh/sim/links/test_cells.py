@@ -32,7 +32,7 @@ def result(name: str, seed: int) -> Result:
 
 
 @pytest.mark.parametrize("name", BOUNDS)
-def test_share_and_latency_are_no_worse(name: str) -> None:
+def test_share_and_latency_stay_within_their_bounds(name: str) -> None:
     seed, least_share, longest_ms = BOUNDS[name]
     found = result(name, seed)
     assert found.share > least_share

@@ -48,14 +48,14 @@ def test_cubic_alone_fills_the_link_and_the_queue() -> None:
     assert fmean(queued) > 0.6 * QUEUE_PACKETS
 
 
-def test_cubic_keeps_its_share_of_the_window_after_a_loss() -> None:
+def test_cubic_multiplies_its_window_by_beta_after_a_loss() -> None:
     controller = Cubic()
     controller.cwnd = 100.0
     controller.on_loss(1.0, 100)
     assert controller.cwnd == pytest.approx(100 * BETA)
 
 
-def test_cubic_gives_way_to_random_losses() -> None:
+def test_random_loss_reduces_cubic_throughput() -> None:
     (share,), _ = Alone(Cubic(), loss=0.02).run(10.0, 20.0)
     assert share < 0.4
 
@@ -79,12 +79,12 @@ def test_bbr_holds_about_one_round_trip_in_flight() -> None:
     assert min(in_flight) <= 4
 
 
-def test_bbr_does_not_give_way_to_random_losses() -> None:
+def test_random_loss_does_not_reduce_bbr_throughput() -> None:
     (share,), _ = Alone(Bbr(random.Random(1)), loss=0.02).run(5.0, 20.0)
     assert share > 0.9
 
 
-def test_two_cubic_flows_share_alike() -> None:
+def test_two_cubic_flows_share_the_link_fairly() -> None:
     shares, _ = Alone(Cubic(), Cubic()).run(20.0, 60.0)
     assert sum(shares) > 0.99
     assert min(shares) > 0.35

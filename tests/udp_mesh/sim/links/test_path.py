@@ -23,7 +23,7 @@ def carried(link: Link, packets: int, packet_bytes: int = 1250, every_s: float =
     return arrived
 
 
-def test_packets_follow_each_other_at_the_rate_after_the_delay() -> None:
+def test_packets_arrive_at_the_link_rate_after_the_delay() -> None:
     arrived = carried(Link(constant(10e6), constant(0.02)), 3)
     assert [at for _, at in arrived] == pytest.approx([0.021, 0.022, 0.023])
 
@@ -37,7 +37,7 @@ def test_a_link_without_rate_holds_its_queue_until_it_returns() -> None:
     assert [at for _, at in arrived] == pytest.approx([0.501, 0.502])
 
 
-def test_losses_have_their_share() -> None:
+def test_packets_are_lost_at_the_configured_rate() -> None:
     assert len(carried(Link(loss=0.2), 5000, every_s=0.01)) == pytest.approx(4000, rel=0.03)
 
 
@@ -51,13 +51,13 @@ def test_a_stall_delays_everything_behind_it_and_keeps_the_order() -> None:
     assert bursts > 20
 
 
-def test_reordered_packets_are_overtaken() -> None:
+def test_reordering_changes_the_order_and_loses_nothing() -> None:
     numbers = [number for number, _ in carried(Link(reorder_share=0.05), 500, every_s=0.002)]
     assert sorted(numbers) == list(range(500))
     assert numbers != sorted(numbers)
 
 
-def test_packets_larger_than_the_mtu_vanish() -> None:
+def test_packets_larger_than_the_mtu_are_dropped() -> None:
     link = Link(mtu=Steps((0.0, 1.0), (1500, 1300)))
     assert len(carried(link, 20, packet_bytes=1400, every_s=0.1)) == 10
 
@@ -69,7 +69,7 @@ def chain(hop_loss: float) -> tuple[SimEventQueue, HalfDuplexChain]:
     )
 
 
-def test_each_hop_takes_the_channel_from_the_others() -> None:
+def test_hops_share_one_half_duplex_channel() -> None:
     queue, line = chain(0.0)
     arrived: list[float] = []
     for _ in range(100):

@@ -18,12 +18,12 @@ def test_a_value_holds_until_the_next_change() -> None:
 
 
 @pytest.mark.parametrize("times", [(), (1.0,), (0.0, 2.0, 2.0)])
-def test_times_start_at_zero_and_grow(times: tuple[float, ...]) -> None:
+def test_step_times_must_start_at_zero_and_increase(times: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="found"):
         Steps(times, (1.0,) * len(times))
 
 
-def test_a_rate_walk_goes_from_one_rate_to_the_next_and_fades() -> None:
+def test_a_rate_walk_moves_between_adjacent_rates_with_fades() -> None:
     walk = wifi_rate_walk(3, 120.0)
     assert walk == wifi_rate_walk(3, 120.0)
     assert walk != wifi_rate_walk(4, 120.0)
@@ -39,7 +39,7 @@ def test_a_handover_changes_between_two_delays() -> None:
     assert all(a != b for a, b in pairwise(delays.values))
 
 
-def test_a_hole_narrows_the_path() -> None:
+def test_an_mtu_hole_lowers_the_path_mtu() -> None:
     hole = mtu_hole(5.0, 1300)
     assert (hole.at(4.9), hole.at(5.0)) == (1500, 1300)
     assert constant(7.0).at(100.0) == 7.0
