@@ -28,7 +28,7 @@ ARP, IPV4 = ETHERNET + b"\x08\x06" + bytes(28), ETHERNET + b"\x08\x00" + bytes(4
         (b"", ""),
     ],
 )
-def test_arp_is_known_by_the_packet_that_carries_it(packet: bytes, kind: str) -> None:
+def test_arp_frames_are_classified_by_their_batman_packet_type(packet: bytes, kind: str) -> None:
     assert kind_of(packet) == kind
 
 
@@ -41,7 +41,7 @@ def result(scene: str, *, is_on: bool, requests: int = 10) -> dict[str, Any]:
     return {"table": is_on, "scene": scene, "seconds": 30, "nodes": 6, "requests": requests, "overheard": overheard}
 
 
-def test_what_goes_to_one_station_is_acknowledged_and_costs_that_too() -> None:
+def test_unicast_airtime_includes_the_acknowledgement() -> None:
     one = result("pings", is_on=False)
     assert air_us(one, "broadcast") == 180 * airtime_us(24, 90, "ogm")
     assert air_us(one, "unicast") == 20 * airtime_us(0, 84, "probe")

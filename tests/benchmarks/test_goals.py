@@ -16,7 +16,7 @@ from benchmarks.tables import report
 from benchmarks.trial import percentile
 
 
-def test_every_goal_names_a_cell_of_ours_that_is_run() -> None:
+def test_every_goal_names_an_existing_cell_of_our_transport() -> None:
     known = {(cell.set, cell.name) for name in SETS for cell in cells(name) if cell.peer == OURS}
     assert {(goal.set, goal.cell) for goal in GOALS} <= known
 
@@ -27,13 +27,13 @@ def test_every_goal_is_printed_met_or_missed() -> None:
     assert printed.count("| met |") + printed.count("**missed**") == len(judged(results)) > 0
 
 
-def test_cells_are_named_once() -> None:
+def test_cell_names_are_unique() -> None:
     names = [(cell.set, cell.peer, cell.name) for name in SETS for cell in cells(name)]
     assert len(names) == len(set(names))
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.96, True), (0.94, False), (None, False)])
-def test_a_goal_is_met_only_by_a_figure_that_reaches_it(share: float | None, verdict: bool) -> None:
+def test_a_goal_is_met_only_if_its_threshold_is_reached(share: float | None, verdict: bool) -> None:
     results = [{"set": "loss", "name": "0%", "peer": OURS, "share": share}]
     verdicts = {goal.figure: met for goal, _, met in judged(results)}
     assert verdicts["share"] is verdict
@@ -41,7 +41,7 @@ def test_a_goal_is_met_only_by_a_figure_that_reaches_it(share: float | None, ver
 
 
 @given(st.lists(st.floats(0, 100), min_size=1), st.sampled_from([0.5, 0.9, 0.99, 1.0]))
-def test_a_percentile_is_the_smallest_value_that_its_share_does_not_exceed(values: list[float], share: float) -> None:
+def test_a_percentile_is_the_smallest_value_covering_its_share_of_samples(values: list[float], share: float) -> None:
     ordered = sorted(values)
     found = percentile(ordered, share)
     assert found is not None
@@ -76,12 +76,12 @@ def test_our_figures_are_compared_with_the_best_other_transport_and_marked_if_be
     ]
 
 
-def test_what_mostly_never_arrived_has_no_median() -> None:
+def test_a_figure_missing_from_most_runs_has_no_median() -> None:
     runs = [{"set": "cut", "name": "x", "peer": OURS, "recovery_any_s": value} for value in (0.1, None, None)]
     assert medians(runs)[0]["recovery_any_s"] is None
 
 
-def test_a_page_keeps_what_stands_around_a_section(tmp_path: Path) -> None:
+def test_filling_a_section_preserves_the_surrounding_page(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n\n<!-- tables: how -->\n\nold\n\n<!-- end of tables -->\n\nafter\n")
     fill("tables", "new\\1", page)

@@ -60,7 +60,7 @@ def test_a_clean_link_carries_every_frame_and_its_airtime_is_bytes_over_rate(lab
     assert count.airtime_s == pytest.approx(200 * 1028 * 8 / 1e9, rel=0.02)
 
 
-def test_loss_takes_about_its_share_and_attempts_win_it_back_for_airtime(lab: Laboratory) -> None:
+def test_retries_recover_the_configured_loss_at_the_cost_of_airtime(lab: Laboratory) -> None:
     lab.set(rate=1e9, delay_ms=0, loss=0.3, queue=10000, attempts=1)
     lab.reset()
     send(lab, 2000)

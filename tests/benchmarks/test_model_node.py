@@ -24,7 +24,7 @@ def test_an_unknown_command_has_no_answer() -> None:
         model_node().answer("rm -rf /", b"", 0.0)
 
 
-def test_an_answer_takes_as_long_as_its_processes_take_a_router() -> None:
+def test_an_answer_takes_as_long_as_recorded_on_a_router() -> None:
     node = model_node()
     answer = node.answer("/usr/sbin/meshctl-deadman status", b"", 10.0)
     assert answer.busy_s == recorded_costs()["status"].seconds > 0
@@ -32,7 +32,7 @@ def test_an_answer_takes_as_long_as_its_processes_take_a_router() -> None:
     assert b" state=idle " in answer.output
 
 
-def test_only_commands_with_input_are_read_to_its_end() -> None:
+def test_stdin_is_read_only_for_commands_that_take_input() -> None:
     assert takes_input("/usr/sbin/meshctl-deadman change a 1 c1 n 60 30 d")
     assert takes_input("dd of=/root/.ansible/tmp/x/n001.sh bs=65536")
     assert not takes_input("cat /etc/openwrt_release")

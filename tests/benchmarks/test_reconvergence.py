@@ -18,7 +18,7 @@ from meshlab.errors import LabError
 SPACING_US = 28 + 67.5
 
 
-def test_airtime_is_what_802_11_says() -> None:
+def test_airtime_follows_the_802_11_timing_formula() -> None:
     # 12 Mbit/s: 48 bits per symbol of 4 us; 100 bytes, checksum and service bits are 18 symbols
     assert airtime_us(24, 100, "ogm") == SPACING_US + 20 + 18 * 4 + 6
     # 1 Mbit/s, long preamble
@@ -27,7 +27,7 @@ def test_airtime_is_what_802_11_says() -> None:
     assert airtime_us(0, 1500, "probe") == SPACING_US + 36 + 47 * 4 + 6 + 54
 
 
-def test_the_share_of_the_air_is_the_sum_of_all_nodes_packets() -> None:
+def test_the_airtime_share_sums_the_packets_of_all_nodes() -> None:
     overheard = [{"kind": "ogm", "rate": 24, "bytes": 100, "count": 1000}]
     assert share_of_air(overheard) == pytest.approx(1000 * airtime_us(24, 100, "ogm") / (OVERHEARD_S * 1e6))
 
@@ -44,13 +44,13 @@ def row(results: list[dict[str, Any]], case: Case) -> str:
     return next(line for line in table(results).splitlines() if f"| {case.algorithm} | {case.interval_ms} ms" in line)
 
 
-def test_a_row_has_number_of_runs_median_and_range() -> None:
+def test_a_row_shows_the_number_of_runs_the_median_and_the_range() -> None:
     results = [result(FIRST, pause_s=pause_s, overheard=OVERHEARD) for pause_s in (4.0, 1.0, 2.5)]
     assert row(results, FIRST) == "| BATMAN_IV | 500 ms | 3 | 2.5 s (1.0-4.0) | 10 | 0.19% |"
     assert row(results[:1], FIRST) == "| BATMAN_IV | 500 ms | 1 | 4.0 s | 10 | 0.19% |"
 
 
-def test_a_row_says_what_was_not_measured_and_why() -> None:
+def test_a_row_shows_why_a_case_was_not_measured() -> None:
     results = [result(FIRST, failed="waited 150 s for the mesh to settle")]
     assert row(results, FIRST) == "| BATMAN_IV | 500 ms | 0 | failed: waited 150 s for the mesh to settle | - | - |"
     assert row(results, SECOND) == "| BATMAN_V | 1000 ms | 0 | not measured | - | - |"
@@ -69,7 +69,7 @@ def test_a_pause_counts_once_telemetry_has_flowed_again_for_a_while() -> None:
     assert longest_pause(arrivals((5.0, 8.0), until_s=13.0), 5.0, 16.0) is None
 
 
-def test_no_pause_is_said_only_after_a_while() -> None:
+def test_no_pause_is_reported_only_after_a_minimum_time() -> None:
     assert longest_pause(arrivals(until_s=10.0), 5.0, 10.0) is None
     assert longest_pause(arrivals(until_s=40.0), 5.0, 40.0) == 0.0
     assert longest_pause([], 5.0, 40.0) is None
@@ -126,7 +126,7 @@ def measure(results: Path, cases: list[Case], *, runs: int = 2, ends_s: float = 
     return [f"{one['interval_ms']}: {one.get('pause_s', one.get('failed'))}" for one in recorded(results)]
 
 
-def test_what_is_measured_is_not_measured_again(tmp_path: Path, machine: Machine) -> None:
+def test_measured_cases_are_not_measured_again(tmp_path: Path, machine: Machine) -> None:
     results = tmp_path / "results.jsonl"
     machine.outcomes = {FIRST: [1.0, 2.0], SECOND: [3.0, 4.0]}
     assert measure(results, [FIRST]) == ["500: 1.0", "500: 2.0"]
@@ -138,7 +138,7 @@ def test_what_is_measured_is_not_measured_again(tmp_path: Path, machine: Machine
     assert measure(results, [FIRST, SECOND]) == ["1000: 3.0", "1000: 4.0", "500: 5.0", "500: 6.0"]
 
 
-def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path, machine: Machine) -> None:
+def test_a_failed_case_is_recorded_and_the_next_one_starts(tmp_path: Path, machine: Machine) -> None:
     machine.outcomes = {
         FIRST: [1.0, TimeoutError("waited 90 s for telemetry over the other relay")],
         SECOND: [NoPauseError("telemetry did not pause when one fell silent"), 3.0, 4.0],
@@ -151,14 +151,14 @@ def test_a_case_that_fails_is_written_down_and_the_next_one_begun(tmp_path: Path
     assert machine.boots == 1
 
 
-def test_a_machine_that_ends_is_started_once_more_for_the_cases_left(tmp_path: Path, machine: Machine) -> None:
+def test_a_dead_machine_is_restarted_once_for_the_remaining_cases(tmp_path: Path, machine: Machine) -> None:
     machine.outcomes = {FIRST: [LabError("gone")], SECOND: [3.0, 4.0], THIRD: [LabError("gone again")]}
     lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND, THIRD])
     assert lines == ["500: gone", "1000: 3.0", "1000: 4.0", "100: gone again"]
     assert machine.boots == 2
 
 
-def test_without_time_each_case_that_was_not_begun_says_so(tmp_path: Path, machine: Machine) -> None:
+def test_cases_not_started_before_the_deadline_are_recorded_as_such(tmp_path: Path, machine: Machine) -> None:
     lines = measure(tmp_path / "results.jsonl", [FIRST, SECOND], ends_s=0.0)
     assert lines == [f"{case.interval_ms}: not begun: no machine, or no time left" for case in (FIRST, SECOND)]
     assert machine.boots == 0

@@ -37,7 +37,7 @@ def saved(*members: tuple[str, bytes]) -> Backup:
     return read_backup(with_info(archive(("etc/config/network", b"config x\n"), *members), INFO), "b.tgz")
 
 
-def test_a_backup_reads_back_with_what_it_was_taken_from() -> None:
+def test_a_backup_round_trips_with_its_metadata() -> None:
     backup = saved(("etc/dropbear/authorized_keys", b"key"))
     assert (backup.node, backup.board, backup.taken_s, backup.packages) == ("b01", INFO["board"], 12.5, ("iw", "wpad"))
     assert {path: new.content for path, new in backup.files.items()} == {
@@ -48,7 +48,7 @@ def test_a_backup_reads_back_with_what_it_was_taken_from() -> None:
 
 
 @pytest.mark.parametrize("path", ["../../etc/passwd", "etc/../../x", "tmp/x/y", "etc/meshctl/change/armed", "a b/c"])
-def test_paths_that_must_not_be_written_are_left_out(path: str) -> None:
+def test_unsafe_paths_are_excluded_from_a_backup(path: str) -> None:
     assert set(saved((path, b"x")).files) == {"/etc/config/network"}
 
 
@@ -73,21 +73,21 @@ def test_scripts_that_disable_services_at_boot_are_reported_and_not_restored() -
     # the archives hold the time they were made at, which must not be part of a test's name
     ids=["empty", "no gzip", "no tar", "no description", "nothing of ours", "broken description", "no object"],
 )
-def test_what_is_no_backup_is_refused_with_its_file(data: bytes, message: str) -> None:
+def test_an_invalid_backup_is_rejected_with_its_file_name(data: bytes, message: str) -> None:
     with pytest.raises(InputError, match=r"^b\.tgz: ") as caught:
         read_backup(data, "b.tgz")
     assert message in str(caught.value)
 
 
 @given(st.binary(max_size=200), st.integers(0, 400))
-def test_damaged_bytes_give_an_error_or_a_backup_and_nothing_else(noise: bytes, at: int) -> None:
+def test_corrupted_bytes_raise_only_input_errors(noise: bytes, at: int) -> None:
     data = bytearray(with_info(archive(("etc/config/network", b"config x\n")), INFO))
     data[at : at + len(noise)] = noise
     with contextlib.suppress(InputError):
         read_backup(bytes(data), "b.tgz")
 
 
-def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
+def test_a_backup_is_restored_only_to_its_own_node_and_board() -> None:
     seen = running(fleet(), "b01")
     assert incompatibility(saved(), "b01", seen) == ""
     assert "the backup is of node b01, not b02" in incompatibility(saved(), "b02", seen)
@@ -95,7 +95,7 @@ def test_a_backup_goes_onto_its_own_node_and_board_only() -> None:
     assert uninstalled_packages(saved(), replace(seen, packages={"iw": "1"})) == ("wpad",)
 
 
-def test_a_backup_that_lets_in_none_of_our_keys_is_refused_and_one_without_keys_is_not() -> None:
+def test_a_backup_whose_authorized_keys_lock_us_out_is_rejected() -> None:
     node = fleet().nodes["b01"]
     keys = {"/etc/dropbear/authorized_keys": NewFile(f"{fleet().operators.ssh_keys[0]}\n".encode(), 0o600)}
     ours = OwnKey("agent key", "ssh-ed25519", b64decode(fleet().operators.ssh_keys[0].split()[1]))

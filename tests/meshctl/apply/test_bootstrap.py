@@ -42,14 +42,14 @@ def test_an_unknown_device_must_be_named_by_the_operator() -> None:
     assert identify(labelled(), device("02:00:00:00:00:42"), "b02").name == "b02"
 
 
-def test_the_wrong_device_is_refused_whatever_the_operator_says() -> None:
+def test_a_device_with_the_wrong_mac_is_rejected_even_if_named_by_the_operator() -> None:
     with pytest.raises(NodeError, match="expected b02, its MAC belongs to b01"):
         identify(labelled(), device(MAC), "b02")
     with pytest.raises(NodeError, match="b01 has MAC 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
         identify(labelled(), device("02:00:00:00:00:42"), "b01")
 
 
-def test_one_node_is_not_found_twice() -> None:
+def test_the_same_node_at_two_addresses_is_rejected() -> None:
     with pytest.raises(NodeError, match="already found at another address"):
         identify(labelled(), device(MAC), "", identified=["b01"])
 
@@ -62,7 +62,7 @@ def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
     assert theirs == {"state": "retired"}
 
 
-def test_a_device_that_was_refused_leaves_the_pins_of_before(tmp_path: Path) -> None:
+def test_rejected_devices_have_their_previous_host_key_pins_restored(tmp_path: Path) -> None:
     trust = TrustStore(tmp_path / "known_hosts")
     old, new = (HostKey("ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes([number]) * 32) for number in (1, 2))
     trust.replace("b01", old)

@@ -10,7 +10,7 @@ from meshctl.device.deadman import bundle
 from tests.meshctl.plan.support import PASS_PHRASE, factory, fleet, planned, running, wanted
 
 
-def test_a_change_holds_exactly_the_files_that_differ_and_what_was_there() -> None:
+def test_a_change_holds_only_differing_files_and_their_previous_hashes() -> None:
     team, seen = fleet(channel=11), running(fleet(), "b01")
     change = change_of("c1", planned(team, "b01", seen), wanted(team, "b01"), seen, ())
     assert set(change.files) == {"/etc/config/wireless", "/etc/meshctl/node"}
@@ -19,13 +19,13 @@ def test_a_change_holds_exactly_the_files_that_differ_and_what_was_there() -> No
     assert change.reload == reload_script({"etc/config/wireless"}, ())
 
 
-def test_what_is_not_there_yet_is_expected_to_be_absent() -> None:
+def test_a_missing_file_is_expected_to_stay_absent() -> None:
     seen = factory(fleet(), "b01")
     change = change_of("c1", planned(fleet(), "b01", seen), wanted(fleet(), "b01"), seen, ())
     assert change.expected["/etc/dropbear/authorized_keys"] is None
 
 
-def test_bytes_that_were_lost_on_the_way_are_not_expected() -> None:
+def test_a_file_with_undecodable_bytes_has_no_expected_hash() -> None:
     team, seen = fleet(channel=11), running(fleet(), "b01")
     assert seen.uci is not None
     odd = replace(seen, uci={**seen.uci, "wireless": seen.uci["wireless"] + "# \ufffd\n"})
@@ -33,7 +33,7 @@ def test_bytes_that_were_lost_on_the_way_are_not_expected() -> None:
     assert "/etc/config/wireless" not in change.expected
 
 
-def test_every_rendered_path_is_one_that_the_switch_takes() -> None:
+def test_every_rendered_path_is_accepted_by_the_dead_mans_switch() -> None:
     seen = factory(fleet(), "b01")
     assert bundle(change_of("c1", planned(fleet(), "b01", seen), wanted(fleet(), "b01"), seen, ()))
 

@@ -41,7 +41,7 @@ def gaps(after: Observation, since_s: float | None = 20.0) -> tuple[str, ...]:
     return unmet(expectation(wanted(fleet(), "b01"), good(), [BASE]), after, since_s=since_s)
 
 
-def test_a_node_with_all_it_had_has_proven_itself() -> None:
+def test_a_node_that_regained_everything_passes_the_health_check() -> None:
     assert gaps(good()) == ()
 
 
@@ -79,15 +79,15 @@ def test_a_node_with_all_it_had_has_proven_itself() -> None:
         (replace(good(), originators=()), "it has no route to the base"),
     ],
 )
-def test_what_is_not_there_is_named(after: Observation, gap: str) -> None:
+def test_each_missing_item_is_named(after: Observation, gap: str) -> None:
     assert gaps(after) == (gap,)
 
 
-def test_half_of_the_neighbors_is_enough_since_robots_move() -> None:
+def test_half_of_the_previous_neighbors_is_enough() -> None:
     assert gaps(replace(good(), neighbours=(MeshNeighbour("02:00:00:00:00:77", "mesh0", 10),))) == ()
 
 
-def test_what_was_heard_before_the_change_does_not_count() -> None:
+def test_neighbors_last_heard_before_the_change_do_not_count() -> None:
     stale = replace(good(), neighbours=(MeshNeighbour(OTHER, "mesh0", 8000), MeshNeighbour(BASE, "mesh0", 8000)))
     assert gaps(stale, since_s=20.0) == ()
     assert gaps(stale, since_s=5.0) == ("it hears 0 mesh neighbors of the 2 it had",)
@@ -103,7 +103,7 @@ def test_the_base_counts_only_if_it_was_reached_before() -> None:
     assert expectation(wanted(fleet(), "b01"), before, [BASE]).base_macs == frozenset()
 
 
-def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> None:
+def test_the_base_may_be_reached_by_a_mac_acquired_during_the_run() -> None:
     expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
     moved = "42:00:00:00:00:01"
     after = replace(good(), originators=(Originator(moved, moved, "mesh0", 200, True, 250),))
@@ -122,7 +122,7 @@ def test_the_base_may_be_reached_by_an_address_that_it_got_during_the_run() -> N
         ("psk2+ccmp", None, ()),
     ],
 )
-def test_an_encrypted_radio_that_joined_in_the_open_has_not_proven_itself(
+def test_an_encrypted_radio_without_wpa_supplicant_fails_the_health_check(
     encryption: str, supplicants: tuple[str, ...] | None, gaps: tuple[str, ...]
 ) -> None:
     expected = expectation(wanted(fleet(), "b01"), good(), [BASE])

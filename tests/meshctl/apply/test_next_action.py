@@ -37,7 +37,7 @@ def statuses(draw: st.DrawFn) -> ChangeStatus:
 
 
 @given(statuses(), st.lists(st.sampled_from(["lan", "base"])), st.booleans(), st.booleans(), st.booleans())
-def test_only_our_own_applied_and_proven_change_at_the_new_address_is_confirmed(
+def test_only_our_own_applied_and_verified_change_at_the_new_address_is_confirmed(
     status: ChangeStatus, missing: list[str], new: bool, leaving: bool, given_up: bool
 ) -> None:
     chosen = move(status, *missing, new=new, leaving=leaving, given_up=given_up)
@@ -50,7 +50,7 @@ def test_only_our_own_applied_and_proven_change_at_the_new_address_is_confirmed(
 
 
 @given(statuses(), st.booleans())
-def test_what_was_given_up_is_never_sent_begun_or_confirmed(status: ChangeStatus, new: bool) -> None:
+def test_an_abandoned_change_is_never_sent_started_or_confirmed(status: ChangeStatus, new: bool) -> None:
     assert move(status, new=new, given_up=True) not in (Action.START, Action.BEGIN, Action.CONFIRM)
 
 
@@ -71,11 +71,11 @@ def test_what_was_given_up_is_never_sent_begun_or_confirmed(status: ChangeStatus
         (ChangeStatus("applied", "c2", last_id="c1", last_outcome="restored"), Action.WENT_BACK),
     ],
 )
-def test_each_state_of_the_switch_has_its_move(status: ChangeStatus, expected: Action) -> None:
+def test_each_state_of_the_switch_maps_to_its_next_action(status: ChangeStatus, expected: Action) -> None:
     assert move(status) is expected
 
 
-def test_an_unproven_change_is_given_its_time_and_then_taken_back() -> None:
+def test_an_unverified_change_gets_its_full_window_and_is_then_aborted() -> None:
     assert move(APPLIED, "no neighbour") is Action.WAIT
     assert move(replace(APPLIED, left_s=2.0), "no neighbour") is Action.ABORT
     assert move(replace(APPLIED, reload_status=1), "no neighbour") is Action.ABORT
@@ -83,12 +83,12 @@ def test_an_unproven_change_is_given_its_time_and_then_taken_back() -> None:
     assert move(APPLIED, new=False) is Action.WAIT
 
 
-def test_the_age_of_a_change_is_what_is_gone_of_its_window() -> None:
+def test_the_age_of_a_change_is_the_elapsed_part_of_its_window() -> None:
     assert applied_age_s(APPLIED) == 20.0
     assert applied_age_s(ChangeStatus("waiting", "c1", window_s=60)) is None
 
 
-def test_a_person_reads_why_it_went_back() -> None:
+def test_the_rollback_reason_is_human_readable() -> None:
     status = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="boot")
     assert rollback_reason(status, ()) == "its power was cut, or it rebooted, before it was confirmed"
     late = replace(status, last_reason="timeout")
@@ -101,7 +101,7 @@ def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
     assert reason == "it was not confirmed in time: b01: login refused for root; tried: key a"
 
 
-def test_that_it_could_not_be_reached_is_said_where_nothing_was_missing_afterwards() -> None:
+def test_the_connection_error_is_reported_only_if_no_check_was_unmet() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     reason = rollback_reason(late, (), "", "cannot connect: Connection refused")
     assert reason == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"

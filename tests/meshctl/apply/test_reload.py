@@ -105,12 +105,12 @@ def node(tmp_path: Path) -> Node:
     return Node(tmp_path)
 
 
-def test_nothing_is_reloaded_for_a_file_that_is_no_package(node: Node) -> None:
+def test_files_outside_uci_packages_trigger_no_reload(node: Node) -> None:
     assert node.reload() == (0, "")
     assert [line for line in node.log if "service list" not in line] == []
 
 
-def test_every_changed_package_has_its_event_sent_and_procd_is_waited_for(node: Node) -> None:
+def test_each_changed_package_sends_its_event_and_waits_for_procd(node: Node) -> None:
     assert node.reload("system", "dhcp") == (0, "")
     events = [line for line in node.log if "service event" in line]
     assert all(name in event for name, event in zip(("dhcp", "system", "barrier"), events, strict=True))
@@ -118,7 +118,7 @@ def test_every_changed_package_has_its_event_sent_and_procd_is_waited_for(node: 
     assert not list((node.place / "run" / "meshctl").iterdir())
 
 
-def test_a_procd_that_never_runs_its_reloads_is_a_failure(node: Node) -> None:
+def test_the_reload_fails_if_procd_never_runs_its_triggers(node: Node) -> None:
     (node.place / "stuck").touch()
     status, said = node.reload("system")
     assert status == 1
@@ -138,26 +138,26 @@ def test_a_reload_that_is_done_before_the_window_ends_succeeds(node: Node) -> No
     assert node.reload("system", environ={"UNTIL_S": "1017"}) == (0, "")
 
 
-def test_where_procd_takes_no_trigger_its_reloads_are_waited_for_blindly(node: Node) -> None:
+def test_a_fixed_delay_is_used_if_procd_rejects_the_trigger(node: Node) -> None:
     (node.place / "no-triggers").touch()
     assert node.reload("system") == (0, "")
     assert node.slept_s() == 10
 
 
-def test_a_ruleset_that_nft_refuses_is_a_failure_although_fw4_ends_with_0(node: Node) -> None:
+def test_a_ruleset_rejected_by_nft_is_a_failure_even_if_fw4_exits_with_0(node: Node) -> None:
     node.service("firewall")
     status, said = node.reload("firewall")
     assert (status, said) == (1, "failed: the firewall's new ruleset is not loaded")
 
 
-def test_the_firewall_is_loaded_after_procd_and_the_interfaces_are_done(node: Node) -> None:
+def test_the_firewall_is_reloaded_after_procd_and_the_interfaces_settle(node: Node) -> None:
     assert node.reload("network", "firewall") == (0, "")
     barriers = [at for at, line in enumerate(node.log) if "service delete" in line]
     assert len(barriers) == 2
     assert barriers[1] < node.log.index("firewall reload")
 
 
-def test_a_firewall_that_does_not_run_is_started_now_and_not_at_the_next_boot(node: Node) -> None:
+def test_a_stopped_firewall_is_started_immediately(node: Node) -> None:
     (node.place / "run" / "fw4.state").unlink()
     assert node.reload("firewall") == (0, "")
     assert "firewall start" in node.log
@@ -169,7 +169,7 @@ def test_a_firewall_that_is_disabled_is_left_alone(node: Node) -> None:
     assert [line for line in node.log if line.startswith("firewall")] == ["firewall enabled"]
 
 
-def test_a_firewall_that_failed_before_stops_no_change_of_the_network(node: Node) -> None:
+def test_an_already_broken_firewall_does_not_fail_a_network_change(node: Node) -> None:
     node.service("firewall")
     assert node.reload("network") == (0, "")
 
@@ -182,12 +182,12 @@ def test_on_releases_with_fw3_its_exit_status_counts(node: Node) -> None:
     assert node.reload("firewall")[0] == 1
 
 
-def test_a_dropbear_that_keeps_its_options_is_not_waited_for(node: Node) -> None:
+def test_a_dropbear_with_unchanged_options_is_not_waited_for(node: Node) -> None:
     assert node.reload("dropbear") == (0, "")
     assert node.slept_s() == 0
 
 
-def test_a_dropbear_that_gets_other_options_is_waited_for_until_its_old_process_has_ended(node: Node) -> None:
+def test_a_dropbear_with_changed_options_is_waited_for_until_its_old_process_exits(node: Node) -> None:
     with subprocess.Popen(["sleep", "600"]) as old:
         (node.place / "dropbear").write_text(DROPBEAR % (old.pid, 22))
         (node.place / "dropbear.next").write_text(DROPBEAR % (old.pid, 2222))
@@ -203,14 +203,14 @@ def test_a_dropbear_that_gets_other_options_is_waited_for_until_its_old_process_
     assert node.slept_s() >= 1
 
 
-def test_a_dropbear_that_does_not_end_is_a_failure(node: Node) -> None:
+def test_a_dropbear_process_that_does_not_exit_is_a_failure(node: Node) -> None:
     (node.place / "dropbear").write_text(DROPBEAR % (os.getpid(), 22))
     (node.place / "dropbear.next").write_text(DROPBEAR % (os.getpid(), 2222))
     assert node.reload("dropbear") == (1, "failed: dropbear still runs with its old options")
     assert node.slept_s() == 15
 
 
-def test_radios_that_netifd_is_setting_up_are_waited_for(node: Node) -> None:
+def test_the_reload_waits_for_radios_that_netifd_is_setting_up(node: Node) -> None:
     (node.place / "pending").touch()
     assert node.reload("wireless") == (0, "")
     assert node.slept_s() == 1
@@ -239,7 +239,7 @@ wireless.default_radio0.device='radio0'
         (1, True, False, False),
     ],
 )
-def test_radios_that_were_lost_or_stay_on_are_taken_down_and_up_once(
+def test_lost_radios_and_disabled_radios_still_up_are_reset_once(
     node: Node, disabled: int, before: bool, after: bool, is_reset: bool
 ) -> None:
     node.tool("wifi", 'echo "wifi $1" >>"$HERE/log"')
@@ -261,7 +261,7 @@ def test_radios_that_were_lost_or_stay_on_are_taken_down_and_up_once(
         ("option proto 'static'", '{"static": {}}', False),
     ],
 )
-def test_netifd_restarts_where_it_does_not_know_batman_adv_yet(
+def test_netifd_is_restarted_only_if_it_lacks_the_batadv_protocol_handler(
     node: Node, network: str, handlers: str, restarts: bool
 ) -> None:
     (node.place / "network").write_text(network)
@@ -270,7 +270,7 @@ def test_netifd_restarts_where_it_does_not_know_batman_adv_yet(
     assert ("network restart" in node.log) is restarts
 
 
-def test_a_back_ends_service_is_restarted_and_its_failure_counts(node: Node) -> None:
+def test_a_back_end_service_is_restarted_and_a_failed_restart_is_reported(node: Node) -> None:
     node.service("meshmerize")
     assert node.reload("network", services=("meshmerize",)) == (0, "")
     assert "meshmerize restart" in node.log
@@ -282,7 +282,7 @@ def test_a_back_ends_service_is_restarted_and_its_failure_counts(node: Node) -> 
     ("client", "pings"),
     [({"SSH_CONNECTION": "10.42.0.2 51000 10.42.0.11 22"}, [f"-c {SPEAK_FRAMES} 10.42.0.2"]), ({}, [])],
 )
-def test_a_node_whose_network_changes_speaks_to_the_address_it_was_reached_from_and_waits_for_no_answer(
+def test_a_network_change_pings_the_ssh_client_without_waiting_for_a_reply(
     node: Node, client: dict[str, str], pings: list[str]
 ) -> None:
     os.mkfifo(node.place / "go")

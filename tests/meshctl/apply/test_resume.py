@@ -45,7 +45,7 @@ def test_a_node_left_in_the_old_cell_is_reported_with_how_to_reach_it() -> None:
     )
 
 
-def test_nodes_that_ended_otherwise_need_no_account() -> None:
+def test_only_uncertain_nodes_in_the_plan_are_reported() -> None:
     assert (
         resolutions(7, [Outcome("b01", Result.FAILED), Outcome("b09", Result.UNCERTAIN)], prepared(Verdict.SAME)) == {}
     )

@@ -27,7 +27,7 @@ def refusal(state: EarlierState | None = None, outcome: Outcome = DONE, later: t
     return irreversible(7, fleet().nodes["b01"], outcome, state or recorded(), later)
 
 
-def test_the_plan_of_a_rollback_leads_exactly_to_the_earlier_files() -> None:
+def test_a_rollback_plan_restores_exactly_the_earlier_files() -> None:
     now_fleet = fleet(channel=11)
     old = wanted(fleet(), "b01")
     renderer = Renderer.of(now_fleet, secret)
@@ -55,7 +55,7 @@ def test_secrets_are_written_back_and_never_shown() -> None:
     assert PASS_PHRASE not in wireless.masked
 
 
-def test_what_can_be_taken_back_is() -> None:
+def test_a_reversible_run_is_rolled_back() -> None:
     assert refusal() == ""
 
 
@@ -68,7 +68,7 @@ def test_what_can_be_taken_back_is() -> None:
         (replace(recorded(), added=("etc/config/x",)), DONE, (), "run 7 created /etc/config/x, which would stay"),
     ],
 )
-def test_what_cannot_be_taken_back_is_refused(
+def test_an_irreversible_run_is_rejected(
     state: EarlierState | None, outcome: Outcome, later: tuple[int, ...], why: str
 ) -> None:
     assert refusal(state, outcome, later).startswith(why)
@@ -79,13 +79,13 @@ def test_a_node_without_a_record_or_unmanaged_is_refused() -> None:
     assert "no longer manages" in irreversible(7, None, DONE, recorded(), ())
 
 
-def test_an_earlier_address_is_refused() -> None:
+def test_a_rollback_to_a_different_address_is_rejected() -> None:
     state = recorded()
     files = tuple(replace(file, text=(file.text or "").replace("10.42.0.101", "10.42.0.99")) for file in state.files)
     assert "its address was 10.42.0.99" in refusal(replace(state, files=files))
 
 
-def test_bytes_that_are_not_known_are_not_written_back() -> None:
+def test_a_file_with_undecodable_bytes_is_not_restored() -> None:
     state = recorded()
     new = wanted(fleet(channel=11), "b01")
     seen = running(fleet(), "b01")
@@ -95,7 +95,7 @@ def test_bytes_that_are_not_known_are_not_written_back() -> None:
     assert state.files
 
 
-def test_undone_runs_do_not_stand_in_the_way() -> None:
+def test_rolled_back_runs_do_not_block_a_rollback() -> None:
     assert without_undone([(8, None), (9, 8)]) == ()
     assert without_undone([(8, None), (9, None), (10, 9)]) == (8,)
     # rolling back a rollback applies the run again

@@ -67,13 +67,13 @@ def test_an_unobserved_node_and_one_without_a_mesh_radio_have_no_holders() -> No
     assert entries_of("b02", {**around, "b02": itself()}) == ()
 
 
-def test_a_station_table_of_any_length_has_few_asked() -> None:
+def test_the_number_of_queried_holders_is_limited() -> None:
     entries = [StationEntry(f"n{number:03}", "mesh0", MAC) for number in range(200)]
     assert list(by_holder(entries)) == [f"n{number:03}" for number in range(MAX_QUERIED)]
 
 
 @given(st.lists(st.floats(0, 30), max_size=20))
-def test_neighbors_of_an_unreachable_node_are_queried_at_once_then_with_pauses_up_to_a_minute(
+def test_queries_for_an_unreachable_node_back_off_up_to_the_maximum_pause(
     lateness: list[float],
 ) -> None:
     asked: list[float] = []
@@ -128,7 +128,7 @@ def at(seen: Observation, asked_at_s: float, *, uptime_s: float | None) -> Obser
 @pytest.mark.parametrize(
     ("connected_s", "is_old"), [(150, True), (104, True), (102, False), (40, False), (None, False)]
 )
-def test_an_entry_older_than_the_boot_of_its_node_is_unflushed(connected_s: int | None, is_old: bool) -> None:
+def test_an_entry_older_than_its_nodes_boot_counts_as_unflushed(connected_s: int | None, is_old: bool) -> None:
     # it is up since 900, give or take what an answer takes; the neighbor has its entry since 1001 - connected_s
     around = {
         "b01": at(
@@ -142,7 +142,7 @@ def test_an_entry_older_than_the_boot_of_its_node_is_unflushed(connected_s: int 
     assert unflushed_boot_s("b03", around) is None
 
 
-def test_those_whose_best_way_to_the_base_begins_with_the_node_are_behind_it() -> None:
+def test_nodes_whose_best_next_hop_to_the_base_is_the_node_are_routed_through_it() -> None:
     around = {
         "b01": hop("b01", BASE, BASE),
         "b02": itself(MAC),
@@ -251,18 +251,18 @@ def test_an_entry_is_removed_only_where_its_neighbor_is_heard_and_does_not_answe
     assert flushed(tmp_path, now) == printed
 
 
-def test_one_lost_echo_request_is_not_enough(tmp_path: Path) -> None:
+def test_three_echo_requests_are_sent_before_an_entry_is_removed(tmp_path: Path) -> None:
     flushed(tmp_path, Second(100, 50, LOST))
     assert (tmp_path / "asked").read_text() == f"meshif bat0 ping -c 3 -t 1 {MAC}\n"
 
 
-def test_the_batctl_of_19_07_is_asked_in_its_own_words(tmp_path: Path) -> None:
+def test_the_batctl_syntax_of_openwrt_19_07_is_tried_as_a_fallback(tmp_path: Path) -> None:
     assert flushed(tmp_path, Second(100, 50, "Error - unknown command: meshif")) == f"unknown {MAC}\n"
     asked = (tmp_path / "asked").read_text().splitlines()
     assert asked == [f"{word} bat0 ping -c 3 -t 1 {MAC}" for word in ("meshif", "-m")]
 
 
-def test_where_there_is_no_batman_adv_only_a_restart_that_was_seen_counts(tmp_path: Path) -> None:
+def test_without_batman_adv_an_entry_is_removed_only_after_an_observed_restart(tmp_path: Path) -> None:
     assert flushed(tmp_path, Second(100, 50, LOST), bat="") == f"unknown {MAC}\n"
     assert flushed(tmp_path, Second(100, 50, ANSWERED), bat="", has_restarted=True) == f"gone {MAC}\n"
 
@@ -272,7 +272,7 @@ def test_an_entry_that_cannot_be_removed_is_reported(tmp_path: Path) -> None:
     assert deletions(tmp_path, [Second(100, 50, LOST)], text)[0] == "kept unknown\n"
 
 
-def test_a_holder_that_did_not_answer_before_looks_on_all_of_its_interfaces(tmp_path: Path) -> None:
+def test_an_entry_without_a_known_interface_is_flushed_on_all_interfaces(tmp_path: Path) -> None:
     text = flush_script([StationEntry("b01", "", MAC)], older_than_s=11.2)
     printed, deleted = deletions(tmp_path, [Second(100, 50, LOST)], text)
     assert printed == f"gone {MAC}\n" * 2
@@ -287,11 +287,11 @@ def watched(place: Path, seconds: list[Second]) -> list[int]:
     return [int(line.split()[0]) for line in deleted]
 
 
-def test_a_radio_that_keeps_answering_is_never_removed(tmp_path: Path) -> None:
+def test_the_entry_of_a_radio_that_keeps_answering_is_never_removed(tmp_path: Path) -> None:
     assert watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(65)]) == []
 
 
-def test_a_radio_that_is_silent_and_then_heard_without_answering_is_removed_once(tmp_path: Path) -> None:
+def test_a_radio_heard_again_without_answering_has_its_entry_removed_once(tmp_path: Path) -> None:
     (tmp_path / "renews").touch()
     away = [Second(1000 * at, 500 + at, LOST) for at in range(2, 20)]
     back = [Second(100, 520 + at, LOST) for at in range(40)]
@@ -304,11 +304,11 @@ def test_a_radio_that_comes_back_as_a_new_station_is_left_alone(tmp_path: Path) 
     assert watched(tmp_path, [*away, *(Second(100, at, LOST) for at in range(40))]) == []
 
 
-def test_where_removing_it_does_not_help_it_is_not_repeated_for_ever(tmp_path: Path) -> None:
+def test_an_ineffective_removal_is_attempted_at_most_three_times(tmp_path: Path) -> None:
     assert len(watched(tmp_path, [Second(100, 500 + at, LOST) for at in range(60)])) == 3
 
 
-def test_no_word_of_a_node_is_run(tmp_path: Path) -> None:
+def test_values_reported_by_a_node_are_never_executed_by_the_shell(tmp_path: Path) -> None:
     evil = [StationEntry("b01", "mesh0; touch x", "$(touch x)"), StationEntry("b01", "'; touch x; '", "`touch x`")]
     for has_restarted in (False, True):
         text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)

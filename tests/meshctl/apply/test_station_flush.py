@@ -169,7 +169,7 @@ def test_unanswered_queries_are_retried_at_the_end_and_the_rest_is_reported() ->
     ]
 
 
-def test_an_entry_is_no_older_for_the_time_that_a_login_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_login_time_counts_toward_the_age_threshold_of_an_entry(monkeypatch: pytest.MonkeyPatch) -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
@@ -229,7 +229,7 @@ def test_current_and_recently_heard_neighbors_are_observed() -> None:
     assert known_neighbors(fleet(), seen, known, now_s=1000.0 + REMEMBERED_S + 1) == ("b01",)
 
 
-def test_radios_are_distinguished_by_name_unless_all_are_meant() -> None:
+def test_radios_are_matched_by_name_unless_every_radio_is_selected() -> None:
     assert "mesh7" in EVERY_RADIO
     assert "mesh1" not in Radios(frozenset({"mesh0"}))
 
@@ -275,7 +275,7 @@ class TestOnAVirtualFleet:
         assert ended.results == {"n001": "done"}, ended.out + ended.err
         assert notes(ended) == FLUSHED
 
-    def test_a_change_of_other_files_flushes_no_entry(self, rig: Rig) -> None:
+    def test_a_change_outside_the_wireless_config_flushes_no_entries(self, rig: Rig) -> None:
         text = rig.inventory(rig.current).read_text(encoding="utf-8")
         assert text.count("hop_penalty: 3") == 1
         rig.inventory("penalty").write_text(text.replace("hop_penalty: 3", "hop_penalty: 4"), encoding="utf-8")

@@ -18,7 +18,7 @@ def members(data: bytes) -> dict[str, tarfile.TarInfo]:
         return {member.name: member for member in tar}
 
 
-def test_it_holds_the_configuration_the_host_keys_the_switch_and_a_marker() -> None:
+def test_the_archive_holds_configuration_host_keys_dead_mans_switch_and_marker() -> None:
     found = members(archive(wanted(fleet(), "b01"), KEYS, "mark"))
     rendered = {file.path for file in wanted(fleet(), "b01").files}
     switch = {path.lstrip("/") for path in deadman.installed_files()}
@@ -39,5 +39,5 @@ def test_private_files_stay_private_and_the_boot_hook_is_enabled() -> None:
     assert {member.uid for member in found.values()} == {0}
 
 
-def test_the_same_node_gives_the_same_bytes() -> None:
+def test_the_archive_is_deterministic() -> None:
     assert archive(wanted(fleet(), "b01"), KEYS, "mark") == archive(wanted(fleet(), "b01"), KEYS, "mark")

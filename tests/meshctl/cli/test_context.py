@@ -19,13 +19,13 @@ from meshctl.fleet import Interrupt, Outcome, Result
         ((Result.FAILED, Result.UNREACHABLE), ExitCode.FINDINGS),
     ],
 )
-def test_only_silence_is_unreachable_and_everything_else_that_is_not_well_is_to_act_on(
+def test_any_failure_other_than_unreachable_nodes_exits_with_findings(
     results: tuple[Result, ...], code: ExitCode
 ) -> None:
     assert exit_for([Outcome("b03", result) for result in results], Interrupt()) is code
 
 
-def test_an_interrupted_run_says_so_whatever_came_of_it() -> None:
+def test_an_interrupted_run_has_its_own_exit_code_whatever_its_outcomes() -> None:
     interrupt = Interrupt()
     interrupt.request()
     assert exit_for([Outcome("b03", Result.FAILED)], interrupt) is ExitCode.INTERRUPTED

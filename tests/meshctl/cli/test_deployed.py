@@ -34,7 +34,7 @@ def _states(inventory: Path) -> dict[str, NodeState]:
     return {name: node.state for name, node in load_fleet(inventory).nodes.items()}
 
 
-def test_a_beacon_is_marked_and_nothing_else_is_touched(inventory: Path) -> None:
+def test_a_beacon_is_marked_as_deployed_without_other_edits(inventory: Path) -> None:
     before = (inventory / "fleet.yaml").read_text().splitlines()
     result = _run(inventory, "husky1-b3")
     assert result.exit_code == 0, result.output
@@ -45,7 +45,7 @@ def test_a_beacon_is_marked_and_nothing_else_is_touched(inventory: Path) -> None
     assert _states(inventory)["husky1-b3"] is NodeState.DEPLOYED
 
 
-def test_a_label_names_a_beacon_whatever_its_capitals(inventory: Path) -> None:
+def test_labels_match_beacons_case_insensitively(inventory: Path) -> None:
     assert _run(inventory, "b2").exit_code == 0
     assert _states(inventory)["husky1-b2"] is NodeState.DEPLOYED
     assert "the one with the bent antenna" in (inventory / "fleet.yaml").read_text()
@@ -58,7 +58,7 @@ def test_several_beacons_and_patterns_are_one_edit(inventory: Path) -> None:
     assert "rover1-b02" not in marked
 
 
-def test_what_is_marked_already_is_said_and_left(inventory: Path) -> None:
+def test_an_already_deployed_beacon_is_reported_and_left_unchanged(inventory: Path) -> None:
     _run(inventory, "husky1-b1")
     text = (inventory / "fleet.yaml").read_text()
     result = _run(inventory, "husky1-b1")
@@ -66,7 +66,7 @@ def test_what_is_marked_already_is_said_and_left(inventory: Path) -> None:
     assert (inventory / "fleet.yaml").read_text() == text
 
 
-def test_the_way_back_is_a_beacon_that_was_picked_up(inventory: Path) -> None:
+def test_back_marks_a_beacon_as_carried_again(inventory: Path) -> None:
     _run(inventory, "husky1-b1", "husky1-b2")
     assert _run(inventory, "husky1-b1", "--back").exit_code == 0
     states = _states(inventory)
@@ -87,7 +87,7 @@ def test_a_dry_run_shows_the_edit_and_writes_nothing(inventory: Path) -> None:
         (("x*",), "no beacon matches 'x*'"),
     ],
 )
-def test_what_is_no_beacon_is_refused_and_nothing_is_written(
+def test_a_node_that_is_not_a_beacon_is_rejected_and_nothing_is_written(
     words: tuple[str, ...], message: str, inventory: Path
 ) -> None:
     text = (inventory / "fleet.yaml").read_text()
@@ -97,7 +97,7 @@ def test_what_is_no_beacon_is_refused_and_nothing_is_written(
     assert (inventory / "fleet.yaml").read_text() == text
 
 
-def test_a_lost_beacon_is_not_brought_back_by_the_way(inventory: Path) -> None:
+def test_a_lost_beacon_is_not_implicitly_marked_as_deployed(inventory: Path) -> None:
     file = inventory / "fleet.yaml"
     file.write_text(file.read_text().replace("{label: B2}", "{label: B2, state: lost}"))
     result = _run(inventory, "husky1-b2")
@@ -106,7 +106,7 @@ def test_a_lost_beacon_is_not_brought_back_by_the_way(inventory: Path) -> None:
     assert "meshctl inventory state husky1-b2 deployed" in result.stderr
 
 
-def test_without_beacons_the_command_says_what_it_expects(inventory: Path) -> None:
+def test_missing_or_conflicting_arguments_are_usage_errors(inventory: Path) -> None:
     result = _run(inventory)
     assert (result.exit_code, "expected beacons, or --from-mesh" in result.stderr) == (2, True)
     both = _run(inventory, "--from-mesh", "--back")

@@ -31,7 +31,7 @@ def said(capfd: pytest.CaptureFixture[str], *words: str) -> str:
 
 
 @pytest.mark.usefixtures("journal")
-def test_runs_stand_below_a_heading_newest_first(capfd: pytest.CaptureFixture[str]) -> None:
+def test_runs_are_listed_newest_first_below_a_header(capfd: pytest.CaptureFixture[str]) -> None:
     lines = said(capfd).splitlines()
     assert lines[0].split() == ["RUN", "BEGAN", "COMMAND", "FLEET", "RESULT"]
     assert [line.split()[0] for line in lines[1:]] == ["4", "3", "2", "1"]
@@ -39,7 +39,7 @@ def test_runs_stand_below_a_heading_newest_first(capfd: pytest.CaptureFixture[st
 
 
 @pytest.mark.usefixtures("journal")
-def test_a_node_s_runs_stand_fleet_by_fleet(capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_runs_of_a_node_are_grouped_by_fleet(capfd: pytest.CaptureFixture[str]) -> None:
     text = said(capfd, "--node", "b01")
     blocks = [block.splitlines() for block in text.split("\n\n")]
     assert [block[0] for block in blocks] == ["b01 of mine", "b01 of ruins", "b01 of mine (lab)"]
@@ -58,7 +58,7 @@ def test_a_node_s_runs_stand_fleet_by_fleet(capfd: pytest.CaptureFixture[str]) -
         (("--real", "--limit", "2"), [4, 3]),
     ],
 )
-def test_runs_are_chosen_by_fleet_and_by_what_is_real(
+def test_runs_are_filtered_by_fleet_and_by_real_or_virtual(
     capfd: pytest.CaptureFixture[str], words: tuple[str, ...], runs: list[int]
 ) -> None:
     listed = json.loads(said(capfd, *words, "--json"))

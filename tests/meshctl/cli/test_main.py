@@ -38,7 +38,7 @@ def test_help_lists_every_command_under_its_heading() -> None:
 
 
 @pytest.mark.parametrize("words", [["lab"], ["robots", "topic"]], ids=" ".join)
-def test_the_help_of_a_group_does_not_cut_summaries(words: list[str]) -> None:
+def test_group_help_does_not_truncate_command_summaries(words: list[str]) -> None:
     shown = run(*words, "--help", COLUMNS="60").stdout
     assert "Commands:" in shown
     assert "..." not in shown.split("Commands:")[1]
@@ -121,7 +121,7 @@ def test_ctrl_c_ends_with_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert end.value.code == 130
 
 
-def test_a_reader_that_has_seen_enough_is_no_failure() -> None:
+def test_a_closed_output_pipe_is_not_a_failure() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "meshctl", "lint", "--list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -131,7 +131,7 @@ def test_a_reader_that_has_seen_enough_is_no_failure() -> None:
         assert (process.stderr.read(), process.wait()) == ("", 0)
 
 
-def test_ctrl_c_before_the_command_has_begun_is_reported_as_any_other(
+def test_ctrl_c_before_the_command_starts_is_reported_as_interrupted(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(meant: str) -> None:

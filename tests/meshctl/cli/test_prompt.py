@@ -59,11 +59,11 @@ def test_no_color_leaves_plans_and_live_lines_plain(monkeypatch: pytest.MonkeyPa
     ("command", "sent"),
     [(["ps | grep x"], "ps | grep x"), (["echo", "a  b", "$HOME"], "echo 'a  b' '$HOME'"), (["uptime"], "uptime")],
 )
-def test_one_word_is_the_node_s_shell_s_and_several_arrive_as_they_are(command: list[str], sent: str) -> None:
+def test_a_single_argument_is_passed_to_the_shell_and_several_are_quoted(command: list[str], sent: str) -> None:
     assert shell_words(command) == sent
 
 
-def test_a_resumed_bootstrap_says_that_silent_nodes_belong_on_the_bench() -> None:
+def test_a_resumed_bootstrap_advises_connecting_unreachable_nodes_on_the_bench() -> None:
     nodes = {"b01": NodePlan("b01", Verdict.AWAY, reason="no answer"), "b02": NodePlan("b02", Verdict.SAME)}
     plan = Plan("f", 0.0, "base", nodes)
     assert bench_advice(run_of("bootstrap"), plan) == (

@@ -92,7 +92,7 @@ def test_render_prints_every_node_with_its_key_masked(run: Run) -> None:
     assert KEY not in ran.out
 
 
-def test_render_writes_the_nodes_that_are_named(run: Run, inventory: Path, tmp_path: Path) -> None:
+def test_render_writes_only_the_selected_nodes(run: Run, inventory: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     ran = run("render", "b0[12]", "base", "--inventory", inventory, "--out", out)
     assert (ran.code, ran.err) == (0, "")
@@ -132,7 +132,7 @@ def test_an_image_whose_ports_may_be_dead_gets_a_warning(run: Run, inventory: Pa
 
 
 @pytest.mark.parametrize(("vlans", "message"), [("{0: 3 0t}", "1 to 4094"), ("{1: eth0}", "such as 3 0t")])
-def test_a_layout_that_no_switch_can_have_is_refused(run: Run, inventory: Path, vlans: str, message: str) -> None:
+def test_an_invalid_switch_vlan_layout_is_rejected(run: Run, inventory: Path, vlans: str, message: str) -> None:
     (inventory / "fleet.yaml").write_text(INVENTORY.replace("[eth0]", f"[eth0]\n    switch_vlans: {vlans}"))
     ran = run("render", "b01")
     assert ran.code == 2
@@ -156,7 +156,7 @@ def test_a_missing_key_is_reported_with_its_place(run: Run, inventory: Path, mon
     assert "meshes.main.key" in ran.err
 
 
-def test_nothing_is_written_when_one_node_cannot_be(run: Run, inventory: Path, tmp_path: Path) -> None:
+def test_nothing_is_written_if_one_node_cannot_be_rendered(run: Run, inventory: Path, tmp_path: Path) -> None:
     text = INVENTORY.replace("b[01-03]: {", 'b[01-03]: {extra_uci: {wireless.radio9.rts: "1"}, ')
     (inventory / "fleet.yaml").write_text(text)
     ran = run("render", "--out", tmp_path / "out")
@@ -167,7 +167,7 @@ def test_nothing_is_written_when_one_node_cannot_be(run: Run, inventory: Path, t
     assert not (tmp_path / "out").exists()
 
 
-def test_diff_of_the_same_is_silent(run: Run, inventory: Path) -> None:
+def test_diff_of_identical_inventories_prints_nothing(run: Run, inventory: Path) -> None:
     assert run("diff", inventory, inventory) == Ran(0, "", "")
 
 
@@ -221,7 +221,7 @@ class TestRevisions:
         assert self.git(repository, "status", "--porcelain") == before
 
     @pytest.mark.usefixtures("repository")
-    def test_two_revisions_are_compared_by_folder_and_from_below(self, run: Run) -> None:
+    def test_two_revisions_are_compared_by_root_and_relative_paths(self, run: Run) -> None:
         ran = run("diff", "HEAD~1:", "HEAD:./")
         assert ran.code == 1
         assert "channel: '6' -> '1'" in ran.out
@@ -235,12 +235,12 @@ class TestRevisions:
             ("HEAD:../../etc/passwd", "no such file or directory in HEAD"),
         ],
     )
-    def test_a_missing_inventory_or_node_is_reported(self, run: Run, argument: str, words: str) -> None:
+    def test_a_missing_revision_or_inventory_file_is_reported(self, run: Run, argument: str, words: str) -> None:
         ran = run("diff", argument, "fleet.yaml")
         assert ran.code == 2
         assert words in ran.err
 
-    def test_a_broken_inventory_is_named_by_its_revision(self, run: Run, repository: Path) -> None:
+    def test_an_invalid_inventory_is_reported_with_its_revision(self, run: Run, repository: Path) -> None:
         (repository / "fleet.yaml").write_text(INVENTORY.replace("channel: 6", "chanel: 6"))
         self.commit(repository, "third")
         ran = run("diff", "HEAD:fleet.yaml", repository)

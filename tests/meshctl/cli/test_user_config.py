@@ -59,7 +59,7 @@ def test_a_bad_file_is_reported_with_its_line(tmp_path: Path, text: str, message
     assert hint in caught.value.hint
 
 
-def test_the_file_is_found_by_xdg_and_can_be_named_or_switched_off(tmp_path: Path) -> None:
+def test_the_config_file_is_located_by_xdg_and_can_be_overridden_or_disabled(tmp_path: Path) -> None:
     file = tmp_path / "meshctl/config.toml"
     file.parent.mkdir()
     file.write_text('color = "never"\nparallel = 3\n')

@@ -69,7 +69,7 @@ def test_a_file_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     assert "cannot write the log file" in str(result.exception)
 
 
-def test_every_line_of_a_hidden_value_is_masked_but_no_short_word() -> None:
+def test_every_line_of_a_hidden_value_is_masked_except_short_ones() -> None:
     event_log.hide("-----BEGIN KEY-----\nb64b64b64\nab\n")
     assert event_log.masked("x b64b64b64 ab") == f"x {event_log.MASK} ab"
 

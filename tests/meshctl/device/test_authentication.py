@@ -48,7 +48,7 @@ def test_a_replaced_key_file_is_parsed_again(tmp_path: Path, parsed: list[Path])
     assert parsed[:2] == [path, path]
 
 
-def test_a_key_parsed_with_its_passphrase_does_not_open_without(tmp_path: Path, parsed: list[Path]) -> None:
+def test_a_key_cached_with_its_passphrase_still_requires_it(tmp_path: Path, parsed: list[Path]) -> None:
     path = keypair(tmp_path / "operator", passphrase="open sesame")
     load_key(path, Secret("open sesame"))
     load_key(path, Secret("open sesame"))

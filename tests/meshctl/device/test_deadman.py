@@ -66,7 +66,7 @@ def uptime_s() -> float:
     return float(Path("/proc/uptime").read_text().split()[0])
 
 
-def test_a_confirmed_change_stays_and_the_services_run_with_it(node: Sandbox) -> None:
+def test_a_confirmed_change_persists_and_the_services_use_it(node: Sandbox) -> None:
     applied(node)
     assert is_after(node.path("/etc"))
     assert node.deadman("confirm", "c1", NONCE) == "ok state=idle id=c1 outcome=confirmed"
@@ -80,7 +80,7 @@ def test_a_confirmed_change_stays_and_the_services_run_with_it(node: Sandbox) ->
     assert is_after(node.path("/etc"))
 
 
-def test_an_unconfirmed_change_is_taken_back_and_the_services_reloaded(node: Sandbox) -> None:
+def test_an_unconfirmed_change_is_rolled_back_and_the_services_are_reloaded(node: Sandbox) -> None:
     applied(node, window_s="1")
     eventually(lambda: state(node) == "idle" and not node.processes())
     assert is_before(node.path("/etc"))
@@ -89,7 +89,7 @@ def test_an_unconfirmed_change_is_taken_back_and_the_services_reloaded(node: San
     assert refusal(node.deadman("confirm", "c1", NONCE)) == "restored"
 
 
-def test_a_change_survives_no_reboot_unconfirmed(node: Sandbox) -> None:
+def test_an_unconfirmed_change_is_rolled_back_at_boot(node: Sandbox) -> None:
     applied(node)
     node.close_processes()
     node.reboot()
@@ -99,7 +99,7 @@ def test_a_change_survives_no_reboot_unconfirmed(node: Sandbox) -> None:
     assert node.path("/tmp/meshctl").exists()
 
 
-def test_the_boot_hook_runs_before_everything_that_reads_what_it_restores() -> None:
+def test_the_boot_hook_runs_before_every_service_that_reads_restored_files() -> None:
     hook = script("deadman.init")
     assert hook.startswith("#!/bin/sh /etc/rc.common\n")
     start = re.search(r"^START=(\d+)$", hook, re.MULTILINE)
@@ -108,7 +108,7 @@ def test_the_boot_hook_runs_before_everything_that_reads_what_it_restores() -> N
     assert f"S{start[1]}meshctl-deadman" < min("S10boot", "S10system", "S12log", "S19dropbear", "S20network")
 
 
-def test_only_the_right_nonce_confirms_and_only_once_the_change_is_there(node: Sandbox) -> None:
+def test_only_the_right_nonce_confirms_and_only_an_applied_change(node: Sandbox) -> None:
     armed(node)
     assert refusal(node.deadman("confirm", "c1", NONCE)) == "not-applied"
     node.deadman("apply", OWNER, "c1", "now")
@@ -120,14 +120,14 @@ def test_only_the_right_nonce_confirms_and_only_once_the_change_is_there(node: S
     assert refusal(node.deadman("confirm", "c1", "guess")) == "wrong-state"
 
 
-def test_the_nonce_itself_never_reaches_the_flash_before_it_is_said(node: Sandbox) -> None:
+def test_the_nonce_is_not_written_to_flash_before_confirmation(node: Sandbox) -> None:
     applied(node)
     for path in node.path("/etc").rglob("*"):
         if path.is_file() and not path.is_symlink():
             assert NONCE not in path.read_text(errors="replace")
 
 
-def test_an_applied_change_is_taken_back_at_once_when_asked(node: Sandbox) -> None:
+def test_aborting_an_applied_change_rolls_it_back_immediately(node: Sandbox) -> None:
     applied(node)
     assert node.deadman("abort", OWNER, "c1").startswith("ok")
     eventually(lambda: state(node) == "idle" and not node.processes())
@@ -136,7 +136,7 @@ def test_an_applied_change_is_taken_back_at_once_when_asked(node: Sandbox) -> No
     assert "192.168.1.1" in (node.text("/harness/running") or "")
 
 
-def test_staging_and_arming_change_nothing_and_are_undone_by_abort(node: Sandbox) -> None:
+def test_staging_and_arming_change_no_files_and_can_be_aborted(node: Sandbox) -> None:
     staged(node)
     assert is_before(node.path("/etc"))
     assert node.deadman("abort", OWNER, "c1") == "ok state=idle id=c1"
@@ -148,7 +148,7 @@ def test_staging_and_arming_change_nothing_and_are_undone_by_abort(node: Sandbox
     assert node.text("/harness/running") is None
 
 
-def test_every_verb_may_be_repeated_when_its_answer_was_lost(node: Sandbox) -> None:
+def test_repeated_verbs_after_a_lost_answer_are_harmless(node: Sandbox) -> None:
     staged(node)
     assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("ok")
     assert node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG).startswith("ok")
@@ -166,7 +166,7 @@ def test_a_newer_stage_takes_the_place_of_one_that_was_not_armed(node: Sandbox) 
     assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "busy"
 
 
-def test_two_operators_cannot_cross(node: Sandbox) -> None:
+def test_another_operator_is_locked_out_until_the_lock_is_released(node: Sandbox) -> None:
     prepare(node)
     assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "not-locked"
     assert node.deadman("lock", OWNER, LONG).startswith("ok")
@@ -179,7 +179,7 @@ def test_two_operators_cannot_cross(node: Sandbox) -> None:
     assert node.deadman("lock", OTHER, LONG).startswith("ok")
 
 
-def test_a_change_belongs_to_its_owner_even_after_the_lock_ran_out(node: Sandbox) -> None:
+def test_a_change_still_belongs_to_its_owner_after_the_lock_is_lost(node: Sandbox) -> None:
     armed(node)
     node.deadman("unlock", OWNER)
     assert node.deadman("lock", OTHER, LONG).startswith("ok")
@@ -188,7 +188,7 @@ def test_a_change_belongs_to_its_owner_even_after_the_lock_ran_out(node: Sandbox
     assert node.deadman("abort", OTHER, "c1").startswith("ok")
 
 
-def test_a_lock_runs_out_by_itself_and_with_a_reboot(node: Sandbox) -> None:
+def test_a_lock_expires_after_its_ttl_and_on_reboot(node: Sandbox) -> None:
     assert node.deadman("lock", OWNER, "1").startswith("ok")
     eventually(lambda: node.deadman("lock", OTHER, LONG).startswith("ok"))
     boot_id = node.text("/harness/boot_id")
@@ -221,7 +221,7 @@ def test_foreign_uncommitted_changes_are_refused_before_anything_happens(node: S
     assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "foreign-changes"
 
 
-def test_a_file_that_is_not_what_the_plan_saw_is_refused(node: Sandbox) -> None:
+def test_a_file_changed_since_planning_is_rejected_at_stage(node: Sandbox) -> None:
     prepare(node)
     node.deadman("lock", OWNER, LONG)
     for path, text in (("/etc/config/network", "edited\n"), ("/etc/new/place/of.conf", "made by hand\n")):
@@ -250,7 +250,7 @@ def test_an_edit_during_the_countdown_is_kept_and_the_change_dropped(node: Sandb
     assert last(node) == ("c1", "refused", "moved-on")
 
 
-def test_the_switch_waits_for_its_moment_and_can_be_called_off_until_then(node: Sandbox) -> None:
+def test_a_scheduled_change_can_be_aborted_until_its_due_time(node: Sandbox) -> None:
     armed(node)
     answer = node.deadman("apply", OWNER, "c1", "in", "1000.5")
     status = parse_status(node.deadman("status"))
@@ -264,7 +264,7 @@ def test_the_switch_waits_for_its_moment_and_can_be_called_off_until_then(node: 
     assert node.text("/harness/running") is None
 
 
-def test_a_moment_is_named_by_the_nodes_own_uptime(node: Sandbox) -> None:
+def test_the_apply_time_is_given_as_the_nodes_uptime(node: Sandbox) -> None:
     armed(node)
     uptime = uptime_s()
     assert refusal(node.deadman("apply", OWNER, "c1", "at", f"{uptime - 5:.2f}")) == "too-late"
@@ -276,14 +276,14 @@ def test_a_moment_is_named_by_the_nodes_own_uptime(node: Sandbox) -> None:
         eventually(lambda: state(node) == "applied")
 
 
-def test_a_reload_that_hangs_does_not_hold_up_the_way_back(node: Sandbox) -> None:
+def test_a_hanging_reload_does_not_block_the_rollback(node: Sandbox) -> None:
     hangs = change(reload="grep -q 192.168.1.1 /etc/config/network && echo back >>/harness/running || sleep 100000")
     applied(node, window_s="1", wanted=hangs)
     eventually(lambda: node.text("/harness/running") == "back\n")
     assert is_before(node.path("/etc"))
 
 
-def test_a_reload_learns_when_its_window_ends_and_that_of_the_way_back_has_none(node: Sandbox) -> None:
+def test_a_reload_gets_its_deadline_and_the_rollback_reload_gets_none(node: Sandbox) -> None:
     log = 'echo "${UNTIL_S:-none}" >>/harness/log'
     armed(node, "60", change(reload=log))
     before_s = uptime_s()
@@ -297,7 +297,7 @@ def test_a_reload_learns_when_its_window_ends_and_that_of_the_way_back_has_none(
     assert back == "none"
 
 
-def test_the_way_back_lets_a_reload_under_way_come_to_its_end_first(node: Sandbox) -> None:
+def test_a_rollback_waits_for_a_running_reload_to_finish(node: Sandbox) -> None:
     # two of OpenWrt's reload_config at once spoil each other's list of what changed
     log = "echo begin >>/harness/log; until [ -e /harness/go ]; do sleep 0.1; done; echo end >>/harness/log"
     applied(node, wanted=change(reload=log))
@@ -309,7 +309,7 @@ def test_the_way_back_lets_a_reload_under_way_come_to_its_end_first(node: Sandbo
     assert node.text("/harness/log") == "begin\nend\nbegin\nend\n"
 
 
-def test_nothing_is_staged_while_the_root_is_still_in_ram(node: Sandbox) -> None:
+def test_staging_is_rejected_while_the_root_is_in_ram(node: Sandbox) -> None:
     prepare(node)
     node.deadman("lock", OWNER, LONG)
     stage = f"exec /usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}"
@@ -318,14 +318,14 @@ def test_nothing_is_staged_while_the_root_is_still_in_ram(node: Sandbox) -> None
     assert not node.path("/etc/meshctl/change").exists()
 
 
-def test_when_the_restored_state_cannot_be_reloaded_the_node_reboots_into_it(node: Sandbox) -> None:
+def test_the_node_reboots_if_reloading_the_restored_state_fails(node: Sandbox) -> None:
     applied(node, window_s="1", wanted=change(reload="exit 1"))
     eventually(lambda: node.text("/harness/reboots") == "reboot\n")
     assert is_before(node.path("/etc"))
     assert not node.path("/etc/meshctl/change").exists()
 
 
-def test_the_second_timer_acts_when_the_first_was_killed(node: Sandbox) -> None:
+def test_a_change_whose_timer_was_killed_is_orphaned_and_can_be_aborted(node: Sandbox) -> None:
     applied(node)
     pid = (node.text("/tmp/meshctl/change-c1/watch.pid") or "").strip()
     assert node.run("/bin/sh", "-c", f"kill -9 {pid}").returncode == 0
@@ -341,7 +341,7 @@ def test_without_the_boot_hook_nothing_is_armed(node: Sandbox) -> None:
     assert refusal(node.deadman("arm", OWNER, "c1", NONCE_HASH, LONG)) == "not-enabled"
 
 
-def test_uci_that_the_node_cannot_read_is_refused(node: Sandbox) -> None:
+def test_unparsable_uci_is_rejected_at_stage(node: Sandbox) -> None:
     prepare(node)
     broken = Change("c1", {"/etc/config/wireless": NewFile(b"BROKEN")}, "true")
     node.put(BUNDLE, bundle(broken))
@@ -366,7 +366,7 @@ def test_uci_that_the_node_cannot_read_is_refused(node: Sandbox) -> None:
         "/proc/x/y",
     ],
 )
-def test_a_path_that_is_not_a_file_in_flash_is_refused_by_the_node_itself(node: Sandbox, path: str) -> None:
+def test_the_node_rejects_paths_that_are_not_files_in_flash(node: Sandbox, path: str) -> None:
     prepare(node)
     node.deadman("lock", OWNER, LONG)
     manifest = f"remove - - - {path}\n".encode()
@@ -393,7 +393,7 @@ def test_a_damaged_bundle_is_refused(node: Sandbox, damage: str) -> None:
 @pytest.mark.parametrize(
     "words", [("fly",), (), ("lock", "a b", "1"), ("lock", "a", "-1"), ("lock", "", "1"), ("lock",)]
 )
-def test_a_call_that_makes_no_sense_is_refused(node: Sandbox, words: tuple[str, ...]) -> None:
+def test_invalid_verbs_and_arguments_are_usage_errors(node: Sandbox, words: tuple[str, ...]) -> None:
     assert refusal(node.deadman(*words)) == "usage"
 
 

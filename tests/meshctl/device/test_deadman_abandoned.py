@@ -32,7 +32,7 @@ def test_a_started_change_is_never_taken_over(node: Sandbox) -> None:
     assert refusal(node.deadman("stage", OTHER, "c2", BUNDLE)) == "busy"
 
 
-def test_an_armed_change_that_was_never_started_ends_once_its_owner_has_lost_the_lock(node: Sandbox) -> None:
+def test_an_armed_but_unstarted_change_expires_after_its_owner_loses_the_lock(node: Sandbox) -> None:
     armed(node)
     # what `arm` starts, at the end of its time: the owner still holds the lock and may start it
     node.deadman("expire", "c1", "0")
@@ -45,13 +45,13 @@ def test_an_armed_change_that_was_never_started_ends_once_its_owner_has_lost_the
     assert is_before(node.path("/etc"))
 
 
-def test_an_armed_change_has_a_process_that_ends_it(node: Sandbox) -> None:
+def test_an_armed_change_has_an_expiry_process(node: Sandbox) -> None:
     armed(node)
     commands = [Path(f"/proc/{process}/cmdline").read_bytes() for process in node.processes()]
     assert [command for command in commands if b"\0expire\0c1\0" in command]
 
 
-def test_another_operator_ends_a_change_that_was_armed_and_never_started(node: Sandbox) -> None:
+def test_another_operator_can_replace_a_change_that_was_armed_but_never_started(node: Sandbox) -> None:
     armed(node)
     # its process is gone too: the node ran out of memory
     node.close_processes()
@@ -109,7 +109,7 @@ def test_a_reload_that_hangs_is_not_waited_for_beyond_the_limit(node: Sandbox) -
 
 
 @pytest.mark.parametrize("cut", [0, 100])
-def test_a_bundle_that_a_cut_link_has_shortened_changes_nothing_and_does_not_stay(node: Sandbox, cut: int) -> None:
+def test_a_truncated_bundle_changes_nothing_and_is_deleted(node: Sandbox, cut: int) -> None:
     prepare(node)
     content = bundle(change())
     answer = change_at_once(node, content[:cut], hashlib.sha256(content).hexdigest())

@@ -135,7 +135,7 @@ def test_a_power_cut_at_any_command_leaves_the_old_state_or_the_new(name: str, n
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_a_kill_at_any_command_without_a_reboot_is_taken_back_or_completed(name: str, node: Sandbox) -> None:
+def test_a_kill_at_any_command_leads_to_rollback_or_completion_without_a_reboot(name: str, node: Sandbox) -> None:
     faults = Faults(node)
     before = VERBS[name][0]
     before(faults)

@@ -40,7 +40,7 @@ def test_a_full_flash_is_noticed_before_anything_changes(node: Sandbox) -> None:
     assert not (node.path("/tmp/after") / "meshctl/change").exists()
 
 
-def test_a_flash_that_fills_up_later_does_not_stop_the_way_back(node: Sandbox) -> None:
+def test_a_flash_that_fills_up_later_does_not_block_the_rollback(node: Sandbox) -> None:
     prepare(node)
     answer = on_small_flash(
         node,
@@ -84,7 +84,7 @@ def test_a_lock_that_could_not_be_written_is_refused(node: Sandbox) -> None:
     assert second.startswith("ok")
 
 
-def test_a_lock_is_given_back_although_memory_is_full(node: Sandbox) -> None:
+def test_a_lock_can_be_released_with_full_memory(node: Sandbox) -> None:
     *_, given_back, taken = on_small_memory(
         node,
         f"""

@@ -9,7 +9,7 @@ from contextlib import suppress
 from meshctl.device.liveness import ActivityStream
 
 
-def test_a_reader_wakes_no_more_often_than_the_poll_interval() -> None:
+def test_short_read_timeouts_are_raised_to_the_poll_interval() -> None:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         stream = ActivityStream(ours, poll_s=2.0)
@@ -41,7 +41,7 @@ def test_closing_wakes_the_reader_at_once() -> None:
         assert not reader.is_alive()
 
 
-def test_a_stream_that_the_other_side_closed_closes() -> None:
+def test_a_stream_closed_by_the_peer_can_be_closed() -> None:
     ours, theirs = socket.socketpair()
     theirs.close()
     ActivityStream(ours).close()

@@ -151,7 +151,7 @@ spoiled = st.builds(
 
 
 @given(st.one_of(st.text(), json_values.map(json.dumps), spoiled))
-def test_no_text_makes_any_parser_raise(text: str) -> None:
+def test_no_parser_raises_on_arbitrary_text(text: str) -> None:
     for parse in PARSERS:
         parse(text)
     for link in iw.parse_iw_dev(text) or ():
@@ -159,7 +159,7 @@ def test_no_text_makes_any_parser_raise(text: str) -> None:
 
 
 @given(st.dictionaries(st.sampled_from(NAMES), st.builds(OutputSection, st.binary(max_size=80), st.integers(-1, 255))))
-def test_any_sections_at_all_give_an_observation(sections: dict[str, OutputSection]) -> None:
+def test_arbitrary_sections_yield_an_observation(sections: dict[str, OutputSection]) -> None:
     assert interpret(sections, asked_at_s=0.0, answered_at_s=0.0).asked_at_s == 0.0
 
 
@@ -169,7 +169,7 @@ def test_sections_keep_every_byte(bodies: list[bytes]) -> None:
     assert split_sections(output, "NONCE") == {f"s{n}": OutputSection(body, n) for n, body in enumerate(bodies)}
 
 
-def test_a_section_that_another_one_pretends_to_be_needs_the_nonce() -> None:
+def test_section_markers_without_the_nonce_are_ignored() -> None:
     output = b"NONCE begin config x\nother begin authorized_keys\nevil\nother end 0\n\nNONCE end 0\n"
     assert list(split_sections(output, "NONCE")) == ["config x"]
 
@@ -253,7 +253,7 @@ def test_host_keys_are_fingerprinted_as_a_client_sees_them(connection: SshConnec
     assert [known.fingerprint for known in seen.host_keys] == [host_key(node).fingerprint]
 
 
-def test_a_path_that_the_shell_would_split_is_refused() -> None:
+def test_relative_paths_and_shell_metacharacters_are_rejected() -> None:
     for path in ("/etc/a b", "/etc/$(reboot)", "relative", "/etc/a;b"):
         with pytest.raises(ValueError, match="absolute path"):
             observation_script("nonce", [path])
@@ -273,7 +273,7 @@ def test_modes_are_read_from_ls(listed: str, mode: int | None) -> None:
     assert system.parse_mode(listed) == mode
 
 
-def test_apks_own_list_is_understood_too() -> None:
+def test_the_output_of_apk_list_is_parsed() -> None:
     text = (
         "batctl-full-2025.4-r1 mips_24kc {feeds/routing/batctl} (GPL-2.0-only) [installed]\n"
         "libubox20240329-2024.03.29~eb9bcb64-r1 mips_24kc {libubox} (ISC) [installed]\n"

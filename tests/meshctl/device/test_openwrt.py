@@ -84,7 +84,7 @@ def test_a_change_from_installation_to_confirmation(
     assert is_after(node.path("/etc"))
 
 
-def test_an_applied_change_outlives_the_connection_that_started_it_and_is_undone_by_itself(
+def test_an_applied_change_outlives_its_connection_and_rolls_back_on_timeout(
     connection: SshConnection, server: Server, node: Sandbox, tmp_path: Path
 ) -> None:
     prepare(node)
@@ -114,7 +114,7 @@ def test_a_refusal_carries_its_code_and_its_reason(connection: SshConnection, no
     assert deadman.status(connection).last_outcome == "aborted"
 
 
-def test_a_switch_that_is_missing_or_broken_is_said_so(connection: SshConnection, node: Sandbox) -> None:
+def test_a_missing_or_broken_dead_mans_switch_is_reported(connection: SshConnection, node: Sandbox) -> None:
     node.put(deadman.PROGRAM, "#!/bin/sh\necho what\n", 0o755)
     with pytest.raises(CommandFailed, match="answered lock with 'what'"):
         deadman.lock(connection, OWNER, ttl_s=1)
@@ -136,7 +136,9 @@ def test_a_change_of_many_kilobytes_arrives_whole(connection: SshConnection, nod
     assert node.path("/etc/meshctl/change/new/etc/big/file").read_bytes() == content
 
 
-def test_uptime_is_measured_against_our_clock_with_a_bound(connection: SshConnection, node: Sandbox) -> None:
+def test_uptime_is_measured_against_the_local_clock_with_an_error_bound(
+    connection: SshConnection, node: Sandbox
+) -> None:
     seen = openwrt.measure_uptime(connection)
     assert seen.boot_id == (node.text("/harness/boot_id") or "").strip()
     assert seen.error_s > 0
@@ -158,13 +160,13 @@ def test_files_come_back_with_their_bytes_and_modes(connection: SshConnection, n
         openwrt.fetch_files(connection, ["/etc/a b; reboot"])
 
 
-def test_a_backup_is_sysupgrades_own(connection: SshConnection, node: Sandbox) -> None:
+def test_a_backup_is_created_by_sysupgrade(connection: SshConnection, node: Sandbox) -> None:
     node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
     assert openwrt.backup(connection) == b"backup\n"
     assert list(node.path("/tmp/meshctl").glob("backup*")) == []
 
 
-def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection, node: Sandbox) -> None:
+def test_an_image_is_validated_by_sysupgrade_and_procd(connection: SshConnection, node: Sandbox) -> None:
     node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
     node.put("/tmp/good.bin", "good")
     node.put("/tmp/bad.bin", "wrong board")
@@ -185,11 +187,11 @@ def test_an_image_is_judged_by_sysupgrade_and_by_procd(connection: SshConnection
     assert (bare.valid, bare.reason) == (False, "it does not accept a configuration from the running system")
 
 
-def test_what_ends_the_connection_is_answered_first(connection: Connection, node: Sandbox) -> None:
+def test_starting_sysupgrade_answers_before_the_connection_ends(connection: Connection, node: Sandbox) -> None:
     node.put("/sbin/sysupgrade", SYSUPGRADE, 0o755)
     openwrt.start_sysupgrade(connection, "/tmp/image.bin", "/tmp/config.tgz")
     eventually(lambda: calls(node) == ["sysupgrade -n -f /tmp/config.tgz /tmp/image.bin"])
 
 
-def test_a_root_that_is_in_flash_is_not_taken_for_one_in_memory(connection: SshConnection) -> None:
+def test_a_root_in_flash_is_not_reported_as_in_ram(connection: SshConnection) -> None:
     assert not openwrt.root_in_ram(connection)

@@ -95,7 +95,7 @@ def cut_power_at(node: Sandbox, step: str, verb: str, *words: str) -> None:
     node.reboot()
 
 
-def test_confirmed_packages_stay_and_their_files_leave_the_memory(node: Sandbox, tool: str) -> None:
+def test_confirmed_packages_persist_and_their_package_files_are_deleted(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     applied(node, wanted=change(tool))
     assert is_after_packages(node, tool)
@@ -108,7 +108,7 @@ def test_confirmed_packages_stay_and_their_files_leave_the_memory(node: Sandbox,
     assert not node.path("/etc/meshctl/change").exists()
 
 
-def test_unconfirmed_packages_are_removed_and_those_removed_put_back(node: Sandbox, tool: str) -> None:
+def test_unconfirmed_package_changes_are_fully_rolled_back(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     armed(node, "1", change(tool))
     before = root(node)
@@ -118,7 +118,7 @@ def test_unconfirmed_packages_are_removed_and_those_removed_put_back(node: Sandb
     assert last(node) == ("c1", "restored", "timeout")
 
 
-def test_what_a_package_runs_is_started_again_when_it_is_put_back(node: Sandbox, tool: str) -> None:
+def test_a_packages_services_are_restarted_when_it_is_restored(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     applied(node, window_s="1", wanted=change(tool))
     assert node.text("/harness/wpad") == "stop\nstart\n"
@@ -127,7 +127,7 @@ def test_what_a_package_runs_is_started_again_when_it_is_put_back(node: Sandbox,
     assert node.text("/harness/batman") == "start\nstop\n"
 
 
-def test_files_and_packages_of_one_change_go_and_come_back_together(node: Sandbox, tool: str) -> None:
+def test_files_and_packages_of_a_change_are_applied_and_rolled_back_together(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     before = installed_packages(node, tool)
     applied(node, wanted=change(tool, touches_files=True))
@@ -138,7 +138,7 @@ def test_files_and_packages_of_one_change_go_and_come_back_together(node: Sandbo
     assert installed_packages(node, tool) == before
 
 
-def test_an_installation_that_fails_half_way_is_undone_before_any_file_changes(node: Sandbox, tool: str) -> None:
+def test_a_failed_package_installation_is_rolled_back_before_any_file_changes(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     node.put("/harness/fail", "")
     armed(node, LONG, change(tool, touches_files=True))
@@ -151,7 +151,7 @@ def test_an_installation_that_fails_half_way_is_undone_before_any_file_changes(n
 
 
 @pytest.mark.parametrize("step", ["prerm", "removed", "unpack", "postinst", "installed"])
-def test_a_power_cut_in_the_middle_of_packages_is_undone_by_the_boot(node: Sandbox, tool: str, step: str) -> None:
+def test_a_power_cut_during_package_changes_is_rolled_back_at_boot(node: Sandbox, tool: str, step: str) -> None:
     with_tool(node, tool)
     armed(node, LONG, change(tool))
     before = root(node)
@@ -165,7 +165,7 @@ def test_a_power_cut_in_the_middle_of_packages_is_undone_by_the_boot(node: Sandb
     assert (node.text("/harness/wpad") or "").split().count("start") == (step in ("postinst", "installed"))
 
 
-def test_a_power_cut_while_packages_are_undone_is_undone_by_the_next_boot(node: Sandbox, tool: str) -> None:
+def test_a_package_rollback_interrupted_by_a_power_cut_is_completed_at_boot(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     armed(node, LONG, change(tool))
     before = root(node)
@@ -175,7 +175,7 @@ def test_a_power_cut_while_packages_are_undone_is_undone_by_the_next_boot(node: 
     assert root(node) == before
 
 
-def test_staging_and_dropping_a_change_of_packages_touches_none(node: Sandbox, tool: str) -> None:
+def test_staging_and_aborting_a_package_change_touches_no_packages(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     staged(node, change(tool))
     before = root(node)
@@ -183,7 +183,7 @@ def test_staging_and_dropping_a_change_of_packages_touches_none(node: Sandbox, t
     assert root(node) == before
 
 
-def test_packages_that_their_tool_cannot_remove_are_removed_without_it(node: Sandbox, tool: str) -> None:
+def test_packages_the_package_manager_cannot_remove_are_removed_without_it(node: Sandbox, tool: str) -> None:
     with_tool(node, tool)
     armed(node, LONG, change(tool, touches_files=True))
     before = root(node)
@@ -222,7 +222,7 @@ def test_a_package_file_that_cannot_be_read_is_refused(node: Sandbox, tool: str)
     assert refusal(node.deadman("stage", OWNER, "c1", BUNDLE)) == "flash-full"
 
 
-def test_words_that_a_shell_would_split_are_refused() -> None:
+def test_paths_with_blanks_and_unknown_package_managers_are_rejected() -> None:
     with pytest.raises(ValueError, match="without blanks"):
         packages("opkg", ["/tmp/a b.ipk"])
     with pytest.raises(ValueError, match="expected opkg or apk"):

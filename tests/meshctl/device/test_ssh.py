@@ -81,7 +81,7 @@ def test_a_command_gives_its_output_its_errors_and_its_status(connection: SshCon
     assert (done.stdout, done.stderr, done.exit_status) == ("said\n", "complained\n", 3)
 
 
-def test_the_other_side_is_busybox_ash(connection: SshConnection) -> None:
+def test_the_test_server_is_dropbear_with_busybox_ash(connection: SshConnection) -> None:
     assert connection._transport.remote_version.startswith("SSH-2.0-dropbear")
     assert "BusyBox" in connection.run("busybox | head -n 1").stdout
 
@@ -95,7 +95,7 @@ def test_a_script_of_any_length_reads_exactly_its_stdin(connection: SshConnectio
         assert done.exit_status == 0
 
 
-def test_stdin_and_both_outputs_flow_at_once_whatever_their_size(connection: SshConnection) -> None:
+def test_stdin_stdout_and_stderr_are_streamed_concurrently_at_any_size(connection: SshConnection) -> None:
     pieces = [bytes([n % 251]) * 40_000 for n in range(40)]
     done = connection.run("tee /dev/stderr", stdin=iter(pieces))
     assert done.stdout_bytes == done.stderr_bytes == b"".join(pieces)
@@ -109,7 +109,7 @@ def test_many_commands_run_over_one_connection(connection: SshConnection) -> Non
     assert [connection.run(f"echo {n}").stdout for n in range(20)] == [f"{n}\n" for n in range(20)]
 
 
-def test_a_command_without_end_is_stopped_by_its_deadline(connection: SshConnection) -> None:
+def test_a_command_that_never_ends_times_out(connection: SshConnection) -> None:
     with pytest.raises(Timeout):
         connection.run("sleep 100000", timeout_s=0.5)
     assert not connection.is_open
@@ -160,7 +160,7 @@ def test_a_channel_closed_before_its_command_is_opened_again(
     assert len(opened) == 3
 
 
-def test_a_server_that_dies_in_the_middle_is_a_lost_connection(connection: SshConnection, server: Server) -> None:
+def test_a_server_that_dies_mid_session_is_a_lost_connection(connection: SshConnection, server: Server) -> None:
     def talk_on() -> None:
         while True:
             connection.run("echo there")
@@ -170,7 +170,7 @@ def test_a_server_that_dies_in_the_middle_is_a_lost_connection(connection: SshCo
         talk_on()
 
 
-def test_no_key_of_ours_is_a_clean_refusal_that_names_what_was_tried(
+def test_rejected_keys_cause_an_authentication_error_listing_the_keys_tried(
     server: Server, trust: TrustStore, tmp_path: Path
 ) -> None:
     strange = [keypair(tmp_path / f"stranger-{n}") for n in range(5)]
@@ -180,7 +180,7 @@ def test_no_key_of_ours_is_a_clean_refusal_that_names_what_was_tried(
     assert "b03" in str(caught.value)
 
 
-def test_the_right_key_is_found_behind_more_wrong_ones_than_the_server_allows(
+def test_the_right_key_is_found_after_several_wrong_ones(
     server: Server, trust: TrustStore, key: Path, tmp_path: Path
 ) -> None:
     strange = [keypair(tmp_path / f"stranger-{n}") for n in range(4)]
@@ -203,7 +203,7 @@ def test_a_device_with_a_password_refuses_the_empty_one_cleanly(server: Server, 
     assert caught.value.tried == ("no password", "empty password")
 
 
-def test_a_password_opens_what_it_fits(node: Sandbox, trust: TrustStore) -> None:
+def test_only_the_right_password_is_accepted(node: Sandbox, trust: TrustStore) -> None:
     crypted = subprocess.run(
         ["openssl", "passwd", "-6", "s3cret"], capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -244,7 +244,7 @@ def test_every_modern_key_type_serves_as_host_key_and_as_ours(
         assert ssh.host_key == host_key(node, key_type)
 
 
-def test_an_encrypted_key_opens_with_its_passphrase_and_says_so_without(
+def test_an_encrypted_key_requires_its_passphrase(
     node: Sandbox, server: Server, trust: TrustStore, tmp_path: Path
 ) -> None:
     locked = keypair(tmp_path / "locked", passphrase="open sesame")
@@ -258,9 +258,7 @@ def test_an_encrypted_key_opens_with_its_passphrase_and_says_so_without(
         connect(server.endpoint(), credentials=only(tmp_path / "nowhere"), trust=trust, deadlines=PATIENT)
 
 
-def test_an_unknown_host_key_is_refused_before_anything_secret_is_said(
-    server: Server, tmp_path: Path, key: Path
-) -> None:
+def test_an_unknown_host_key_is_rejected_with_its_fingerprint(server: Server, tmp_path: Path, key: Path) -> None:
     with pytest.raises(HostKeyUnknown) as caught:
         connect(server.endpoint(), credentials=only(key), trust=TrustStore(tmp_path / "empty"), deadlines=PATIENT)
     assert caught.value.fingerprint.startswith("SHA256:")
@@ -291,7 +289,7 @@ def test_the_pinned_key_is_asked_for_even_when_the_server_prefers_another(
         assert ssh.host_key == host_key(node, "rsa")
 
 
-def test_a_node_behind_another_is_reached_through_it_and_pinned_under_its_own_name(
+def test_a_node_reached_through_a_jump_host_is_pinned_under_its_own_name(
     node: Sandbox, trust: TrustStore, key: Path, tmp_path: Path
 ) -> None:
     give_dropbear(node, root_password="!")
@@ -312,7 +310,7 @@ def test_a_node_behind_another_is_reached_through_it_and_pinned_under_its_own_na
             login(nowhere, trust, key, via=jump)
 
 
-def test_the_sha1_only_server_of_19_07_is_met_for_that_release_alone(trust: TrustStore, tmp_path: Path) -> None:
+def test_a_sha1_only_server_is_accepted_only_for_openwrt_19_07_or_by_opt_in(trust: TrustStore, tmp_path: Path) -> None:
     key = keypair(tmp_path / "rsa", "rsa")
     directory = tmp_path / "openssh"
     old = ("HostKeyAlgorithms ssh-rsa", "PubkeyAcceptedAlgorithms ssh-rsa", "CASignatureAlgorithms ssh-rsa")
@@ -330,7 +328,7 @@ def test_the_sha1_only_server_of_19_07_is_met_for_that_release_alone(trust: Trus
                 connect(endpoint, credentials=ours, trust=trust, release=release, deadlines=PATIENT)
 
 
-def test_a_19_07_profile_still_takes_the_better_algorithm_where_there_is_one(
+def test_an_openwrt_19_07_profile_still_prefers_rsa_sha2_if_offered(
     node: Sandbox, trust: TrustStore, tmp_path: Path
 ) -> None:
     key = keypair(tmp_path / "rsa", "rsa")
@@ -422,7 +420,7 @@ IMPATIENT = Deadlines(connect_s=5, handshake_s=0.5, auth_s=5, channel_s=5, run_s
         (hang_up, PATIENT, Unreachable),
     ],
 )
-def test_whatever_answers_there_the_error_is_ours_and_in_time(
+def test_a_misbehaving_server_causes_a_timely_connection_error(
     behave: Callable[[socket.socket], None], deadlines: Deadlines, error: type[Exception], trust: TrustStore
 ) -> None:
     with answering(behave) as endpoint, pytest.raises(error, match="liar") as caught:
@@ -431,7 +429,7 @@ def test_whatever_answers_there_the_error_is_ours_and_in_time(
         assert caught.value.phase == "the SSH handshake"
 
 
-def test_no_answer_is_unreachable(trust: TrustStore) -> None:
+def test_a_refused_connection_is_unreachable(trust: TrustStore) -> None:
     endpoint = Endpoint("127.0.0.1", free_port(), identity="b03")
     with pytest.raises(Unreachable, match=r"b03 .*cannot connect"):
         connect(endpoint, credentials=Credentials(use_agent=False), trust=trust)
@@ -451,7 +449,7 @@ def test_a_server_frozen_after_login_is_a_timeout_and_not_a_hang(
             os.kill(pid, 18)
 
 
-def test_a_server_that_falls_silent_is_given_up_long_before_the_command_has_to_end(
+def test_a_silent_server_is_dropped_long_before_the_command_deadline(
     server: Server, key: Path, trust: TrustStore, node: Sandbox
 ) -> None:
     alert = replace(PATIENT, ask_s=0.2, silence_s=1.0)
@@ -468,7 +466,7 @@ def test_a_server_that_falls_silent_is_given_up_long_before_the_command_has_to_e
         assert not connected.is_open
 
 
-def test_a_quiet_command_keeps_its_connection_because_its_server_gives_signs_of_life(
+def test_keepalives_keep_the_connection_of_a_quiet_command_open(
     server: Server, key: Path, trust: TrustStore, node: Sandbox
 ) -> None:
     alert = replace(PATIENT, ask_s=0.05)
@@ -488,7 +486,7 @@ def test_a_quiet_command_keeps_its_connection_because_its_server_gives_signs_of_
         assert waiting.result().stdout == "now\n"
 
 
-def test_closing_leaves_no_process_of_ours_on_the_node(
+def test_closing_the_connection_leaves_no_server_process_on_the_node(
     server: Server, key: Path, trust: TrustStore, node: Sandbox
 ) -> None:
     connected = connect(server.endpoint(), credentials=only(key), trust=trust, deadlines=PATIENT)

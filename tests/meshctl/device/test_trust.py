@@ -42,12 +42,12 @@ pins = st.builds(
 
 
 @given(st.lists(pins).map(tuple))
-def test_what_is_dumped_is_parsed_back(wanted: tuple[Pin, ...]) -> None:
+def test_dumped_pins_round_trip(wanted: tuple[Pin, ...]) -> None:
     assert parse_pins(dump_pins(wanted)) == wanted
 
 
 @given(st.text())
-def test_any_text_gives_pins_or_an_error_that_names_its_line(text: str) -> None:
+def test_arbitrary_text_yields_pins_or_an_input_error_naming_the_source(text: str) -> None:
     try:
         parse_pins(text, source="pins")
     except InputError as error:
@@ -61,7 +61,7 @@ def test_a_fingerprint_is_the_one_ssh_keygen_shows(tmp_path: Path) -> None:
     assert parse_key(path.with_suffix(".pub").read_text()).fingerprint == shown
 
 
-def test_openssh_finds_our_pins_and_we_find_its_hashed_ones(tmp_path: Path) -> None:
+def test_pins_are_interoperable_with_openssh_including_hashed_names(tmp_path: Path) -> None:
     path = tmp_path / "id"
     subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", path], check=True)
     ours = parse_key(path.with_suffix(".pub").read_text())
@@ -75,7 +75,7 @@ def test_openssh_finds_our_pins_and_we_find_its_hashed_ones(tmp_path: Path) -> N
     assert trust.pinned("b04") == ()
 
 
-def test_a_known_key_passes_an_unknown_one_and_a_changed_one_do_not(tmp_path: Path) -> None:
+def test_unknown_and_changed_host_keys_are_rejected(tmp_path: Path) -> None:
     trust = store(tmp_path)
     with pytest.raises(HostKeyUnknown):
         trust.check(B03, key(1))
@@ -87,7 +87,7 @@ def test_a_known_key_passes_an_unknown_one_and_a_changed_one_do_not(tmp_path: Pa
     assert "`meshctl trust b03 --replace`" in caught.value.hint
 
 
-def test_a_node_may_have_a_key_of_each_type_but_not_a_new_type_unasked(tmp_path: Path) -> None:
+def test_a_node_may_have_several_key_types_but_an_unpinned_type_is_rejected(tmp_path: Path) -> None:
     trust = store(tmp_path)
     trust.add("b03", key(1), key(2, "ssh-rsa"))
     trust.check(B03, key(2, "ssh-rsa"))
@@ -95,7 +95,7 @@ def test_a_node_may_have_a_key_of_each_type_but_not_a_new_type_unasked(tmp_path:
         trust.check(B03, key(3, "ecdsa-sha2-nistp256"))
 
 
-def test_pins_are_by_name_so_an_address_that_moves_keeps_its_trust(tmp_path: Path) -> None:
+def test_pins_are_keyed_by_node_name_and_survive_an_address_change(tmp_path: Path) -> None:
     trust = store(tmp_path)
     trust.add("b03", key(1))
     trust.check(Endpoint("192.168.1.1", identity="b03"), key(1))
@@ -103,7 +103,7 @@ def test_pins_are_by_name_so_an_address_that_moves_keeps_its_trust(tmp_path: Pat
         trust.check(Endpoint("10.42.0.13", identity="b04"), key(1))
 
 
-def test_without_a_name_the_address_is_the_name_as_openssh_writes_it(tmp_path: Path) -> None:
+def test_an_endpoint_without_a_name_is_matched_by_address_as_in_openssh(tmp_path: Path) -> None:
     trust = store(tmp_path, f"[127.0.0.1]:2222,127.0.0.1 {key(1).text}\n")
     trust.check(Endpoint("127.0.0.1", port=2222), key(1))
     trust.check(Endpoint("127.0.0.1"), key(1))
@@ -118,7 +118,7 @@ def test_a_revoked_key_is_refused_even_where_it_is_pinned(tmp_path: Path) -> Non
     assert trust.pinned("b03") == (key(1),)
 
 
-def test_replacing_concerns_one_name_and_leaves_every_other_line(tmp_path: Path) -> None:
+def test_replacing_a_pin_leaves_all_other_names_unchanged(tmp_path: Path) -> None:
     trust = store(tmp_path, f"b03,b04 {key(1).text}\nb05 {key(5).text}\n")
     trust.replace("b03", key(2))
     assert trust.pinned("b03") == (key(2),)
@@ -161,7 +161,7 @@ def test_the_file_is_parsed_once_until_it_changes(tmp_path: Path, monkeypatch: p
     assert trust.known(B03) == ()
 
 
-def test_keys_come_in_the_order_of_the_file_also_under_hashed_names(tmp_path: Path) -> None:
+def test_keys_are_returned_in_file_order_including_hashed_names(tmp_path: Path) -> None:
     path = tmp_path / "hashed"
     path.write_text(f"b03 {key(2).text}\n")
     subprocess.run(["ssh-keygen", "-q", "-H", "-f", path], capture_output=True, check=True)
@@ -192,7 +192,7 @@ def test_many_writers_lose_no_pin(tmp_path: Path) -> None:
         (f"b03 ssh-ed25519 {base64.b64encode(b'ab').decode()}", "not of type"),
     ],
 )
-def test_a_line_that_cannot_be_meant_is_refused_with_its_number(line: str, said: str, tmp_path: Path) -> None:
+def test_an_invalid_line_is_rejected_with_its_line_number(line: str, said: str, tmp_path: Path) -> None:
     trust = store(tmp_path, f"# the fleet\n\n{line}\n")
     with pytest.raises(InputError, match=r"known_hosts:3: ") as caught:
         trust.check(B03, key(1))

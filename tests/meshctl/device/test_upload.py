@@ -28,7 +28,7 @@ def leftovers(node: Sandbox) -> list[str]:
 
 
 @pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES - 1, CHUNK_BYTES, 3 * CHUNK_BYTES + 17])
-def test_what_arrives_is_what_was_sent_with_its_mode(connection: SshConnection, node: Sandbox, size: int) -> None:
+def test_content_is_uploaded_intact_with_its_mode(connection: SshConnection, node: Sandbox, size: int) -> None:
     data = os.urandom(size)
     reported: list[UploadProgress] = []
     done = upload(connection, data, TARGET, mode=0o600, progress=reported.append)
@@ -80,7 +80,7 @@ class CutAfter(Connection):
         self._connection.close()
 
 
-def test_an_upload_goes_on_after_every_cut_from_what_was_verified(node: Sandbox, tmp_path: Path) -> None:
+def test_an_interrupted_upload_resumes_from_the_verified_data(node: Sandbox, tmp_path: Path) -> None:
     ready(node, tmp_path)
     data = os.urandom(5 * CHUNK_BYTES + 99)
     for chunks in (2, 1, 0):
@@ -146,9 +146,7 @@ class Spoiling(Connection):
         self._connection.close()
 
 
-def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
-    connection: SshConnection, node: Sandbox
-) -> None:
+def test_data_corrupted_in_transit_is_detected_and_never_installed(connection: SshConnection, node: Sandbox) -> None:
     data = os.urandom(2 * CHUNK_BYTES)
     upload(Spoiling(connection, 1), data, TARGET)
     assert node.path(TARGET).read_bytes() == data
@@ -158,7 +156,7 @@ def test_bytes_that_change_on_the_way_are_noticed_and_never_put_in_place(
     assert not node.path(TARGET).exists()
 
 
-def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_path: Path) -> None:
+def test_content_larger_than_free_space_is_rejected_before_sending(node: Sandbox, tmp_path: Path) -> None:
     ready(node, tmp_path)
     reported: list[UploadProgress] = []
     with dropbear(node, tmp_kib=1024) as server, log_in(server, node, tmp_path) as connected:
@@ -169,7 +167,7 @@ def test_what_does_not_fit_is_refused_before_a_byte_is_sent(node: Sandbox, tmp_p
     assert reported == []
 
 
-def test_a_rate_is_held_by_pausing_for_what_was_sent(connection: SshConnection, node: Sandbox) -> None:
+def test_the_rate_limit_is_kept_by_pausing_after_sent_data(connection: SshConnection, node: Sandbox) -> None:
     pauses: list[float] = []
     data = os.urandom(CHUNK_BYTES + 1000)
     upload(connection, data, TARGET, rate_bytes_per_s=50_000, sleep=pauses.append)
@@ -178,13 +176,13 @@ def test_a_rate_is_held_by_pausing_for_what_was_sent(connection: SshConnection, 
     assert max(pauses) <= 0.1
 
 
-def test_a_path_that_names_no_file_is_a_mistake_of_ours(connection: SshConnection) -> None:
+def test_an_invalid_target_path_raises_value_error(connection: SshConnection) -> None:
     for path in ("relative", "/", "/tmp/.."):
         with pytest.raises(ValueError, match="absolute path"):
             upload(connection, b"x", path)
 
 
-def test_a_link_that_is_cut_under_what_is_being_sent_ends_the_sending_and_nothing_else() -> None:
+def test_an_eof_while_sending_stdin_only_stops_the_feeder() -> None:
     """paramiko says so with an EOFError of its own, at whatever moment of a write the link goes."""
 
     class Gone:

@@ -33,12 +33,12 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_right_image_passes(folder: Path) -> None:
+def test_a_valid_image_passes(folder: Path) -> None:
     assert check(folder / "image.bin", profile(folder)) == ()
     assert image_path(profile(folder)) == folder / "image.bin"
 
 
-def test_a_signature_of_the_image_itself_will_do(folder: Path) -> None:
+def test_a_detached_signature_of_the_image_is_accepted(folder: Path) -> None:
     (folder / "sha256sums").unlink()
     shutil.copy(VECTORS / "image.bin.sig", folder)
     assert check(folder / "image.bin", profile(folder)) == ()
@@ -64,11 +64,11 @@ def test_a_missing_image_is_unreadable(folder: Path) -> None:
         ({"usign_key": "image.bin"}, "FW008"),
     ],
 )
-def test_another_hash_revision_or_key_is_found(folder: Path, changes: dict[str, Any], code: str) -> None:
+def test_a_wrong_hash_revision_or_signing_key_is_detected(folder: Path, changes: dict[str, Any], code: str) -> None:
     assert codes(folder / "image.bin", profile(folder, **changes)) == [code]
 
 
-def test_another_board_target_or_release_is_found(folder: Path) -> None:
+def test_a_wrong_board_target_or_release_is_detected(folder: Path) -> None:
     image = folder / "image.bin"
     assert codes(image, replace(profile(folder), board="ubnt,rocket-m")) == ["FW005"]
     assert codes(image, replace(profile(folder), target="ath79/mikrotik")) == ["FW005"]
@@ -85,14 +85,14 @@ def test_missing_and_damaged_metadata_are_distinguished(folder: Path) -> None:
     assert codes(image, plain) == ["FW003"]
 
 
-def test_a_snapshot_has_no_release_to_compare(folder: Path) -> None:
+def test_a_snapshot_image_skips_the_release_check(folder: Path) -> None:
     version = {"version": "SNAPSHOT", "revision": "r24106-1", "target": "ath79/generic"}
     image = folder / "image.bin"
     image.write_bytes(append_metadata(b"x", {"supported_devices": ["compex,wpj344-16m"], "version": version}))
     assert codes(image, profile(folder, sha256="", usign_key="")) == []
 
 
-def test_a_changed_list_is_not_signed(folder: Path) -> None:
+def test_a_modified_checksum_list_fails_signature_verification(folder: Path) -> None:
     sums = folder / "sha256sums"
     sums.write_text(sums.read_text() + f"{'0' * 64} *other.bin\n")
     (finding,) = check(folder / "image.bin", profile(folder))
@@ -100,12 +100,12 @@ def test_a_changed_list_is_not_signed(folder: Path) -> None:
     assert "does not match" in finding.message
 
 
-def test_an_image_beside_the_signed_list_is_not_signed(folder: Path) -> None:
+def test_an_image_not_in_the_signed_checksum_list_is_unsigned(folder: Path) -> None:
     (folder / "image.bin").rename(folder / "other.bin")
     assert codes(folder / "other.bin", profile(folder)) == ["FW008"]
 
 
-def test_an_exchanged_image_fails_the_signed_list(folder: Path) -> None:
+def test_a_replaced_image_fails_the_signed_checksum_list(folder: Path) -> None:
     image = folder / "image.bin"
     metadata = {"supported_devices": ["compex,wpj344-16m"]}
     image.write_bytes(append_metadata(b"evil", metadata))
@@ -114,13 +114,13 @@ def test_an_exchanged_image_fails_the_signed_list(folder: Path) -> None:
     assert finding.found == sha256(image.read_bytes())
 
 
-def test_nothing_signed_says_what_to_put_where(folder: Path) -> None:
+def test_a_missing_signature_hints_at_the_required_files(folder: Path) -> None:
     (folder / "sha256sums").unlink()
     (finding,) = check(folder / "image.bin", profile(folder))
     assert finding.hint == "put image.bin.sig, or sha256sums and sha256sums.sig, beside the image"
 
 
-def test_usigns_own_signature_verifies_and_no_other_message_does() -> None:
+def test_a_usign_signature_verifies_only_its_own_message_and_key() -> None:
     key = parse_public_key((VECTORS / "key.pub").read_text())
     signature = (VECTORS / "sha256sums.sig").read_text()
     message = (VECTORS / "sha256sums").read_bytes()
@@ -134,6 +134,6 @@ def test_usigns_own_signature_verifies_and_no_other_message_does() -> None:
 @pytest.mark.parametrize(
     "text", ["", "untrusted comment: x\n", "x\nRWQ=\n", "untrusted comment: x\nRWQ=\n", "untrusted comment: x\n!\n"]
 )
-def test_what_is_no_key_is_refused(text: str) -> None:
+def test_an_invalid_public_key_is_rejected(text: str) -> None:
     with pytest.raises(BadSignature, match="expected"):
         parse_public_key(text)

@@ -25,7 +25,7 @@ IMAGE = (VECTORS / "image.bin").read_bytes()
 BODY = b"K" * 96
 
 
-def test_what_fwtool_wrote_is_read() -> None:
+def test_trailers_written_by_fwtool_are_read() -> None:
     signature, info = read_trailers(IMAGE)
     assert (signature.type, signature.data, signature.is_intact) == (TrailerType.SIGNATURE, b"ucert goes here", True)
     assert (info.type, info.data, info.is_intact) == (
@@ -35,7 +35,7 @@ def test_what_fwtool_wrote_is_read() -> None:
     )
 
 
-def test_the_same_image_is_written_to_the_byte() -> None:
+def test_an_appended_signature_matches_fwtool_byte_for_byte() -> None:
     info = read_trailers(IMAGE)[1]
     size = len(BODY) + 8 + len(info.data) + 16
     # the JSON of the vector ends in a line end, which is part of what fwtool was given
@@ -50,7 +50,7 @@ def test_metadata_has_board_release_revision_and_target() -> None:
     assert (metadata.target, metadata.profile, metadata.compat_version) == ("ath79/generic", "compex_wpj344-16m", "1.0")
 
 
-def test_an_incompatible_image_has_its_boards_under_another_key() -> None:
+def test_boards_of_an_incompatible_image_are_read_from_new_supported_devices() -> None:
     image = append_metadata(
         BODY,
         {"compat_version": "2.0", "supported_devices": ["Image version mismatch"], "new_supported_devices": ["a,b"]},
@@ -68,7 +68,7 @@ def test_an_image_without_trailers_has_no_metadata() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 50, 95])
-def test_a_changed_image_is_damaged(at: int) -> None:
+def test_a_modified_image_fails_the_checksum(at: int) -> None:
     changed = bytearray(IMAGE)
     changed[at] ^= 1
     with pytest.raises(DamagedImage, match="checksum"):
@@ -88,19 +88,19 @@ def test_appended_metadata_reads_back(body: bytes, extra: dict[str, str]) -> Non
 
 
 @given(st.binary(max_size=40), st.integers(0, 2**32 - 1), st.integers(0, 255), st.integers(0, 2**32 - 1))
-def test_any_trailer_gives_an_answer(body: bytes, crc: int, kind: int, size: int) -> None:
+def test_an_arbitrary_trailer_raises_only_damaged_image(body: bytes, crc: int, kind: int, size: int) -> None:
     trailer = b"FWx0" + crc.to_bytes(4, "big") + bytes([kind, 0, 0, 0]) + size.to_bytes(4, "big")
     with suppress(DamagedImage):
         read_trailers(body + trailer)
 
 
 @given(st.one_of(st.binary(max_size=40), st.from_regex(rb'\{"(version|supported_devices)": ?[\[{"1a-z\]}]{0,9}\}')))
-def test_any_metadata_gives_an_answer(text: bytes) -> None:
+def test_arbitrary_metadata_raises_only_damaged_image(text: bytes) -> None:
     with suppress(DamagedImage):
         parse_metadata(text)
 
 
-def test_metadata_and_signatures_have_a_limit() -> None:
+def test_oversized_metadata_and_signatures_are_rejected() -> None:
     with pytest.raises(ValueError, match="at most"):
         append_metadata(BODY, {"x": "y" * 31_000})
     with pytest.raises(ValueError, match="at most"):

@@ -23,7 +23,7 @@ def handled(number: signal.Signals, before: signal.Handlers) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_asks_to_stop_and_a_second_one_to_leave(number: signal.Signals) -> None:
+def test_the_first_signal_requests_a_stop_and_the_second_an_immediate_exit(number: signal.Signals) -> None:
     interrupt = Interrupt()
     said: list[str] = []
     with handled(number, signal.Handlers.SIG_DFL), interrupt.on_signals(said.append):
@@ -42,7 +42,7 @@ def test_repeated_hangups_request_only_a_stop() -> None:
     assert (interrupt.stopping, interrupt.leaving) == (True, False)
 
 
-def test_under_nohup_a_closed_terminal_asks_for_nothing() -> None:
+def test_sighup_is_ignored_under_nohup() -> None:
     interrupt = Interrupt()
     with handled(signal.SIGHUP, signal.Handlers.SIG_IGN), interrupt.on_signals(lambda text: None):
         signal.raise_signal(signal.SIGHUP)

@@ -36,7 +36,7 @@ def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> N
         assert journal.unfinished(run.id) == ("a", "c")
 
 
-def test_what_a_run_left_stands_until_a_later_run_takes_it_up(path: Path) -> None:
+def test_unfinished_nodes_remain_until_a_later_run_takes_them_up(path: Path) -> None:
     with Journal(path) as journal:
         first = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
         first.finish_node(Outcome("a", Result.UNREACHABLE))
@@ -52,7 +52,7 @@ def test_what_a_run_left_stands_until_a_later_run_takes_it_up(path: Path) -> Non
         assert [run.id for run in journal.runs(fleet="f", node="b")] == [2, 1]
 
 
-def test_a_change_is_lost_sight_of_from_its_beginning_until_a_run_has_seen_how_its_node_is(path: Path) -> None:
+def test_a_change_is_unfinished_from_its_start_until_a_run_reaches_its_node_again(path: Path) -> None:
     with Journal(path) as journal:
         first = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b", "c"))
         for name in ("a", "b", "c"):
@@ -73,7 +73,7 @@ def test_a_change_is_lost_sight_of_from_its_beginning_until_a_run_has_seen_how_i
         assert journal.unfinished_changes("f") == {}
 
 
-def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:
+def test_steps_record_failures_and_interruptions(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("apply", fleet="f", inventory="inv", nodes=("a",))
         with run.step("a", "upload"):
@@ -93,7 +93,7 @@ def test_steps_tell_what_failed_and_what_was_cut_short(path: Path) -> None:
         cut.__exit__(None, None, None)
 
 
-def test_a_run_whose_process_died_is_over_and_called_interrupted(path: Path) -> None:
+def test_a_run_whose_process_died_is_reported_as_interrupted(path: Path) -> None:
     script = (
         "import os, sys; from pathlib import Path; from meshctl.fleet.journal import Journal\n"
         "Journal(Path(sys.argv[1])).begin('provision', fleet='f', inventory='i', nodes=('a',)); os._exit(9)"
@@ -134,7 +134,7 @@ def test_an_older_sighting_never_replaces_a_newer_one(path: Path) -> None:
         assert journal.last_known("other") == {}
 
 
-def test_what_is_no_journal_is_refused_with_its_path(path: Path) -> None:
+def test_a_file_that_is_not_a_journal_is_rejected_with_its_path(path: Path) -> None:
     path.parent.mkdir(parents=True)
     path.write_bytes(b"this is no database, it is a letter" * 100)
     with pytest.raises(MeshctlError, match=str(path)):
@@ -148,21 +148,21 @@ def test_a_journal_of_a_later_version_is_refused(path: Path) -> None:
         Journal(path)
 
 
-def test_the_journal_stands_in_the_users_state_directory() -> None:
+def test_the_journal_is_located_in_the_xdg_state_directory() -> None:
     assert default_path({"XDG_STATE_HOME": "/s"}) == Path("/s/meshctl/journal.sqlite")
     assert default_path({"HOME": "/home/a", "XDG_STATE_HOME": "relative"}) == Path(
         "/home/a/.local/state/meshctl/journal.sqlite"
     )
 
 
-def test_our_own_process_lives_and_a_later_one_with_the_same_pid_is_another() -> None:
+def test_a_reused_pid_is_not_mistaken_for_the_original_process() -> None:
     own = this_process()
     assert process_lives(own)
     assert not process_lives(own + "1")
     assert process_lives("elsewhere:1:1")
 
 
-def test_an_unwritable_journal_stops_no_work_and_is_reported(path: Path) -> None:
+def test_an_unwritable_journal_is_reported_without_stopping_the_run(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         journal._file._database.execute("PRAGMA query_only = ON")
@@ -183,7 +183,7 @@ def held_by_another(path: Path) -> Iterator[sqlite3.Connection]:
         yield other
 
 
-def test_what_a_held_journal_does_not_take_is_written_as_soon_as_it_is_free(path: Path) -> None:
+def test_writes_deferred_by_a_locked_journal_are_flushed_once_it_is_free(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a", "b"))
         with held_by_another(path):
@@ -200,7 +200,7 @@ def test_what_a_held_journal_does_not_take_is_written_as_soon_as_it_is_free(path
         assert journal.last_known("f")["a"].facts == {"boot_id": "1"}
 
 
-def test_a_full_disk_loses_nothing_once_there_is_room_again(path: Path) -> None:
+def test_writes_deferred_by_a_full_disk_are_kept_until_space_is_available(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         database = journal._file._database
@@ -232,7 +232,7 @@ def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> N
     assert "XDG_STATE_HOME" in caught.value.hint
 
 
-def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> None:
+def test_a_lab_and_a_real_fleet_of_the_same_name_are_kept_separate(path: Path) -> None:
     with Journal(path) as field, Journal(path, lab="/lab") as lab:
         practice = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))
         with practice.step("a", "apply"):
@@ -254,7 +254,7 @@ def test_a_lab_and_the_real_fleet_of_the_same_name_share_nothing(path: Path) -> 
         assert (record.fleet, record.lab) == ("f", "/lab")
 
 
-def test_runs_that_an_earlier_version_kept_under_the_real_fleet_s_name_go_to_their_lab(path: Path) -> None:
+def test_lab_runs_recorded_as_real_by_an_earlier_version_are_moved_to_their_lab(path: Path) -> None:
     def lab_of(inventory: str) -> str:
         return "/lab" if inventory == "/lab/inventory" else ""
 

@@ -22,7 +22,7 @@ EVENTS = [
 ]
 
 
-def test_plain_lines_tell_steps_notes_and_outcomes() -> None:
+def test_plain_lines_show_steps_notes_and_outcomes() -> None:
     out = io.StringIO()
     with PlainProgress(out) as progress:
         for event in EVENTS:
@@ -57,7 +57,7 @@ def test_live_lines_keep_outcomes_and_count_them() -> None:
     assert "1/2 nodes: 1 rolled back" in shown
 
 
-def test_a_reader_that_stands_still_holds_up_no_work() -> None:
+def test_a_blocked_reader_does_not_block_the_run() -> None:
     may_write = threading.Event()
 
     class Slow(io.StringIO):
@@ -74,7 +74,7 @@ def test_a_reader_that_stands_still_holds_up_no_work() -> None:
     assert len(out.getvalue().splitlines()) == 4
 
 
-def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
+def test_a_broken_pipe_stops_the_output_but_not_the_run() -> None:
     class Closed(io.StringIO):
         def write(self, text: str) -> int:
             raise BrokenPipeError
@@ -90,7 +90,7 @@ def test_a_reader_that_is_gone_ends_the_lines_and_no_work() -> None:
 STOPPING = "stopping: finishing the nodes in progress, starting no more (again to leave at once)"
 
 
-def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() -> None:
+def test_the_stopping_state_is_shown_with_the_nodes_still_in_progress() -> None:
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100, height=30)
     with ThreadedProgress(LiveProgress(console, 3)) as progress:
@@ -105,7 +105,7 @@ def test_the_state_of_stopping_stands_in_the_live_lines_with_what_is_finished() 
     assert "STOPPING: finishing b02; no other node will be started" in shown
 
 
-def test_the_second_request_replaces_the_first_ones_state() -> None:
+def test_a_second_stop_request_replaces_the_displayed_state() -> None:
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100, height=30)
     with LiveProgress(console, 1) as progress:
@@ -115,7 +115,7 @@ def test_the_second_request_replaces_the_first_ones_state() -> None:
     assert "LEAVING: finishing b01" in screen.getvalue()
 
 
-def test_more_nodes_than_lines_leave_room_for_the_totals_and_the_state_of_stopping() -> None:
+def test_long_node_lists_are_cut_to_fit_the_totals_and_stopping_state() -> None:
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=100, height=12)
     with LiveProgress(console, 40) as progress:

@@ -37,7 +37,7 @@ def test_every_node_has_exactly_one_outcome_in_the_given_order(fates: list[str],
     }
 
 
-def test_never_more_than_parallel_nodes_are_in_work_and_all_slots_are_used() -> None:
+def test_exactly_the_allowed_number_of_nodes_runs_in_parallel() -> None:
     lock, full = threading.Lock(), threading.Barrier(3, timeout=60)
     in_work, most = set[str](), 0
 
@@ -70,7 +70,7 @@ def test_after_the_budget_is_spent_no_further_node_is_begun() -> None:
     assert all(outcome.result is Result.PENDING for outcome in run(NODES, work, parallel=4, budget=budget).values())
 
 
-def test_an_interruption_lets_those_in_work_finish_and_begins_no_more() -> None:
+def test_an_interrupt_lets_running_nodes_finish_and_starts_no_more() -> None:
     interrupt = Interrupt()
 
     def work(node: str) -> Outcome:
@@ -86,7 +86,7 @@ def test_an_interruption_lets_those_in_work_finish_and_begins_no_more() -> None:
     assert interrupt.leaving
 
 
-def test_a_bug_is_raised_once_the_nodes_in_work_are_done() -> None:
+def test_an_unexpected_exception_is_reraised() -> None:
     def work(node: str) -> Outcome:
         raise RuntimeError(f"bug at {node}")
 
@@ -94,7 +94,7 @@ def test_a_bug_is_raised_once_the_nodes_in_work_are_done() -> None:
         run(NODES, work, parallel=1)
 
 
-def test_an_input_error_stops_everything_since_every_node_would_meet_it() -> None:
+def test_an_input_error_aborts_the_whole_run() -> None:
     def work(node: str) -> Outcome:
         raise InputError("secret env:MESH_KEY is not set")
 
@@ -102,7 +102,7 @@ def test_an_input_error_stops_everything_since_every_node_would_meet_it() -> Non
         run(NODES, work, parallel=2)
 
 
-def test_events_begin_and_finish_every_node() -> None:
+def test_every_node_emits_started_and_finished_events() -> None:
     events: list[Event] = []
     run(NODES[:2], done, parallel=1, observer=events.append)
     assert [(event.kind, event.node) for event in events] == [
@@ -110,7 +110,7 @@ def test_events_begin_and_finish_every_node() -> None:
     ]
 
 
-def test_totals_tell_good_from_unreachable_from_failed() -> None:
+def test_totals_distinguish_good_unreachable_and_failed_nodes() -> None:
     good = totals([done("a"), Outcome("b", Result.UNCHANGED)])
     away = totals([done("a"), Outcome("b", Result.UNREACHABLE)])
     bad = totals([Outcome("a", Result.ROLLED_BACK), Outcome("b", Result.UNREACHABLE)])

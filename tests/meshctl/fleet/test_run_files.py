@@ -18,7 +18,7 @@ def files(tmp_path: Path) -> RunFiles:
     return RunFiles(tmp_path / "journal.sqlite")
 
 
-def test_what_is_saved_is_loaded_and_readable_by_its_owner_only(files: RunFiles) -> None:
+def test_saved_files_round_trip_and_are_readable_only_by_the_owner(files: RunFiles) -> None:
     files.save(3, BEFORE, {"b01": {"files": []}})
     assert files.load(3, BEFORE) == {"b01": {"files": []}}
     (file,) = (files.root / "3").iterdir()
@@ -26,7 +26,7 @@ def test_what_is_saved_is_loaded_and_readable_by_its_owner_only(files: RunFiles)
     assert files.load(3, CHANGES) is None
 
 
-def test_only_the_latest_runs_keep_what_they_replaced(files: RunFiles, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_latest_runs_keep_their_previous_state(files: RunFiles, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_files, "MAX_BEFORE", 2)
     for run in (1, 2, 3):
         files.save(run, CHANGES, {"b01": []})

@@ -47,7 +47,7 @@ _WHOLE_FILES = {
 
 
 @pytest.mark.parametrize("name", _WHOLE_FILES)
-def test_a_file_that_cannot_be_an_inventory_is_refused_at_its_place(name: str, tmp_path: Path) -> None:
+def test_an_invalid_inventory_file_is_rejected_with_its_location(name: str, tmp_path: Path) -> None:
     text, code, line, column = _WHOLE_FILES[name]
     loaded = load_text(tmp_path, text)
     assert loaded.fleet is None
@@ -122,7 +122,7 @@ _PARTS = {
 
 
 @pytest.mark.parametrize("name", _PARTS)
-def test_a_wrong_part_is_named_with_its_line_and_what_was_expected(name: str, tmp_path: Path) -> None:
+def test_an_invalid_value_is_reported_with_its_line_and_what_was_expected(name: str, tmp_path: Path) -> None:
     text, code, line, message = _PARTS[name]
     found = [item for item in errors_of(tmp_path, text) if item.code == code]
     assert found
@@ -145,7 +145,7 @@ def test_a_wrong_part_is_named_with_its_line_and_what_was_expected(name: str, tm
         ("nodes: {n: {hardware: rockt, address: 10.42.0.1}}\n", "rocket"),
     ],
 )
-def test_a_slip_of_the_pen_is_answered_with_what_was_meant(text: str, meant: str, tmp_path: Path) -> None:
+def test_a_misspelled_name_gets_a_did_you_mean_hint(text: str, meant: str, tmp_path: Path) -> None:
     assert any(item.hint == f"did you mean '{meant}'?" for item in errors_of(tmp_path, text))
 
 
@@ -167,12 +167,12 @@ def test_every_error_is_reported_and_in_the_order_of_the_file(tmp_path: Path) ->
     ]
 
 
-def test_one_range_is_one_error_however_many_nodes_it_makes(tmp_path: Path) -> None:
+def test_an_error_in_a_range_is_reported_once_for_all_its_nodes(tmp_path: Path) -> None:
     found = errors_of(tmp_path, "nodes: {'b[0001-5000]': {hardware: rockt, address: {from: 10.42.0.1}}}\n")
     assert [item.code for item in found] == ["INV034"]
 
 
-def test_every_circle_of_groups_is_reported_once_and_spoils_only_its_own_nodes(tmp_path: Path) -> None:
+def test_each_inheritance_cycle_is_reported_once_and_affects_only_its_own_nodes(tmp_path: Path) -> None:
     text = """\
         groups:
           a: {inherits: [b]}
@@ -209,7 +209,7 @@ def test_a_key_in_two_files_names_both_places(tmp_path: Path) -> None:
     assert str(tmp_path / "fleet.yaml") in found[0].found
 
 
-def test_an_error_in_an_included_file_stands_in_that_file(tmp_path: Path) -> None:
+def test_an_error_in_an_included_file_is_located_in_that_file(tmp_path: Path) -> None:
     found = errors_of(tmp_path, "include: [a.yaml]\n", a="\ntopics: {t: {priority: x}}\n")
     assert (found[0].position.file, found[0].position.line) == (str(tmp_path / "a.yaml"), 2)
 
@@ -228,7 +228,7 @@ def test_bytes_that_are_not_utf8_are_located(content: bytes, tmp_path: Path) -> 
     assert problem.found.startswith("the byte 0x")
 
 
-def test_a_missing_file_a_missing_directory_and_an_endless_name_are_errors(tmp_path: Path) -> None:
+def test_missing_files_and_invalid_paths_are_errors(tmp_path: Path) -> None:
     for path in (tmp_path / "gone.yaml", tmp_path, tmp_path / ("x" * 5000), Path("a\0b")):
         (problem,) = load(path).diagnostics
         assert problem.code == "INV001"
@@ -249,7 +249,7 @@ def test_an_endless_file_is_read_no_further_than_its_limit() -> None:
     assert str(MAX_FILE_BYTES) in problem.expected
 
 
-def test_a_thousand_errors_are_enough(tmp_path: Path) -> None:
+def test_the_number_of_reported_errors_is_limited(tmp_path: Path) -> None:
     found = errors_of(tmp_path, "".join(f"key{number}: 1\n" for number in range(2 * MAX_DIAGNOSTICS)))
     assert len(found) == MAX_DIAGNOSTICS + 1
     assert sum(item.code == "INV099" for item in found) == 1
@@ -257,7 +257,7 @@ def test_a_thousand_errors_are_enough(tmp_path: Path) -> None:
     assert len(found) == MAX_DIAGNOSTICS + 1
 
 
-def test_messages_stay_on_one_line_and_free_of_control_characters(tmp_path: Path) -> None:
+def test_messages_are_single_line_without_control_characters(tmp_path: Path) -> None:
     text = '"\\e[31mred\\n": 1\nnodes: {"\\e[2J": {}}\ntopics: {t: {priority: "\\e[31m"}}\n'
     for item in errors_of(tmp_path, text):
         assert str(item).isprintable()

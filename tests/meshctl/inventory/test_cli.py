@@ -28,7 +28,7 @@ def test_init_writes_a_starter_that_loads(tmp_path: Path) -> None:
     assert load_fleet(tmp_path / "new").operators.ssh_keys == ()
 
 
-def test_init_enters_the_operators_public_key(tmp_path: Path) -> None:
+def test_init_adds_the_operators_public_key(tmp_path: Path) -> None:
     (tmp_path / ".ssh").mkdir()
     (tmp_path / ".ssh" / "id_ed25519.pub").write_text(_KEY + "\n")
     assert _meshctl("init", tmp_path / "a", home=tmp_path).exit_code == 0
@@ -45,7 +45,7 @@ def test_init_overwrites_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", ["-----BEGIN OPENSSH PRIVATE KEY-----\n", "hello\n", f"{_KEY}\n{_KEY}\n", ""])
-def test_init_takes_no_private_key_and_nothing_else_that_is_no_public_key(content: str, tmp_path: Path) -> None:
+def test_init_rejects_anything_but_a_single_public_key(content: str, tmp_path: Path) -> None:
     (tmp_path / "key").write_text(content)
     result = _meshctl("init", tmp_path / "new", "--ssh-key", tmp_path / "key")
     assert result.exit_code == 2
@@ -53,7 +53,7 @@ def test_init_takes_no_private_key_and_nothing_else_that_is_no_public_key(conten
     assert not (tmp_path / "new").exists()
 
 
-def test_init_where_nothing_can_be_written_says_so(tmp_path: Path) -> None:
+def test_init_in_an_unwritable_place_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     result = _meshctl("init", tmp_path / "file" / "new")
     assert result.exit_code == 2
@@ -103,7 +103,7 @@ def test_show_why_names_value_layer_file_and_line() -> None:
     assert records["radios.radio0.tx_power_dbm"]["line"] == line
 
 
-def test_show_of_an_unknown_node_asks_what_was_meant() -> None:
+def test_show_of_an_unknown_node_suggests_a_similar_name() -> None:
     result = _meshctl("inventory", "show", "husky1-03", "-i", SHIPPED / "subt-final")
     assert result.exit_code == 2
     assert "did you mean 'husky1-b03'?" in result.stderr

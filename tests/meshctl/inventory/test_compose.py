@@ -25,7 +25,7 @@ def test_both_parsers_give_the_same_tree_with_the_same_places(name: str, monkeyp
 
 
 @pytest.mark.parametrize("text", ["[" * 50_000, "a: [", "a: *b", "- !x y", "a: @", "{a: 1, a: 2}", "\ufffe", "é: 'ü"])
-def test_both_parsers_refuse_the_same_with_the_same_code(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_parsers_report_the_same_errors_at_the_same_lines(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     first = compose(Source("t.yaml", text))
     monkeypatch.setattr(module, "LOADER", yaml.SafeLoader)
     second = compose(Source("t.yaml", text))
@@ -42,12 +42,12 @@ def test_both_parsers_refuse_the_same_with_the_same_code(text: str, monkeypatch:
         ("a:\n\t- b\n", "indent YAML with spaces"),
     ],
 )
-def test_a_usual_slip_is_answered_with_its_remedy(text: str, hint: str) -> None:
+def test_common_yaml_mistakes_get_a_hint(text: str, hint: str) -> None:
     (problem,) = compose(Source("t.yaml", text)).diagnostics
     assert hint in problem.hint
 
 
-def test_offsets_count_characters_whatever_they_are_made_of() -> None:
+def test_offsets_count_characters_not_bytes() -> None:
     text = "ä: 'öü'\nß: [日本, x]\n"
     root = compose(Source("t.yaml", text)).root
     assert isinstance(root, MappingNode)
@@ -55,7 +55,7 @@ def test_offsets_count_characters_whatever_they_are_made_of() -> None:
     assert text[value.start : value.end] == "'öü'"
 
 
-def test_a_path_names_the_file_in_every_place(tmp_path: Path) -> None:
+def test_syntax_errors_name_the_file(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text("x: [1\n")
     source = read_source(tmp_path / "a.yaml")
     assert isinstance(source, Source)

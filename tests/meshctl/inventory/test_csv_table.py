@@ -34,7 +34,7 @@ def errors_of(text: str) -> list[tuple[int, str]]:
     return [(item.position.line, item.text) for item in raised.value.diagnostics]
 
 
-def test_what_is_exported_changes_nothing() -> None:
+def test_importing_an_unchanged_export_makes_no_edits() -> None:
     fleet = load_fleet(EXAMPLE)
     rows = read(write(fleet.nodes.values()), "boxes.csv")
     assert len(rows) == len(fleet.nodes)
@@ -78,7 +78,7 @@ def test_nodes_are_added_only_on_request(inventory: Path) -> None:
     assert str(load_fleet(inventory).nodes["extra1"].address.ip) == "10.42.0.250"
 
 
-def test_a_new_node_that_the_inventory_does_not_allow_is_not_written(inventory: Path) -> None:
+def test_an_invalid_new_node_is_not_written(inventory: Path) -> None:
     before = (inventory / "fleet.yaml").read_bytes()
     done = run(inventory, "node,label\nextra1,X1\n", "--add")
     assert done.exit_code == 2
@@ -128,7 +128,7 @@ def test_all_wrong_values_are_reported_at_their_lines() -> None:
         ("label\nZZ\n", 2, "label: expected a node of the inventory, found 'ZZ'"),
     ],
 )
-def test_a_table_that_is_none_is_an_error(table: str, line: int, text: str) -> None:
+def test_an_invalid_table_is_reported_with_its_line(table: str, line: int, text: str) -> None:
     ((at, found), *_) = errors_of(table)
     assert at == line
     assert text in found

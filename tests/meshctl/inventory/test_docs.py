@@ -22,24 +22,24 @@ def _examples() -> list[str]:
     return re.findall(r"```yaml\n(.*?)```", _TEXT, re.DOTALL)
 
 
-def test_every_code_stands_in_the_table() -> None:
+def test_every_diagnostic_code_is_documented() -> None:
     rows = dict(re.findall(r"^\| (INV\d{3}) \| (.*) \|$", _TEXT, re.MULTILINE))
     assert rows == MEANINGS
 
 
-def test_each_range_of_the_table_makes_what_it_says() -> None:
+def test_each_documented_range_expands_as_documented() -> None:
     rows = re.findall(r"^\| `([^`]*\[[^`]*)` \| (.*) \|$", _TEXT, re.MULTILINE)
     assert len(rows) == 4
     for pattern, made in rows:
         assert ", ".join(f"`{name}`" for name in expand(pattern)) == made
 
 
-def test_every_section_and_state_is_named() -> None:
+def test_every_section_and_node_state_is_documented() -> None:
     for name in (*InventoryDocument.model_fields, *(state.value for state in NodeState)):
         assert f"`{name}`" in _TEXT, name
 
 
-def test_the_limits_are_those_of_the_code() -> None:
+def test_the_documented_limits_match_the_code() -> None:
     limits = (
         f"{source.MAX_FILE_BYTES // 2**20} MiB a file, {include.MAX_FILES} files, {MAX_VALUES:,} values",
         f"{MAX_DEPTH} levels, {MAX_NAMES:,} nodes, {MAX_DIAGNOSTICS:,} reported errors",
@@ -55,7 +55,7 @@ def test_the_nodes_of_the_example_load(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_each_reference_of_the_example_loads(number: int, tmp_path: Path) -> None:
+def test_each_documented_secret_reference_loads(number: int, tmp_path: Path) -> None:
     reference = _examples()[1].splitlines()[number].partition(": ")[2]
     loaded = load_text(tmp_path, f"{HEAD}udp_mesh:\n  keys:\n  - {reference}\n")
     assert loaded.fleet is not None, loaded.diagnostics

@@ -41,7 +41,7 @@ def _comments(text: str) -> list[str]:
     return re.findall(r"#.*", text)
 
 
-def test_a_state_is_changed_in_its_line_only(final: Path) -> None:
+def test_changing_a_state_edits_only_its_line(final: Path) -> None:
     before = (final / "fleet.yaml").read_text()
     editor = Editor.open(final)
     set_state(editor, "uav1-radio", NodeState.DEPLOYED)
@@ -60,7 +60,7 @@ def test_a_state_is_changed_in_its_line_only(final: Path) -> None:
     assert load_fleet(final).nodes["uav1-radio"].state is NodeState.DEPLOYED
 
 
-def test_a_node_of_a_range_gets_an_entry_of_its_own_behind_the_range(final: Path) -> None:
+def test_editing_a_node_of_a_range_adds_its_own_entry_after_the_range(final: Path) -> None:
     before = load_fleet(final)
     editor = Editor.open(final)
     set_state(editor, "husky1-b03", NodeState.LOST)
@@ -86,7 +86,7 @@ def test_a_node_of_a_range_gets_an_entry_of_its_own_behind_the_range(final: Path
     assert lines[start + 2] == "  husky1-b01: {state: deployed}"
 
 
-def test_topics_are_added_changed_and_removed_in_the_file_that_holds_them(final: Path) -> None:
+def test_topics_are_edited_in_the_included_file_that_defines_them(final: Path) -> None:
     main = (final / "fleet.yaml").read_text()
     comments = _comments((final / "topics.yaml").read_text())
     editor = Editor.open(final)
@@ -105,7 +105,7 @@ def test_topics_are_added_changed_and_removed_in_the_file_that_holds_them(final:
     assert (final / "fleet.yaml").read_text() == main
 
 
-def test_adding_what_exists_and_touching_what_does_not_is_refused(final: Path) -> None:
+def test_adding_existing_and_changing_missing_entries_is_rejected(final: Path) -> None:
     editor = Editor.open(final)
     acts: list[Callable[[], None]] = [
         lambda: add_topic(editor, "fpv", {"priority": 3}),
@@ -154,7 +154,7 @@ def test_a_file_that_changed_meanwhile_is_not_overwritten(final: Path) -> None:
         save(changes)
 
 
-def test_saving_keeps_mode_link_line_ends_and_byte_order_mark(tmp_path: Path) -> None:
+def test_saving_preserves_mode_symlink_line_endings_and_byte_order_mark(tmp_path: Path) -> None:
     real = tmp_path / "real.yaml"
     text = HEAD + "nodes:\n  n: {hardware: rocket, address: 10.42.0.1}   # mine\n"
     real.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
@@ -187,7 +187,7 @@ _LAYOUTS = {
 
 
 @pytest.mark.parametrize("layout", _LAYOUTS)
-def test_every_layout_takes_sets_and_removals(layout: str, tmp_path: Path) -> None:
+def test_values_can_be_set_and_removed_in_every_layout(layout: str, tmp_path: Path) -> None:
     head = HEAD + "defaults: {hardware: rocket, address: {rule: network + index}}\n"
     (tmp_path / "fleet.yaml").write_text(head + _LAYOUTS[layout])
     comments = _comments(_LAYOUTS[layout])
@@ -211,7 +211,7 @@ def test_every_layout_takes_sets_and_removals(layout: str, tmp_path: Path) -> No
     assert (fleet.nodes["a"].state, fleet.nodes["b"].serial) == (NodeState.DEPLOYED, "")
 
 
-def test_the_last_entry_of_a_mapping_leaves_an_empty_one(tmp_path: Path) -> None:
+def test_removing_the_last_entry_leaves_an_editable_empty_mapping(tmp_path: Path) -> None:
     for section in ("topics: {t: {priority: 1}}\n", "topics:   # none\n  t:\n    priority: 1\n"):
         (tmp_path / "fleet.yaml").write_text(HEAD + section)
         editor = Editor.open(tmp_path)
@@ -272,7 +272,7 @@ def _texts(value: object) -> object:
 
 @given(path=_PATHS, value=_VALUES)
 @settings(max_examples=150)
-def test_a_replaced_value_reads_back_as_meant_beside_unchanged_neighbours(path: tuple[str, ...], value: Value) -> None:
+def test_a_replaced_value_round_trips_and_leaves_other_values_unchanged(path: tuple[str, ...], value: Value) -> None:
     root = _root(_BASE)
     old, parent = descend(root, path), descend(root, path[:-1])
     assert old is not None
@@ -318,7 +318,7 @@ def test_an_inserted_entry_reads_back_and_its_removal_restores_the_text(
     )
 )
 @settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_run_of_state_changes_keeps_every_comment_and_ends_in_the_last(
+def test_a_series_of_state_changes_keeps_comments_and_the_last_state_wins(
     steps: list[tuple[str, NodeState]], tmp_path: Path
 ) -> None:
     target = tmp_path / "run"
@@ -365,7 +365,7 @@ _STEPS = st.tuples(
     tail=st.sampled_from(["", "\n  ", "topics: {}\n"]),
 )
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_any_edit_of_any_layout_is_made_as_meant_or_refused(
+def test_an_edit_in_any_layout_is_applied_correctly_or_rejected(
     entries: list[str], steps: list[tuple[str, str]], tail: str, tmp_path: Path
 ) -> None:
     head = HEAD + "defaults: {hardware: rocket, address: 10.42.0.1}\nnodes:\n"

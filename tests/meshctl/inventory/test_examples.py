@@ -16,7 +16,7 @@ def final() -> Fleet:
     return load_fleet(SHIPPED / "subt-final")
 
 
-def test_the_papers_team_is_complete(final: Fleet) -> None:
+def test_the_example_fleet_matches_the_team_in_the_paper(final: Fleet) -> None:
     assert Counter(node.role for node in final.nodes.values()) == {Role.BASE: 1, Role.ROBOT: 7, Role.BEACON: 12}
     assert set(final.robots) == {"base-station", "husky1", "husky2", "spot1", "spot2", "uav1"}
     for husky in ("husky1", "husky2"):
@@ -39,7 +39,7 @@ def test_every_radio_stays_within_one_watt_conducted_and_36_dbm(final: Fleet) ->
     assert (beacon.hardware.rated_power_dbm, beacon.conducted_dbm) == (33, 30)
 
 
-def test_the_emergency_stop_is_most_urgent_and_video_least(final: Fleet) -> None:
+def test_the_emergency_stop_has_the_highest_priority_and_video_the_lowest(final: Fleet) -> None:
     order = sorted(final.topics, key=lambda topic: topic.priority)
     assert [topic.topic_class for topic in order] == [
         TopicClass.EMERGENCY_STOP,
@@ -53,7 +53,7 @@ def test_the_emergency_stop_is_most_urgent_and_video_least(final: Fleet) -> None
 
 
 @pytest.mark.parametrize("name", ["subt-final", "starter"])
-def test_names_and_addresses_are_distinct_and_references_lead_somewhere(name: str) -> None:
+def test_addresses_are_unique_and_references_resolve(name: str) -> None:
     fleet = load_fleet(SHIPPED / name)
     addresses = [node.address.ip for node in fleet.nodes.values()]
     addresses += [robot.computer.address.ip for robot in fleet.robots.values() if robot.computer is not None]

@@ -46,12 +46,12 @@ def _load_bytes(content: bytes) -> Loaded:
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes(content: bytes) -> None:
+def test_arbitrary_bytes_load_or_yield_diagnostics(content: bytes) -> None:
     _load_bytes(content)
 
 
 @given(st.lists(st.sampled_from(_TOKENS), max_size=30), st.sampled_from([b"", b" ", b"\n"]))
-def test_any_run_of_yamls_own_words(tokens: list[bytes], between: bytes) -> None:
+def test_arbitrary_yaml_tokens_load_or_yield_diagnostics(tokens: list[bytes], between: bytes) -> None:
     _load_bytes(between.join(tokens))
 
 
@@ -61,7 +61,7 @@ def test_any_run_of_yamls_own_words(tokens: list[bytes], between: bytes) -> None
     )
 )
 @settings(max_examples=100)
-def test_the_example_with_pieces_cut_out_and_put_in(cuts: list[tuple[int, int, bytes]]) -> None:
+def test_splicing_tokens_into_the_example_loads_or_yields_diagnostics(cuts: list[tuple[int, int, bytes]]) -> None:
     content = _EXAMPLE
     for at, length, token in cuts:
         content = content[:at] + token + content[at + length :]
@@ -70,7 +70,7 @@ def test_the_example_with_pieces_cut_out_and_put_in(cuts: list[tuple[int, int, b
 
 @given(st.lists(st.tuples(st.integers(0, len(_LINES) - 1), st.integers(0, len(_LINES) - 1)), min_size=1, max_size=4))
 @settings(max_examples=60)
-def test_the_example_with_lines_exchanged(swaps: list[tuple[int, int]]) -> None:
+def test_swapping_lines_of_the_example_loads_or_yields_diagnostics(swaps: list[tuple[int, int]]) -> None:
     lines = list(_LINES)
     for one, other in swaps:
         lines[one], lines[other] = lines[other], lines[one]
@@ -100,7 +100,7 @@ _PATHS = [path for path in _paths(_DOCUMENT) if path]
 
 @given(st.sampled_from(_PATHS), _JSON)
 @settings(max_examples=100)
-def test_the_example_with_any_value_in_place_of_any_other(path: tuple[Any, ...], value: Any) -> None:
+def test_replacing_any_value_of_the_example_loads_or_yields_diagnostics(path: tuple[Any, ...], value: Any) -> None:
     document = copy.deepcopy(_DOCUMENT)
     place = document
     for part in path[:-1]:
@@ -111,7 +111,7 @@ def test_the_example_with_any_value_in_place_of_any_other(path: tuple[Any, ...],
 
 @given(_JSON)
 @settings(max_examples=150)
-def test_composing_reads_the_same_structure_as_pyyaml(value: Any) -> None:
+def test_compose_yields_the_same_structure_as_pyyaml(value: Any) -> None:
     text = yaml.safe_dump(value)
     composed = compose(Source("t.yaml", text))
     if composed.root is None or composed.diagnostics:

@@ -58,7 +58,7 @@ def _with_entries_of_their_own(nodes: int) -> str:
 
 
 @pytest.mark.parametrize("shape", [_one_by_one, _in_a_range, _through_groups, _with_entries_of_their_own])
-def test_twice_the_nodes_cost_at_most_twice_the_calls(shape: Callable[[int], str], tmp_path: Path) -> None:
+def test_the_cost_of_loading_grows_linearly_with_the_fleet(shape: Callable[[int], str], tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     counts = []
     for nodes in (200, 400, 800):

@@ -41,7 +41,7 @@ def test_every_key_has_a_description() -> None:
         check(definition, name)
 
 
-def test_the_examples_satisfy_it(validator: Draft202012Validator) -> None:
+def test_the_examples_validate_against_the_schema(validator: Draft202012Validator) -> None:
     assert list(validator.iter_errors(_example())) == []
     starter = yaml.safe_load((SHIPPED / "starter" / "fleet.yaml").read_text())
     assert list(validator.iter_errors(starter)) == []
@@ -55,7 +55,7 @@ def test_an_included_file_satisfies_it_by_itself(validator: Draft202012Validator
 
 
 @pytest.mark.parametrize("key", ["fleet", "country"])
-def test_the_first_file_must_say_what_a_fleet_must_have(key: str, validator: Draft202012Validator) -> None:
+def test_the_main_file_requires_fleet_and_country(key: str, validator: Draft202012Validator) -> None:
     document = _example()
     del document[key]
     assert list(validator.iter_errors(document)) != []
@@ -79,7 +79,7 @@ def test_the_first_file_must_say_what_a_fleet_must_have(key: str, validator: Dra
         (("operators", "ssh_keys"), "ssh-ed25519 AAAA"),
     ],
 )
-def test_what_the_loader_refuses_the_schema_refuses(
+def test_values_rejected_by_the_loader_are_rejected_by_the_schema(
     path: tuple[str, ...], value: Any, validator: Draft202012Validator, tmp_path: Path
 ) -> None:
     document = copy.deepcopy(_example())
@@ -94,7 +94,7 @@ def test_what_the_loader_refuses_the_schema_refuses(
     assert load_text(tmp_path, yaml.safe_dump(document)).fleet is None
 
 
-def test_what_the_loader_takes_without_quotes_the_schema_takes(validator: Draft202012Validator) -> None:
+def test_unquoted_values_accepted_by_the_loader_are_accepted_by_the_schema(validator: Draft202012Validator) -> None:
     document = _example()
     document["hardware"]["rocket"]["release"] = 24.10
     document["nodes"]["spare"] = None

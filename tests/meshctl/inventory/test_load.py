@@ -14,7 +14,7 @@ from meshctl.model import Band, NodeState, Release, Role, SecretKind
 from tests.meshctl.inventory.inventories import HEAD, fleet_of, load_text
 
 
-def test_a_scalar_means_what_its_field_reads_and_not_what_yaml_guesses(tmp_path: Path) -> None:
+def test_scalars_are_interpreted_by_field_type_and_not_by_yaml_rules(tmp_path: Path) -> None:
     text = HEAD.replace("country: US", "country: NO").replace("release: 23.05", "release: 24.10")
     loaded = load_text(
         tmp_path,
@@ -28,7 +28,7 @@ def test_a_scalar_means_what_its_field_reads_and_not_what_yaml_guesses(tmp_path:
     assert (node.mac, node.serial, node.label) == ("12:34:56:12:34:56", "0123", "1e3")
 
 
-def test_a_range_makes_its_nodes_in_order_with_addresses_counted_up(tmp_path: Path) -> None:
+def test_a_range_expands_in_order_with_consecutive_addresses(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "nodes: {'b[08-11]': {hardware: rocket, address: {from: 10.42.0.101}}}\n")
     assert [(name, str(node.address)) for name, node in fleet.nodes.items()] == [
         ("b08", "10.42.0.101/24"),
@@ -49,7 +49,7 @@ def test_a_range_in_a_plain_key_needs_no_quotes(tmp_path: Path) -> None:
     assert list(fleet.nodes) == ["b1-xa", "b1-xb", "b3-xa", "b3-xb"]
 
 
-def test_a_nodes_own_entry_wins_over_its_range_wherever_it_stands(tmp_path: Path) -> None:
+def test_a_nodes_own_entry_overrides_its_range_in_either_order(tmp_path: Path) -> None:
     own = "  b02: {state: lost, label: broken}\n"
     ranged = "  b[01-03]: {hardware: rocket, state: carried, address: {from: 10.42.0.101}}\n"
     for entries in (own + ranged, ranged + own):
@@ -63,7 +63,7 @@ def test_a_nodes_own_entry_wins_over_its_range_wherever_it_stands(tmp_path: Path
         assert str(fleet.nodes["b02"].address) == "10.42.0.102/24"
 
 
-def test_a_node_with_its_own_address_does_not_move_the_others(tmp_path: Path) -> None:
+def test_an_explicit_address_does_not_shift_the_addresses_of_other_nodes(tmp_path: Path) -> None:
     text = """\
         groups: {g: {hardware: rocket, address: {rule: network + 50 + 2 * index}}}
         nodes:
@@ -75,14 +75,14 @@ def test_a_node_with_its_own_address_does_not_move_the_others(tmp_path: Path) ->
     assert [str(node.address.ip) for node in fleet.nodes.values()] == ["10.42.0.52", "10.42.0.200", "10.42.0.56"]
 
 
-def test_the_address_takes_its_prefix_from_the_mesh_unless_it_brings_one(tmp_path: Path) -> None:
+def test_an_address_without_a_prefix_takes_it_from_the_mesh(tmp_path: Path) -> None:
     text = "nodes: {a: {hardware: rocket, address: 10.42.0.1}, b: {hardware: rocket, address: 10.42.0.2/16}}\n"
     fleet = fleet_of(tmp_path, text)
     assert fleet.nodes["a"].address == IPv4Interface("10.42.0.1/24")
     assert fleet.nodes["b"].address == IPv4Interface("10.42.0.2/16")
 
 
-def test_a_radio_joins_the_only_mesh_of_its_band_and_null_switches_it_off(tmp_path: Path) -> None:
+def test_a_radio_joins_the_only_mesh_of_its_band_unless_mesh_is_null(tmp_path: Path) -> None:
     text = """\
         nodes:
           on: {hardware: rocket, address: 10.42.0.1}
@@ -111,7 +111,7 @@ def test_with_two_meshes_in_a_band_a_radio_joins_none_by_itself(tmp_path: Path) 
     assert loaded.fleet.meshes["fast"].band is Band.G5
 
 
-def test_defaults_lie_below_groups_below_the_node_and_mappings_join(tmp_path: Path) -> None:
+def test_nodes_override_groups_override_defaults_and_mappings_are_merged(tmp_path: Path) -> None:
     text = """\
         defaults: {hardware: rocket, state: spare, role: beacon, ssh: {port: 2222, user: admin}}
         groups:
@@ -126,7 +126,7 @@ def test_defaults_lie_below_groups_below_the_node_and_mappings_join(tmp_path: Pa
     assert (node.radios[0].tx_power_dbm, node.radios[0].mac) == (20, "02:00:00:00:00:01")
 
 
-def test_a_robot_that_lists_a_node_carries_it(tmp_path: Path) -> None:
+def test_nodes_listed_by_a_robot_belong_to_it_unless_assigned_elsewhere(tmp_path: Path) -> None:
     text = """\
         nodes:
           r: {hardware: rocket, address: 10.42.0.1}
@@ -178,7 +178,7 @@ def test_an_include_below_home_follows_the_given_environment(tmp_path: Path) -> 
     assert load(inventory).diagnostics[0].code == "INV010"
 
 
-def test_an_include_outside_the_tree_a_link_there_and_a_pipe_are_refused_unread(tmp_path: Path) -> None:
+def test_includes_outside_the_tree_and_special_files_are_rejected_unread(tmp_path: Path) -> None:
     inventory = tmp_path / "fleet"
     inventory.mkdir()
     (tmp_path / "token.yaml").write_text("HUNTER2: secret\n")
@@ -194,7 +194,7 @@ def test_an_include_outside_the_tree_a_link_there_and_a_pipe_are_refused_unread(
     assert load(inventory).diagnostics[0].code == "INV020", "in the same work tree it is read"
 
 
-def test_aliases_share_values_and_a_byte_order_mark_and_crlf_are_read(tmp_path: Path) -> None:
+def test_aliases_byte_order_marks_and_crlf_are_supported(tmp_path: Path) -> None:
     text = HEAD + "groups:\n  a: {radios: &r {radio0: {tx_power_dbm: 11}}}\nnodes:\n"
     text += "  n: {hardware: rocket, address: 10.42.0.1, radios: *r}\n"
     (tmp_path / "fleet.yaml").write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
@@ -203,7 +203,7 @@ def test_aliases_share_values_and_a_byte_order_mark_and_crlf_are_read(tmp_path: 
     assert fleet.where("fleet").position.line == 2
 
 
-def test_a_node_without_a_body_and_empty_sections_are_empty_mappings(tmp_path: Path) -> None:
+def test_empty_nodes_and_sections_are_read_as_empty_mappings(tmp_path: Path) -> None:
     text = "defaults: {hardware: rocket, address: {rule: network + index}}\nnodes:\n  a:\n  b:\ntopics:\ngroups:\n"
     fleet = fleet_of(tmp_path, text)
     assert [str(node.address.ip) for node in fleet.nodes.values()] == ["10.42.0.1", "10.42.0.2"]

@@ -17,7 +17,7 @@ def final() -> Fleet:
     return load_fleet(SHIPPED / "subt-final")
 
 
-def test_the_text_at_an_origin_is_the_value_or_its_key(final: Fleet) -> None:
+def test_an_origin_points_at_the_value_or_its_key(final: Fleet) -> None:
     lines = {file: Path(file).read_text().splitlines() for file in final.files}
     seen = 0
     for path, origin in final.provenance.items():
@@ -63,12 +63,12 @@ def test_an_origin_names_the_layer(final: Fleet, path: tuple[str, ...], layer: s
     assert final.where(*path).layer == layer
 
 
-def test_a_path_that_is_not_there_is_missing(final: Fleet) -> None:
+def test_an_unknown_path_raises_missing_origin(final: Fleet) -> None:
     with pytest.raises(MissingOrigin):
         final.where("weather", "today")
 
 
-def test_why_tells_the_layer_of_every_value(tmp_path: Path) -> None:
+def test_explain_names_the_layer_of_every_value(tmp_path: Path) -> None:
     text = """\
         defaults: {hardware: rocket}
         groups: {g: {state: carried, extra_uci: {wireless.radio0.rts: "500"}}}
@@ -88,7 +88,7 @@ def test_why_tells_the_layer_of_every_value(tmp_path: Path) -> None:
     assert whys["extra_uci.wireless.radio0.rts"].origin.position.line == 15
 
 
-def test_a_node_has_no_values_but_its_own_without_defaults(tmp_path: Path) -> None:
+def test_without_defaults_a_node_has_provenance_only_for_its_own_values(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "nodes: {n: {hardware: rocket, address: 10.42.0.1}}\n")
     assert {path for path in fleet.provenance if path[0] == "nodes"} == {
         ("nodes",),

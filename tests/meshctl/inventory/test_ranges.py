@@ -10,7 +10,7 @@ from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 
 
 @given(st.integers(0, 500), st.integers(0, 50), st.integers(1, 5))
-def test_a_span_makes_every_number_once_with_the_width_of_its_first(low: int, more: int, width: int) -> None:
+def test_a_span_expands_to_every_number_zero_padded_like_its_first(low: int, more: int, width: int) -> None:
     first = str(low).zfill(width)
     names = expand(f"b[{first}-{low + more}]x")
     assert [int(name[1:-1]) for name in names] == list(range(low, low + more + 1))
@@ -35,6 +35,6 @@ def test_lists_spans_and_words_mix() -> None:
 
 
 @pytest.mark.parametrize("pattern", ["b[]", "b[1-]", "b[2-1]", "b[1,1]", "b[[1]]", "b]", "b[1-100001]", "[1-999]" * 9])
-def test_what_is_no_range_is_refused(pattern: str) -> None:
+def test_an_invalid_range_is_rejected(pattern: str) -> None:
     with pytest.raises(BadRange):
         expand(pattern)

@@ -31,7 +31,7 @@ MESH = "meshes:\n  main:\n    ssid: team   # our own\n    {}\n"
         ("batman: HUNTER2", "batman: ***"),
     ],
 )
-def test_a_line_shows_what_the_format_knows_and_nothing_secret(line: str, shown: str) -> None:
+def test_a_line_shows_known_values_and_masks_secrets(line: str, shown: str) -> None:
     found = Excerpts(MESH.format(line)).line(4, 5)
     assert found == (f"    {shown}", 5)
 
@@ -55,13 +55,13 @@ def test_a_line_shows_what_the_format_knows_and_nothing_secret(line: str, shown:
         "\ufeffkey: HUNTER2\r\nkey: HUNTER2\r\n",
     ],
 )
-def test_no_line_of_any_file_shows_a_secret(text: str) -> None:
+def test_no_excerpt_shows_a_secret(text: str) -> None:
     excerpts = Excerpts(text)
     lines = [excerpts.line(number, 1) for number in range(1, text.count("\n") + 2)]
     assert not [line for line in lines if line is not None and "HUNTER2" in line[0]]
 
 
-def test_the_place_moves_with_what_is_masked() -> None:
+def test_the_column_is_adjusted_for_masked_text() -> None:
     text = "nodes: {b03: {pass: HUNTER2HUNTER2, address: 10.42.0.1}}\n"
     column = text.index("10.42") + 1
     found = Excerpts(text).line(1, column)
@@ -72,7 +72,7 @@ def test_the_place_moves_with_what_is_masked() -> None:
 
 
 @pytest.mark.parametrize("name", ["lab", "starter", "subt-final"])
-def test_the_shipped_inventories_are_shown_as_they_stand(name: str) -> None:
+def test_the_shipped_inventories_are_shown_unmasked(name: str) -> None:
     text = (shipped("inventory") / name / "fleet.yaml").read_text(encoding="utf-8")
     excerpts = Excerpts(text)
     changed = [
@@ -84,6 +84,6 @@ def test_the_shipped_inventories_are_shown_as_they_stand(name: str) -> None:
 
 
 @given(st.text(), st.integers(1, 5), st.integers(0, 50))
-def test_any_text_has_lines(text: str, number: int, column: int) -> None:
+def test_arbitrary_text_yields_excerpts_with_valid_columns(text: str, number: int, column: int) -> None:
     found = Excerpts(text).line(number, column)
     assert found is None or found[1] <= len(found[0]) + 1

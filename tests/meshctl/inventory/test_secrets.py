@@ -139,7 +139,7 @@ def test_secrets_and_stores_are_never_shown_as_text_or_serialized(tmp_path: Path
         "operators: {password: hunter2!}\n",
     ],
 )
-def test_a_secret_written_into_the_inventory_is_refused_and_not_repeated(text: str, tmp_path: Path) -> None:
+def test_an_inline_secret_in_the_inventory_is_rejected_and_not_echoed(text: str, tmp_path: Path) -> None:
     loaded = load_text(tmp_path, HEAD.replace("meshes:\n", "x:\n") + text)
     assert loaded.fleet is None
     assert not any("hunter2!" in repr(item) for item in loaded.diagnostics)
