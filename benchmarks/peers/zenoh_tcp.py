@@ -16,7 +16,7 @@ from benchmarks.peers import PORT
 _MATCH_TIMEOUT_S = 30.0
 
 
-def _open(listen: list[str], dial: list[str]) -> Any:
+def open_session(listen: list[str], dial: list[str]) -> Any:
     configuration = zenoh.Config()
     for key, value in (
         ("mode", "peer"), ("scouting/multicast/enabled", False), ("scouting/gossip/enabled", False),
@@ -43,7 +43,7 @@ class _Sender:
 class _Transport:
     @asynccontextmanager
     async def sender(self, address: str) -> AsyncIterator[_Sender]:
-        session = await asyncio.to_thread(_open, [], [f"tcp/{address}:{PORT}"])
+        session = await asyncio.to_thread(open_session, [], [f"tcp/{address}:{PORT}"])
         try:
             publishers = [
                 session.declare_publisher(
@@ -64,7 +64,7 @@ class _Transport:
 
     @asynccontextmanager
     async def receiver(self, on_message: Callable[[bytes], None]) -> AsyncIterator[None]:
-        session = await asyncio.to_thread(_open, [f"tcp/0.0.0.0:{PORT}"], [])
+        session = await asyncio.to_thread(open_session, [f"tcp/0.0.0.0:{PORT}"], [])
         subscribers = [
             session.declare_subscriber(key, lambda sample: on_message(sample.payload.to_bytes()))
             for key in ("bulk", "urgent")

@@ -8,7 +8,6 @@ is requested with a Nack, a few times. The answer is a unicast copy, or a Cancel
 
 from collections import OrderedDict, deque
 from collections.abc import Iterable
-from dataclasses import replace
 
 from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.ranges import RangeSet
@@ -169,7 +168,7 @@ def _with_timestamp(frames: tuple[TopicAnnounce, Fragment], accepted: AcceptedMe
     """The frames with a timestamp and the message's remaining lifetime."""
     announce, fragment = frames
     assert fragment.head is not None
-    head = replace(fragment.head, life_ms=accepted.life_ms(now))
+    head = fragment.head._replace(life_ms=accepted.life_ms(now))
     return [Sent(clock_ms(now)), announce, fragment._replace(head=head)]
 
 

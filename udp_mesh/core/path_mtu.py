@@ -3,7 +3,8 @@
 from udp_mesh.core.events import PathNarrowed
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import OutgoingMessage
-from udp_mesh.core.sender.packetizer import Path, build_mtu_probe, datagram_room
+from udp_mesh.core.sender.packetizer import build_mtu_probe
+from udp_mesh.core.sender.path import Path, datagram_room
 from udp_mesh.core.sender.pmtu import NARROWER_MTUS
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender

@@ -24,10 +24,11 @@ from udp_mesh.core.outbox import HeldMessage
 from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, header_bytes
+from udp_mesh.core.sender.path import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.pmtu import ETHERNET_MTU
 from udp_mesh.core.sender.rate_limit import TokenBucket
+from udp_mesh.core.sender.send_quota import pack_until
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
@@ -156,7 +157,7 @@ def _accept(
     message_id: MessageId, channel: TopicChannel, payload: bytes, packed: bytes | None, accepted_at: float
 ) -> AcceptedMessage:
     topic = channel.topic
-    flags = MessageFlag.RELIABLE if topic.reliable else MessageFlag(0)
+    flags = MessageFlag.RELIABLE if topic.reliable else 0
     if packed is not None:
         flags |= MessageFlag.COMPRESSED
     deadline = None if topic.deadline_s is None else accepted_at + topic.deadline_s
@@ -195,8 +196,13 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     report_ended(state, peer, now)
-    state.ready[peer] = None
-    state.arm(peer)
+    shared_at = pack_until(sender, topic.priority, now)
+    if shared_at <= now:
+        state.ready[peer] = None
+        state.arm(peer)
+    elif shared_at < sender.wake_at:
+        sender.wake_at = shared_at
+        state.arm(peer)
 
 
 def accepts_compressed(session: Session) -> bool:

@@ -21,7 +21,7 @@ from udp_mesh.core.receiver.replay_check import (
     small_frames,
     timestamp_of,
 )
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State

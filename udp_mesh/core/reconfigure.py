@@ -32,7 +32,7 @@ def restore_outboxes(state: State, now: float) -> None:
             continue
         message_id = MessageId(state.next_message_id)
         state.next_message_id += 1
-        flags = MessageFlag.RELIABLE if channel.topic.reliable else MessageFlag(0)
+        flags = MessageFlag.RELIABLE if channel.topic.reliable else 0
         deadline = None if stored.remaining_s is None else now + stored.remaining_s
         accepted = AcceptedMessage(message_id, channel, stored.payload, stored.payload, flags, now, deadline)
         enqueue(state, stored.peer, accepted, now, stored.key)

@@ -167,6 +167,8 @@ class Rates:
     """Maximum delay of an acknowledgement; under bulk the sender requests most of them at once (see `ack_spacing`)."""
     pace_quantum_s: float = 0.003
     """Packets worth this much time are sent together; less costs CPU per wake-up, more costs latency."""
+    pack_s: float = 0.003
+    """How long a small message that is not urgent waits for others to share its datagram, in a stream of them."""
     broadcast_packets_per_s: float = 400.0
     """Rate limit of less urgent broadcasts: they are not acknowledged, so no window limits them."""
     starved_s: float = 5.0
@@ -180,7 +182,16 @@ class Rates:
     """Maximum fraction of time for which a level may be held back, so that none starves."""
 
     def __post_init__(self) -> None:
-        for name in ("heartbeat_s", "heartbeat_sparse_s", "offline_s", "peer_lost_s", "ack_delay_s", "pace_quantum_s"):
+        times = (
+            "heartbeat_s",
+            "heartbeat_sparse_s",
+            "offline_s",
+            "peer_lost_s",
+            "ack_delay_s",
+            "pace_quantum_s",
+            "pack_s",
+        )
+        for name in times:
             if getattr(self, name) <= 0:
                 raise ValueError(f"rates.{name}: expected a positive time, found {getattr(self, name)}")
         if not 0 <= self.yield_share < 1:

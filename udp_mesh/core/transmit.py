@@ -14,7 +14,8 @@ from udp_mesh.core.peers.heartbeat import heartbeat_datagrams
 from udp_mesh.core.peers.introduction import introduction
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES, send_copies, send_level
+from udp_mesh.core.sender.packetizer import send_copies, send_level
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode

@@ -133,14 +133,22 @@ class Driver:
 
     # Called by the application
 
+    @property
+    def sends_now(self) -> bool:
+        """Whether something leaves in this loop iteration."""
+        return self._pump_requested
+
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, type_name: str = ""
     ) -> MessageId | Rejected:
-        """`Endpoint.send`, now; the datagrams leave in this loop iteration."""
+        """`Endpoint.send`, now; the datagrams leave in this loop iteration, or with others soon after."""
         outcome = self.node.send(
             topic, payload, destination=destination, now=self._advance_clock(), type_name=type_name
         )
-        self._schedule_pump()
+        if not self.node.is_quiet:
+            self._schedule_pump()
+        elif not self._pump_requested and not self.closed:
+            self._reschedule()
         return outcome
 
     def apply(self, settings: Settings) -> list[str]:

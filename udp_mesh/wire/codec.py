@@ -73,23 +73,24 @@ _BITMAP_ONES = (1 << limits.ACK_BITMAP_BITS) - 1
 # Encoding
 
 
-def encode(frames: Sequence[Frame]) -> bytes:
-    """The encoded frames of a datagram, in order; a fragment at the end is written without its length.
+def encode(frames: Sequence[Frame], *, compact: bool = False) -> bytes:
+    """The encoded frames of a datagram, in order; a fragment at the end is written without its length. `compact`: the
+    receiver accepts compact fragments.
 
     Raises ValueError for a value the format cannot carry (a mistake of the caller).
     """
     if len(frames) == 1:
-        return _encode_frame(frames[0], last=True)
+        return _encode_frame(frames[0], last=True, compact=compact)
     if not 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM:
         raise ValueError(f"datagram: expected 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, found {len(frames)}")
     final = len(frames) - 1
-    return b"".join([_encode_frame(frame, last=place == final) for place, frame in enumerate(frames)])
+    return b"".join([_encode_frame(frame, last=place == final, compact=compact) for place, frame in enumerate(frames)])
 
 
-def _encode_frame(frame: Frame, *, last: bool) -> bytes:
+def _encode_frame(frame: Frame, *, last: bool, compact: bool) -> bytes:
     match frame:
         case Fragment():
-            return encode_fragment(frame, last=last)
+            return encode_fragment(frame, last=last, compact=compact)
         case Ack():
             return _encode_ack(frame)
         case Heartbeat():

@@ -31,6 +31,8 @@ class Feature(IntFlag):
     """Accepts `Sent` and a head's remaining lifetime, timestamps what it sends, and answers a ping to its source."""
     CONFIRM = 8
     """Answers messages that have `MessageFlag.CONFIRM` with `Delivered` once they are safe."""
+    COMPACT = 16
+    """Accepts compact fragments."""
 
 
 class Waiting(NamedTuple):
@@ -74,8 +76,8 @@ class Heartbeat:
     2**24. A boot that finds its own recent clock here knows that this heartbeat is no recording."""
 
 
-class MessageFlag(IntFlag):
-    """How a message is to be treated."""
+class MessageFlag:
+    """Bits that say how a message is to be treated. Plain integers, because an `IntFlag` costs a microsecond a use."""
 
     RELIABLE = 1
     """Retransmitted until delivered, expired or the peer is lost; otherwise best effort."""
@@ -90,8 +92,7 @@ class MessageFlag(IntFlag):
     Set only to peers that announce `Feature.CONFIRM`."""
 
 
-@dataclass(frozen=True, slots=True)
-class MessageHead:
+class MessageHead(NamedTuple):
     """Properties of a message, carried by its first fragment (position 0)."""
 
     size_bytes: int

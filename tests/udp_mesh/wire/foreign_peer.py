@@ -169,6 +169,8 @@ class Parser:
         raise ValueError(f"no frame of type {kind}")
 
     def fragment(self, kind: int) -> Fields:
+        if kind & 64:
+            return self.compact(kind)
         message_id, position = self.take("II" if kind & 8 else "IH")
         names = ("size", "fragments", "age", "topic", "priority", "flags")
         head = dict(zip(names, self.take("IIIHBB"), strict=True)) if kind & 1 else None
@@ -177,6 +179,16 @@ class Parser:
         count = self.take("H")[0] if kind & 2 else len(self.data) - self.at
         (payload,) = self.take(f"{count}s")
         return {"id": message_id, "position": position, "head": head, "payload": payload, "cast": bool(kind & 16)}
+
+    def compact(self, kind: int) -> Fields:
+        message_id, *fields = self.take("IHBBH")
+        head = dict(zip(("topic", "priority", "flags", "age"), fields, strict=True))
+        if kind & 32:
+            head["life"] = self.take("I")[0]
+        count = self.take("H")[0] if kind & 2 else len(self.data) - self.at
+        (payload,) = self.take(f"{count}s")
+        head |= {"size": count, "fragments": 1}
+        return {"id": message_id, "position": 0, "head": head, "payload": payload, "cast": bool(kind & 16)}
 
 
 # The node

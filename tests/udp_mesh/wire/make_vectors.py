@@ -78,6 +78,17 @@ FRAMES: dict[str, list[Frame]] = {
     ],
 }
 
+COMPACT_FRAMES: dict[str, list[Frame]] = {
+    "compact message": [Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 40), ack_now=True)],
+    "compact messages with a remaining life, and one without": [
+        Sent(0x01020304),
+        Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 6, 1, 40, 1500)),
+        Fragment(2, 0, b"", MessageHead(0, 1, 3, 15, 0, 0xFFFF)),
+    ],
+    "a message too old to be compact": [Fragment(3, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 0x10000))],
+}
+"""For receivers that announce COMPACT."""
+
 LEGACY: dict[str, LegacyDatagram] = {
     "host": Host("ugv1", "10.10.0.1"),
     "payload": LegacyPayload(0x7FFF, 1, 3, b"data", wants_ack=True),
@@ -97,6 +108,9 @@ def describe(value: object) -> object:
         return value.hex()
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         fields: Mapping[str, object] = value._asdict()
+        if isinstance(value, MessageHead) and value.life_ms is None:
+            # Omitted, so that files of earlier versions stay unchanged.
+            fields = {name: field for name, field in fields.items() if name != "life_ms"}
         return {"type": type(value).__name__, **{name: describe(field) for name, field in fields.items()}}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         named = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
@@ -112,7 +126,9 @@ def describe(value: object) -> object:
 
 
 def make_frames() -> object:
-    return {name: {"frames": describe(frames), "hex": encode(frames).hex()} for name, frames in FRAMES.items()}
+    vectors = {name: (frames, encode(frames)) for name, frames in FRAMES.items()}
+    vectors |= {name: (frames, encode(frames, compact=True)) for name, frames in COMPACT_FRAMES.items()}
+    return {name: {"frames": describe(frames), "hex": encoded.hex()} for name, (frames, encoded) in vectors.items()}
 
 
 def make_sealed() -> object:

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.wire.strategies import frames as any_frame
-from udp_mesh.core.sender.packetizer import IP6_EXTRA_BYTES, IP_UDP_BYTES
+from udp_mesh.core.sender.path import IP6_EXTRA_BYTES, IP_UDP_BYTES
 from udp_mesh.crypto import LONG_OVERHEAD_BYTES
 from udp_mesh.wire import limits
 from udp_mesh.wire.codec import decode, encode
@@ -20,6 +20,7 @@ from udp_mesh.wire.frames import Ack, Cancel, Fragment, Frame, Heartbeat, Messag
 @given(st.lists(any_frame, min_size=1, max_size=6))
 def test_decoding_inverts_encoding(frames: list[Frame]) -> None:
     assert decode(encode(frames)) == frames
+    assert decode(encode(frames, compact=True)) == frames
 
 
 @given(st.lists(any_frame, min_size=1, max_size=3), st.data())
@@ -62,6 +63,11 @@ def test_a_bulk_fragment_costs_seven_bytes() -> None:
     assert len(raw) == 1400 + FRAGMENT_BYTES == 1407
 
 
+def test_a_small_message_among_others_costs_thirteen_bytes() -> None:
+    message = Fragment(1, 0, b"0123456789", MessageHead(10, 1, 2, 5, 1))
+    assert len(encode([message, message], compact=True)) - len(encode([message], compact=True)) == 10 + 13
+
+
 def test_an_acknowledgement_without_gaps_costs_no_bitmap() -> None:
     complete = encode([Ack(1000, (1 << 256) - 1, 0, 0)])
     gap = encode([Ack(1000, (1 << 256) - 1 - (1 << 9), 0, 0)])
@@ -95,6 +101,12 @@ def test_too_many_frames_are_refused() -> None:
         (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 10, 0, 0, 0, 0, 0), "empty"),
         (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 2, 1, 0, 0, 0, 0) + b"x", "contradict"),
         (struct.pack(">BIHIIIHBB", 0x81, 1, 0, 1, 1, 0, 0, 16, 0) + b"x", "priority"),
+        (struct.pack(">BIHBBH", 0xC0, 1, 2, 0, 0, 0) + b"x", "compact"),
+        (struct.pack(">BIHBBH", 0xC9, 1, 2, 0, 0, 0) + b"x", "compact"),
+        (struct.pack(">BIHBBH", 0xC1, 1, 2, 16, 0, 0) + b"x", "priority"),
+        (struct.pack(">BIHBBHI", 0xE1, 1, 2, 0, 0, 0, 0) + b"x", "lifetime"),
+        (struct.pack(">BIHBBHH", 0xC3, 1, 2, 0, 0, 0, 9) + b"x", "expected 9 bytes, found 1"),
+        (struct.pack(">BIHB", 0xC1, 1, 2, 0), "expected 10 bytes"),
         (struct.pack(">BIHH", 0x82, 1, 3, 100) + b"x" * 99, "expected 100 bytes, found 99"),
         (struct.pack(">BII", 0x88, 1, 1 << 21) + b"x", "out of range"),
         (struct.pack(">BIBII", 6, 1, 1, 0, 0xFFFFFFFF), "out of range"),

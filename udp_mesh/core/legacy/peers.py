@@ -18,7 +18,7 @@ from udp_mesh.core.legacy.sender import LegacySender
 from udp_mesh.core.peers.peer_state import PeerEvent, PeerState
 from udp_mesh.core.peers.session import Meters, Peer
 from udp_mesh.core.publish import release_outbox, report_ended, store_in_outbox
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.settings import Address, LinkInfo, Neighbour, Settings
 from udp_mesh.core.state import SUSPENDED_S, State

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import OutgoingMessage
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.sender import PROBE_INTERVAL_S, Sender
 from udp_mesh.core.settings import Address

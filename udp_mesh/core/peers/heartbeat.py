@@ -18,7 +18,7 @@ from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_HEARD, MAX_HEARD_CLOCKS
 
-OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED
+OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT
 
 
 def own_features(settings: Settings) -> int:

@@ -19,7 +19,7 @@ from udp_mesh.core.peers.session_state import (
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.receiver.receiver import Receiver
-from udp_mesh.core.sender.packetizer import Path
+from udp_mesh.core.sender.path import Path
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
@@ -369,4 +369,5 @@ class Session:
         self.features = beat.features
         self.clock_ms = beat.clock_ms
         self.path.timed = bool(beat.features & Feature.TIMED)
+        self.path.compact = bool(beat.features & Feature.COMPACT)
         self.path.confirms = bool(beat.features & Feature.CONFIRM)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
-from udp_mesh.wire.frames import MessageFlag
 
 MAX_SMALL_FRAGMENTS = 3
 """An urgent message of at most this many fragments is worth sending twice, and a newer message may replace it after its
@@ -36,7 +35,8 @@ class AcceptedMessage:
     """The bytes passed to `send`."""
     body: bytes
     """The bytes on the wire (compressed or not)."""
-    flags: MessageFlag
+    flags: int
+    """Bits of `MessageFlag`."""
     accepted_at: float
     deadline: float | None
     broadcast_number: int | None = None

@@ -8,19 +8,25 @@ datagram.
 
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.path import IP_UDP_BYTES, Path
 from udp_mesh.core.sender.pending import Outcome
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.scheduler import Run
-from udp_mesh.core.sender.send_quota import ack_spacing, cwnd_room, next_send_at, send_quota, urgent_wait_until
+from udp_mesh.core.sender.send_quota import (
+    ack_spacing,
+    cwnd_room,
+    next_send_at,
+    pack_until,
+    send_quota,
+    urgent_wait_until,
+)
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot
-from udp_mesh.core.settings import Address
-from udp_mesh.crypto import LONG_OVERHEAD_BYTES, SHORT_OVERHEAD_BYTES, SendChannel
 from udp_mesh.wire.codec import ANNOUNCE_BYTES, encode
 from udp_mesh.wire.fragment import (
+    COMPACT_BYTES,
     FRAGMENT,
     FRAGMENT_ACK_NOW,
     FRAGMENT_BYTES,
@@ -29,18 +35,13 @@ from udp_mesh.wire.fragment import (
     HEAD_BYTES,
     LENGTH_BYTES,
     LIFE_BYTES,
+    MAX_COMPACT_AGE_MS,
     NARROW_HEADER,
     WIDE_FROM,
     WIDE_HEADER,
 )
-from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageFlag, MessageHead, Ping, Sent, TopicAnnounce
+from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageFlag, MessageHead, Ping, TopicAnnounce
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
-
-IP_UDP_BYTES = 28
-"""IPv4 and UDP headers."""
-
-IP6_EXTRA_BYTES = 20
-"""Additional size of an IPv6 header."""
 
 MIN_ROOM_BYTES = 64
 """With less room than this in a datagram, no further small message is added."""
@@ -52,85 +53,6 @@ ID_BYTES = 4
 
 NO_MESSAGE_ID = 0xFFFF_FFFF
 """Messages are numbered from 0; no boot lives long enough to use this number."""
-
-
-def header_bytes(address: Address) -> int:
-    """Size of the IP and UDP headers of a datagram to or from this address."""
-    return IP_UDP_BYTES + (IP6_EXTRA_BYTES if ":" in address[0] else 0)
-
-
-def datagram_room(address: Address, mtu: int, fragment_bytes: int) -> int:
-    """Bytes of frames that fit a datagram in an IP packet of `mtu` bytes, at most those of one full fragment."""
-    return min(mtu - header_bytes(address) - LONG_OVERHEAD_BYTES, fragment_bytes + FRAGMENT_WIDE_BYTES)
-
-
-class Path:
-    """The path to the peer: link, address, sealing and sizes."""
-
-    __slots__ = (
-        "address",
-        "channel",
-        "confirmed",
-        "confirms",
-        "fragment_bytes",
-        "heard_at",
-        "link",
-        "mtu",
-        "room_bytes",
-        "timed",
-    )
-
-    def __init__(self, channel: SendChannel) -> None:
-        self.channel = channel
-        self.confirmed = False
-        """The peer has answered in this channel, so the short header suffices."""
-        self.link = ""
-        self.address: Address = ("", 0)
-        self.heard_at = float("-inf")
-        """When the peer was last heard from this address."""
-        self.mtu = 0
-        """Largest IP packet in bytes."""
-        self.room_bytes = 0
-        """Largest size of a datagram's frames. Small fragments that share a datagram make it no larger than a full
-        fragment does."""
-        self.fragment_bytes = 0
-        """Payload of a full fragment."""
-        self.timed = False
-        self.confirms = False
-        """The peer confirms messages that ask for it."""
-        """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
-
-    def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
-        """Use this path from now on. Messages already started keep their fragments if these still fit."""
-        self.link, self.address, self.mtu = link, address, mtu
-        self.room_bytes = datagram_room(address, mtu, fragment_bytes)
-        self.fragment_bytes = self.room_bytes - FRAGMENT_WIDE_BYTES
-
-    def with_timestamp(self, frames: list[Frame], now: float) -> list[Frame]:
-        """The frames, preceded by a timestamp if the peer accepts it.
-
-        The timestamp is not part of `room_bytes`, which leaves room for the long header: that is larger than the short
-        one by more than a timestamp and a remaining lifetime. With a long header, both are omitted if they do not fit.
-        """
-        return [Sent(clock_ms(now)), *frames] if self.timed else frames
-
-    def encode(self, frames: list[Frame], now: float) -> bytes:
-        """The encoded frames, with a timestamp if it fits the path."""
-        encoded = encode(self.with_timestamp(frames, now))
-        return encoded if self.confirmed or len(encoded) <= self.room_bytes else encode(frames)
-
-    def seal(self, frames: bytes) -> tuple[int, bytes]:
-        return self.channel.seal(frames) if self.confirmed else self.channel.seal_long(frames)
-
-    def seal_run(self, run: list[bytes]) -> list[bytes]:
-        """Seal datagrams under the channel's next numbers."""
-        if self.confirmed:
-            return self.channel.seal_run(run)
-        return [self.channel.seal_long(frames)[1] for frames in run]
-
-    @property
-    def overhead_bytes(self) -> int:
-        return SHORT_OVERHEAD_BYTES if self.confirmed else LONG_OVERHEAD_BYTES
 
 
 def send_level(
@@ -146,10 +68,14 @@ def send_level(
     urgent_level = priority <= sender.rates.urgent_priority
     level_pace = sender.congestion.pacing_packets_per_s()
     used = 0
+    sender.room_bytes = path.room_bytes
     snapshot = sender.snapshot(now, urgent=urgent_level)
     while used < room_bytes:
         run = sender.scheduler.peek(priority)
         if run is None:
+            break
+        if not urgent_level and (shared_at := pack_until(sender, priority, now)) > now:
+            sender.wake_at = min(sender.wake_at, shared_at)
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
@@ -298,19 +224,22 @@ def _send_datagram(
         if next_run.retransmit and (message, next_run.position) in fragments:
             # Several copies of it were lost; one datagram needs only one.
             scheduler.consume(next_run, 1)
-            next_run = _next_small(sender, path, priority, room)
+            next_run = _next_small(sender, path, priority, room, now)
             continue
-        size = _fragment_frame_bytes(sender, path, next_run)
+        size = _fragment_frame_bytes(sender, path, next_run, now)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
         retransmitted += next_run.retransmit
         fragments.append((message, next_run.position))
         scheduler.consume(next_run, 1)
         last = next_run.position == message.fragments - 1
-        ack_now = urgent or sender.since_ack_requested >= spacing or (last and scheduler.is_idle(priority))
+        ack_now = urgent or sender.since_ack_requested >= spacing
+        if not ack_now and last and scheduler.is_idle(priority):
+            ack_now = now >= sender.ack_requested_at + sender.rates.ack_delay_s
         frames.extend(_frames(sender, path, next_run, now, ack_now=ack_now))
         if ack_now:
             sender.since_ack_requested = 0
+            sender.ack_requested_at = now
         room -= size
         if urgent and message.small and not next_run.retransmit:
             sender.schedule_copies(message, next_run.position, now)
@@ -318,8 +247,10 @@ def _send_datagram(
             sender.finish(message, Outcome.SENT)
         if room < MIN_ROOM_BYTES:
             break
-        next_run = _next_small(sender, path, priority, room)
+        next_run = _next_small(sender, path, priority, room, now)
     sender.retransmitted += retransmitted
+    if not urgent and (len(fragments) > 1 or room > path.room_bytes // 2):
+        sender.packed_at, sender.packs = now, len(fragments) > 1
     return _seal_datagram(sender, path, fragments, frames, snapshot, out, urgent=urgent)
 
 
@@ -342,7 +273,7 @@ def _seal_datagram(
     return len(data)
 
 
-def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | None:
+def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float) -> Run | None:
     """The next fragment of the level if it is small enough to share the datagram and needs no decision of the main
     loop."""
     run = sender.scheduler.peek(priority)
@@ -353,19 +284,25 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int) -> Run | N
             return None
         _begin(sender, path, run.message)
         run = Run(run.message, 0, run.message.fragments, retransmit=False)
-    return run if _fragment_frame_bytes(sender, path, run) <= room else None
+    return run if _fragment_frame_bytes(sender, path, run, now) <= room else None
 
 
-def _fragment_frame_bytes(sender: Sender, path: Path, run: Run) -> int:
-    """Size of the frames that carry one fragment."""
+def _fragment_frame_bytes(sender: Sender, path: Path, run: Run, now: float) -> int:
+    """Size of the frames that carry one fragment, at most."""
     message = run.message
     start, end = message.span(run.position)
-    size = end - start + FRAGMENT_WIDE_BYTES + LENGTH_BYTES
-    if run.position == 0:
-        size += HEAD_BYTES + (LIFE_BYTES if _sends_life(path, message) else 0)
-        channel = message.accepted.channel
-        if channel.number not in sender.announced:
-            size += ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
+    size = end - start + LENGTH_BYTES
+    if run.position:
+        return size + FRAGMENT_WIDE_BYTES
+    channel = message.accepted.channel
+    if path.compact and message.fragments == 1 and (now - message.accepted.accepted_at) * 1000 <= MAX_COMPACT_AGE_MS:
+        size += COMPACT_BYTES
+    else:
+        size += FRAGMENT_BYTES + HEAD_BYTES
+    if _sends_life(path, message):
+        size += LIFE_BYTES
+    if channel.number not in sender.announced:
+        size += ANNOUNCE_BYTES + len(channel.name.encode()) + len(channel.type_name.encode())
     return size
 
 

@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 from udp_mesh.core.sender.message import OutgoingMessage
 
+SMALL_OVERHEAD_BYTES = 13
+"""Approximate bytes of header of a small message in a datagram with others."""
+
 
 class Run(NamedTuple):
     """Fragments of one message ready to send: `length` positions starting at `position`.
@@ -25,9 +28,11 @@ class Run(NamedTuple):
 
 
 class _Level:
-    __slots__ = ("fresh", "retransmit", "stale_fresh", "stale_retransmits")
+    __slots__ = ("fresh", "fresh_bytes", "retransmit", "stale_fresh", "stale_retransmits")
 
     def __init__(self) -> None:
+        self.fresh_bytes = 0
+        """Bytes of the messages in `fresh`, with `SMALL_OVERHEAD_BYTES` each; approximate when some have ended."""
         self.retransmit: deque[tuple[OutgoingMessage, int]] = deque()
         self.fresh: deque[OutgoingMessage] = deque()
         self.stale_retransmits: deque[tuple[OutgoingMessage, int]] = deque()
@@ -56,7 +61,9 @@ class Scheduler:
 
     def push(self, message: OutgoingMessage, *, first: bool = False) -> None:
         """Queue the unsent part of a message; `first` puts it at the front of its level."""
-        fresh = self._levels[message.priority].fresh
+        level = self._levels[message.priority]
+        fresh = level.fresh
+        level.fresh_bytes += len(message.body) + SMALL_OVERHEAD_BYTES
         if first:
             fresh.appendleft(message)
         else:
@@ -90,7 +97,13 @@ class Scheduler:
                     continue
                 return Run(message, message.next_position, left, retransmit=False, stale=fresh is level.stale_fresh)
         self.waiting &= ~(1 << priority)
+        level.fresh_bytes = 0
         return None
+
+    def fills(self, priority: int, room_bytes: int) -> bool:
+        """Whether this level has enough for a datagram, or retransmissions."""
+        level = self._levels[priority]
+        return level.fresh_bytes >= room_bytes or bool(level.retransmit or level.stale_retransmits)
 
     def consume(self, run: Run, count: int) -> None:
         """Remove the first `count` fragments of the run just peeked."""
@@ -101,6 +114,7 @@ class Scheduler:
         message = run.message
         message.next_position += count
         if message.next_position >= message.fragments:
+            level.fresh_bytes -= len(message.body) + SMALL_OVERHEAD_BYTES
             (level.fresh if level.fresh and level.fresh[0] is message else level.stale_fresh).popleft()
 
     def park_head(self, run: Run) -> None:

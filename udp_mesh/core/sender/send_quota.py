@@ -6,6 +6,7 @@
    allows. An unresponsive peer gets only probes.
 3. `next_send_at`: when nothing may be sent, the time at which pacing or a late acknowledgement changes that.
 4. `ack_spacing`: how often packets request an acknowledgement, which determines when one is late.
+5. `pack_until`: how long small messages wait to share a datagram.
 
 Acknowledgements are lost in bursts or delayed by a process that was not scheduled. A window that waits for them leaves
 the link idle, so the link is assumed to keep delivering for some tens of milliseconds.
@@ -102,3 +103,22 @@ def _late_at(sender: Sender) -> float:
     capacity = sender.congestion.capacity_packets_per_s()
     spacing_s = ack_spacing(sender) / capacity if capacity else 0.0
     return sender.last_progress + max(LATE_AFTER_S, spacing_s)
+
+
+def pack_until(sender: Sender, priority: int, now: float) -> float:
+    """Until when the small messages of this level wait for others to share their datagram; `now`: they do not.
+
+    As with Nagle's algorithm (RFC 896), a message is sent at once while none before it is in flight, so a lone one, and
+    one that follows the acknowledgement of the last, never wait. In a stream, each datagram is followed by `pack_s`
+    without another, unless one is full.
+    """
+    until = sender.packed_at + sender.rates.pack_s
+    if (
+        until <= now
+        or priority <= sender.rates.urgent_priority
+        or not (sender.packs or sender.in_flight.outstanding)
+        or sender.state is not SendState.ACTIVE
+        or sender.scheduler.fills(priority, sender.room_bytes)
+    ):
+        return now
+    return until

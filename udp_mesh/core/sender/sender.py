@@ -100,6 +100,14 @@ class Sender(PendingMessages):
         """The application, not window or pacing, limits how much is sent."""
         self.since_ack_requested = 0
         """Packets sent since the last one that requested an immediate acknowledgement."""
+        self.ack_requested_at = float("-inf")
+        """When the end of the queue last requested one."""
+        self.packed_at = float("-inf")
+        """When the last datagram with room to spare was sent that was not urgent."""
+        self.packs = False
+        """That datagram held several messages: more of them are likely to come."""
+        self.room_bytes = 0
+        """Bytes of frames in a datagram of the path."""
         self.loss = 0.0
         self.send_twice = False
         """Loss was seen recently: small urgent messages are sent twice."""

@@ -13,7 +13,7 @@ from functools import partial
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.sender.packetizer import IP_UDP_BYTES
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.links.path import Carrier

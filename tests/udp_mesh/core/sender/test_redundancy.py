@@ -9,7 +9,6 @@ from udp_mesh.core.events import MessageId
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.redundancy import EARLY_COPIES, MAX_OVERDUE_COPIES, RedundantCopies
 from udp_mesh.core.settings import Topic
-from udp_mesh.wire.frames import MessageFlag
 
 GAP_S, OVERDUE_S = 0.003, 0.025
 EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
@@ -17,9 +16,7 @@ EARLY_S = [GAP_S, *(gaps * GAP_S for _, gaps in EARLY_COPIES)]
 
 def fragment(*, reliable: bool = True) -> OutgoingMessage:
     topic = Topic("stop", priority=0, reliable=reliable)
-    accepted = AcceptedMessage(
-        MessageId(1), TopicChannel(0, topic, topic.name, ""), b"x", b"x", MessageFlag(0), 0.0, None
-    )
+    accepted = AcceptedMessage(MessageId(1), TopicChannel(0, topic, topic.name, ""), b"x", b"x", 0, 0.0, None)
     message = OutgoingMessage(accepted, 0, reliable=reliable)
     message.begin(0, 1400, 1400)
     return message
