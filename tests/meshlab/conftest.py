@@ -47,6 +47,13 @@ reload_config
 """
 
 
+def factory_reset(node: VirtualNode) -> None:
+    """Erase what the node has on flash, and boot it. The fleet is shared: a radio that a test leaves behind would be
+    taken for the next one's."""
+    node.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
+    node.power_cut()
+
+
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualFleet]:
     """base - near - far in a line, a working mesh in which only the base is wired; factory-fresh on the bench: `box`,
@@ -88,8 +95,7 @@ def node(fleet: VirtualFleet) -> Iterator[VirtualNode]:
     yield box
     fleet.repair("box")
     box.wait_up()
-    box.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
-    box.power_cut()
+    factory_reset(box)
 
 
 def unplug(fleet: VirtualFleet) -> None:

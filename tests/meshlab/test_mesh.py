@@ -10,7 +10,7 @@ import paramiko
 import pytest
 
 from meshlab.fleet import VirtualFleet
-from tests.meshlab.conftest import MESH, answers, connect, in_mesh, run
+from tests.meshlab.conftest import MESH, answers, connect, factory_reset, in_mesh, run
 from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
@@ -139,3 +139,4 @@ def test_openwrt_25_12_joins_an_open_cell_when_configured_for_encryption(fleet: 
     until(lambda: new.exec(asked).stdout.startswith("Joined IBSS"), "the cell")
     info = json.loads(new.exec('ubus call iwinfo info \'{"device":"mesh0"}\'').stdout)
     assert info["encryption"]["enabled"] is False
+    factory_reset(new)

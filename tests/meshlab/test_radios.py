@@ -8,7 +8,7 @@ import pytest
 
 from meshctl.apply.change_set import reload_script
 from meshlab.fleet import VirtualFleet, VirtualNode
-from tests.meshlab.conftest import MESH
+from tests.meshlab.conftest import MESH, factory_reset
 from tests.waiting import until
 
 WIRELESS = "etc/config/wireless"
@@ -26,14 +26,15 @@ set wireless.mesh0.key=a-pass-phrase"""
 
 @pytest.fixture
 def latest(fleet: VirtualFleet) -> Iterator[VirtualNode]:
-    """A node of 25.12 in an open cell, which is reset afterwards."""
+    """A node of 25.12 in an open cell. It starts from erased flash: with an interface of an earlier test it would have
+    mesh0 before its own is set up."""
     new = fleet.node("new")
     new.wait_up()
+    factory_reset(new)
     new.exec(MESH.format(address="10.42.0.9", channel=6)).check("set up")
     until(lambda: index(new) != "", "mesh0")
     yield new
-    new.exec("cd /lab/node/flash && rm -rf current copy.* sysupgrade.tgz").check("erase flash")
-    new.power_cut()
+    factory_reset(new)
 
 
 def index(node: VirtualNode) -> str:
