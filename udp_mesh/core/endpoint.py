@@ -102,6 +102,10 @@ class Endpoint:
         """Whether `datagrams_to_send` may return something. False right after it returned everything."""
         return bool(self._legacy) or transmit.has_datagrams(self._state)
 
+    def is_due_before(self, at: float) -> bool:
+        """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
+        return self._state.next_peer_at() < at or bool(self._state.compression_queue)
+
     @property
     def is_quiet(self) -> bool:
         """Whether there is nothing to send and no event until `next_timer`, so that the driver may skip the node.

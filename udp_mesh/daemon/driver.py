@@ -147,7 +147,7 @@ class Driver:
         )
         if not self.node.is_quiet:
             self._schedule_pump()
-        elif not self._pump_requested and not self.closed:
+        elif not self._pump_requested and not self.closed and self.node.is_due_before(self._due):
             self._reschedule()
         return outcome
 

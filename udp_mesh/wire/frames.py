@@ -14,14 +14,14 @@ retransmission.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 Payload: TypeAlias = bytes | bytearray | memoryview
 
 
-class Feature(IntFlag):
-    """Optional features that a node announces; unknown bits are ignored."""
+class Feature:
+    """Bits of the optional features that a node announces; unknown bits are ignored."""
 
     ZLIB = 1
     """Accepts messages compressed with zlib (RFC 1950)."""
@@ -77,7 +77,8 @@ class Heartbeat:
 
 
 class MessageFlag:
-    """Bits that say how a message is to be treated. Plain integers, because an `IntFlag` costs a microsecond a use."""
+    """Bits that say how a message is to be treated. Plain integers, as in `Feature`: an `IntFlag` costs a microsecond a
+    use."""
 
     RELIABLE = 1
     """Retransmitted until delivered, expired or the peer is lost; otherwise best effort."""

@@ -219,14 +219,14 @@ def _send_datagram(
     spacing = ack_spacing(sender)
     sender.since_ack_requested += 1
     next_run: Run | None = run
+    size = _fragment_frame_bytes(sender, path, run, now)
     while next_run is not None:
         message = next_run.message
         if next_run.retransmit and (message, next_run.position) in fragments:
             # Several copies of it were lost; one datagram needs only one.
             scheduler.consume(next_run, 1)
-            next_run = _next_small(sender, path, priority, room, now)
+            next_run, size = _next_small(sender, path, priority, room, now)
             continue
-        size = _fragment_frame_bytes(sender, path, next_run, now)
         if frames and (size > room or len(frames) >= MAX_FRAMES_PER_DATAGRAM - 3):
             break
         retransmitted += next_run.retransmit
@@ -247,7 +247,7 @@ def _send_datagram(
             sender.finish(message, Outcome.SENT)
         if room < MIN_ROOM_BYTES:
             break
-        next_run = _next_small(sender, path, priority, room, now)
+        next_run, size = _next_small(sender, path, priority, room, now)
     sender.retransmitted += retransmitted
     if not urgent and (len(fragments) > 1 or room > path.room_bytes // 2):
         sender.packed_at, sender.packs = now, len(fragments) > 1
@@ -273,18 +273,19 @@ def _seal_datagram(
     return len(data)
 
 
-def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float) -> Run | None:
-    """The next fragment of the level if it is small enough to share the datagram and needs no decision of the main
-    loop."""
+def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float) -> tuple[Run | None, int]:
+    """The next fragment of the level and the size of its frames, if it is small enough to share the datagram and needs
+    no decision of the main loop."""
     run = sender.scheduler.peek(priority)
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
-        return None
+        return None, 0
     if not run.message.started:
         if len(run.message.body) > room:
-            return None
+            return None, 0
         _begin(sender, path, run.message)
         run = Run(run.message, 0, run.message.fragments, retransmit=False)
-    return run if _fragment_frame_bytes(sender, path, run, now) <= room else None
+    size = _fragment_frame_bytes(sender, path, run, now)
+    return (run, size) if size <= room else (None, 0)
 
 
 def _fragment_frame_bytes(sender: Sender, path: Path, run: Run, now: float) -> int:
