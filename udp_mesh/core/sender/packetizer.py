@@ -100,7 +100,7 @@ def send_level(
             continue
         if not message.started:
             _begin(sender, path, message)
-            run = Run(message, 0, message.fragments, retransmit=False)
+            run = run._replace(length=message.fragments)
         before = used
         is_plain = bucket is None and message.accepted.broadcast_number is None
         if run.position and run.length > 2 and quota > 1 and is_plain:
@@ -283,7 +283,7 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float
         if len(run.message.body) > room:
             return None, 0
         _begin(sender, path, run.message)
-        run = Run(run.message, 0, run.message.fragments, retransmit=False)
+        run = run._replace(length=run.message.fragments)
     size = _fragment_frame_bytes(sender, path, run, now)
     return (run, size) if size <= room else (None, 0)
 

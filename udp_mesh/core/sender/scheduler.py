@@ -2,7 +2,8 @@
 is built.
 
 Within a level, retransmissions go first, then messages in the order accepted. After the peer was unresponsive,
-`demote_stale` puts what waited on urgent levels behind new messages.
+`demote_stale` puts what waited on urgent levels behind new messages. On the other levels, where new messages may never
+end, `alternate_stale` sends what waited for long and what is new in turn.
 """
 
 from collections import deque
@@ -28,9 +29,12 @@ class Run(NamedTuple):
 
 
 class _Level:
-    __slots__ = ("fresh", "fresh_bytes", "retransmit", "stale_fresh", "stale_retransmits")
+    __slots__ = ("alternates", "fresh", "fresh_bytes", "retransmit", "stale_fresh", "stale_next", "stale_retransmits")
 
     def __init__(self) -> None:
+        self.alternates = False
+        """Stale and fresh messages are sent in turn, until one of them has run out."""
+        self.stale_next = False
         self.fresh_bytes = 0
         """Bytes of the messages in `fresh`, with `SMALL_OVERHEAD_BYTES` each; approximate when some have ended."""
         self.retransmit: deque[tuple[OutgoingMessage, int]] = deque()
@@ -82,7 +86,8 @@ class Scheduler:
     def peek(self, priority: int) -> Run | None:
         """What is sent next on this level. None, with the level's bit cleared, if it is empty."""
         level = self._levels[priority]
-        for retransmit, fresh in ((level.retransmit, level.fresh), (level.stale_retransmits, level.stale_fresh)):
+        queues = ((level.retransmit, level.fresh), (level.stale_retransmits, level.stale_fresh))
+        for retransmit, fresh in reversed(queues) if level.stale_next else queues:
             while retransmit:
                 message, position = retransmit[0]
                 if message.ended or message.arrived[position]:
@@ -98,34 +103,40 @@ class Scheduler:
                 return Run(message, message.next_position, left, retransmit=False, stale=fresh is level.stale_fresh)
         self.waiting &= ~(1 << priority)
         level.fresh_bytes = 0
+        level.alternates = level.stale_next = False
         return None
 
     def fills(self, priority: int, room_bytes: int) -> bool:
-        """Whether this level has enough for a datagram, or retransmissions."""
+        """Whether this level has enough for a datagram, or anything but fresh messages."""
         level = self._levels[priority]
-        return level.fresh_bytes >= room_bytes or bool(level.retransmit or level.stale_retransmits)
+        return level.fresh_bytes >= room_bytes or bool(level.retransmit or level.stale_retransmits or level.stale_fresh)
 
     def consume(self, run: Run, count: int) -> None:
         """Remove the first `count` fragments of the run just peeked."""
         level = self._levels[run.message.priority]
         if run.retransmit:
-            (level.retransmit or level.stale_retransmits).popleft()
+            (level.stale_retransmits if run.stale else level.retransmit).popleft()
             return
         message = run.message
         message.next_position += count
         if message.next_position >= message.fragments:
-            level.fresh_bytes -= len(message.body) + SMALL_OVERHEAD_BYTES
-            (level.fresh if level.fresh and level.fresh[0] is message else level.stale_fresh).popleft()
+            self._pop(level, run)
+            level.stale_next = level.alternates and not run.stale
 
     def park_head(self, run: Run) -> None:
         """Remove the message of the run just peeked (a rate limit parks it)."""
         level = self._levels[run.message.priority]
         if run.retransmit:
-            (level.retransmit or level.stale_retransmits).popleft()
-        elif level.fresh and level.fresh[0] is run.message:
-            level.fresh.popleft()
+            (level.stale_retransmits if run.stale else level.retransmit).popleft()
         else:
+            self._pop(level, run)
+
+    def _pop(self, level: _Level, run: Run) -> None:
+        if run.stale:
             level.stale_fresh.popleft()
+        else:
+            level.fresh_bytes -= len(run.message.body) + SMALL_OVERHEAD_BYTES
+            level.fresh.popleft()
 
     def demote_stale(self, last_priority: int) -> None:
         """Mark what waits on levels up to `last_priority` as stale: new messages overtake it."""
@@ -138,6 +149,22 @@ class Scheduler:
             if level.fresh:
                 level.stale_fresh.extend(level.fresh)
                 level.fresh.clear()
+                level.fresh_bytes = 0
+
+    def alternate_stale(self, first_priority: int, queued_before: float) -> None:
+        """From this level on, send what was queued before then and what was queued later in turn, a message each."""
+        for priority, level in self._levels.items():
+            if priority < first_priority:
+                continue
+            kept: deque[tuple[OutgoingMessage, int]] = deque()
+            for entry in level.retransmit:
+                (level.stale_retransmits if entry[0].queued_at < queued_before else kept).append(entry)
+            level.retransmit = kept
+            while level.fresh and level.fresh[0].queued_at < queued_before:
+                message = level.fresh.popleft()
+                level.fresh_bytes -= len(message.body) + SMALL_OVERHEAD_BYTES
+                level.stale_fresh.append(message)
+            level.alternates = bool(level.stale_fresh or level.stale_retransmits)
 
     def rebuild(self, messages: list[OutgoingMessage], *, keep_fragments: bool) -> None:
         """Rebuild the queues from these messages in this order; `keep_fragments` keeps queued retransmissions."""

@@ -50,6 +50,9 @@ MAX_ACK_WAIT_S = 1.0
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
 
+STALE_AFTER_S = 1.0
+"""After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
+
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
@@ -158,7 +161,7 @@ class Sender(PendingMessages):
             if not all(packet.snapshot.urgent for packet in acknowledged):
                 self.non_urgent_progress = now
             if self.state is SendState.UNRESPONSIVE:
-                self._on_responsive()
+                self._on_responsive(now)
             self._transition(SendEvent.ACKNOWLEDGED)
             if self.pmtu.suspect:
                 self.pmtu.on_acked(acknowledged, in_flight.spurious - spurious, now)
@@ -394,10 +397,11 @@ class Sender(PendingMessages):
             self.allow_probe(now)
             self.probe_credit = min(RESUME_BURST_PACKETS, int(self.congestion.cwnd))
 
-    def _on_responsive(self) -> None:
+    def _on_responsive(self, now: float) -> None:
         self._resume_backoff.reset()
         self.probe_credit = 0
         self.scheduler.demote_stale(self.rates.urgent_priority)
+        self.scheduler.alternate_stale(self.rates.urgent_priority + 1, now - STALE_AFTER_S)
 
     def reprioritize(self) -> None:
         """Move waiting messages to their topics' new levels."""

@@ -12,11 +12,13 @@ from udp_mesh.core.settings import Topic
 from udp_mesh.wire.frames import MessageFlag
 
 
-def outgoing(priority: int, fragments: int) -> OutgoingMessage:
+def outgoing(priority: int, fragments: int, *, queued_at: float = 0.0) -> OutgoingMessage:
     channel = TopicChannel(0, Topic("t", priority=priority), "t", "")
     body = bytes(10 * fragments)
     message = OutgoingMessage(
-        AcceptedMessage(MessageId(1), channel, body, body, MessageFlag.RELIABLE, 0.0, None), priority, reliable=True
+        AcceptedMessage(MessageId(1), channel, body, body, MessageFlag.RELIABLE, queued_at, None),
+        priority,
+        reliable=True,
     )
     message.begin(1, 10, 10)
     return message
@@ -28,6 +30,7 @@ steps = st.lists(
         st.tuples(st.just("take"), st.integers(1, 3), st.just(0)),
         st.tuples(st.just("lose"), st.integers(0, 50), st.just(0)),
         st.tuples(st.just("aside"), st.integers(0, 15), st.just(0)),
+        st.tuples(st.just("alternate"), st.integers(0, 15), st.just(0)),
     ),
     max_size=60,
 )
@@ -59,7 +62,7 @@ def test_every_fragment_is_sent_in_strict_priority_order(
 
     for what, number, size in plan:
         if what == "push":
-            message = outgoing(number, size)
+            message = outgoing(number, size, queued_at=float(len(messages)))
             messages.append(message)
             scheduler.push(message)
             waiting.extend([(number, len(messages) - 1)] * size)
@@ -71,6 +74,8 @@ def test_every_fragment_is_sent_in_strict_priority_order(
             waiting.append((message.priority, messages.index(message)))
         elif what == "aside":
             scheduler.demote_stale(number)
+        elif what == "alternate":
+            scheduler.alternate_stale(number, messages[len(messages) // 2].queued_at if messages else 0.0)
     while scheduler.waiting:
         take(3)
     assert not waiting
@@ -88,6 +93,21 @@ def test_fresh_urgent_messages_are_sent_before_demoted_stale_ones() -> None:
         scheduler.consume(run, 1)
         order.append(run.message)
     assert order == [fresh, stale]
+
+
+def test_other_levels_send_stale_and_fresh_messages_in_turn() -> None:
+    scheduler = Scheduler()
+    messages = [outgoing(9, 1, queued_at=float(second)) for second in range(8)]
+    for message in messages[:5]:
+        scheduler.push(message)
+    scheduler.alternate_stale(4, 5.0)
+    for message in messages[5:]:
+        scheduler.push(message)
+    order = []
+    while (run := scheduler.peek(9)) is not None:
+        scheduler.consume(run, 1)
+        order.append(messages.index(run.message))
+    assert order == [5, 0, 6, 1, 7, 2, 3, 4]
 
 
 def test_an_urgent_message_is_sent_next_in_the_middle_of_a_bulk_transfer() -> None:
