@@ -161,10 +161,21 @@ dropbear_is_new() {
 	done
 }
 
+# resolve_without_dnsmasq: dnsmasq's script makes /tmp/resolv.conf name 127.0.0.1 and undoes that only for the sections it
+# still finds. Without any, nothing would resolve names until the next boot, not even those of time servers.
+resolve_without_dnsmasq() {
+	grep -q '^nameserver 127\.0\.0\.1$' /tmp/resolv.conf 2>/dev/null || return 0
+	! uci -q show dhcp | grep -q '=dnsmasq$' || return 0
+	for servers in /tmp/resolv.conf.d/resolv.conf.auto /tmp/resolv.conf.auto; do
+		[ ! -e "$servers" ] || { ln -sf "$servers" /tmp/resolv.conf && return; }
+	done
+}
+
 mkdir -p /tmp/meshctl
 before_dropbear=$(dropbear_service)
 before_interfaces=" $(cd /sys/class/net && echo *) "
 [ -z "$PACKAGES" ] || take_up
+! changed dhcp || resolve_without_dnsmasq
 if changed network wireless; then
 	learn_batman_adv
 	settle_radios
