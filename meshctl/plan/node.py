@@ -108,6 +108,7 @@ def node_plan(
             *seen.notes,
             *_tagged_ports(node, seen, after.get("network")),
             *_lacking_scripts(node, seen, basis, firmware),
+            *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
         ),
     )
 
@@ -144,6 +145,20 @@ def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: F
     return (
         f"it lacks {package}: without its /usr/share/hostap/wdev.uc OpenWrt {node.release} brings up no mesh "
         "interface, and the node would roll back. Build the image with it",
+    )
+
+
+def _lasting_thresholds(
+    before: Package | None, after: Package | None, firmware: FirmwareStep | None
+) -> tuple[str, ...]:
+    """Thresholds of radios that are removed: OpenWrt's scripts set them only if present, so the driver keeps them."""
+    if before is None or after is None or firmware is not None:
+        return ()
+    return tuple(
+        f"{radio.name}: {option} {radio.get(option)} is removed, but stays in force until the node reboots"
+        for radio in before.of_type("wifi-device")
+        for option in ("rts", "frag")
+        if radio.get(option) and ((new := after.section(radio.name or "")) is None or not new.get(option))
     )
 
 

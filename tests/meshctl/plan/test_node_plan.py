@@ -175,3 +175,16 @@ def test_an_untagged_port_to_a_vlan_switch_is_planned_with_a_note() -> None:
     assert note.startswith("eth0 connects to a switch whose LAN is eth0.1")
     assert node_plan(want, behind, FINGERPRINTS).notes == ()
     assert node_plan(replace(want, files=kept), seen, FINGERPRINTS).notes == ()
+
+
+@pytest.mark.parametrize(("option", "value"), [("rts", "500"), ("frag", "1000")])
+def test_a_removed_threshold_is_noted_because_the_driver_keeps_it(option: str, value: str) -> None:
+    seen = running(fleet(), "b01")
+    assert seen.uci is not None
+    wireless = seen.uci["wireless"].replace(
+        "config wifi-device 'radio0'\n", f"config wifi-device 'radio0'\n\toption {option} '{value}'\n"
+    )
+    plan = planned(fleet(), "b01", replace(seen, uci={**seen.uci, "wireless": wireless}))
+    assert plan.verdict is Verdict.CHANGE
+    assert f"radio0: {option} {value} is removed, but stays in force until the node reboots" in plan.notes
+    assert not any("stays in force" in note for note in planned(fleet(), "b01", seen).notes)
