@@ -184,6 +184,7 @@ class Endpoint:
 
     def close(self, now: float) -> None:
         """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
+        transmit.flush_packed(self._state, now)
         reconfigure.close(self._state, now)
 
 

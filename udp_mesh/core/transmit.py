@@ -51,6 +51,17 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
     return out
 
 
+def flush_packed(state: State, now: float) -> None:
+    """Send what waits to share a datagram."""
+    if state.closed:
+        return
+    for peer in state.peer_table.peers.values():
+        if peer.sender is not None and peer.sender.scheduler.waiting:
+            peer.sender.packed_at = _ALWAYS
+            state.ready[peer] = None
+    state.outgoing.extend(collect(state, now, None))
+
+
 def count_sent(state: State, out: list[Datagram]) -> None:
     """Count the datagrams being sent, in whatever format."""
     counters = state.event_queue.counters

@@ -107,6 +107,16 @@ def test_larger_messages_on_the_level_do_not_wait() -> None:
     assert max(size for at, size in world.sent if at <= 0.0006) > 1400
 
 
+def test_messages_that_wait_are_sent_when_the_node_closes() -> None:
+    world = Recorded()
+    for _ in range(5):
+        world.send("a", "pose", b"last", "b")
+    world.nodes["a"].close(world.now)
+    world.run(1.0)
+    received = [event.payload for event in world.events_of("b", MessageReceived) if isinstance(event, MessageReceived)]
+    assert received[3:] == [b"last"] * 5
+
+
 def test_a_stream_requests_fewer_acknowledgements_than_it_has_datagrams() -> None:
     world = Recorded()
     before = world.nodes["b"].conditions(world.now).counters.acknowledgements_sent
