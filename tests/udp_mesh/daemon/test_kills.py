@@ -23,7 +23,7 @@ from tests.udp_mesh.daemon.processes import (
     wait_online,
 )
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from udp_mesh.client import MeshError
+from udp_mesh.client import MeshClient, MeshError
 
 pytestmark = pytest.mark.xdist_group("udp_mesh_kills")
 
@@ -82,6 +82,11 @@ def test_a_hung_disk_delays_only_the_publisher_that_waits_for_it() -> None:
             assert outcomes(patient, 1) == {number: "delivered"}
 
 
+def priority_of(operator: MeshClient, name: str) -> int | None:
+    topics = operator.request("topics")["topics"]
+    return next((topic["priority"] for topic in topics if topic["name"] == name), None)
+
+
 def test_a_reload_under_load_drops_nothing() -> None:
     with two_daemons() as (alice, bob), alice.client() as sender, bob.client() as receiver, alice.client() as operator:
         receiver.subscribe("map", "extra")
@@ -92,6 +97,7 @@ def test_a_reload_under_load_drops_nothing() -> None:
             alice.write(text.replace("[topics]", f"[topics]\nextra = {{ priority = {turn} }}"))
             if turn % 2:
                 alice.signal(signal.SIGHUP)
+                poll(lambda turn=turn: priority_of(operator, "extra") == turn, "the reload")  # type: ignore[misc]
             else:
                 assert any("extra" in change for change in operator.request("reload")["changes"])
         numbers.append(sender.publish("extra", b"new topic", to="bob", notify=True))
