@@ -25,6 +25,20 @@ done
 wait
 cat /tmp/count"""
 
+# how often a call that runs is taken for one that has ended, and the other way round for one that has
+SEEN = """
+. /rom/lab/netifd_call.sh
+unseen=0 ended=0
+for number in $(seq 200); do
+	/rom/lab/genuine/busybox setsid sh -c '/rom/lab/genuine/busybox usleep 60000; : lab/netifd' &
+	pid=$!
+	for look in 1 2 3 4 5; do is_call $pid || unseen=$((unseen + 1)); done
+	wait $pid
+	is_call $pid || ended=$((ended + 1))
+done
+echo $unseen $ended
+"""
+
 
 def test_one_process_at_a_time_holds_a_lock(fleet: VirtualFleet) -> None:
     for _ in range(4):
@@ -35,3 +49,9 @@ def test_the_lock_of_a_killed_process_is_free(fleet: VirtualFleet) -> None:
     killed = "sh -c '. /rom/lab/lock.sh; lock killed; kill -9 $$'"
     taken = fleet.node("box").exec(f"{killed}; . /rom/lab/lock.sh; lock killed && echo taken; unlock killed")
     assert taken.stdout.split()[-1] == "taken"
+
+
+def test_a_call_of_netifd_is_seen_while_it_replaces_its_program(fleet: VirtualFleet) -> None:
+    """Otherwise `wifi down; wifi up` may be handled in the wrong order."""
+    counted = fleet.node("box").exec(SEEN, timeout_s=120.0).check("count")
+    assert counted.stdout.split() == ["0", "200"]
