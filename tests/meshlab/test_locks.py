@@ -30,9 +30,10 @@ SEEN = """
 . /rom/lab/netifd_call.sh
 unseen=0 ended=0
 for number in $(seq 200); do
-	/rom/lab/genuine/busybox setsid sh -c '/rom/lab/genuine/busybox usleep 60000; : lab/netifd' &
+	/rom/lab/genuine/busybox setsid sh -c 'while /rom/lab/genuine/busybox usleep 9000; do :; done; : lab/netifd' &
 	pid=$!
 	for look in 1 2 3 4 5; do is_call $pid || unseen=$((unseen + 1)); done
+	kill $pid
 	wait $pid
 	is_call $pid || ended=$((ended + 1))
 done

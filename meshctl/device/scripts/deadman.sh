@@ -137,7 +137,13 @@ read_marker() {
 is_armed() { [ -f "$CHANGE/armed.$ID" ]; }
 
 alive() { # PIDFILE: a process of ours still runs under that number
-	read -r pid 2>/dev/null <"$1" && grep -q meshctl-deadman "/proc/$pid/cmdline" 2>/dev/null
+	read -r pid 2>/dev/null <"$1" || return 1
+	case $(cat "/proc/$pid/cmdline" 2>/dev/null) in
+	*meshctl-deadman*) ;;
+	# a process that is being started has no command line yet; a zombie has none any more
+	'') grep -q '^State:[^Z]*$' "/proc/$pid/status" 2>/dev/null ;;
+	*) return 1 ;;
+	esac
 }
 
 # finish OUTCOME REASON: remember how it ended, then forget the change; the marker goes first, because a directory

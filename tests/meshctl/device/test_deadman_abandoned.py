@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.device.deadman import bundle
+from meshctl.device.scripts import script
 from tests.meshctl.device.changes import (
     BUNDLE,
     NONCE,
@@ -117,3 +118,33 @@ def test_a_truncated_bundle_changes_nothing_and_is_deleted(node: Sandbox, cut: i
     assert is_before(node.path("/etc"))
     assert not node.path("/tmp/meshctl/c1.tgz").exists()
     assert " state=idle " in node.deadman("status")
+
+
+# how often a timer that runs is taken for one that has ended, and how often one that has ended for one that runs
+SEEN = """
+unseen=0 dead=0
+for number in $(seq 150); do
+    env env env env env env env env sh -c 'while usleep 9000; do :; done; : meshctl-deadman' &
+    echo $! >/tmp/pid
+    for look in 1 2 3 4 5; do alive /tmp/pid || unseen=$((unseen + 1)); done
+    kill $!
+    wait $!
+    alive /tmp/pid && dead=$((dead + 1))
+done
+sh -c 'usleep 300000 & echo $! >/tmp/pid; exec sleep 60' &
+parent=$!
+for look in $(seq 500); do
+    ! grep -q 'State:.*Z' "/proc/$(cat /tmp/pid)/status" || break
+    usleep 10000
+done 2>/dev/null
+alive /tmp/pid && zombie=alive || zombie=ended
+kill $parent
+echo $unseen $dead $zombie
+"""
+
+
+def test_a_timer_counts_as_alive_while_it_is_being_started(node: Sandbox) -> None:
+    """During execve a process has no command line."""
+    alive = script("deadman.sh").split("\nalive() ", 1)[1].split("\n}\n", 1)[0]
+    counted = node.run("sh", "-c", f"alive() {alive}\n}}\n{SEEN}")
+    assert counted.stdout.split() == ["0", "0", "ended"], counted.stderr
