@@ -135,6 +135,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 out.append(Datagram(session.path.link, session.path.address, data, True))
             peers.append(peer)
             sender.wake_at = _INFINITY
+            sender.packing = 0
             mask |= sender.scheduler.waiting
         else:
             del state.ready[peer]
@@ -173,7 +174,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             report_ended(state, peer, now)
         if room > 0:
             state.ready.pop(peer, None)
-            sender.app_limited = not sender.scheduler.waiting
+            sender.app_limited = not sender.scheduler.waiting & ~sender.packing
         if held & sender.scheduler.waiting:
             until = state.priority_backoff.held_until(now)
             if until is not None:

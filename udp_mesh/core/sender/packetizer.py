@@ -76,6 +76,7 @@ def send_level(
             break
         if not urgent_level and (shared_at := pack_until(sender, priority, now)) > now:
             sender.wake_at = min(sender.wake_at, shared_at)
+            sender.packing |= 1 << priority
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace

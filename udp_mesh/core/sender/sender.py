@@ -107,6 +107,8 @@ class Sender(PendingMessages):
         """When the end of the queue last requested one."""
         self.packed_at = float("-inf")
         """When the last datagram with room to spare was sent that was not urgent."""
+        self.packing = 0
+        """Mask of the levels whose messages wait to share a datagram: the application limits how much they send."""
         self.packs = False
         """That datagram held several messages: more of them are likely to come."""
         self.room_bytes = 0

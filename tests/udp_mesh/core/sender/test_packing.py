@@ -117,6 +117,18 @@ def test_messages_that_wait_are_sent_when_the_node_closes() -> None:
     assert received[3:] == [b"last"] * 5
 
 
+def test_the_application_limits_a_stream_that_waits_to_share_datagrams() -> None:
+    """Otherwise its rate would be taken for that of the link."""
+    world = Recorded()
+    world.stream("pose", 2000, 0.0005)
+    sender = world.nodes["a"]._state.peer_table.peers["b"].open_sender()
+    limited = []
+    for _ in range(50):
+        world.run(0.0107)
+        limited.append(sender.app_limited)
+    assert all(limited)
+
+
 def test_a_stream_requests_fewer_acknowledgements_than_it_has_datagrams() -> None:
     world = Recorded()
     before = world.nodes["b"].conditions(world.now).counters.acknowledgements_sent
