@@ -77,10 +77,8 @@ def run_context(
     from meshctl.nodes.collect import known_macs
 
     fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
-    observations = (
-        observe_neighbors(opened.access, fleet, seen, known, observations=observed, interrupt=opened.interrupt)
-        if seen
-        else observed
+    observations = observe_neighbors(
+        opened.access, fleet, seen, known, observations=observed, interrupt=opened.interrupt
     )
     return RunContext(
         fleet,

@@ -196,7 +196,8 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     report_ended(state, peer, now)
-    shared_at = pack_until(sender, topic.priority, now)
+    session = peer.session
+    shared_at = now if session is None else pack_until(sender, topic.priority, session.path.room_bytes, now)
     if shared_at <= now:
         state.ready[peer] = None
         state.arm(peer)

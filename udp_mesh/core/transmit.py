@@ -57,7 +57,7 @@ def flush_packed(state: State, now: float) -> None:
         return
     for peer in state.peer_table.peers.values():
         if peer.sender is not None and peer.sender.scheduler.waiting:
-            peer.sender.packed_at = _ALWAYS
+            peer.sender.packing.sent_at = _ALWAYS
             state.ready[peer] = None
     state.outgoing.extend(collect(state, now, None))
 
@@ -135,7 +135,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 out.append(Datagram(session.path.link, session.path.address, data, True))
             peers.append(peer)
             sender.wake_at = _INFINITY
-            sender.packing = 0
+            sender.packing.waiting = 0
             mask |= sender.scheduler.waiting
         else:
             del state.ready[peer]
@@ -174,7 +174,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             report_ended(state, peer, now)
         if room > 0:
             state.ready.pop(peer, None)
-            sender.app_limited = not sender.scheduler.waiting & ~sender.packing
+            sender.app_limited = not sender.scheduler.waiting & ~sender.packing.waiting
         if held & sender.scheduler.waiting:
             until = state.priority_backoff.held_until(now)
             if until is not None:

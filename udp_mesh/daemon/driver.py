@@ -145,9 +145,11 @@ class Driver:
         outcome = self.node.send(
             topic, payload, destination=destination, now=self._advance_clock(), type_name=type_name
         )
+        if self._pump_requested or self.closed:
+            return outcome
         if not self.node.is_quiet:
             self._schedule_pump()
-        elif not self._pump_requested and not self.closed and self.node.is_due_before(self._due):
+        elif self.node.is_due_before(self._due):
             self._reschedule()
         return outcome
 

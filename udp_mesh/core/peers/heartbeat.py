@@ -23,7 +23,7 @@ OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT
 
 def own_features(settings: Settings) -> int:
     """What this node announces."""
-    return int(OWN_FEATURES | Feature.CONFIRM if settings.confirms else OWN_FEATURES)
+    return OWN_FEATURES | Feature.CONFIRM if settings.confirms else OWN_FEATURES
 
 
 REPLY_WITHIN_S = 0.1

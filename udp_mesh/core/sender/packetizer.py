@@ -68,15 +68,14 @@ def send_level(
     urgent_level = priority <= sender.rates.urgent_priority
     level_pace = sender.congestion.pacing_packets_per_s()
     used = 0
-    sender.room_bytes = path.room_bytes
     snapshot = sender.snapshot(now, urgent=urgent_level)
     while used < room_bytes:
         run = sender.scheduler.peek(priority)
         if run is None:
             break
-        if not urgent_level and (shared_at := pack_until(sender, priority, now)) > now:
+        if not urgent_level and (shared_at := pack_until(sender, priority, path.room_bytes, now)) > now:
             sender.wake_at = min(sender.wake_at, shared_at)
-            sender.packing |= 1 << priority
+            sender.packing.waiting |= 1 << priority
             break
         urgent = urgent_level and not run.stale
         pace = None if urgent else level_pace
@@ -101,7 +100,7 @@ def send_level(
             continue
         if not message.started:
             _begin(sender, path, message)
-            run = run._replace(length=message.fragments)
+            run = Run(message, 0, message.fragments, retransmit=False, stale=run.stale)
         before = used
         is_plain = bucket is None and message.accepted.broadcast_number is None
         if run.position and run.length > 2 and quota > 1 and is_plain:
@@ -250,8 +249,8 @@ def _send_datagram(
             break
         next_run, size = _next_small(sender, path, priority, room, now)
     sender.retransmitted += retransmitted
-    if not urgent and (len(fragments) > 1 or room > path.room_bytes // 2):
-        sender.packed_at, sender.packs = now, len(fragments) > 1
+    if not urgent:
+        sender.packing.on_sent(len(fragments), has_room=room > path.room_bytes // 2, now=now)
     return _seal_datagram(sender, path, fragments, frames, snapshot, out, urgent=urgent)
 
 
@@ -284,7 +283,7 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float
         if len(run.message.body) > room:
             return None, 0
         _begin(sender, path, run.message)
-        run = run._replace(length=run.message.fragments)
+        run = Run(run.message, 0, run.message.fragments, retransmit=False, stale=run.stale)
     size = _fragment_frame_bytes(sender, path, run, now)
     return (run, size) if size <= room else (None, 0)
 

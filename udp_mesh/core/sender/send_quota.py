@@ -105,20 +105,22 @@ def _late_at(sender: Sender) -> float:
     return sender.last_progress + max(LATE_AFTER_S, spacing_s)
 
 
-def pack_until(sender: Sender, priority: int, now: float) -> float:
-    """Until when the small messages of this level wait for others to share their datagram; `now`: they do not.
+def pack_until(sender: Sender, priority: int, room_bytes: int, now: float) -> float:
+    """Until when the small messages of this level wait for others to share their datagram, which holds `room_bytes` of
+    frames; `now`: they do not.
 
     As with Nagle's algorithm (RFC 896), a message is sent at once while none before it is in flight, so a lone one, and
     one that follows the acknowledgement of the last, never wait. In a stream, each datagram is followed by `pack_s`
     without another, unless one is full.
     """
-    until = sender.packed_at + sender.rates.pack_s
+    packing = sender.packing
+    until = packing.sent_at + sender.rates.pack_s
     if (
         until <= now
         or priority <= sender.rates.urgent_priority
-        or not (sender.packs or sender.in_flight.outstanding)
+        or not (packing.is_stream or sender.in_flight.outstanding)
         or sender.state is not SendState.ACTIVE
-        or sender.scheduler.fills(priority, sender.room_bytes)
+        or sender.scheduler.fills(priority, room_bytes)
     ):
         return now
     return until

@@ -18,6 +18,7 @@ from udp_mesh.core.congestion.pacer import Pacer
 from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.packing import Packing
 from udp_mesh.core.sender.pending import PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
@@ -105,14 +106,7 @@ class Sender(PendingMessages):
         """Packets sent since the last one that requested an immediate acknowledgement."""
         self.ack_requested_at = float("-inf")
         """When the end of the queue last requested one."""
-        self.packed_at = float("-inf")
-        """When the last datagram with room to spare was sent that was not urgent."""
-        self.packing = 0
-        """Mask of the levels whose messages wait to share a datagram: the application limits how much they send."""
-        self.packs = False
-        """That datagram held several messages: more of them are likely to come."""
-        self.room_bytes = 0
-        """Bytes of frames in a datagram of the path."""
+        self.packing = Packing()
         self.loss = 0.0
         self.send_twice = False
         """Loss was seen recently: small urgent messages are sent twice."""
