@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
 from udp_mesh.sim.links.bbr import Bbr
 from udp_mesh.sim.links.cubic import Cubic
@@ -60,8 +59,3 @@ FAMILIAR = (
 )
 
 CELLS = {cell.name: cell for cell in (*FAMILIAR, *UNFAMILIAR)}
-
-
-def shortened(cell: Cell, duration_s: float) -> Cell:
-    """The same link for less time."""
-    return replace(cell, duration_s=duration_s)

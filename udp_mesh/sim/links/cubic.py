@@ -29,7 +29,6 @@ class Cubic:
         self._w_max = 0.0
         self._prior_cwnd = 0.0
         self._epoch_at: float | None = None
-        self._epoch_cwnd = 0.0
         self._k_s = 0.0
         self._reno_cwnd = 0.0
         self._rtt_s = 0.0
@@ -59,7 +58,7 @@ class Cubic:
 
     def _begin_epoch(self, now: float) -> None:
         self._epoch_at = now
-        self._epoch_cwnd = self._reno_cwnd = self.cwnd
+        self._reno_cwnd = self.cwnd
         self._w_max = max(self._w_max, self.cwnd)
         self._k_s = ((self._w_max - self.cwnd) / C) ** (1 / 3)
 

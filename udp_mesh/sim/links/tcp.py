@@ -120,10 +120,6 @@ class TcpFlow:
     def in_flight(self) -> int:
         return len(self._in_flight)
 
-    @property
-    def smoothed_rtt_s(self) -> float | None:
-        return self._smoothed_rtt_s
-
     # Sender
 
     def _send(self) -> None:
