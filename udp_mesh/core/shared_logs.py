@@ -32,12 +32,17 @@ from udp_mesh.core.logs.messages import CONTROL_TOPIC
 from udp_mesh.core.logs.replicator import Replicator
 from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.logs.topics import is_log_traffic, log_of
+from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
+from udp_mesh.core.peers.session import Session
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.core.state import State
 from udp_mesh.wire.frames import Feature
 
 SYNC_S = 1.0
 """Interval at which peers are checked for a changed feature: a running node may get its first log."""
+
+SILENT_S = 3.5
+"""A peer not heard for this long is probably out of reach, long before it is offline: robots meet for seconds."""
 
 
 class SharedLogs:
@@ -149,19 +154,27 @@ class SharedLogs:
                 pass
         self._events.emit(event)
 
-    def _has_logs(self, name: str) -> bool:
+    def _session(self, name: str) -> Session | None:
+        """The session of an online peer that takes part in logs."""
         peer = self._state.peer_table.peers.get(name)
-        return (
-            peer is not None and peer.online and peer.session is not None and bool(peer.session.features & Feature.LOGS)
-        )
+        if peer is None or not peer.online or peer.session is None or not peer.session.features & Feature.LOGS:
+            return None
+        return peer.session
+
+    def _has_logs(self, name: str) -> bool:
+        return self._session(name) is not None
 
     def _sync(self, now: float) -> None:
         for peer in self._state.peer_table.online():
             if peer.name not in self.replicator.peers and self._has_logs(peer.name):
                 self.replicator.peer_online(peer.name, now)
         for name in list(self.replicator.peers):
-            if not self._has_logs(name):
+            session = self._session(name)
+            if session is None:
                 self.replicator.peer_offline(name)
+            else:
+                silent_s = max(SILENT_S, MISSED_HEARTBEATS * session.interval_s)
+                self.replicator.peer_silent(name, now - session.last_heard > silent_s)
 
     def _send(self, topic: str, payload: bytes, destination: str | None, now: float) -> MessageId | Rejected:
         return publish.send(self._state, topic, payload, destination, "", now)

@@ -98,6 +98,8 @@ class PeerView:
     """It has not been told what this node holds."""
     asked: bool = False
     """It was asked what it holds."""
+    silent: bool = False
+    """Nothing was heard from it for a while: it is online, but probably out of reach already."""
 
     def set_held(self, entry: HaveEntry) -> RangeSet:
         """Replace what it holds of one log; returns what is new."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 
+from udp_mesh.core.logs.knowledge import PeerView
 from udp_mesh.core.logs.retention import Shelf
 from udp_mesh.core.settings import Log, Topic
 
@@ -11,7 +12,7 @@ from udp_mesh.core.settings import Log, Topic
 class Policy:
     """`shelves` and `peers` are those of the `Replicator`, as they change."""
 
-    def __init__(self, name: str, shelves: Mapping[str, Shelf], peers: Container[str]) -> None:
+    def __init__(self, name: str, shelves: Mapping[str, Shelf], peers: Mapping[str, PeerView]) -> None:
         self.name = name
         self.topics: dict[str, Topic] = {}
         self._shelves = shelves
@@ -32,8 +33,9 @@ class Policy:
         return not readers or self.name in readers
 
     def reader_online(self, topic: str, excluding: str = "") -> bool:
-        """Whether a named reader, other than this node and `excluding`, is online here."""
-        return any(name in self._peers for name in self.readers(topic) if name not in (self.name, excluding))
+        """Whether a named reader, other than this node and `excluding`, is in reach."""
+        others = (name for name in self.readers(topic) if name not in (self.name, excluding))
+        return any(name in self._peers and not self._peers[name].silent for name in others)
 
     def copies(self, topic: str) -> int:
         """How many nodes in reach of each other carry an item, besides its source and readers."""

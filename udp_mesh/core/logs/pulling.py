@@ -167,7 +167,11 @@ class Pulling:
         """`skip`, with what a node that only carries leaves alone."""
         key, topic = state.key, state.key.topic
         read = state.read_by_all(policy.readers(topic))
-        carriers = [view.held[key] for peer, view in peers.items() if peer != key.source and key in view.held]
+        carriers = [
+            view.held[key]
+            for peer, view in peers.items()
+            if peer != key.source and key in view.held and not view.silent
+        ]
         enough = in_at_least(policy.copies(topic), carriers)
         return as_set([*skip.ranges(), *read.ranges(), *enough.ranges()])
 
@@ -233,7 +237,7 @@ def missing(state: LogState, held: RangeSet, skip: RangeSet, limit: int) -> list
 
 def _holders(peers: Mapping[str, PeerView], log: LogKey, counts: Mapping[str, int]) -> Iterable[tuple[str, RangeSet]]:
     """The peers that hold something of a log: its source first, then those with the fewest open requests."""
-    holders = [(name, view.held[log]) for name, view in peers.items() if log in view.held]
+    holders = [(name, view.held[log]) for name, view in peers.items() if log in view.held and not view.silent]
     return sorted(holders, key=lambda holder: (holder[0] != log.source, counts.get(holder[0], 0), holder[0]))
 
 

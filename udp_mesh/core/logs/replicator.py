@@ -9,15 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from udp_mesh.core.events import (
-    Event,
-    ExpiryReason,
-    LogItemDropped,
-    MessageId,
-    Receipt,
-    Rejected,
-    RejectReason,
-)
+from udp_mesh.core.events import Event, ExpiryReason, LogItemDropped, MessageId, Receipt, Rejected, RejectReason
 from udp_mesh.core.logs.announcements import Announcements
 from udp_mesh.core.logs.conditions import LogConditions, conditions_of
 from udp_mesh.core.logs.delivery import Deliveries
@@ -64,7 +56,7 @@ class Replicator:
         self._pulling = Pulling()
         self._announcements = Announcements(send, self._entry, now)
         self._outcomes = Outcomes(emit)
-        self._deliveries = Deliveries(emit, self._taken, confirms=settings.confirms)
+        self._deliveries = Deliveries(emit, store, self._completed.append, self._taken, confirms=settings.confirms)
         self._maintain_at = now + MAINTENANCE_S
         self._run_soon = False
         self.rejected_items = 0
@@ -92,7 +84,7 @@ class Replicator:
             held = HeldItem(stored.size_bytes, now - stored.age_s, stored.taken)
             self.shelves[stored.id.log.topic].add(stored.id, held)
             if not stored.taken:
-                self._deliver_stored(stored.id)
+                self._deliveries.again(stored.id)
         for state in self.logs.values():
             if self.policy.is_reader(state.key.topic):
                 state.add_reader(self.policy.name, tuple(state.received.ranges()))
@@ -170,10 +162,9 @@ class Replicator:
         self._deliveries.confirm(receipt)
 
     def request_again(self, receipt: Receipt) -> None:
-        """A local program could not keep an item: deliver it again."""
-        item = self._deliveries.returned(receipt)
-        if item is not None:
-            self._completed.append(lambda now: self._deliver(item))
+        """No local program took an item: deliver it again."""
+        self._deliveries.returned(receipt)
+        self._run_soon = True
 
     def _taken(self, item: ItemId) -> None:
         held = self.shelves[item.log.topic].items.get(item) if item.log.topic in self.shelves else None
@@ -188,15 +179,11 @@ class Replicator:
         if topic is not None:
             self._deliveries.deliver(item, topic.priority)
 
-    def _deliver_stored(self, item: ItemId) -> None:
-        """Deliver an item that no program has taken in an earlier run."""
-
-        def done(data: bytes | None) -> None:
-            self._completed.append(lambda now: self._read_for_delivery(item, data, now))
-
-        self._store.get(item, done)
-
-    def _read_for_delivery(self, item: ItemId, data: bytes | None, now: float) -> None:
+    def _deliver_read(self, item: ItemId, data: bytes | None, now: float) -> None:
+        """Deliver an item that was read from the store."""
+        self._run_soon = True
+        if item.log.topic not in self.shelves or item not in self.shelves[item.log.topic].items:
+            return
         try:
             if data is None:
                 raise DecodeError("the disk does not return it")
@@ -208,7 +195,7 @@ class Replicator:
 
     def peer_online(self, peer: str, now: float) -> None:
         """A peer with logs is online, or began a new run."""
-        self.peer_offline(peer)
+        self._pulling.requests.forget(peer)
         self.peers[peer] = PeerView()
         for key in self.logs:
             if peer in self.policy.readers(key.topic):
@@ -223,6 +210,14 @@ class Replicator:
             self._serving.peer_offline(peer)
             self._run_soon = True
 
+    def peer_silent(self, peer: str, silent: bool) -> None:
+        """Nothing was heard from the peer for a while, or it is heard again: request from whom is in reach."""
+        view = self.peers[peer]
+        if view.silent is not silent:
+            view.silent = silent
+            self._pulling.requests.forget(peer)
+            self._run_soon = True
+
     def on_control(self, peer: str, payload: bytes, now: float) -> None:
         """A `Have` or `ItemRequest` of a peer. Malformed ones are counted."""
         view = self.peers.get(peer)
@@ -231,22 +226,26 @@ class Replicator:
         except DecodeError:
             self.rejected_items += 1
             return
-        if view is None:
-            return
         match message:
-            case Have():
+            case Have() if view is not None:
                 self._on_have(peer, view, message, now)
             case ItemRequest():
+                # Even from a peer that is not online here yet: it hears us.
                 for key, ranges in message.entries:
                     self._on_request(peer, view, key, ranges)
+            case _:
+                return
         self._run_soon = True
 
     def _on_have(self, peer: str, view: PeerView, message: Have, now: float) -> None:
+        view.silent = False
         if message.complete:
             view.held.clear()
             view.reader_online.clear()
         if message.asks:
+            # What was requested before may not have reached it.
             view.needs_all = True
+            self._pulling.requests.forget(peer)
         for entry in message.entries:
             state = self._log(entry.log)
             if state is None:
@@ -260,7 +259,7 @@ class Replicator:
                 self._outcomes.report(state, before, peer, new, self.policy.readers(entry.log.topic), now)
             self._pulling.requests.keep_only(peer, entry.log, as_set(entry.held))
 
-    def _on_request(self, peer: str, view: PeerView, key: LogKey, ranges: tuple[tuple[int, int], ...]) -> None:
+    def _on_request(self, peer: str, view: PeerView | None, key: LogKey, ranges: tuple[tuple[int, int], ...]) -> None:
         state = self.logs.get(key)
         if state is None:
             return
@@ -272,7 +271,7 @@ class Replicator:
             for number in range(first, last + 1):
                 if not self._serving.request(peer, ItemId(key, number)):
                     return
-        if available.count < wanted.held.count:
+        if view is not None and available.count < wanted.held.count:
             # Something was dropped meanwhile: tell what is left.
             view.needs_all = True
 
@@ -384,6 +383,7 @@ class Replicator:
             for topic in self.policy.topics:
                 for item in self.shelves[topic].too_old(now):
                     self._drop(item, ExpiryReason.TOO_OLD, now)
+        self._deliveries.run(self._deliver_read)
         self._announcements.run(self.logs, self.peers, now)
         for peer, message in self._pulling.plan(self.logs, self.peers, self.policy, now):
             self._send(CONTROL_TOPIC, encode_control(message), peer, now)
