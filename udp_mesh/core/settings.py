@@ -90,7 +90,7 @@ class Log:
 
     `readers` are the nodes whose programs get the items (empty: all nodes with the topic). Each node keeps the newest
     items up to `max_items`, `max_bytes` and `max_age_s` (None: no limit), counted from when it stored them. `copies` is
-    how many nodes that reach each other carry an item, besides its source and readers (0: nobody carries).
+    how many nodes that reach each other carry an item, besides its source and readers (0: none).
     """
 
     readers: tuple[str, ...] = ()

@@ -1,6 +1,6 @@
 """Signatures of log items (Ed25519, RFC 8032): each log has a key pair of its own, and its public key names it.
 
-Whoever relays an item can verify it and cannot change it, even with the fleet's key; rotating that key leaves stored
+A node that relays an item can verify it and cannot change it, even with the fleet's key; rotating that key leaves stored
 items valid.
 """
 

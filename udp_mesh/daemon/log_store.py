@@ -267,7 +267,7 @@ class SqliteLogStore:
 
         assert self._loop is not None
         with contextlib.suppress(RuntimeError):
-            # The loop is closed: nobody waits for the results.
+            # The loop is closed: no caller waits for the results.
             self._loop.call_soon_threadsafe(report)
 
 

@@ -155,4 +155,4 @@ class TopicDocument(Document):
     repair: Flag = False
     """Let receivers request lost broadcasts again."""
     log: TopicLogDocument = NOT_WRITTEN
-    """Make the topic a shared log: other robots, too, pass its messages on to the destinations. `{}` for the defaults."""
+    """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""

@@ -1,6 +1,6 @@
 """Shared logs: items that reach their readers through any node that meets both sides.
 
-A topic with a `Log` is a log. Each source numbers its items; nodes tell each other which items they hold (`messages`),
+A topic with a `Log` is a log. Each source numbers its items; nodes announce which items they hold (`messages`),
 request what they lack from anyone who has it, and keep it on disk within the topic's retention. In this order:
 
 1. `replicator.Replicator.append` signs and stores an item (`item`) and announces it once it is on disk.

@@ -1,4 +1,4 @@
-"""What this node tells its peers about the items it holds: changes soon, everything at a meeting and now and then."""
+"""Announces to peers which items this node holds: changes soon, everything at a meeting and once a minute."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NEVER = float("inf")
 
 
 class Announcements:
-    """`entry(log, peer)` is what to tell a peer of a log (None: nothing, its topic is no log any more)."""
+    """`entry(log, peer)` is what to announce of a log (None: nothing, because its topic is no longer a log)."""
 
     def __init__(self, send: Send, entry: Callable[[LogKey, str], HaveEntry | None], now: float) -> None:
         self._send = send
@@ -35,8 +35,8 @@ class Announcements:
         return min(self._announce_at, self._complete_at)
 
     def note(self, log: LogKey, now: float, *, heard: bool = False) -> None:
-        """Something about this log changed; `heard`: only what its readers have, as others tell. Peers with a reader
-        in reach hear that from the reader itself."""
+        """Something about this log changed; `heard`: only what its readers have, as reported by others. Peers with a
+        reader in reach hear that from the reader itself."""
         self._changed[log] = heard and self._changed.get(log, True)
         self._announce_at = min(self._announce_at, max(now + GATHER_S, self._announced_at + INTERVAL_S))
 

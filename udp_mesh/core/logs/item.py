@@ -37,7 +37,7 @@ class LogKey(NamedTuple):
 
 
 class ItemId(NamedTuple):
-    """Names one item in the whole fleet, for ever."""
+    """Identifies one item in the whole fleet."""
 
     log: LogKey
     number: int

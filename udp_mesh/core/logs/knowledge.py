@@ -79,7 +79,7 @@ class LogState:
         return common
 
     def entry(self, readers: tuple[str, ...], *, reader_online: bool) -> HaveEntry:
-        """What this node tells others."""
+        """What this node announces."""
         holders = tuple(
             Holder(name, tuple(have.ranges()))
             for name, have in sorted(self.readers.items())
@@ -95,7 +95,7 @@ class PeerView:
     held: dict[LogKey, RangeSet] = field(default_factory=dict)
     reader_online: set[LogKey] = field(default_factory=set)
     needs_all: bool = True
-    """It has not been told what this node holds."""
+    """This node has not announced to it what it holds."""
     asked: bool = False
     """It was asked what it holds."""
     silent: bool = False

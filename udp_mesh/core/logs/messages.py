@@ -1,4 +1,4 @@
-"""What log nodes tell each other: `Have` (what the sender holds and what readers have) and `ItemRequest` (a request).
+"""The control messages of log nodes: `Have` (what the sender holds and what readers have) and `ItemRequest` (a request).
 
 Both travel as messages of the reserved topic `CONTROL_TOPIC`, items as messages of `item_topic(topic)`: the transport's
 priorities, acknowledgements and encryption apply to them. Each list and range is bounded; a decoder returns a value or
@@ -59,7 +59,7 @@ class Holder(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class HaveEntry:
-    """One log. `held` replaces what the sender told before; `readers` only adds to it."""
+    """One log. `held` replaces what the sender listed before; `readers` only adds to it."""
 
     log: LogKey
     held: Ranges

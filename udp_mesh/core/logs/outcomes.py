@@ -1,4 +1,4 @@
-"""Which readers and carriers have this node's own items: told to the program that published them, once each."""
+"""Which readers and carriers have this node's own items: reported once each to the program that published them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Outcomes:
             del self._published[next(iter(self._published))]
 
     def drop(self, item: ItemId) -> None:
-        """The item was dropped; whoever has it may still deliver it."""
+        """The item was dropped here; other nodes may still deliver it."""
         self._published.pop(item, None)
 
     def report(

@@ -51,7 +51,7 @@ class Requests:
         self.counts[peer] = self.counts.get(peer, 0) + 1
 
     def received(self, item: ItemId, now: float) -> None:
-        """The item came, from whomever."""
+        """The item came, from this or another peer."""
         peer = self.items.pop(item, None)
         if peer is not None:
             self.counts[peer] -= 1

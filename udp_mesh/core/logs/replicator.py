@@ -272,7 +272,7 @@ class Replicator:
                 if not self._serving.request(peer, ItemId(key, number)):
                     return
         if view is not None and available.count < wanted.held.count:
-            # Something was dropped meanwhile: tell what is left.
+            # Something was dropped meanwhile: list what is left.
             view.needs_all = True
 
     def on_item(self, peer: str, topic: str, payload: bytes, now: float) -> None:
@@ -363,7 +363,7 @@ class Replicator:
         self._announcements.note(item.log, now)
 
     def _entry(self, key: LogKey, peer: str) -> HaveEntry | None:
-        """What a peer is told of a log."""
+        """What is announced of a log to a peer."""
         if key.topic not in self.policy.topics:
             return None
         online = self.policy.reader_online(key.topic, excluding=peer)

@@ -24,7 +24,7 @@ class HeldItem:
 
 
 class Shelf:
-    """The held items of one topic. `is_read` tells whether all readers are known to have an item, `is_own` whether this
+    """The held items of one topic. `is_read` says whether all readers are known to have an item, `is_own` whether this
     node is its source."""
 
     def __init__(self, log: Log, is_read: Callable[[ItemId], bool], is_own: Callable[[ItemId], bool]) -> None:

@@ -11,8 +11,8 @@ _ITEMS = f"{LOG_PREFIX}/"
 
 
 def with_log_topics(settings: Settings) -> Settings:
-    """The settings with the reserved topics of its logs. Items have their log's priority and rate limit; what nodes
-    tell each other about logs is as urgent as the most urgent of them."""
+    """The settings with the reserved topics of its logs. Items have their log's priority and rate limit; control
+    messages are as urgent as the most urgent of them."""
     logs = [topic for topic in settings.topics if topic.log is not None]
     if not logs:
         return settings

@@ -40,7 +40,7 @@ def test_an_item_cannot_be_moved_to_another_topic() -> None:
         decode_item("estop", encode_item(KEY, ITEM))
 
 
-def test_nobody_else_can_sign_for_a_log() -> None:
+def test_only_the_owner_of_a_log_can_sign_for_it() -> None:
     with pytest.raises(ValueError, match="does not belong"):
         encode_item(SigningKey(bytes(32)), ITEM)
 

@@ -64,7 +64,7 @@ class Liar(LogTeam):
         self.connect("base", "mallory")
         self.run(3)
 
-    def tell(self, topic: str, payload: bytes) -> None:
+    def submit(self, topic: str, payload: bytes) -> None:
         self.send("mallory", topic, payload, "base")
         self.run(0.5)
 
@@ -82,8 +82,8 @@ def test_forged_items_are_refused() -> None:
         bytes([signed[0] ^ 1]) + signed[1:],
         random.Random(1).randbytes(200),
     ):
-        team.tell(item_topic("artifact"), data)
-    team.tell(item_topic("unknown"), signed)
+        team.submit(item_topic("artifact"), data)
+    team.submit(item_topic("unknown"), signed)
     assert team.read("base") == []
     assert team.stores["base"].items == {}
 
@@ -93,8 +93,8 @@ def test_invented_numbers_cost_little_and_block_nothing() -> None:
     log = LogKey("artifact", "spot", bytes(32))
     everything = encode_control(Have((HaveEntry(log, ((1, (1 << 32) - 1),)),), complete=True))
     for _ in range(50):
-        team.tell(CONTROL_TOPIC, everything)
-        team.tell(CONTROL_TOPIC, encode_control(ItemRequest(((log, ((1, 4_000_000_000),)),))))
+        team.submit(CONTROL_TOPIC, everything)
+        team.submit(CONTROL_TOPIC, encode_control(ItemRequest(((log, ((1, 4_000_000_000),)),))))
     team.start("spot")
     team.connect("base", "spot")
     team.publish("spot", b"real")
@@ -106,5 +106,5 @@ def test_random_control_messages_are_counted() -> None:
     team = Liar()
     rng = random.Random(2)
     for _ in range(40):
-        team.tell(CONTROL_TOPIC, bytes((rng.choice((1, 2)),)) + rng.randbytes(rng.randint(0, 60)))
+        team.submit(CONTROL_TOPIC, bytes((rng.choice((1, 2)),)) + rng.randbytes(rng.randint(0, 60)))
     assert list(team.events_of("base", MessageReceived)) == []
