@@ -1,7 +1,7 @@
 """Signatures of log items (Ed25519, RFC 8032): each log has a key pair of its own, and its public key names it.
 
-A node that relays an item can verify it and cannot change it, even with the fleet's key; rotating that key leaves stored
-items valid.
+A node that relays an item can verify it and cannot change it, even with the fleet's key; rotating that key leaves
+stored items valid.
 """
 
 from __future__ import annotations

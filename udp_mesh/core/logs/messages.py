@@ -1,4 +1,4 @@
-"""The control messages of log nodes: `Have` (what the sender holds and what readers have) and `ItemRequest` (a request).
+"""The control messages of log nodes: `Have` (what the sender holds and what readers have) and `ItemRequest`.
 
 Both travel as messages of the reserved topic `CONTROL_TOPIC`, items as messages of `item_topic(topic)`: the transport's
 priorities, acknowledgements and encryption apply to them. Each list and range is bounded; a decoder returns a value or
