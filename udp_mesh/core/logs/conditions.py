@@ -11,7 +11,7 @@ from udp_mesh.core.logs.retention import Shelf
 
 @dataclass(frozen=True, slots=True)
 class LogHolder:
-    """One node that has items of a log: a reader (even if it dropped them since), or an online peer that carries them."""
+    """A node that has items of a log: a reader (even if it dropped them since), or an online peer that carries them."""
 
     name: str
     reader: bool
