@@ -105,7 +105,7 @@ def _report(path: Path, page: Path | None = None) -> int:
             sys.stdout.write(json.dumps(record, indent=1) + "\n")
     bad = [record for record in cases if not record["holds"]]
     bad += [record for record in records if record["part"] == "crowd" and (record["wrong"] or record["not new"])]
-    sys.stdout.write(f"{len(cases)} cases, {len(bad)} do not hold\n")
+    sys.stdout.write(f"{len(cases)} cases, {len(bad)} failed\n")
     return 1 if bad else 0
 
 
