@@ -24,7 +24,7 @@ def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[
             case Verdict.SAME:
                 what = "it matches the inventory"
             case Verdict.CHANGE:
-                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and will be changed again"
+                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and will change again"
             case Verdict.REFUSED:
                 what = f"it answers and is refused: {plan.reason}"
             case Verdict.AWAY:

@@ -27,7 +27,7 @@ def prepared(verdict: Verdict) -> Prepared:
     ("verdict", "text"),
     [
         (Verdict.SAME, "now it matches the inventory"),
-        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and will be changed again"),
+        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and will change again"),
         (Verdict.REFUSED, "now it answers and is refused: no board"),
         (Verdict.AWAY, "now it is still unreachable"),
     ],
