@@ -1,7 +1,7 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and says with which `--first` the next call
-goes on. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
+Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and prints the `--first` with which the
+next call continues. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
 """
 
 from __future__ import annotations

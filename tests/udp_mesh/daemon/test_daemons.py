@@ -125,7 +125,7 @@ def test_a_client_that_sends_garbage_does_not_disturb_others(pair: Pair, raw: by
         client.request("peers")
 
 
-def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: Pair) -> None:
+def test_a_message_above_the_limit_is_refused_and_the_connection_continues(pair: Pair) -> None:
     alice, bob = pair
     limit = Limits().message_bytes
     with alice.client() as sender, bob.client() as receiver:
