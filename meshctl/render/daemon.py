@@ -208,7 +208,7 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
 
 
 def _log(topic: Topic, log: TopicLog) -> Iterator[str]:
-    """A log's readers are the topic's destinations, whoever is its source."""
+    """A log's readers are the topic's destinations, on every robot."""
     if topic.rate_limit_bytes_per_s is not None:
         yield f"rate_limit_bytes_per_s = {topic.rate_limit_bytes_per_s}"
     if topic.compression:

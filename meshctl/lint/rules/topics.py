@@ -391,11 +391,7 @@ def log_contradicted(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for key, found, is_set in (
             ("reliable", "false", not topic.reliable),
             ("keep_last", str(topic.keep_last), bool(topic.keep_last)),
-            (
-                "deadline_s",
-                f"{topic.deadline_s:g}" if topic.deadline_s is not None else "",
-                topic.deadline_s is not None,
-            ),
+            ("deadline_s", f"{topic.deadline_s} s", topic.deadline_s is not None),
             ("outbox", topic.outbox.value, topic.outbox is not Outbox.NONE),
             ("repair", "true", topic.repair),
         ):

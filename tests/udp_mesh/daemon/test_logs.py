@@ -93,7 +93,7 @@ def test_items_reach_a_base_that_their_source_never_meets() -> None:
         assert "base 13" in shown
 
 
-def test_a_publisher_is_told_who_has_its_item() -> None:
+def test_a_publisher_learns_who_has_its_item() -> None:
     with team() as members:
         members["spot"].start()
         members["husky"].start()
