@@ -28,6 +28,7 @@ from udp_mesh.daemon.neighbours import (
     parse_address,
     read_neighbour,
 )
+from udp_mesh.daemon.position_requests import publish_meter, set_position
 from udp_mesh.daemon.service import Service
 from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_json, topics_json
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
@@ -182,6 +183,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
         "conditions": conditions_json(driver.conditions()),
+        "positions": service.positions.json(),
     }
 
 
@@ -351,6 +353,8 @@ COMMANDS = {
     "drop-topic": drop_topic,
     "set-window": set_window,
     "set-rates": set_rates,
+    "set-position": set_position,
+    "publish-meter": publish_meter,
     "set-neighbour": set_neighbour,
     "drop-neighbour": drop_neighbour,
     "neighbours": neighbours,

@@ -28,7 +28,14 @@ from udp_mesh.core.settings import (
 )
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.file_access import is_exposed, read_regular
-from udp_mesh.daemon.interface import BENCH_TOPIC, DEFAULT_SOCKET, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
+from udp_mesh.daemon.interface import (
+    BENCH_TOPIC,
+    DEFAULT_SOCKET,
+    PING_TOPIC,
+    PONG_TOPIC,
+    POSITION_TOPIC,
+    RESERVED_PREFIX,
+)
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
     TOPIC_NAME,
@@ -37,6 +44,14 @@ from udp_mesh.daemon.neighbours import (
     parse_address,
     read_link,
     read_neighbours,
+)
+from udp_mesh.daemon.positions import (
+    DEFAULT_FRAME,
+    MAX_COORDINATE_M,
+    MAX_FRAME_BYTES,
+    Position,
+    PositionSource,
+    is_frame,
 )
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
@@ -56,6 +71,8 @@ RESERVED_TOPICS = (
     Topic(PING_TOPIC, priority=0, deadline_s=10.0),
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
     Topic(BENCH_TOPIC, priority=15, reliable=True),
+    # The next one comes in seconds: a lost one is not sent again, an old one not at all.
+    Topic(POSITION_TOPIC, priority=13, reliable=False, keep_last=1, deadline_s=5.0),
 )
 
 
@@ -87,6 +104,8 @@ class Configuration:
     settings: Settings
     links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
+    position: Position | None = None
+    """The fixed position of a node that does not move."""
     file: Path | None = None
 
 
@@ -179,6 +198,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
     neighbours = read_neighbours(top, port)
     rates, limits = read_rates(top.table("rates")), _read_limits(top.table("limits"))
     daemon = _read_daemon(top.table("daemon"))
+    position = _read_position(top.table("position")) if top.has("position") else None
     top.finish()
     if source.problems:
         raise ConfigurationError(sorted(source.problems, key=lambda problem: problem.line))
@@ -199,7 +219,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
         )
     except ValueError as error:
         raise ConfigurationError([problem_from(source, error)]) from error
-    return Configuration(settings, links, daemon)
+    return Configuration(settings, links, daemon, position)
 
 
 def _window(packets: int | None) -> Literal["adaptive"] | int:
@@ -316,6 +336,20 @@ def _read_daemon(table: Table) -> DaemonSettings:
     )
     table.finish()
     return settings
+
+
+def _read_position(table: Table) -> Position:
+    """`x_m`, `y_m` and optional `z_m` and `frame`."""
+    high = MAX_COORDINATE_M
+    for key in ("x_m", "y_m"):
+        if not table.has(key):
+            table.source.report((*table.path, key), "a number of meters", "none")
+    frame = table.text("frame", DEFAULT_FRAME) or ""
+    if not is_frame(frame):
+        table.report("frame", f"a name of 1 to {MAX_FRAME_BYTES} bytes without spaces", frame)
+    x_m, y_m, z_m = (table.number(key, None, -high, high) for key in ("x_m", "y_m", "z_m"))
+    table.finish()
+    return Position(x_m or 0.0, y_m or 0.0, z_m, frame, 0.0, PositionSource.CONFIGURATION)
 
 
 def _read_path(table: Table, key: str, default: Path) -> Path:

@@ -7,6 +7,7 @@ replacing it would make some file systems write it at once.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import os
@@ -20,6 +21,24 @@ from udp_mesh.wire.limits import MAX_LEGACY_FRAGMENTS
 log = logging.getLogger(__name__)
 
 MAX_FILE_BYTES = 1 << 20
+
+
+class LegacyPositions:
+    """The file, and what it holds."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.saved = load_positions(path)
+
+    async def save(self, positions: Mapping[str, ReceivePosition]) -> None:
+        """Saves what was received from legacy peers, if it changed."""
+        if positions == self.saved:
+            return
+        self.saved = dict(positions)
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
+        except OSError as error:
+            log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)
 
 
 def load_positions(path: Path) -> dict[str, ReceivePosition]:

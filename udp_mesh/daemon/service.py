@@ -33,8 +33,9 @@ from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
-from udp_mesh.daemon.legacy_positions import load_positions, save_positions
+from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
+from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
 from udp_mesh.daemon.subscriptions import Subscriptions
@@ -61,8 +62,7 @@ class Service:
             configuration.daemon.state_directory / "outbox", configuration.daemon.outbox_disk_bytes
         )
         self._flusher = Flusher(self.store)
-        self._positions_file = configuration.daemon.state_directory / "legacy-positions.json"
-        self._positions = load_positions(self._positions_file)
+        self._legacy = LegacyPositions(configuration.daemon.state_directory / "legacy-positions.json")
         self.driver = Driver(
             configuration.settings,
             configuration.links,
@@ -70,7 +70,7 @@ class Service:
             rng=rng,
             on_event=self._event,
             store=self.store,
-            legacy_positions=self._positions,
+            legacy_positions=self._legacy.saved,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
         self.inbox = Inbox(
@@ -80,6 +80,9 @@ class Service:
         )
         self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
+        self.positions = PositionExchange(
+            self.driver, configuration.settings.name, configuration.position, lambda: self.recorder
+        )
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
@@ -101,16 +104,18 @@ class Service:
         if any(topic is not None and topic.outbox_on_disk for topic in topics):
             self.store.check_writable()
         self._publish_conditions()
+        self.positions.start()
 
     async def close(self) -> None:
         """Stops the driver, cancels waiting requests and ends the recording."""
         if self._conditions_timer is not None:
             self._conditions_timer.cancel()
+        self.positions.close()
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
-        await self._save_positions()
+        await self._legacy.save(self.driver.node.legacy_positions())
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
         await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
@@ -253,6 +258,9 @@ class Service:
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)
             changes.append("links")
+        if fresh.position != running.position:
+            self.positions.set_fixed(fresh.position)
+            changes.append("position")
         self.configuration = replace(fresh, settings=settings, daemon=running.daemon)
         return changes + notes
 
@@ -326,6 +334,8 @@ class Service:
             waiting = self._pings.get(event.payload)
             if waiting is not None and not waiting.done():
                 waiting.set_result(self.driver.now())
+        else:
+            self.positions.on_reserved_message(event)
 
     # Messages held until a program takes them
 
@@ -352,7 +362,7 @@ class Service:
         if self.store.needs_flush:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
-        self._spawn(self._save_positions())
+        self._spawn(self._legacy.save(self.driver.node.legacy_positions()))
         self.inbox.take_read()
         self.subscriptions.pass_on_held()
         clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
@@ -370,17 +380,6 @@ class Service:
             }
             for client in clients:
                 client.send_event(header)
-
-    async def _save_positions(self) -> None:
-        """Saves what was received from legacy peers, if there are any and it changed."""
-        positions = self.driver.node.legacy_positions()
-        if positions == self._positions:
-            return
-        self._positions = positions
-        try:
-            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._positions_file, positions)
-        except OSError as error:
-            log.warning("legacy-positions-not-saved path=%s error=%s", self._positions_file, error)
 
     def _count(self, topic: str) -> TopicCount:
         count = self.counts.get(topic)
