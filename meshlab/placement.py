@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 
+from meshctl.placement.path_loss import Point
 from meshlab import propagation_file
 from meshlab.errors import LabError
 from meshlab.fleet import VirtualFleet, VirtualNode
-from meshlab.propagation import Point, RadioEnvironment, links_of
+from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.state import Power
 
 _FILE_NAME = "ground.json"
