@@ -34,13 +34,20 @@ class Schema:
 
 
 class SqliteFile:
-    """The open file. Safe for several threads and processes."""
+    """The open file. Safe for several threads and processes; `read_only` neither creates nor changes it."""
 
-    def __init__(self, path: Path, schema: Schema) -> None:
+    def __init__(self, path: Path, schema: Schema, *, read_only: bool = False) -> None:
         """Open the file, or create it. Raises MeshctlError."""
         self.path = path
         self._schema = schema
         self._lock = threading.Lock()
+        if read_only:
+            self._open_read_only()
+        else:
+            self._open()
+
+    def _open(self) -> None:
+        path, schema = self.path, self._schema
         try:
             path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._database = sqlite3.connect(
@@ -62,6 +69,30 @@ class SqliteFile:
             what = f"cannot open the {schema.name}" if self._hint(error) else f"not a {schema.name} of meshctl"
             hint = self._hint(error) or "move the file away and run again"
             raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
+
+    def _open_read_only(self) -> None:
+        """Without changing anything, also where nothing can be written: there nobody else writes, either."""
+        error: Exception = MeshctlError("not opened")
+        for mode in ("mode=ro", "immutable=1"):
+            try:
+                uri = f"{self.path.resolve().as_uri()}?{mode}"
+                self._database = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+            except sqlite3.Error as failed:
+                error = failed
+                continue
+            try:
+                version = self._version()
+                self._database.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+            except sqlite3.Error as failed:
+                error = failed
+                self._database.close()
+                continue
+            if version == self._schema.version:
+                return
+            self._database.close()
+            error = MeshctlError(f"found version {version}, expected {self._schema.version}")
+            break
+        raise MeshctlError(f"{self.path}: cannot read as a {self._schema.name}: {error}") from error
 
     def _enter_wal(self) -> None:
         # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
