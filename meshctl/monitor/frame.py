@@ -147,8 +147,8 @@ def links_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "signal_dbm": heard.get("signal_dbm"),
                     "noise_dbm": heard.get("noise_dbm"),
                     "snr_db": heard.get("snr_db"),
-                    "mcs": heard.get("mcs"),
-                    "bitrate_kbit_s": heard.get("bitrate_kbit_s"),
+                    "mcs": heard.get("rx_mcs"),
+                    "bitrate_kbit_s": heard.get("rx_bitrate_kbit_s"),
                     "age_s": round(age_s + (heard.get("age_s") or 0.0), 3),
                 }
             )
