@@ -66,7 +66,7 @@ FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act ==
 	lost = 1 - $6 / 144.4
 	made = $7 > since[device " " $3] ? $7 : since[device " " $3]
 	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t%d\n\trx packets:\t%d\n\ttx bytes:\t%d\n\ttx packets:\t%d\n\ttx retries:\t%d\n\ttx failed:\t%d\n\trx drop misc:\t0\n", $3, device, $5 + ($8 ? (now - $8) * 1000 : 0), \
-		sent * 80, sent, sent * 80, sent, sent * lost / (1.01 - lost), sent * lost ^ 7
+		sent * 80, sent, sent * 80, sent, sent * lost / (1.01 - lost), sent * lost * lost * lost * lost * lost * lost * lost
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
 	printf "\ttx bitrate:\t%.1f MBit/s MCS %d short GI\n\trx bitrate:\t%.1f MBit/s MCS %d short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", rate_of(mcs), mcs, rate_of(mcs), mcs, $6 * 0.4, made ? now - made : uptime
 }
