@@ -65,8 +65,8 @@ def connect(
 ) -> SshConnection:
     """An authenticated connection to `endpoint`, through the node of `via` if given.
 
-    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; otherwise it is used only if the server offers nothing else
-    and the node's `release` is 19.07. `meter` counts the connection's bytes. Raises Unreachable, Timeout, ConnectionLost,
+    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; otherwise it is used only if the server offers nothing
+    else and the node's `release` is 19.07. `meter` counts its bytes. Raises Unreachable, Timeout, ConnectionLost,
     IncompatibleServer, HostKeyUnknown, HostKeyChanged, AuthenticationRefused, and InputError for an unusable key file.
     """
     limits = deadlines or Deadlines()
