@@ -71,7 +71,9 @@ class Frame:
         """The frame of a document with `time_s`; numbers that JSON lacks become null. Raises KeyError without it."""
         time_s = round(float(document["time_s"]), 3)
         finite = _finite({**document, "time_s": time_s})
-        return cls(time_s, json.dumps(finite, separators=(",", ":"), ensure_ascii=False))
+        text = json.dumps(finite, separators=(",", ":"), ensure_ascii=False)
+        # half of a surrogate pair is no character, and no encoding has it
+        return cls(time_s, text.encode("utf-8", "replace").decode())
 
     @property
     def document(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import os
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,16 @@ from meshctl.monitor.alarm_log import (
     reported_alarms,
 )
 from meshctl.monitor.frame import Frame
-from meshctl.monitor.history_file import ALARM_COLUMNS, LOG_ALARM, LOG_BYTES, SCHEMA, alarm_of, milliseconds, row_of
+from meshctl.monitor.history_file import (
+    ALARM_COLUMNS,
+    LOG_ALARM,
+    LOG_BYTES,
+    SCHEMA,
+    alarm_of,
+    milliseconds,
+    row_of,
+    silence_of,
+)
 
 # Below this a frame of a large fleet and its indexes would not fit.
 MIN_BYTES = 8 << 20
@@ -147,7 +156,17 @@ class FrameStore:
                 self.problem = ""
                 self._unwritten = None
                 self._pending.clear()
-        return change.began
+        return self._with_silences(change.began, frame.time_s)
+
+    def _with_silences(self, alarms: tuple[LoggedAlarm, ...], now_s: float) -> tuple[LoggedAlarm, ...]:
+        if not alarms:
+            return ()
+        try:
+            silences = self.silences(now_s)
+        except MeshctlError:
+            # better told twice than never
+            return alarms
+        return tuple(replace(alarm, silenced=silence_of(alarm.key, silences)) for alarm in alarms)
 
     def _follow(self, change: AlarmChange, now_s: float) -> None:
         self._open = dict(change.open)

@@ -160,6 +160,7 @@ def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
         drift=None if plan is None else tuple(change.path for change in plan.files),
         uptime_s=observed.uptime_s,
         load=None if observed.load is None else observed.load.minute / observed.load.processors,
+        processors=None if observed.load is None else observed.load.processors,
         memory_free=memory.available / memory.total if memory and memory.total else None,
         flash_free_bytes=observed.overlay.free if observed.overlay else None,
         clock_offset_s=observed.clock_offset_s,

@@ -68,6 +68,7 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         "drift": None if node.drift is None else list(node.drift),
         "uptime_s": node.uptime_s,
         "load": _rounded(node.load),
+        "processors": node.processors,
         "memory_free": _rounded(node.memory_free),
         "flash_free_bytes": node.flash_free_bytes,
         "clock_offset_s": _rounded(node.clock_offset_s),

@@ -122,6 +122,7 @@ class NodeStatus:
     uptime_s: float | None = None
     load: float | None = None
     """Load average over one minute, per processor."""
+    processors: int | None = None
     memory_free: float | None = None
     """Share of available memory, 0..1."""
     flash_free_bytes: int | None = None
