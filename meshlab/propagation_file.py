@@ -21,6 +21,8 @@ from meshlab.propagation import RadioEnvironment
 from meshlab.quality import TQ_MAX
 from meshlab.spec import LinkSpec
 
+FLEET_FILE = "ground.json"
+"""A running fleet's radio environment, in its directory."""
 _LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
 
 

@@ -49,6 +49,8 @@ COMMANDS: dict[str, Entry] = {
     "status": Entry("meshctl.cli.status", "status", "Show the fleet's state and alarms", _INSPECT),
     "preflight": Entry("meshctl.cli.status", "preflight", "Run the go/no-go checks before a mission", _INSPECT),
     "topology": Entry("meshctl.cli.topology", "topology", "Show the mesh topology", _INSPECT),
+    "meter": Entry("meshctl.cli.meter", "meter", "Show when a robot should drop its next beacon", _INSPECT),
+    "plan-placement": Entry("meshctl.cli.plan_placement", "plan_placement", "Plan beacons along a route", _INSPECT),
     "trust": Entry("meshctl.cli.ssh", "trust", "Pin the SSH host keys of nodes", _INSPECT),
     "run": Entry("meshctl.cli.ssh", "run", "Run a shell command on nodes", _INSPECT),
     "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _INSPECT),

@@ -179,7 +179,18 @@ def frame_loss(model: PathLossModel, strength_dbm: float) -> float:
 
 def walls_between(walls: Sequence[Wall], a: Point, b: Point) -> tuple[Wall, ...]:
     """The walls on the straight line between two points."""
-    return tuple(wall for wall in walls if _cross(a, b, wall.a, wall.b))
+    left, right = min(a[0], b[0]), max(a[0], b[0])
+    low, high = min(a[1], b[1]), max(a[1], b[1])
+    return tuple(
+        wall
+        for wall in walls
+        # most walls of a mine are elsewhere
+        if min(wall.a[0], wall.b[0]) <= right
+        and max(wall.a[0], wall.b[0]) >= left
+        and min(wall.a[1], wall.b[1]) <= high
+        and max(wall.a[1], wall.b[1]) >= low
+        and _cross(a, b, wall.a, wall.b)
+    )
 
 
 def wall_loss_db(walls: Sequence[Wall], a: Point, b: Point) -> float:

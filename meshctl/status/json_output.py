@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from meshctl.robots.facts import PositionFacts
 from meshctl.status.last_known import typed
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NodeStatus, RadioStatus, RobotStatus
@@ -125,6 +126,18 @@ def _radio(radio: RadioStatus) -> dict[str, Any]:
     }
 
 
+def _position(place: PositionFacts) -> dict[str, Any]:
+    return {
+        "name": place.name,
+        "x_m": _rounded(place.x_m),
+        "y_m": _rounded(place.y_m),
+        "z_m": _rounded(place.z_m),
+        "frame": place.frame,
+        "age_s": _rounded(place.age_s),
+        "source": place.source,
+    }
+
+
 def _robot(robot: RobotStatus) -> dict[str, Any]:
     base = {
         "name": robot.name,
@@ -142,7 +155,8 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
     }
     facts = robot.facts
     if facts is None:
-        return {**base, "computer": None, "daemon": None, "bridge": None, "peers": None, "queues": None, "topics": None}
+        nothing = ("computer", "daemon", "bridge", "peers", "position", "positions", "queues", "topics")
+        return {**base, **dict.fromkeys(nothing)}
     computer = facts.computer
     return {
         **base,
@@ -171,6 +185,8 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
             "unkeyed": facts.unkeyed,
         },
         "bridge": None if facts.bridge is None else {"service": facts.bridge.active or None},
+        "position": next((_position(one) for one in facts.positions if one.name == robot.name), None),
+        "positions": [_position(one) for one in facts.positions],
         "peers": [
             {
                 "name": peer.name,
