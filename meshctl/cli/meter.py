@@ -27,7 +27,8 @@ from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, carried_be
 from meshctl.placement.margin import MAX_SHARED_HOPS, required_snr_db
 from meshctl.placement.meter import Advice, Meter, Position, Reading
 from meshctl.placement.reading import is_due_to_speak, line, page, reading_json, style_of, words
-from meshctl.robots.local_daemon import DaemonError, LocalDaemon, positions_in, socket_path
+from meshctl.robots.local_daemon import DaemonError, LocalDaemon, socket_path
+from meshctl.robots.position_facts import positions_in
 
 DEFAULT_LOAD_MBIT_S = 2.0
 # Shorter ways between two positions are the noise of an odometry.
@@ -157,10 +158,11 @@ class _Positions:
 
     def _from_daemon(self) -> Position | None:
         try:
-            found = positions_in(self.daemon.request("status")).get(self.robot)
+            known = positions_in(self.daemon.request("status"))
         except DaemonError:
             return None
-        return None if found is None or found[3] > _MAX_POSITION_AGE_S else found[:3]
+        recent = (one for one in known if one.name == self.robot and one.age_s <= _MAX_POSITION_AGE_S)
+        return next(((one.x_m, one.y_m, one.z_m or 0.0) for one in recent), None)
 
 
 @dataclass(slots=True)

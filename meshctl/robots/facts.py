@@ -16,6 +16,7 @@ from typing import Any
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, configuration
 from meshctl.robots.host import Host
+from meshctl.robots.position_facts import PositionFacts, positions_in
 from meshctl.robots.wheels import own_wheel, stock_units
 
 # Two Python programs start and answer, possibly on a small, busy ARM board.
@@ -60,19 +61,6 @@ class PeerFacts:
     round_trip_s: float | None = None
     loss: float = 0.0
     outbox_messages: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class PositionFacts:
-    """Where a robot is, in meters in the coordinate frame `frame`; `source` is `api`, `configuration` or `peer`."""
-
-    name: str
-    x_m: float
-    y_m: float
-    z_m: float | None
-    frame: str
-    age_s: float
-    source: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,9 +216,7 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
         keys=tuple(str(key) for key in status.get("keys", ()) or ()),
         unkeyed=bool(status.get("unkeyed")),
         peers=tuple(_peer(peer) for peer in peers),
-        positions=tuple(
-            position for entry in _objects(status.get("positions")) if (position := _position(entry)) is not None
-        ),
+        positions=positions_in(status),
         queues=_queues(peers),
         topics=tuple(_topic(topic) for topic in _objects(_object(sections.get("topics", ())).get("topics"))),
         computer=_computer(_values(sections.get("computer", ())), now_s),
@@ -352,14 +338,6 @@ def _peer(peer: Mapping[str, Any]) -> PeerFacts:
         _float(peer.get("loss")) or 0.0,
         int(_float(peer.get("outbox_messages")) or 0),
     )
-
-
-def _position(entry: Mapping[str, Any]) -> PositionFacts | None:
-    x_m, y_m, age_s = _float(entry.get("x_m")), _float(entry.get("y_m")), _float(entry.get("age_s"))
-    if x_m is None or y_m is None or age_s is None:
-        return None
-    texts = [str(entry.get(key, "")) for key in ("name", "frame", "source")]
-    return PositionFacts(texts[0], x_m, y_m, _float(entry.get("z_m")), texts[1], age_s, texts[2])
 
 
 def _queues(peers: Iterable[Mapping[str, Any]]) -> tuple[QueueFacts, ...]:

@@ -77,19 +77,3 @@ class LocalDaemon:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
-
-
-def positions_in(status: Mapping[str, Any]) -> dict[str, tuple[float, float, float, float]]:
-    """x, y, z in meters and age in seconds by name, from the daemon's `status`; entries of other forms are left out."""
-    found = {}
-    entries = status.get("positions")
-    for entry in entries if isinstance(entries, list) else ():
-        if not isinstance(entry, dict):
-            continue
-        values = [entry.get(key) for key in ("x_m", "y_m", "age_s")]
-        numbers = [float(one) for one in values if isinstance(one, int | float) and not isinstance(one, bool)]
-        z_m = entry.get("z_m")
-        if len(numbers) == len(values) and isinstance(entry.get("name"), str):
-            height_m = float(z_m) if isinstance(z_m, int | float) else 0.0
-            found[entry["name"]] = (numbers[0], numbers[1], height_m, numbers[2])
-    return found

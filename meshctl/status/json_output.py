@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from meshctl.robots.facts import PositionFacts
+from meshctl.robots.position_facts import PositionFacts
 from meshctl.status.last_known import typed
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NodeStatus, RadioStatus, RobotStatus
