@@ -173,7 +173,7 @@ class Meter:
         hops = {hop.relay: hop for hop in self._hops(look)}
         if not hops:
             return self._without_link(look)
-        self._heard_s = look.now_s
+        self._heard_s = max(self._samples[relay][-1].at_s for relay in hops)
         self._measure_turn(look, hops)
         best = max(hops.values(), key=lambda hop: (hop.path_margin_db, hop.relay))
         hop = hops.get(look.next_hop, best)
@@ -303,7 +303,8 @@ class Meter:
         if hop.link_margin_db < COLLAPSE_DB and self._last_good is not None:
             self._is_returning = True
         if self._is_returning:
-            return Advice.TURN_BACK, "no margin: place the beacon at the last place with one"
+            what = "no beacon left" if look.beacons == 0 else "place the beacon at the last place with one"
+            return Advice.TURN_BACK, f"no margin: {what}"
         if hop.link_margin_db < 0.0:
             return self._drop(look, Advice.DROP_NOW, "no margin left")
         if hop.link_margin_db > STEEP_DB:

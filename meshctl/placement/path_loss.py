@@ -177,8 +177,8 @@ def frame_loss(model: PathLossModel, strength_dbm: float) -> float:
     return 1.0 if loss >= DEAF_LOSS else round(loss, _LOSS_DIGITS)
 
 
-def walls_between(walls: Sequence[Wall], a: Point, b: Point) -> tuple[Wall, ...]:
-    """The walls on the straight line between two points."""
+def walls_between(walls: Sequence[Wall], a: Point, b: Point, *, touching: bool = False) -> tuple[Wall, ...]:
+    """The walls on the straight line between two points; `touching`: also walls in which one of the points lies."""
     left, right = min(a[0], b[0]), max(a[0], b[0])
     low, high = min(a[1], b[1]), max(a[1], b[1])
     return tuple(
@@ -189,7 +189,7 @@ def walls_between(walls: Sequence[Wall], a: Point, b: Point) -> tuple[Wall, ...]
         and max(wall.a[0], wall.b[0]) >= left
         and min(wall.a[1], wall.b[1]) <= high
         and max(wall.a[1], wall.b[1]) >= low
-        and _cross(a, b, wall.a, wall.b)
+        and (_cross(a, b, wall.a, wall.b) or (touching and _touch(a, b, wall.a, wall.b)))
     )
 
 
@@ -205,3 +205,9 @@ def _side(a: Point, b: Point, c: Point) -> float:
 def _cross(a: Point, b: Point, c: Point, d: Point) -> bool:
     """Whether the segments a-b and c-d properly cross."""
     return _side(a, b, c) * _side(a, b, d) < 0 and _side(c, d, a) * _side(c, d, b) < 0
+
+
+def _touch(a: Point, b: Point, c: Point, d: Point) -> bool:
+    """Whether a or b lies on the segment c-d, and the other one does not lie on its line."""
+    at_a, at_b = _side(c, d, a), _side(c, d, b)
+    return (at_a == 0.0) != (at_b == 0.0) and _side(a, b, c) * _side(a, b, d) <= 0

@@ -34,7 +34,7 @@ class Walls:
     segments: tuple[Wall, ...]
 
     def walls(self, a: Point, b: Point) -> Sequence[Wall]:
-        return walls_between(self.segments, a, b)
+        return walls_between(self.segments, a, b, touching=True)
 
 
 @dataclass(frozen=True, slots=True)

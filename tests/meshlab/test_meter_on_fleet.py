@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
 
 # far is the robot; beyond 100 m it hears near alone
 ROW = RadioEnvironment(
-    {"base": NodePosition((0, 0)), "near": NodePosition((60, 0)), "far": NodePosition((85, 0))},
+    {"base": NodePosition((0, 0)), "near": NodePosition((60, 0)), "far": NodePosition((97, 0))},
     path_loss=PathLossModel(exponent=4.0),
 )
 
@@ -73,7 +73,7 @@ def look(fleet: VirtualFleet, margins: HopMargins, now_s: float) -> Look:
 def test_the_meter_follows_a_robot_that_moves(row: VirtualFleet) -> None:
     meter, margins = Meter(7.0), HopMargins(7.0)
     until(lambda: {"near"} <= set(look(row, margins, 0.0).paths), "far's path over near")
-    steps = (85, 91, 97, 103, 109, 115, 121)
+    steps = (97, 101, 105, 109, 113, 117, 121)
     readings = []
     for second, x in enumerate(steps):
         lab(row, "move", "far", str(x), "0")
