@@ -11,6 +11,7 @@ import pytest
 
 from meshctl.cli.main import main
 from meshctl.cli.monitor_history import history_path
+from meshctl.monitor.prometheus import TextfileWriter
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
 from tests.meshctl.status.fleets import trio
@@ -100,6 +101,15 @@ def test_metrics_of_a_history_and_the_files_for_prometheus(
     assert out.read_text() == page
     assert out.stat().st_mode & 0o777 == 0o644
     assert [file.name for file in tmp_path.glob("*meshctl.prom*")] == ["meshctl.prom"]
+    with FrameStore.open_running(history_path("trio", None)) as running:
+        newest = running.latest()
+        assert newest is not None
+        writer = TextfileWriter(tmp_path / "no" / "x.prom", running)
+        writer(newest, ())
+        assert "cannot be written" in writer.problem
+        writer.path = out
+        writer(newest, ())
+        assert (writer.problem, out.read_text()) == ("", page)
     assert "groups:" in said(capfd, "metrics", "--rules")
     assert json.loads(said(capfd, "metrics", "--dashboard"))["uid"] == "meshctl-fleet"
     assert json.loads(said(capfd, "metrics", "--file-sd", "-i", inventory)) == []

@@ -51,7 +51,11 @@ def frame_with_everything(fleet: Fleet) -> Frame:
             for one in HEALTHY["rover"].stations or ()
         ),
     )
-    facts = robot_facts("rover", peer("station", outbox_messages=3), queues=(queue(0, 2, 5.5), queue(5, 9, 1.0)))
+    facts = robot_facts(
+        "rover",
+        peer("station", outbox_messages=3, capacity_bits_per_s=4e6),
+        queues=(queue(0, 2, 5.5), queue(5, 9, 1.0)),
+    )
     status = as_json(status_of(fleet, {**HEALTHY, "rover": rover}, {**CREW, "rover": facts}))
     status["nodes"][1]["neighbours"][0]["name"] = HOSTILE
     checks = preflight(fleet, status_of(fleet))
