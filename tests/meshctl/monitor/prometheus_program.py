@@ -32,6 +32,13 @@ def promtool(*arguments: str) -> str:
     return done.stdout
 
 
+def free_tcp_port() -> int:
+    """A port on loopback that is free at the moment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 class Prometheus:
     """A running server."""
 
@@ -61,9 +68,7 @@ class Prometheus:
 @contextmanager
 def running(folder: Path, targets: dict[str, str], *, rules: str = "", file_sd: str = "") -> Iterator[Prometheus]:
     """A server that scrapes `targets` (job -> host:port) every second."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_tcp_port()
     (folder / "rules.yml").write_text(rules or "groups: []\n")
     (folder / "targets.json").write_text(file_sd or "[]")
     jobs = [{"job_name": job, "static_configs": [{"targets": [target]}]} for job, target in targets.items()]

@@ -24,10 +24,9 @@ from meshctl.monitor.metrics import metric_families, render_metrics
 from meshctl.monitor.prometheus import alert_rules, dashboard, file_sd
 from meshctl.status import preflight
 from meshctl.status.json_output import as_json
-from tests.meshctl.monitor.prometheus_program import Prometheus, promtool, running
+from tests.meshctl.monitor.prometheus_program import Prometheus, free_tcp_port, promtool, running
 from tests.meshctl.status.fleets import CREW, HEALTHY, INVENTORY, NOW, peer, queue, robot_facts, status_of, trio
 from tests.udp_mesh.daemon.processes import two_daemons
-from tests.udp_mesh.links.sockets import free_port
 from tests.waiting import until
 
 HOSTILE = 'b"\\\n}} 1\x00\u2028\U0001f916'
@@ -51,11 +50,8 @@ def frame_with_everything(fleet: Fleet) -> Frame:
             for one in HEALTHY["rover"].stations or ()
         ),
     )
-    facts = robot_facts(
-        "rover",
-        peer("station", outbox_messages=3, capacity_bits_per_s=4e6),
-        queues=(queue(0, 2, 5.5), queue(5, 9, 1.0)),
-    )
+    station = peer("station", outbox_messages=3, capacity_bits_per_s=4e6)
+    facts = robot_facts("rover", station, queues=(queue(0, 2, 5.5), queue(5, 9, 1.0)))
     status = as_json(status_of(fleet, {**HEALTHY, "rover": rover}, {**CREW, "rover": facts}))
     status["nodes"][1]["neighbours"][0]["name"] = HOSTILE
     checks = preflight(fleet, status_of(fleet))
@@ -101,7 +97,7 @@ def test_prometheus_scrapes_radios_and_daemons_and_knows_every_metric_of_dashboa
     fleet: Fleet, tmp_path: Path
 ) -> None:
     frame = frame_with_everything(fleet)
-    port = free_port()
+    port = free_tcp_port()
     with (
         two_daemons(alice_more=f'metrics_address = "127.0.0.1:{port}"') as (alice, _),
         served(lambda: render_metrics(frame)) as target,
