@@ -1,4 +1,4 @@
-"""Collect a frame on a schedule: snapshot -> status -> frame -> store -> hooks and whoever else wants it.
+"""Collect a frame on a schedule: snapshot -> status -> frame -> store -> hooks and other listeners.
 
 `FrameSampler.run` works in a thread of its own until `stop`. A round that fails (locked journal, unreadable key file)
 is a `problem`, and the next one is tried at its time. What a round costs on the air is measured at the sockets; the

@@ -172,7 +172,7 @@ class FrameStore:
         try:
             silences = self.silences(now_s)
         except MeshctlError:
-            # better told twice than never
+            # better reported although silenced than never
             return alarms
         return tuple(replace(alarm, silenced=silence_of(alarm.key, silences)) for alarm in alarms)
 
