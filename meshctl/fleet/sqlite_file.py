@@ -71,7 +71,7 @@ class SqliteFile:
             raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
 
     def _open_read_only(self) -> None:
-        """Without changing anything, also where nothing can be written: there nobody else writes, either."""
+        """Open it without changing anything. Where nothing can be written, no other process writes either."""
         error: Exception = MeshctlError("not opened")
         for mode in ("mode=ro", "immutable=1"):
             try:

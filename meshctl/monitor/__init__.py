@@ -2,5 +2,5 @@
 
 `sampler` collects a snapshot on a schedule; `frame` makes one JSON document of it; `store` keeps the frames in one
 SQLite file, and `alarm_log` the alarms in the same file; `metrics` renders the newest frame for Prometheus; `hooks`
-tells other programs of new alarms. docs/monitor.md describes the file, the frame and the metrics.
+reports new alarms to other programs. docs/monitor.md describes the file, the frame and the metrics.
 """

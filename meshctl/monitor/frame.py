@@ -70,10 +70,16 @@ class Frame:
     def of(cls, document: Mapping[str, Any]) -> Frame:
         """The frame of a document with `time_s`; numbers that JSON lacks become null. Raises KeyError without it."""
         time_s = round(float(document["time_s"]), 3)
-        finite = _finite({**document, "time_s": time_s})
-        text = json.dumps(finite, separators=(",", ":"), ensure_ascii=False)
+        whole = {**document, "time_s": time_s}
+        try:
+            text = _dumped(whole)
+        except ValueError:
+            whole = _finite(whole)
+            text = _dumped(whole)
         # half of a surrogate pair is no character, and no encoding has it
-        return cls(time_s, text.encode("utf-8", "replace").decode())
+        frame = cls(time_s, text.encode("utf-8", "replace").decode())
+        frame._document = whole
+        return frame
 
     @property
     def document(self) -> dict[str, Any]:
@@ -176,6 +182,11 @@ def _airtime(airtime: Airtime) -> dict[str, Any]:
         "limit_share": airtime.limit_share,
         "interval_s": airtime.interval_s,
     }
+
+
+def _dumped(document: Mapping[str, Any]) -> str:
+    """Raises ValueError for an infinite or undefined number."""
+    return json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:

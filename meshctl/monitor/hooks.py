@@ -1,4 +1,4 @@
-"""Tell other programs of new alarms: a webhook and a command, in a thread of their own.
+"""Report new alarms to other programs: a webhook and a command, in a thread of their own.
 
 `AlarmHooks.notify` never blocks: alarms wait in a bounded queue, and the oldest are dropped if a hook cannot follow.
 What a device says reaches a hook as JSON and as environment variables, never as part of a command line.
@@ -34,7 +34,7 @@ MAX_TEXT = 1000
 
 @dataclass(frozen=True, slots=True)
 class HookSettings:
-    """Where to tell of alarms. `command` is a program and its arguments; `min_level` one of `alarm_log.LEVELS`."""
+    """Where to report alarms. `command` is a program and its arguments; `min_level` one of `alarm_log.LEVELS`."""
 
     webhook: str = ""
     command: tuple[str, ...] = ()
@@ -52,8 +52,8 @@ class HookSettings:
 
 @dataclass(slots=True)
 class AlarmHooks:
-    """The hooks and their thread. `problem` says why the last call failed; `dropped` counts alarms that nobody was told
-    of."""
+    """The hooks and their thread. `problem` says why the last call failed; `dropped` counts alarms that were
+    never reported."""
 
     settings: HookSettings
     fleet: str = ""
@@ -66,17 +66,17 @@ class AlarmHooks:
     _thread: threading.Thread | None = field(default=None, repr=False)
 
     def notify(self, alarms: Sequence[LoggedAlarm]) -> None:
-        """Tell of alarms that began; those that are silenced or below the level are left out. Returns at once."""
+        """Report alarms that began; those that are silenced or below the level are left out. Returns at once."""
         if not self.settings.webhook and not self.settings.command:
             return
         least = LEVELS.index(self.settings.min_level)
-        told = [one for one in alarms if LEVELS.index(one.level) >= least and one.silenced is None]
-        if not told:
+        loud = [one for one in alarms if LEVELS.index(one.level) >= least and one.silenced is None]
+        if not loud:
             return
         with self._wake:
             if self._is_closed:
                 return
-            self._waiting.extend(told)
+            self._waiting.extend(loud)
             while len(self._waiting) > MAX_WAITING:
                 self._waiting.popleft()
                 self.dropped += 1

@@ -192,6 +192,8 @@ def _robots(status: Document) -> Iterator[MetricFamily]:
             ("round_trip_s", "round_trip_seconds", "Round trip to the peer's daemon."),
             ("loss", "loss_ratio", "Share of packets to the peer that are lost."),
             ("outbox_messages", "outbox_messages", "Messages stored for the offline peer."),
+            ("outbox_bytes", "outbox_bytes", "Bytes stored for the offline peer."),
+            ("capacity_bits_per_s", "capacity_bits_per_second", "Estimated capacity of the link for payload."),
         )
     }
     queue = {

@@ -1,4 +1,4 @@
-"""Collect a frame on a schedule: snapshot -> status -> frame -> store -> hooks and whoever else wants it.
+"""Collect a frame on a schedule: snapshot -> status -> frame -> store -> hooks and other listeners.
 
 `FrameSampler.run` works in a thread of its own until `stop`. A round that fails (locked journal, unreadable key file)
 is a `problem`, and the next one is tried at its time. What a round costs on the air is measured at the sockets; the
@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 from meshctl import event_log
 from meshctl.errors import MeshctlError
@@ -53,6 +53,19 @@ def fixed_positions(fleet: Fleet) -> dict[str, FramePosition]:
     for node in fleet.nodes.values():
         if node.position is not None:
             found[node.name] = FramePosition(node.position.x_m, node.position.y_m, node.position.z_m)
+    return found
+
+
+def reported_positions(status: Mapping[str, Any]) -> dict[str, FramePosition]:
+    """The positions that robots' daemons report in a status document; a robot's radios are where it is."""
+    found: dict[str, FramePosition] = {}
+    for robot in status.get("robots", ()):
+        position = robot.get("position")
+        if isinstance(position, Mapping) and isinstance(position.get("x_m"), int | float):
+            place = FramePosition(
+                position["x_m"], position.get("y_m", 0.0), position.get("z_m"), position.get("age_s"), "daemon"
+            )
+            found |= dict.fromkeys((robot["name"], *robot.get("radios", ())), place)
     return found
 
 
@@ -123,7 +136,7 @@ class FrameSampler:
         time_s = self.clock.next_s(None if newest is None else newest.time_s)
         status = assess(snapshot, self.nodes, self.clock.wall(), self.robots)
         document = as_json(status)
-        positions = fixed_positions(self.fleet)
+        positions = fixed_positions(self.fleet) | reported_positions(document)
         if self.positions is not None:
             positions |= self.positions()
         frame = frame_of(

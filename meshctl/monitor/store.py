@@ -102,6 +102,14 @@ class FrameStore:
         return cls(path, max_age_s, max_bytes)
 
     @classmethod
+    def open_running(cls, path: Path) -> FrameStore:
+        """Open the file of a monitor that may be running, to read it, acknowledge and silence. Raises InputError."""
+        if not path.is_file():
+            raise InputError(f"{path}: no history", hint="`meshctl monitor` writes it; or name another with --store")
+        # only an append removes anything
+        return cls(path, 0.0, MIN_BYTES)
+
+    @classmethod
     def open_recording(cls, path: Path) -> FrameStore:
         """Open an existing file for reading alone, on a read-only disk, too. Raises InputError, MeshctlError."""
         if not path.is_file():
@@ -164,7 +172,7 @@ class FrameStore:
         try:
             silences = self.silences(now_s)
         except MeshctlError:
-            # better told twice than never
+            # better reported although silenced than never
             return alarms
         return tuple(replace(alarm, silenced=silence_of(alarm.key, silences)) for alarm in alarms)
 

@@ -61,6 +61,10 @@ class PeerFacts:
     round_trip_s: float | None = None
     loss: float = 0.0
     outbox_messages: int = 0
+    outbox_bytes: int = 0
+    capacity_bits_per_s: float | None = None
+    """The link's estimated capacity for payload; None if too little was sent to measure it."""
+    delivered_bits_per_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,6 +341,9 @@ def _peer(peer: Mapping[str, Any]) -> PeerFacts:
         _float(peer.get("round_trip_s")),
         _float(peer.get("loss")) or 0.0,
         int(_float(peer.get("outbox_messages")) or 0),
+        int(_float(peer.get("outbox_bytes")) or 0),
+        _float(peer.get("capacity_bits_per_s")),
+        _float(peer.get("delivered_bits_per_s")),
     )
 
 

@@ -14,7 +14,7 @@ from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
 from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
-from meshctl.status.radio_facts import neighbors_of, radios_of, temperature_of, with_both_ways
+from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperature_of
 from meshctl.status.robots import RobotAnswers, robot_status
 from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NoAnswer, NodeStatus, health_of
@@ -56,13 +56,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     sightings = seen_by(reports.values(), snapshot.macs)
     paths = {} if snapshot.is_partial else snapshot.graph.paths(snapshot.entry)
     cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by(snapshot.entry)
-    heard = {
-        name: neighbors_of(
-            snapshot.fleet.nodes.get(name), snapshot.observations[name], neighbours_of(report, snapshot.macs)
-        )
-        for name, report in reports.items()
-    }
-    heard = with_both_ways(heard)
+    heard = {name: neighbours_of(report, snapshot.macs) for name, report in reports.items()}
+    snr = {name: snr_of(snapshot.observations[name], heard[name]) for name in reports}
     relays: dict[str, list[str]] = {}
     for name, path in paths.items():
         if path.hops and path.via != snapshot.entry:
@@ -79,7 +74,12 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             node=node,
             observation=seen,
             plan=snapshot.plans.get(node.name),
-            neighbors=heard[node.name],
+            neighbors=neighbors_of(
+                node,
+                seen,
+                heard[node.name],
+                {other: snr[other].get(node.name) for other in heard[node.name] if other in snr},
+            ),
             radios=radios_of(node, seen, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
             is_path_known=snapshot.entry in paths,

@@ -195,6 +195,9 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
                 "round_trip_s": _rounded(peer.round_trip_s, 6),
                 "loss": _rounded(peer.loss),
                 "outbox_messages": peer.outbox_messages,
+                "outbox_bytes": peer.outbox_bytes,
+                "capacity_bits_per_s": _rounded(peer.capacity_bits_per_s, 0),
+                "delivered_bits_per_s": _rounded(peer.delivered_bits_per_s, 0),
             }
             for peer in facts.peers
         ],

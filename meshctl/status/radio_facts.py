@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 
 from meshctl.device.observation import ChannelSurvey, Observation, Sensors, Station
 from meshctl.model import Node
@@ -13,6 +12,8 @@ from meshctl.topology import HeardNeighbor
 # Counters of a shorter time say more about this very query than about the channel.
 MIN_BUSY_MS = 200
 _NO_SENSORS = Sensors({}, {})
+# batman-adv hears a neighbor over a cable, too
+_NO_STATION = Station("", "")
 
 
 def radios_of(node: Node, seen: Observation, previous: Observation | None = None) -> tuple[RadioStatus, ...]:
@@ -68,34 +69,52 @@ def temperature_of(seen: Observation) -> float | None:
     return max((seen.sensors or _NO_SENSORS).temperatures_c.values(), default=None)
 
 
-def neighbors_of(node: Node | None, seen: Observation, heard: Mapping[str, HeardNeighbor]) -> tuple[Neighbor, ...]:
-    """What a node reports of the nodes it hears, best first."""
+def snr_of(seen: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, int]:
+    """The SNR of each node that a node hears, as far as the radio reports signal and noise."""
+    noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
+    at = {station.mac.lower(): noise.get(station.ifname) for station in seen.stations or ()}
+    return {
+        name: one.signal_dbm - noise_dbm
+        for name, one in heard.items()
+        if one.signal_dbm is not None and (noise_dbm := at.get(one.mac.lower())) is not None
+    }
+
+
+def neighbors_of(
+    node: Node | None, seen: Observation, heard: Mapping[str, HeardNeighbor], snr_there: Mapping[str, int | None]
+) -> tuple[Neighbor, ...]:
+    """What a node reports of the nodes it hears, best first; `snr_there` is the SNR at which they report to hear it."""
     stations: dict[str, Station] = {}
     for station in seen.stations or ():
         stations.setdefault(station.mac.lower(), station)
     noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
     meshes = {} if node is None else node.mesh_interfaces
-    found = [_neighbor(name, one, stations.get(one.mac.lower()), noise, meshes) for name, one in heard.items()]
+    found = [
+        _neighbor(name, one, stations.get(one.mac.lower(), _NO_STATION), noise, meshes, snr_there.get(name))
+        for name, one in heard.items()
+    ]
     return tuple(sorted(found, key=lambda one: (-(one.quality or 0.0), -(one.signal_dbm or -200), one.name)))
 
 
 def _neighbor(
     name: str,
     heard: HeardNeighbor,
-    station: Station | None,
+    station: Station,
     noise: Mapping[str, int | None],
     meshes: Mapping[str, str],
+    snr_there_db: int | None,
 ) -> Neighbor:
-    base = Neighbor(name, heard.last_seen_ms, heard.quality, heard.signal_dbm)
-    if station is None:
-        return base
     noise_dbm = noise.get(station.ifname)
     signal_dbm = heard.signal_dbm
-    return replace(
-        base,
+    return Neighbor(
+        name,
+        heard.last_seen_ms,
+        heard.quality,
+        signal_dbm,
         mesh=meshes.get(station.ifname, ""),
         noise_dbm=noise_dbm,
         snr_db=None if noise_dbm is None or signal_dbm is None else signal_dbm - noise_dbm,
+        snr_there_db=snr_there_db,
         chain_signals_dbm=station.chain_signals_dbm,
         tx_mcs=station.tx_mcs,
         rx_mcs=station.rx_mcs,
@@ -110,15 +129,3 @@ def _neighbor(
 
 def _kbit_s(mbit_s: float | None) -> int | None:
     return None if mbit_s is None else round(1000 * mbit_s)
-
-
-def with_both_ways(heard: Mapping[str, tuple[Neighbor, ...]]) -> dict[str, tuple[Neighbor, ...]]:
-    """Every node's neighbors, with the SNR at which they hear the node, as far as they report it."""
-    snr = {(name, one.name): one.snr_db for name, neighbors in heard.items() for one in neighbors}
-
-    def completed(name: str, neighbors: Iterable[Neighbor]) -> Iterable[Neighbor]:
-        for one in neighbors:
-            there = snr.get((one.name, name))
-            yield one if there is None else replace(one, snr_there_db=there)
-
-    return {name: tuple(completed(name, neighbors)) for name, neighbors in heard.items()}

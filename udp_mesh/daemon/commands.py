@@ -219,7 +219,14 @@ def render_metrics(service: Service) -> str:
         "wire_version": str(WIRE_VERSION),
         "boot": service.boot_id.hex(),
     }
-    return metrics.render(driver.conditions(), visible, extra, about=about, uptime_s=driver.now() - service.started)
+    return metrics.render(
+        driver.conditions(),
+        visible,
+        extra,
+        about=about,
+        uptime_s=driver.now() - service.started,
+        latencies=service.latencies.by_priority,
+    )
 
 
 # Change

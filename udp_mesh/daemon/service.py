@@ -33,6 +33,7 @@ from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
+from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.position_exchange import PositionExchange
@@ -63,12 +64,13 @@ class Service:
         )
         self._flusher = Flusher(self.store)
         self._legacy = LegacyPositions(configuration.daemon.state_directory / "legacy-positions.json")
+        self.latencies = Latencies(self._priority)
         self.driver = Driver(
             configuration.settings,
             configuration.links,
             boot_id=boot_id,
             rng=rng,
-            on_event=self._event,
+            on_event=self.latencies.watching(self._event),
             store=self.store,
             legacy_positions=self._legacy.saved,
             urgent_dscp=configuration.daemon.urgent_dscp,
@@ -100,8 +102,7 @@ class Service:
     def start(self) -> None:
         """Starts sending and receiving."""
         self.driver.start()
-        topics = (*self.settings.topics, self.settings.undeclared)
-        if any(topic is not None and topic.outbox_on_disk for topic in topics):
+        if any(one is not None and one.outbox_on_disk for one in (*self.settings.topics, self.settings.undeclared)):
             self.store.check_writable()
         self._publish_conditions()
         self.positions.start()

@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
-from meshctl.errors import InputError
+from meshctl.errors import InputError, MeshctlError
 from meshctl.model import Fleet
+from meshctl.monitor.alarm_log import LoggedAlarm
+from meshctl.monitor.frame import Frame
+from meshctl.monitor.metrics import render_metrics
+from meshctl.monitor.store import FrameStore
 
 # OpenWrt's exporter and its default port (openwrt/packages, utils/prometheus-node-exporter-lua)
 EXPORTER_PACKAGE = "prometheus-node-exporter-lua"
@@ -41,6 +46,24 @@ def file_sd(fleet: Fleet) -> str:
         if EXPORTER_PACKAGE in (*node.hardware.packages, *node.packages)
     ]
     return json.dumps(groups, indent=2) + "\n"
+
+
+class TextfileWriter:
+    """A listener of the sampler that writes every frame's metrics to a file; `problem` says why it could not."""
+
+    def __init__(self, path: Path, store: FrameStore) -> None:
+        self.path = path
+        self.problem = ""
+        self._store = store
+
+    def __call__(self, frame: Frame, began: Sequence[LoggedAlarm]) -> None:
+        try:
+            replace_file(self.path, render_metrics(frame, self._store))
+        except MeshctlError as error:
+            # no reason to miss a frame
+            self.problem = str(error)
+        else:
+            self.problem = ""
 
 
 def replace_file(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Hooks are told of new alarms once, cannot delay the sampler, and no text of a device becomes code."""
+"""Hooks get new alarms once, cannot delay the sampler, and no text of a device becomes code."""
 
 from __future__ import annotations
 
@@ -110,17 +110,17 @@ def test_a_failed_hook_is_a_problem(settings: HookSettings, problem: str) -> Non
     assert hooks.problem.startswith(problem)
 
 
-@pytest.mark.parametrize(("status", "told"), [(200, ""), (500, "500"), (302, "302"), (307, "307")])
-def test_a_webhook_is_followed_nowhere_else(status: int, told: str) -> None:
+@pytest.mark.parametrize(("status", "problem"), [(200, ""), (500, "500"), (302, "302"), (307, "307")])
+def test_a_webhook_is_followed_nowhere_else(status: int, problem: str) -> None:
     with receiver(status) as (url, got):
         hooks = AlarmHooks(HookSettings(url))
         hooks.notify([alarm()])
         hooks.close(20)
     assert len(got) == 1
-    assert (told in hooks.problem) if told else hooks.problem == ""
+    assert (problem in hooks.problem) if problem else hooks.problem == ""
 
 
-def test_only_loud_alarms_above_the_level_are_told() -> None:
+def test_only_loud_alarms_above_the_level_are_reported() -> None:
     with receiver() as (url, got):
         hooks = AlarmHooks(HookSettings(url))
         hooks.notify([alarm("note"), alarm(silenced=Silence(None, "known", "bob")), alarm("warning"), alarm()])
@@ -128,7 +128,7 @@ def test_only_loud_alarms_above_the_level_are_told() -> None:
     assert [one["level"] for one in got] == ["warning", "error"]
 
 
-def test_an_alarm_that_begins_silenced_is_not_told_and_one_that_goes_on_is_told_once(tmp_path: Path) -> None:
+def test_an_alarm_that_begins_silenced_is_not_reported_and_one_that_goes_on_is_reported_once(tmp_path: Path) -> None:
     with receiver() as (url, got), FrameStore.open(tmp_path / "h", 1e5, MIN_BYTES) as store:
         hooks = AlarmHooks(HookSettings(url))
         store.silence("b02", "*", Silence(None, "on the shelf", "bob"))

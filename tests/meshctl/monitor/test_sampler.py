@@ -15,7 +15,7 @@ from meshctl.model import Fleet
 from meshctl.monitor.airtime import MAC_EFFICIENCY, OVERHEAD, airtime_use, next_interval_s
 from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.frame import Frame, FramePosition
-from meshctl.monitor.sampler import FrameClock, FrameSampler, fixed_positions
+from meshctl.monitor.sampler import FrameClock, FrameSampler, fixed_positions, reported_positions
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from meshctl.status.assess import Snapshot
 from tests.meshctl.status.fleets import INVENTORY, NOW, look_of, trio
@@ -167,6 +167,12 @@ def test_frames_stay_in_order_while_the_clock_is_set_back(fleet: Fleet, store: F
     # another process whose clock is wrong
     behind = Rig(fleet, store, Time(wall_s=NOW - 500))
     assert behind.sampler().sample().time_s == first + 3606.001
+
+
+def test_what_daemons_report_goes_before_the_inventory(fleet: Fleet) -> None:
+    status = {"robots": [{"name": "rover", "radios": ["rover"], "position": {"x_m": 4.0, "y_m": 5.0, "age_s": 2.0}}]}
+    assert reported_positions(status) == {"rover": FramePosition(4.0, 5.0, None, 2.0, "daemon")}
+    assert reported_positions({"robots": [{"name": "rover", "radios": [], "position": None}, {"name": "spot"}]}) == {}
 
 
 def test_positions_of_robots_and_radios_go_together(tmp_path: Path) -> None:

@@ -164,7 +164,7 @@ assert "disk is full" in store.problem and "free space" in store.problem, store.
 assert store.latest().time_s == when and store.at(when).time_s == when
 assert [one.time_s for one in store.after(kept[-1])] == [when]
 began = store.append(frame(when + 1, alarm, padding=noise(100_000, 1)))
-assert [one.code for one in began] == ["alone"], "hooks are told on a full disk, too"
+assert [one.code for one in began] == ["alone"], "hooks get them on a full disk, too"
 assert store.problem and store.alarms(now_s=when) == ()
 ballast.unlink()
 assert store.append(frame(when + 2, alarm)) == ()
