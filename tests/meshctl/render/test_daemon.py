@@ -14,7 +14,19 @@ from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.model import Computer, Fleet, Outbox, Robot, Secret, SecretKind, SecretRef, Topic, TopicClass, UdpMesh
+from meshctl.model import (
+    Computer,
+    FixedPosition,
+    Fleet,
+    Outbox,
+    Robot,
+    Secret,
+    SecretKind,
+    SecretRef,
+    Topic,
+    TopicClass,
+    UdpMesh,
+)
 from meshctl.render.daemon import daemon_config, daemon_keys
 from tests.meshctl.render import fleets
 from udp_mesh.core import settings as core
@@ -79,6 +91,16 @@ def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:
         outbox_on_disk=True,
     )
     assert topics["video"] == core.Topic("video", 9, reliable=False, destinations=("base",), repair=True)
+
+
+def test_a_fixed_position_is_the_daemons_and_a_robot_without_one_has_none(tmp_path: Path) -> None:
+    source = fleet(ESTOP)
+    placed = replace(source.robots["base"], position=FixedPosition(12.5, -3.0))
+    source = replace(source, robots={**source.robots, "base": placed})
+    position = loaded(source, "base", tmp_path).position
+    assert position is not None
+    assert (position.x_m, position.y_m, position.z_m, position.frame) == (12.5, -3.0, None, "map")
+    assert loaded(source, "uav", tmp_path).position is None
 
 
 def test_without_broadcast_all_other_robots_are_neighbors(tmp_path: Path) -> None:
