@@ -27,6 +27,7 @@ from meshctl.inventory.documents.robot import (
     RobotDocument,
     SystemDocument,
     TopicDocument,
+    TopicLogDocument,
     UdpMeshDocument,
 )
 from meshctl.inventory.documents.root import InventoryDocument
@@ -54,5 +55,6 @@ __all__ = [
     "SshLayer",
     "SystemDocument",
     "TopicDocument",
+    "TopicLogDocument",
     "UdpMeshDocument",
 ]
