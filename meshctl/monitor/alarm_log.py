@@ -1,8 +1,8 @@
-"""The alarm log: status document -> alarms by device and code -> what began, goes on, and ended. Pure.
+"""The alarm log: status document -> alarms by device and code -> what began, continues, and ended. Pure.
 
 An alarm is one device and one code; a device with several of one code (two radios that are down) has one, with both
 texts. It ends when its device answers without it, or has left the inventory: of a device that does not answer it is not
-known, so it stays open. One that returns within `REOPEN_S` goes on with its acknowledgment: a flapping link is one.
+known, so it stays open. One that returns within `REOPEN_S` continues with its acknowledgment: a flapping link is one.
 """
 
 from __future__ import annotations

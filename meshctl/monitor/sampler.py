@@ -72,7 +72,7 @@ def reported_positions(status: Mapping[str, Any]) -> dict[str, FramePosition]:
 @dataclass(slots=True)
 class FrameClock:
     """The times of frames: the wall clock, which may be set backward, made strictly increasing. While it is behind the
-    last frame, time goes on from there at the pace of the monotonic clock."""
+    last frame, time continues from there at the pace of the monotonic clock."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic

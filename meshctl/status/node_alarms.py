@@ -28,7 +28,7 @@ BUSY_LOAD = 4.0
 # queued are red.
 LOW_SNR_DB = 10
 LONG_QUEUE_PACKETS = 100
-# Doodle Labs, "Network monitoring": above this the channel is not ideal
+# Doodle Labs calls more activity than this not ideal.
 BUSY_CHANNEL_RATIO = 0.8
 # radios have no battery-backed clock and often no NTP: only an offset that breaks logs and certificates matters
 CLOCK_TOLERANCE_S = 3600.0

@@ -121,9 +121,8 @@ class Service:
         self.driver.close()
         await self._legacy.save(self.driver.node.legacy_positions())
         await self.stop_recording()
-        await asyncio.get_running_loop().run_in_executor(None, self.store.close)
-        await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
-        await asyncio.get_running_loop().run_in_executor(None, self.log_store.close)
+        for close in (self.store.close, self.inbox.close, self.log_store.close):
+            await asyncio.get_running_loop().run_in_executor(None, close)
 
     # Requests (called by the local API)
 

@@ -40,7 +40,7 @@ FILENAME ~ /iw$/ {
 }
 # thermal noise of 20 MHz and a noise figure of 6 dB: what ath9k reports in a quiet place
 function noise() { return -95 }
-# the highest rate of two streams in 20 MHz that this signal carries: SNR of 802.11n (Perahia and Stacey, table 5.14, with 3 dB)
+# the highest rate of two streams in 20 MHz for this signal: about the SNR that MCS 0 to 7 need, and 3 dB for the second stream
 function mcs_of(signal,    snr, i, need) {
 	snr = signal - noise()
 	split("5 8 11 14 18 22 25 27", need, " ")
@@ -51,7 +51,7 @@ function rate_of(mcs,    rates) {
 	split("7.2 14.4 21.7 28.9 43.3 57.8 65 72.2 14.4 28.9 43.3 57.8 86.7 115.6 130 144.4", rates, " ")
 	return rates[mcs + 1]
 }
-# beacons and OGMs of every station that is heard, at 1 Mbit/s, and its own
+# beacons and OGMs of every station that is heard, and its own: half a per cent of the time each
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "survey" { if (!$8) beacons++ }
 # deleted and not heard since
 FILENAME ~ /heard$/ && $1 == "S" && $8 && since[$2 " " $3] >= $8 { next }
@@ -73,11 +73,11 @@ FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act ==
 function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
 END {
 	if (verb == "survey" && found && joined) {
-		share = 0.025 * (beacons + 1)
-		if (share > 0.9) share = 0.9
+		share = 0.005 * (beacons + 1)
+		if (share > 0.7) share = 0.7
 		printf "Survey data from %s\n\tfrequency:\t\t\t%d MHz [in use]\n\tnoise:\t\t\t\t%d dBm\n", device, frequency, noise()
 		printf "\tchannel active time:\t\t%d ms\n\tchannel busy time:\t\t%d ms\n", uptime * 1000, uptime * 1000 * share
-		printf "\tchannel receive time:\t\t%d ms\n\tchannel transmit time:\t\t%d ms\n", uptime * 1000 * (share - 0.025), uptime * 25
+		printf "\tchannel receive time:\t\t%d ms\n\tchannel transmit time:\t\t%d ms\n", uptime * 1000 * (share - 0.005), uptime * 5
 	}
 	if (device != "" && !found) fail("No such device", 19)
 	# ad-hoc cells: Linux 5.7 and later; 19.07 has the wireless stack of 4.19

@@ -21,7 +21,7 @@ def store(tmp_path: Path) -> Iterator[FrameStore]:
         yield opened
 
 
-def test_an_alarm_begins_goes_on_and_ends(store: FrameStore) -> None:
+def test_an_alarm_begins_continues_and_ends(store: FrameStore) -> None:
     both = {**WEAK, ("robot:rover", "disk"): "error", ("", "not-compared"): "note"}
     assert [one.key for one in store.append(frame(10.0, both))] == [
         ("b01", "weak"),
@@ -80,7 +80,7 @@ def test_open_alarms_are_known_to_the_next_process(tmp_path: Path) -> None:
         assert store.append(frame(30.0)) == ()
         assert store.alarms(now_s=30.0) == ()
     with FrameStore.open(tmp_path / "one", 86400.0, MIN_BYTES) as store:
-        assert store.append(frame(40.0, WEAK)) == (), "it goes on, also in another process"
+        assert store.append(frame(40.0, WEAK)) == (), "it continues, also in another process"
 
 
 def test_only_an_open_alarm_is_acknowledged(store: FrameStore) -> None:

@@ -128,7 +128,7 @@ def test_only_loud_alarms_above_the_level_are_reported() -> None:
     assert [one["level"] for one in got] == ["warning", "error"]
 
 
-def test_an_alarm_that_begins_silenced_is_not_reported_and_one_that_goes_on_is_reported_once(tmp_path: Path) -> None:
+def test_an_alarm_that_begins_silenced_is_not_reported_and_one_that_continues_is_reported_once(tmp_path: Path) -> None:
     with receiver() as (url, got), FrameStore.open(tmp_path / "h", 1e5, MIN_BYTES) as store:
         hooks = AlarmHooks(HookSettings(url))
         store.silence("b02", "*", Silence(None, "on the shelf", "bob"))

@@ -161,7 +161,7 @@ def test_frames_stay_in_order_while_the_clock_is_set_back(fleet: Fleet, store: F
     first = sampler.sample().time_s
     rig.time.wall_s -= 3600
     rig.time.forward(5)
-    assert sampler.sample().time_s == first + 5.5, "it goes on at the pace of the monotonic clock"
+    assert sampler.sample().time_s == first + 5.5, "it continues at the pace of the monotonic clock"
     rig.time.wall_s += 7200
     assert sampler.sample().time_s == first + 3600 + 6, "a clock that is set forward is followed"
     # another process whose clock is wrong
