@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=6
+VERSION=7
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -298,9 +298,12 @@ drop() { # DIRECTORY CODE TEXT
 }
 
 # At the first boot / is RAM until jffs2 is ready, and what is copied into it then may lack what was written meanwhile
-# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all.
+# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all: procd says so in
+# `rootfs_type` (22.03 on) or as `"initramfs": true` (21.02); up to 19.07 / is the kernel's rootfs. The last mount on /
+# is the one in use.
 in_flash() {
-	! grep -q '^overlayfs:/tmp/root / ' /proc/mounts && ! ubus call system board 2>/dev/null | grep -q '"rootfs_type": "initramfs"'
+	case $(grep ' / ' /proc/mounts | tail -n 1) in 'overlayfs:/tmp/root '* | 'rootfs '*) return 1 ;; esac
+	! ubus call system board 2>/dev/null | grep -q '"initramfs"'
 }
 
 # An armed change that was not started has changed nothing. It ends once its owner has lost the lock.
