@@ -490,10 +490,11 @@ wait_until() {
 	is_armed
 }
 
-reload() { # SCRIPT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
+# Held in the shell: the change may be forgotten before it runs, and of a copy in a full /tmp only a part might, or nothing.
+reload() { # SCRIPT_TEXT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
 	rm -f "$RUN/reloaded"
 	(
-		UNTIL_S=$2 sh "$1" >"$RUN/reload.log" 2>&1 &
+		UNTIL_S=$2 sh -c "${1:-exit 1}" >"$RUN/reload.log" 2>&1 &
 		echo $! >"$RUN/reload.pid"
 		wait $!
 		echo $? >"$RUN/reloaded"
@@ -517,14 +518,13 @@ end_reload() {
 restore() {
 	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
 	sync
-	cp "$CHANGE/reload" "$RUN/restored"
-	reload_it=no stays=''
+	reload_script=$(cat "$CHANGE/reload") reload_it=no stays=''
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
 	finish restored "$1$stays"
 	[ $reload_it = yes ] || return 0
 	end_reload
-	reload "$RUN/restored"
+	reload "$reload_script"
 	now
 	limit=$((NOW + RELOAD_LIMIT_CS))
 	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
@@ -553,10 +553,9 @@ watch() { # ID DUE_CS: detached
 		applied_at_now
 		restore failed
 	else
-		cp "$CHANGE/reload" "$RUN/reload"
 		# a reload that is not done by then would run at once with the one of the restore
 		now
-		reload "$RUN/reload" $((NOW / 100 + WINDOW - PROOF_S))
+		reload "$(cat "$CHANGE/reload")" $((NOW / 100 + WINDOW - PROOF_S))
 		applied_at_now
 		wait_until $((NOW + WINDOW * 100)) || exit 0
 		reason=timeout
