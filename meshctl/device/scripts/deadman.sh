@@ -320,6 +320,7 @@ stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_sta
 	tidy
 	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
+	! is_reloading || refuse busy "services are still reloading after a rollback; try again in a minute"
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
 	no_foreign_changes
 	[ ! -e "$CHANGE" ] || rm -rf "$CHANGE"
@@ -513,6 +514,9 @@ end_reload() {
 	# the shell around it first, which would report its end
 	kill "$reload_pid" "$script_pid" 2>/dev/null
 }
+
+# A restore ends the change before its reload has ended: another change would share the status of that reload.
+is_reloading() { [ ! -e "$RUN/reloaded" ] && read -r script_pid 2>/dev/null <"$RUN/reload.pid" && kill -0 "$script_pid" 2>/dev/null; }
 
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {

@@ -309,6 +309,20 @@ def test_a_rollback_waits_for_a_running_reload_to_finish(node: Sandbox) -> None:
     assert node.text("/harness/log") == "begin\nend\nbegin\nend\n"
 
 
+def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
+    # the status of that reload would count for the new change, before its own services have reloaded
+    second = "[ ! -e /harness/first ] || until [ -e /harness/go ]; do sleep 0.1; done"
+    log = f"echo begin >>/harness/log; {second}; : >/harness/first"
+    applied(node, wanted=change(reload=log))
+    eventually(lambda: (node.text("/harness/log") or "") == "begin\n" and node.path("/harness/first").exists())
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: (node.text("/harness/log") or "") == "begin\nbegin\n")
+    prepare(node)
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("refused busy services are still reloading")
+    node.put("/harness/go", "")
+    eventually(lambda: node.deadman("stage", OWNER, "c1", BUNDLE) == "ok state=staged id=c1")
+
+
 OVERLAY_IN_RAM = "overlayfs:/tmp/root"
 INITRAMFS_19_07 = "rootfs"
 
