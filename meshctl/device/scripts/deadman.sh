@@ -516,7 +516,7 @@ end_reload() {
 }
 
 # A restore ends the change before its reload has ended: another change would share the status of that reload.
-is_reloading() { [ ! -e "$RUN/reloaded" ] && read -r script_pid 2>/dev/null <"$RUN/reload.pid" && kill -0 "$script_pid" 2>/dev/null; }
+is_reloading() { read -r restoring_pid 2>/dev/null <"$RUN/restoring" && kill -0 "$restoring_pid" 2>/dev/null; }
 
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {
@@ -525,6 +525,7 @@ restore() {
 	reload_script=$(cat "$CHANGE/reload") reload_it=no stays=''
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
+	[ $reload_it = no ] || echo $$ 2>/dev/null >"$RUN/restoring"
 	finish restored "$1$stays"
 	[ $reload_it = yes ] || return 0
 	end_reload
@@ -533,6 +534,7 @@ restore() {
 	limit=$((NOW + RELOAD_LIMIT_CS))
 	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
 	read -r status 2>/dev/null <"$RUN/reloaded"
+	rm -f "$RUN/restoring"
 	# the boot path is the one that is known to bring the restored state up
 	[ "$status" = 0 ] || /sbin/reboot
 }
