@@ -115,7 +115,7 @@ REJOIN = Effect("wifi", Cut.MESH, "the interfaces of radio0 leave their networks
 def test_options_in_another_order_cut_what_netifd_takes_down_for_them(
     place: tuple[str, str], expected: list[Effect]
 ) -> None:
-    # somebody's edit has moved an option; meshctl writes the file for another reason, such as another radio
+    # an edit by hand has moved an option; meshctl writes the file for another reason, such as another radio
     assert [cut_by(*place, release) for release in RELEASES] == expected
 
 
