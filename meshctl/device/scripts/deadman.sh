@@ -20,6 +20,7 @@ START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or som
 PROOF_S=3                  # what remains of the window when a reload stops waiting
 RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
+RESTORED_WAIT_CS=2000      # a new change waits so long for the reload of a rollback, then it is refused
 RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
@@ -320,7 +321,7 @@ stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_sta
 	tidy
 	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
-	! is_reloading || refuse busy "services are still reloading after a rollback; try again in a minute"
+	await_restored
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
 	no_foreign_changes
 	[ ! -e "$CHANGE" ] || rm -rf "$CHANGE"
@@ -517,6 +518,15 @@ end_reload() {
 
 # A restore ends the change before its reload has ended: another change would share the status of that reload.
 is_reloading() { read -r restoring_pid 2>/dev/null <"$RUN/restoring" && kill -0 "$restoring_pid" 2>/dev/null; }
+
+await_restored() {
+	now
+	limit=$((NOW + RESTORED_WAIT_CS))
+	while is_reloading; do
+		now && [ $NOW -lt $limit ] || refuse busy "services are still reloading after a rollback; try again in a minute"
+		doze
+	done
+}
 
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {

@@ -318,9 +318,14 @@ def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
     node.deadman("abort", OWNER, "c1")
     eventually(lambda: (node.text("/harness/log") or "") == "begin\nbegin\n")
     prepare(node)
-    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("refused busy services are still reloading")
-    node.put("/harness/go", "")
-    eventually(lambda: node.deadman("stage", OWNER, "c1", BUNDLE) == "ok state=staged id=c1")
+    switch = "/usr/sbin/meshctl-deadman"
+    node.put("/harness/hasty", (node.text(switch) or "").replace("RESTORED_WAIT_CS=2000", "RESTORED_WAIT_CS=20"), 0o755)
+    refused = node.run("/harness/hasty", "stage", OWNER, "c1", BUNDLE).stdout
+    assert refused.startswith("refused busy services are still reloading"), refused
+    with ThreadPoolExecutor(1) as hand:
+        waiting = hand.submit(node.deadman, "stage", OWNER, "c1", BUNDLE)
+        node.put("/harness/go", "")
+        assert waiting.result() == "ok state=staged id=c1"
 
 
 OVERLAY_IN_RAM = "overlayfs:/tmp/root"
