@@ -255,6 +255,8 @@ class Observation:
     overlay: Space | None = None
     root_in_ram: bool | None = None
     """Whether / is still in memory because the flash is not formatted yet (first boot)."""
+    root_read_only: bool | None = None
+    """Whether / cannot be written: failsafe mode, or a failing flash."""
     tmp: Space | None = None
     macs: Mapping[str, str] | None = None
     """Interface name -> MAC address, from /sys/class/net."""

@@ -135,6 +135,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         memory=reader.read("meminfo", system.parse_meminfo),
         overlay=_space(space, "/"),
         root_in_ram=reader.read("root", system.parse_root, required=False),
+        root_read_only=reader.read("root", system.parse_read_only_root, required=False),
         tmp=_space(space, "/tmp"),
         macs=None if macs is None else MappingProxyType(macs),
         ifindexes=MappingProxyType({name: index for index, name in indexes.items()}) if indexes else None,

@@ -101,6 +101,13 @@ def parse_root(text: str) -> bool:
     return any(line.startswith("overlayfs:/tmp/root / ") for line in text.splitlines())
 
 
+def parse_read_only_root(text: str) -> bool:
+    """The lines of /proc/mounts about /: whether nothing can be written below it, as in failsafe mode (the ROM image
+    alone) or after errors of the flash. The last mount is the one in use."""
+    rows = [line.split() for line in text.splitlines() if line.split()[1:2] == ["/"]]
+    return bool(rows) and len(rows[-1]) > 3 and "ro" in rows[-1][3].split(",")
+
+
 def parse_macs(text: str) -> dict[str, str] | None:
     """`NAME ADDRESS INDEX` lines of observe.sh as name -> address; an interface without one is left out."""
     rows = [line.split() for line in text.splitlines()]

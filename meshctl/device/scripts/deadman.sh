@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=6
+VERSION=7
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -20,6 +20,7 @@ START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or som
 PROOF_S=3                  # what remains of the window when a reload stops waiting
 RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
+RESTORED_WAIT_CS=2000      # a new change waits so long for the reload of a rollback, then it is refused
 RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
@@ -298,9 +299,12 @@ drop() { # DIRECTORY CODE TEXT
 }
 
 # At the first boot / is RAM until jffs2 is ready, and what is copied into it then may lack what was written meanwhile
-# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all.
+# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all: procd says so in
+# `rootfs_type` (22.03 on) or as `"initramfs": true` (21.02); up to 19.07 / is the kernel's rootfs. The last mount on /
+# is the one in use.
 in_flash() {
-	! grep -q '^overlayfs:/tmp/root / ' /proc/mounts && ! ubus call system board 2>/dev/null | grep -q '"rootfs_type": "initramfs"'
+	case $(grep ' / ' /proc/mounts | tail -n 1) in 'overlayfs:/tmp/root '* | 'rootfs '*) return 1 ;; esac
+	! ubus call system board 2>/dev/null | grep -q '"initramfs"'
 }
 
 # An armed change that was not started has changed nothing. It ends once its owner has lost the lock.
@@ -317,6 +321,7 @@ stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_sta
 	tidy
 	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
+	await_restored
 	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
 	no_foreign_changes
 	[ ! -e "$CHANGE" ] || rm -rf "$CHANGE"
@@ -487,10 +492,11 @@ wait_until() {
 	is_armed
 }
 
-reload() { # SCRIPT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
+# Held in the shell: the change may be forgotten before it runs, and of a copy in a full /tmp only a part might, or nothing.
+reload() { # SCRIPT_TEXT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
 	rm -f "$RUN/reloaded"
 	(
-		UNTIL_S=$2 sh "$1" >"$RUN/reload.log" 2>&1 &
+		UNTIL_S=$2 sh -c "${1:-exit 1}" >"$RUN/reload.log" 2>&1 &
 		echo $! >"$RUN/reload.pid"
 		wait $!
 		echo $? >"$RUN/reloaded"
@@ -510,22 +516,35 @@ end_reload() {
 	kill "$reload_pid" "$script_pid" 2>/dev/null
 }
 
+# A restore ends the change before its reload has ended: another change would share the status of that reload.
+is_reloading() { read -r restoring_pid 2>/dev/null <"$RUN/restoring" && kill -0 "$restoring_pid" 2>/dev/null; }
+
+await_restored() {
+	now
+	limit=$((NOW + RESTORED_WAIT_CS))
+	while is_reloading; do
+		now && [ $NOW -lt $limit ] || refuse busy "services are still reloading after a rollback; try again in a minute"
+		doze
+	done
+}
+
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {
 	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
 	sync
-	cp "$CHANGE/reload" "$RUN/restored"
-	reload_it=no stays=''
+	reload_script=$(cat "$CHANGE/reload") reload_it=no stays=''
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
+	[ $reload_it = no ] || echo $$ 2>/dev/null >"$RUN/restoring"
 	finish restored "$1$stays"
 	[ $reload_it = yes ] || return 0
 	end_reload
-	reload "$RUN/restored"
+	reload "$reload_script"
 	now
 	limit=$((NOW + RELOAD_LIMIT_CS))
 	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
 	read -r status 2>/dev/null <"$RUN/reloaded"
+	rm -f "$RUN/restoring"
 	# the boot path is the one that is known to bring the restored state up
 	[ "$status" = 0 ] || /sbin/reboot
 }
@@ -550,10 +569,9 @@ watch() { # ID DUE_CS: detached
 		applied_at_now
 		restore failed
 	else
-		cp "$CHANGE/reload" "$RUN/reload"
 		# a reload that is not done by then would run at once with the one of the restore
 		now
-		reload "$RUN/reload" $((NOW / 100 + WINDOW - PROOF_S))
+		reload "$(cat "$CHANGE/reload")" $((NOW / 100 + WINDOW - PROOF_S))
 		applied_at_now
 		wait_until $((NOW + WINDOW * 100)) || exit 0
 		reason=timeout

@@ -208,7 +208,7 @@ def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshCo
     assert len(seen.authorized_keys) == 1
     assert seen.mesh is None
     assert seen.change is not None
-    assert (seen.change.state, seen.change.version) == ("idle", "6")
+    assert (seen.change.state, seen.change.version) == ("idle", "7")
     assert seen.root_in_ram is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None
@@ -333,6 +333,15 @@ def test_a_root_in_memory_is_distinguished_from_one_in_flash() -> None:
     ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
     assert system.parse_root(ram)
     assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
+
+
+def test_a_root_that_cannot_be_written_is_recognized() -> None:
+    rom = "/dev/root / squashfs ro,relatime 0 0\n"
+    assert system.parse_read_only_root(rom)
+    # the last mount on / is the one in use, as after `mount_root` in failsafe mode
+    assert not system.parse_read_only_root(rom + "overlayfs:/overlay / overlay rw,lowerdir=/,upperdir=/ro 0 0\n")
+    assert system.parse_read_only_root("/dev/sda2 / ext4 ro,noatime 0 0\n")
+    assert not system.parse_read_only_root("")
 
 
 def test_a_node_without_a_package_manager_has_one_note_that_says_so() -> None:

@@ -95,3 +95,33 @@ def test_dropbear_and_firewall_changes_cut_logins() -> None:
     for package in empty:
         (effect,) = effects([f"etc/config/{package}"], empty, empty, Release.V24_10)
         assert effect.cut is Cut.LOGIN
+
+
+IN_DEVICE = ("option htmode 'HT20'\n\toption country 'US'", "option country 'US'\n\toption htmode 'HT20'")
+IN_INTERFACE = ("option ifname 'mesh0'\n\toption mode 'adhoc'", "option mode 'adhoc'\n\toption ifname 'mesh0'")
+NO_CHANGE = Effect("wifi", Cut.NOTHING, "no radio changes")
+RESTART = Effect("wifi", Cut.MESH, "radio0 restarts: order of options")
+REJOIN = Effect("wifi", Cut.MESH, "the interfaces of radio0 leave their networks and return: order of options")
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        (IN_DEVICE, [RESTART, RESTART, RESTART, NO_CHANGE, NO_CHANGE, NO_CHANGE]),
+        (IN_INTERFACE, [RESTART, RESTART, RESTART, REJOIN, REJOIN, NO_CHANGE]),
+    ],
+    ids=["radio", "interface"],
+)
+def test_options_in_another_order_cut_what_netifd_takes_down_for_them(
+    place: tuple[str, str], expected: list[Effect]
+) -> None:
+    # an edit by hand has moved an option; meshctl writes the file for another reason, such as another radio
+    assert [cut_by(*place, release) for release in RELEASES] == expected
+
+
+def test_a_change_in_place_names_the_order_of_options_where_that_reconnects_the_interface() -> None:
+    moved = wireless(*IN_INTERFACE)
+    louder = parse(WIRELESS.replace("'27'", "'28'"), "wireless")
+    (effect,) = effects(["etc/config/wireless"], {"wireless": moved}, {"wireless": louder}, Release.V24_10)
+    assert effect.cut is Cut.MESH
+    assert effect.why == "the interfaces of radio0 leave their networks and return: txpower, order of options"
