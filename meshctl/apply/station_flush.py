@@ -138,12 +138,10 @@ class StationFlush:
     def _watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
         """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
         node removes its own, and both count from 0."""
-        owners = self.ctx.run.mac_owners
-        entries = [
-            entry
-            for entry in own_entries(self.node, self.ctx.before, self.radios)
-            if owners.get(entry.mac.lower()) not in self._restarting
-        ]
+        entries = own_entries(self.node, self.ctx.before, self.radios)
+        if self._restarting:
+            owners = self.ctx.run.mac_owners
+            entries = tuple(entry for entry in entries if owners.get(entry.mac.lower()) not in self._restarting)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
 
