@@ -184,7 +184,7 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
     """Observe the participants until each has proven itself or failed, or time is up; then decide, once."""
     backoff = Backoff(commit.window_s * (1 - CONFIRM_SHARE), commit.run.interrupt)
     commit.run.interrupt.wait(
-        max(participant.change.settle_s for participant in commit.participants if participant.change is not None)
+        max(participant.change.first_look_s for participant in commit.participants if participant.change is not None)
     )
     while True:
         commit.each([participant for participant in commit.participants if not participant.is_decided], _prove)
