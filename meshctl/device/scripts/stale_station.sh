@@ -33,6 +33,9 @@ is_old() {
 }
 
 mesh_of() { # DEV: the batman-adv interface that it is a hard interface of
+	# asked once: a watch would start a process for it every time
+	[ "$1" != "$mesh_dev" ] || [ ! -e "/sys/class/net/$mesh" ] || return 0
+	mesh_dev=$1
 	mesh=$(readlink "/sys/class/net/$1/master")
 	mesh=${mesh##*/}
 	[ -n "$mesh" ] || for mesh in /sys/class/net/bat*; do mesh=${mesh##*/} && break; done
