@@ -17,6 +17,9 @@ peer."""
 MAX_TOPIC_BYTES = 255
 """A topic's name: ROS names are shorter; bounds the memory of the table of announced topics."""
 
+MAX_LOG_TOPIC_BYTES = MAX_TOPIC_BYTES - 10
+"""A log's name: its items travel on a reserved topic, whose prefix needs ten bytes."""
+
 MAX_TYPE_BYTES = 255
 """A topic's type name (`pkg/Type`, optionally with a checksum): same reason as MAX_TOPIC_BYTES."""
 
@@ -47,7 +50,7 @@ MAX_RANGES = 64
 """Ranges of missing fragments in one Nack: bounds the repairs one datagram can ask for."""
 
 ACK_BITMAP_BITS = 256
-"""Packets that an acknowledgement covers below its largest number (32 B at most, 0 B if none is missing)."""
+"""Packets that an acknowledgment covers below its largest number (32 B at most, 0 B if none is missing)."""
 
 PRIORITY_LEVELS = 16
 """Priorities 0 (most urgent) to 15: four bits on the wire."""
