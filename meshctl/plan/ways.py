@@ -21,7 +21,7 @@ PACKAGES_S, FIRMWARE_S = 60.0, 300.0
 # What each further node of a stage adds: logins and transfers share the channel (benchmarks.provisioning, 200 nodes).
 NODE_SHARE_S = 0.2
 # A simultaneous change arms in commands of its own, then waits for the scheduled moment (benchmarks.together).
-SIMULTANEOUS_FACTOR = 1.5
+SIMULTANEOUS_FACTOR = 2.5
 # In order, a node is down itself, and once more without a path while the entry node changes.
 USUAL_OUTAGES = 2
 # An operator who waits that much longer wants to know of the other way.
