@@ -6,7 +6,7 @@ fork and exec. Each process counts for the part of meshctl that started it, as o
 - `meshctl`: started by meshctl's own scripts, an OpenWrt tool that they call included. On a router it is the same.
 - `in tools`: started inside such a tool. The lab's stand-ins for ubus, uci, iw, batctl and nft are shell scripts; on a
   router those are programs that start nothing. Init scripts and reload_config start processes there, too.
-- `OpenWrt`: started by procd and netifd because the configuration has changed, whoever changed it.
+- `OpenWrt`: started by procd and netifd because the configuration has changed.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from statistics import median
 from meshctl.plan.values import Cut, NodePlan, Stage, StageKind, Way
 
 IN_ORDER, TOGETHER = "in order", "together"
-# A change of one node that nobody has measured yet: three logins, the reload, the proof.
+# A change of one node, if none was measured yet: three logins, the reload, the proof.
 ASSUMED_CHANGE_S = 12.0
 # Uploading and installing, with the reload and the proof; uploading, flashing and booting.
 PACKAGES_S, FIRMWARE_S = 60.0, 300.0
