@@ -216,6 +216,18 @@ class Journal:
         )
         return dict(rows)
 
+    def change_durations_s(self, fleet: str, *, limit: int = 100) -> tuple[float, ...]:
+        """How long the latest confirmed changes of one node's files took, from staging to the proof."""
+        rows = self._file.read(
+            "SELECT SUM(steps.duration_s) FROM steps JOIN runs ON runs.id = steps.run"
+            " JOIN outcomes ON outcomes.run = steps.run AND outcomes.node = steps.node"
+            " WHERE fleet = ?1 AND command NOT LIKE 'robots %' AND outcomes.result = ?2"
+            " AND step IN ('stage', 'arm', 'apply', 'prove') GROUP BY steps.run, steps.node"
+            " HAVING SUM(step = 'prove') = 1 ORDER BY steps.run DESC LIMIT ?3",
+            (self._key(fleet), Result.DONE.value, limit),
+        )
+        return tuple(duration_s for (duration_s,) in rows)
+
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Store the facts of a node; older facts never replace newer ones."""
         self.remember_all(fleet, {node: facts}, seen_s)
