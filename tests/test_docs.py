@@ -35,6 +35,18 @@ def test_every_source_file_that_a_page_names_exists(page: Path) -> None:
     assert missing == set() or page.name in FOREIGN
 
 
+def test_every_claim_of_the_threat_model_names_existing_tests() -> None:
+    text = (DOCS / "threat-model.md").read_text(encoding="utf-8")
+    tests = ROOT / "tests" / "udp_mesh"
+    files = set(re.findall(r"`((?:\w+/)+test_\w+\.py)`", text))
+    assert len(files) > 15
+    assert {name for name in files if not (tests / name).is_file()} == set()
+    sources = "".join(path.read_text(encoding="utf-8") for path in tests.rglob("test_*.py"))
+    functions = set(re.findall(r"`(test_\w+)", text))
+    assert functions
+    assert {name for name in functions if f"def {name}(" not in sources} == set()
+
+
 def test_node_assumptions_reference_existing_files_and_identifiers() -> None:
     """The tables of node-assumptions.md name files relative to meshctl/ or to the scripts that run on a node."""
     text = (DOCS / "facts/node-assumptions.md").read_text(encoding="utf-8")
