@@ -287,6 +287,8 @@ class Sender(PendingMessages):
             at = self.wake_at
         if self.copies and (at is None or self.copies.next_at() < at):
             at = self.copies.next_at()
+        if self.pmtu.comparisons.running and (at is None or self.pmtu.comparisons.next_at < at):
+            at = self.pmtu.comparisons.next_at
         return at
 
     def pto_s(self) -> float:
@@ -364,15 +366,16 @@ class Sender(PendingMessages):
         self._demote_in_flight()
 
     def consume_small_probe(self, now: float) -> bool:
-        """Whether the probe just allowed is to be a ping: nothing waits, or full fragments may be too large for the
-        path (then one probe in a few, once the peer has been unresponsive for longer)."""
+        """Whether a ping is to be sent as the probe just allowed: nothing waits, or full fragments may be too large for
+        the path. Then it accompanies one probe in a few, and replaces it once the peer has been unresponsive for
+        longer."""
         if self.state is not SendState.UNRESPONSIVE or not self.probe_credit:
             return False
         if self.scheduler.waiting:
-            long_since = now - self.unresponsive_since > FAST_PROBE_FOR_S
-            if not (long_since and self.pmtu.next_probe_is_small()):
+            if not self.pmtu.next_probe_is_small():
                 return False
-            self.probe_credit = 0
+            if now - self.unresponsive_since > FAST_PROBE_FOR_S:
+                self.probe_credit = 0
         self.pmtu.on_small_probe_sent()
         return True
 
