@@ -57,7 +57,6 @@ STALE_AFTER_S = 1.0
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
-
 NON_URGENT_RTT_VALID_S = 1.0
 """While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
 
@@ -283,12 +282,11 @@ class Sender(PendingMessages):
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
             at = deadline
-        if self.wake_at != float("inf") and (at is None or self.wake_at < at):
-            at = self.wake_at
+        wake_at = min(self.wake_at, self.pmtu.comparisons.next_at)
+        if wake_at != float("inf") and (at is None or wake_at < at):
+            at = wake_at
         if self.copies and (at is None or self.copies.next_at() < at):
             at = self.copies.next_at()
-        if self.pmtu.comparisons.running and (at is None or self.pmtu.comparisons.next_at < at):
-            at = self.pmtu.comparisons.next_at
         return at
 
     def pto_s(self) -> float:
@@ -366,9 +364,8 @@ class Sender(PendingMessages):
         self._demote_in_flight()
 
     def consume_small_probe(self, now: float) -> bool:
-        """Whether a ping is to be sent as the probe just allowed: nothing waits, or full fragments may be too large for
-        the path. Then it accompanies one probe in a few, and replaces it once the peer has been unresponsive for
-        longer."""
+        """Whether a ping is sent as the probe just allowed: nothing waits, or full fragments may be too large for the
+        path (then with one probe in a few, and later in its place)."""
         if self.state is not SendState.UNRESPONSIVE or not self.probe_credit:
             return False
         if self.scheduler.waiting:

@@ -3,14 +3,14 @@
 A *comparison* is one ping for each MTU in question. The smallest is the control: once it is answered the path was up,
 and a larger one sent at the same instant, in the same class of traffic, that is not answered soon afterwards was lost
 because of its size, or by chance. This takes a round trip and some tenths of a second (RFC 8899's probe packets), where
-data alone has to wait until late acknowledgements can be excluded.
+data alone has to wait until late acknowledgments can be excluded.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 START_AFTER_S = 0.05
-"""After the first sign. Where large datagrams are lost by chance, the next acknowledgement refutes it before that."""
+"""After the first sign. Where large datagrams are lost by chance, the next acknowledgment refutes it before that."""
 
 INTERVAL_S = 0.05
 LATER_INTERVAL_S = 0.25
