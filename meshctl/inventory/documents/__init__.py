@@ -20,6 +20,7 @@ from meshctl.inventory.documents.robot import (
     RobotDocument,
     SystemDocument,
     TopicDocument,
+    TopicLogDocument,
     UdpMeshDocument,
 )
 from meshctl.inventory.documents.root import InventoryDocument
@@ -46,5 +47,6 @@ __all__ = [
     "SshLayer",
     "SystemDocument",
     "TopicDocument",
+    "TopicLogDocument",
     "UdpMeshDocument",
 ]
