@@ -24,7 +24,7 @@ from meshctl.inventory.documents import (
     TopicLogDocument,
 )
 from meshctl.inventory.layers import NodeSpec
-from meshctl.inventory.nodes import build_nodes, ssh_settings
+from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.tree import MappingNode, descend, position_of
@@ -235,6 +235,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         is_base=document.is_base,
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
         fielded=document.fielded,
+        position=fixed_position(document.position),
     )
 
 

@@ -87,6 +87,15 @@ class SshSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class FixedPosition:
+    """Where a device stands for the whole mission, in meters in the frame of the fleet's map; `z_m` None: unknown."""
+
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Node:
     """One radio device. `address` is its management address with the prefix length, in its mesh's network."""
 
@@ -110,6 +119,7 @@ class Node:
     packages: tuple[str, ...] = ()
     extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     gateway: IPv4Address | None = None
+    position: FixedPosition | None = None
 
     @property
     def unswitched_ports(self) -> tuple[str, ...]:
@@ -155,6 +165,7 @@ class Robot:
     is_base: bool = False
     carries: tuple[str, ...] = ()
     fielded: IPv4Address | None = None
+    position: FixedPosition | None = None
 
 
 @dataclass(frozen=True, slots=True)

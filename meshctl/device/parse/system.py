@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from types import MappingProxyType
 
-from meshctl.device.observation import Bridge, Load, Memory, ReleaseInfo, Space
+from meshctl.device.observation import Bridge, Load, Memory, ReleaseInfo, Sensors, Space
 
 _ASSIGNMENT = re.compile(r"""^DISTRIB_([A-Z]+)=(['"]?)(.*)\2\s*$""", re.MULTILINE)
 _MEMINFO = re.compile(r"^(\w+):\s+(\d{1,15}) kB$", re.MULTILINE)
 _MAC = re.compile(r"[0-9a-fA-F]{2}(?::[0-9a-fA-F]{2}){5}")
 _BOOT_ID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+_BACKLOG = re.compile(r"/sys/kernel/debug/ieee80211/(phy\d{1,3})/aqm:R fq_backlog (\d{1,9})")
+_TEMPERATURE = re.compile(r"/sys/class/(?:ieee80211|thermal)/(phy\d{1,3}|thermal_zone\d{1,3})/\S+?:(-?\d{1,7})")
 _NUMBER = re.compile(r"\d{1,12}(?:\.\d{1,9})?")
 
 
@@ -54,6 +57,19 @@ def parse_load(text: str) -> Load | None:
     if minute is None or len(lines) < 2 or not re.fullmatch(r"\d{1,5}", lines[1].strip()):
         return None
     return Load(minute, max(1, int(lines[1])))
+
+
+def parse_sensors(text: str) -> Sensors:
+    """`PATH:LINE` of debugfs' aqm (`R fq_backlog 12`) and of temperature files; other lines are left out."""
+    queued: dict[str, int] = {}
+    temperatures: dict[str, float] = {}
+    for line in text.splitlines():
+        if found := _BACKLOG.fullmatch(line):
+            queued[found[1]] = int(found[2])
+        elif found := _TEMPERATURE.fullmatch(line):
+            # a radio has one sensor, which it may show in two places
+            temperatures[found[1]] = int(found[2]) / 1000
+    return Sensors(MappingProxyType(queued), MappingProxyType(temperatures))
 
 
 def parse_meminfo(text: str) -> Memory | None:

@@ -51,6 +51,17 @@ supplicants() {
 
 package_tool() { command -v apk || command -v opkg; }
 
+# the channel in use alone: some drivers list every channel of the band
+survey() { # INTERFACE
+	iw dev "$1" survey dump | awk '/^Survey/ { head = $0 } /frequency:/ { used = /\[in use\]/; if (used) print head } used && !/^Survey/'
+}
+
+# packets queued per radio (debugfs), temperatures in thousandths of a degree; a file that is missing is left out
+sensors() {
+	grep -sHE '^-?[0-9]+$|fq_backlog' /sys/kernel/debug/ieee80211/phy*/aqm /sys/class/thermal/thermal_zone*/temp \
+		/sys/class/ieee80211/phy*/hwmon*/temp1_input /sys/class/ieee80211/phy*/device/hwmon/hwmon*/temp1_input
+}
+
 authorized_keys() { [ ! -f /etc/dropbear/authorized_keys ] || cat /etc/dropbear/authorized_keys; }
 
 host_keys() { for key in /etc/dropbear/dropbear_*_host_key; do [ ! -f "$key" ] || dropbearkey -y -f "$key"; done; }
@@ -61,7 +72,11 @@ mesh() { # INTERFACE
 	section "batctl.hardifs_json $1" batctl meshif "$1" hardifs_json
 	section "batctl.neighbors_json $1" batctl meshif "$1" neighbors_json
 	section "batctl.originators_json $1" batctl meshif "$1" originators_json
-	batctl meshif "$1" originators_json >/dev/null 2>&1 && return
+	if batctl meshif "$1" originators_json >/dev/null 2>&1; then
+		section "batctl.statistics $1" batctl meshif "$1" statistics
+		return
+	fi
+	section "batctl.statistics $1" batctl -m "$1" statistics
 	section "batctl.interface $1" batctl -m "$1" if
 	section "batctl.neighbors $1" batctl -m "$1" n
 	section "batctl.originators $1" batctl -m "$1" o
@@ -86,10 +101,12 @@ section iw.dev iw dev
 for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { print $2 }'); do
 	section "iw.link $dev" iw dev "$dev" link
 	section "iw.stations $dev" iw dev "$dev" station dump
+	section "iw.survey $dev" survey "$dev"
 done
 for dev in /sys/class/net/bat*; do
 	[ ! -e "$dev" ] || mesh "${dev##*/}"
 done
+section sensors sensors
 section supplicants supplicants
 section batctl.version batctl -v
 section bridges bridges

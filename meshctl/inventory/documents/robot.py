@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.documents.node import SshLayer
+from meshctl.inventory.documents.node import PositionDocument, SshLayer
 from meshctl.inventory.fields import Address, Flag, Interface, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
@@ -38,6 +38,8 @@ class RobotDocument(Document):
     """Beacons in the robot's racks; may contain ranges."""
     fielded: Address = NOT_WRITTEN
     """Address of the robot's computer while it runs the legacy udp_mesh; replace it with `computer` at migration."""
+    position: PositionDocument = NOT_WRITTEN
+    """Where it stands, if it does not move, as a base station."""
 
 
 class OperatorsDocument(Document):
