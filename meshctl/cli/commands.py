@@ -49,6 +49,7 @@ COMMANDS: dict[str, Entry] = {
     "status": Entry("meshctl.cli.status", "status", "Show the fleet's state and alarms", _INSPECT),
     "preflight": Entry("meshctl.cli.status", "preflight", "Run the go/no-go checks before a mission", _INSPECT),
     "topology": Entry("meshctl.cli.topology", "topology", "Show the mesh topology", _INSPECT),
+    "monitor": Entry("meshctl.cli.monitor", "monitor", "Watch the fleet and serve a live page", _INSPECT),
     "alarms": Entry("meshctl.cli.alarms", "app", "List, acknowledge and silence alarms", _INSPECT),
     "metrics": Entry("meshctl.cli.metrics", "metrics", "Print the fleet's metrics for Prometheus", _INSPECT),
     "trust": Entry("meshctl.cli.ssh", "trust", "Pin the SSH host keys of nodes", _INSPECT),
