@@ -141,14 +141,14 @@ def test_the_tutorial_shows_the_output_of_every_command() -> None:
 
 def test_every_picture_is_shown_and_made_by_a_script() -> None:
     texts = [page.read_text(encoding="utf-8") for page in PAGES]
-    script = (ROOT / "scripts/pictures").read_text(encoding="utf-8")
+    script = "".join((ROOT / "scripts" / name).read_text(encoding="utf-8") for name in ("pictures", "page-pictures"))
     # Those of the links are made, and compared with the list of links, by benchmarks/unfamiliar_links and its test.
     links = [f"links/{picture.stem}" for picture in (DOCS / "images/links").iterdir()]
     assert [name for name in links if not any(f"images/{name}.svg" in text for text in texts)] == []
-    pictures = [picture.stem for picture in (DOCS / "images").iterdir() if picture.is_file()]
+    pictures = [picture.name for picture in (DOCS / "images").iterdir() if picture.is_file()]
     assert len(pictures) > 5
-    assert [name for name in pictures if not any(f"images/{name}.svg" in text for text in texts)] == []
-    assert [name for name in pictures if f'"{name}"' not in script and f'"{name}.svg"' not in script] == []
+    assert [name for name in pictures if not any(f"images/{name}" in text for text in texts)] == []
+    assert [name for name in pictures if f'"{name}"' not in script and f'"{Path(name).stem}"' not in script] == []
 
 
 def test_the_site_lists_every_page() -> None:

@@ -51,6 +51,7 @@ COMMANDS: dict[str, Entry] = {
     "topology": Entry("meshctl.cli.topology", "topology", "Show the mesh topology", _INSPECT),
     "meter": Entry("meshctl.cli.meter", "meter", "Show when a robot should drop its next beacon", _INSPECT),
     "plan-placement": Entry("meshctl.cli.plan_placement", "plan_placement", "Plan beacons along a route", _INSPECT),
+    "monitor": Entry("meshctl.cli.monitor", "monitor", "Watch the fleet and serve a live page", _INSPECT),
     "alarms": Entry("meshctl.cli.alarms", "app", "List, acknowledge and silence alarms", _INSPECT),
     "metrics": Entry("meshctl.cli.metrics", "metrics", "Print the fleet's metrics for Prometheus", _INSPECT),
     "trust": Entry("meshctl.cli.ssh", "trust", "Pin the SSH host keys of nodes", _INSPECT),

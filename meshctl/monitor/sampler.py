@@ -105,6 +105,8 @@ class FrameSampler:
     positions: Positions | None = None
     listeners: list[FrameListener] = field(default_factory=list)
     clock: FrameClock = field(default_factory=FrameClock)
+    topic_classes: Mapping[str, str] = field(default_factory=dict)
+    on_problem: Callable[[str], None] = lambda text: None
     problem: str = ""
     """Why the last round failed; empty if it did not."""
     _end: threading.Event = field(default_factory=threading.Event, repr=False)
@@ -123,6 +125,7 @@ class FrameSampler:
                 self.problem = str(error)
                 self._wait_s = self.interval_s
                 event_log.emit(event_log.INFO, "sample failed", reason=self.problem)
+                self.on_problem(self.problem)
             self._end.wait(max(0.0, began_s + self._wait_s - self.clock.monotonic()))
 
     def stop(self) -> None:
@@ -145,6 +148,7 @@ class FrameSampler:
             checks=preflight(self.fleet, status),
             positions=positions,
             airtime=self._airtime(document, began_s),
+            topic_classes=self.topic_classes,
         )
         began = self.store.append(frame)
         for listener in self.listeners:

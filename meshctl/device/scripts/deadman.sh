@@ -471,7 +471,13 @@ doze() { sleep 0.2 2>/dev/null || sleep 1; }
 # ever written into the FIFO
 pause() {
 	[ -p "$RUN/pause" ] || mkfifo "$RUN/pause" 2>/dev/null
-	if [ -p "$RUN/pause" ]; then read -r -t "$1" _ <>"$RUN/pause" || :; else sleep "$1"; fi
+	if [ -p "$RUN/pause" ]; then
+		read -r -t "$1" _ <>"$RUN/pause" 2>/dev/null
+		# 1: the time is over; more: this shell's read knows no time limit
+		[ $? -le 1 ] || sleep "$1"
+	else
+		sleep "$1"
+	fi
 }
 
 # extra VERB DIRECTORY: what else a change does and undoes besides files; says nothing, since sessions read our answers

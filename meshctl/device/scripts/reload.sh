@@ -39,7 +39,13 @@ is_late() { [ -n "$UNTIL_S" ] && read -r uptime _ </proc/uptime && [ "${uptime%.
 # pause SECONDS: a sleep without a process of its own; nothing is ever written into the FIFO
 pause() {
 	[ -p /tmp/meshctl/pause ] || mkfifo /tmp/meshctl/pause 2>/dev/null
-	if [ -p /tmp/meshctl/pause ]; then read -r -t "$1" _ <>/tmp/meshctl/pause || :; else sleep "$1"; fi
+	if [ -p /tmp/meshctl/pause ]; then
+		read -r -t "$1" _ <>/tmp/meshctl/pause 2>/dev/null
+		# 1: the time is over; more: this shell's read knows no time limit
+		[ $? -le 1 ] || sleep "$1"
+	else
+		sleep "$1"
+	fi
 }
 
 # until_s SECONDS COMMAND...: runs COMMAND once a second until it succeeds; 1 on timeout, or when it is late

@@ -89,7 +89,13 @@ flush_restarted() {
 # pause SECONDS: a sleep without a process of its own; nothing is ever written into the FIFO
 pause() {
 	[ -p /tmp/meshctl/pause ] || mkfifo /tmp/meshctl/pause 2>/dev/null
-	if [ -p /tmp/meshctl/pause ]; then read -r -t "$1" _ <>/tmp/meshctl/pause || :; else sleep "$1"; fi
+	if [ -p /tmp/meshctl/pause ]; then
+		read -r -t "$1" _ <>/tmp/meshctl/pause 2>/dev/null
+		# 1: the time is over; more: this shell's read knows no time limit
+		[ $? -le 1 ] || sleep "$1"
+	else
+		sleep "$1"
+	fi
 }
 
 # watch_stale SECONDS DEV/MAC...: for SECONDS, removes entries that are older than the watch and become stale

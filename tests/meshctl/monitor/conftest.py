@@ -1,7 +1,20 @@
-"""The tests with a real prometheus are collected where there is one (scripts/setup-prometheus)."""
+"""One browser for all of the page's tests. The tests with a real prometheus are collected where there is one
+(scripts/setup-prometheus)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser
+
+from tests.meshctl.monitor.browser import chromium
 from tests.meshctl.monitor.prometheus_program import expects_prometheus
 
 collect_ignore = [] if expects_prometheus() else ["test_prometheus.py"]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    with chromium() as started:
+        yield started

@@ -1,0 +1,131 @@
+"""`meshctl monitor` as its users run it: a virtual fleet breaks and recovers, and a real browser shows the page."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+from typer.testing import CliRunner
+
+from meshctl.cli.main import build
+from meshctl.monitor.store import MIN_BYTES, FrameStore
+from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
+from tests.meshctl.monitor.documents import frame
+from tests.meshctl.status.line_fleet import Bench, line_of_three
+
+pytestmark = pytest.mark.xdist_group("browser")
+
+
+@contextmanager
+def monitoring(bench: Bench, *words: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """The address of the page, and the process."""
+    command = bench.command("monitor", "--interval", "1", "--port", "0", "--timeout", "20", "--json", *words)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=bench.environ) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(process.stdout.readline())["url"], process
+        finally:
+            process.kill()
+
+
+@pytest.mark.lab
+def test_the_page_follows_a_fleet_that_breaks_and_recovers(browser: Browser, tmp_path: Path) -> None:
+    expect.set_options(timeout=PATIENCE_MS)
+    history, run = tmp_path / "run.sqlite", tmp_path / "run.html"
+    with line_of_three(tmp_path) as bench:
+        with (
+            monitoring(bench, "--store", str(history)) as (url, process),
+            opened(browser, url, width=1600) as page,
+        ):
+            totals = page.locator("#totals")
+            expect(totals).to_contain_text("3/3")
+            began = page.locator("html").get_attribute("data-shown")
+            page.click("#tab-radios")
+            row = page.locator("#radios tbody tr", has_text="b02")
+            expect(row).to_contain_text("✓ ok")
+            # a node dies
+            bench.fleet.inject_fault("b02", "off")
+            expect(row).to_contain_text("✕ no answer")
+            expect(page.locator("#verdict")).to_have_attribute("data-go", "false")
+            page.click("#tab-alarms")
+            alarm = page.locator("#alarms article", has_text="unreachable")
+            expect(alarm).to_contain_text("b02")
+            alarm.get_by_role("button", name="Acknowledge").click()
+            expect(page.locator("#alarms article.is-acknowledged")).to_contain_text("acknowledged by")
+            # back in time it still answers
+            page.locator("#slider").fill(str(began))
+            expect(totals).to_contain_text("3/3")
+            expect(page.locator("#mode")).to_contain_text("past")
+            page.keyboard.press("l")
+            expect(totals).to_contain_text("2/3")
+            # it comes back, over a link that has become bad
+            bench.fleet.repair()
+            bench.fleet.link("b01", "b02", tq=90, signal_dbm=-88)
+            expect(totals).to_contain_text("3/3")
+            expect(page.locator("#alarms li", has_text="unreachable")).to_contain_text("b02")
+            page.click("#tab-radios")
+            page.locator("#radios tbody tr", has_text="b02").click()
+            expect(page.locator("#details table .bar[data-class=poor]").first).to_be_visible()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 130
+        # the debriefing
+        done = bench.run_bare("monitor", "--replay", str(history), "--out", str(run))
+        assert done.exit_code == 0, done.stderr
+    with opened(browser, file_url(run)) as page:
+        expect(page.locator("#mode")).to_contain_text("recording")
+        page.click("#live")
+        expect(page.locator("#totals")).to_contain_text("3/3")
+
+
+def run(*words: str) -> tuple[int, str]:
+    environ: dict[str, str | None] = dict.fromkeys(("MESHCTL_INVENTORY", "MESHCTL_LAB", "MESHCTL_MONITOR_TOKEN"))
+    done = CliRunner().invoke(build("monitor"), ["monitor", *words], env=environ, catch_exceptions=False)
+    return done.exit_code, done.output
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Path:
+    path = tmp_path / "run.sqlite"
+    with FrameStore.open(path, 1e9, MIN_BYTES) as store:
+        store.append(frame(1000.0))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--listen", "example.org"], "--listen: expected an IP address, found 'example.org'"),
+        (["--tls-cert", "cert.pem"], "expected --tls-cert and --tls-key together"),
+        (["--out", "run.html"], "--out needs --replay"),
+        (["--replay", "nothing.sqlite"], "cannot read nothing.sqlite: No such file or directory"),
+        (["--replay", "run.sqlite", "--once"], "--replay goes with neither --once nor --allow-actions"),
+        (["--token-file", "nothing"], "cannot read nothing: No such file or directory"),
+        (["--replay", "run.sqlite", "--listen", "192.0.2.1"], "cannot listen on 192.0.2.1 port 8765"),
+    ],
+)
+def test_wrong_options_are_named(
+    words: list[str], expected: str, history: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(history.parent)
+    code, output = run(*words)
+    assert (code, expected in output) == (2, True), output
+
+
+@pytest.mark.parametrize("token", ["", "short", "with a space in it, which is long"])
+def test_a_weak_token_is_refused(token: str, tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(token)
+    code, output = run("--token-file", str(tmp_path / "token"))
+    assert (code, "expected a token of at least 16 printable ASCII characters" in output) == (2, True), output
+
+
+def test_a_history_becomes_one_file(history: Path, tmp_path: Path) -> None:
+    code, output = run("--replay", str(history), "--out", str(tmp_path / "run.html"), "--json")
+    written = json.loads(output)
+    assert (code, written["event"]) == (0, "written")
+    assert (tmp_path / "run.html").stat().st_size == written["bytes"]

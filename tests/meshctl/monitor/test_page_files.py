@@ -1,0 +1,61 @@
+"""The page's files: no inline code, no markup from text, joined without conflicts; the pinned files of others."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from meshctl.monitor.page import ASSETS, joined_modules, modules, single_file
+
+OWN = sorted(ASSETS.glob("*.js"))
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_the_page_has_no_inline_script_style_or_handler() -> None:
+    html = (ASSETS / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r"<script(?![^>]*\bsrc=)|<style|\bstyle=|\son\w+=|javascript:", html) == []
+    # from this server alone
+    assert re.findall(r'(?:src|href)="(?!assets/|#)[^"]*"', html) == []
+    for name in re.findall(r'(?:src|href)="assets/([^"]+)"', html):
+        assert (ASSETS / name).is_file(), name
+
+
+@pytest.mark.parametrize("file", OWN, ids=lambda file: file.name)
+def test_no_module_makes_markup_or_code_of_text(file: Path) -> None:
+    banned = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|setHTML|DOMParser|cookie"
+    assert re.findall(banned, file.read_text(encoding="utf-8")) == []
+
+
+def test_every_module_is_reached_and_no_two_define_the_same_name() -> None:
+    assert sorted(modules()) == [file.name for file in OWN]
+    assert modules()[-1] == "main.js"
+    found = re.findall(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", joined_modules(), re.MULTILINE)
+    assert [name for name, count in Counter(found).items() if count > 1] == []
+    assert not re.search(r"^(?:import|export)\b", joined_modules(), re.MULTILINE)
+
+
+def test_colors_of_classes_are_those_of_okabe_and_ito() -> None:
+    css = (ASSETS / "style.css").read_text(encoding="utf-8").lower()
+    for color in ("#009e73", "#e69f00", "#d55e00", "#56b4e9", "#cc79a7", "#0072b2"):
+        assert color in css
+
+
+def test_a_recording_cannot_leave_its_element() -> None:
+    text = single_file({"meta": {"fleet": "</script><script>alert(1)</script>"}})
+    assert "alert(1)" not in text
+    assert text.count("<script") == text.count("</script>") == 7
+    assert "default-src 'none'" in text
+    assert "src=" not in re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+
+
+def test_files_of_others_are_pinned_by_version_and_hash() -> None:
+    pinned = json.loads((ROOT / "scripts/page-assets/package-lock.json").read_text())["packages"]
+    licenses = (ASSETS / "vendor/LICENSES.txt").read_text(encoding="utf-8")
+    for name, package in pinned.items():
+        if name:
+            assert package["integrity"].startswith("sha512-")
+            assert f"{name.removeprefix('node_modules/')} {package['version']}" in licenses

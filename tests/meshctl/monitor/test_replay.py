@@ -1,0 +1,94 @@
+"""Recordings of udp-mesh as frames, alone and merged into a history."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from meshctl.errors import InputError
+from meshctl.monitor.frame import Frame
+from meshctl.monitor.replay import open_recordings
+from meshctl.monitor.store import MIN_BYTES, FrameStore
+
+PEER = {
+    "name": "base",
+    "online": True,
+    "heard_ago_s": 0.2,
+    "round_trip_s": 0.03,
+    "loss": 0.25,
+    "outbox_messages": 2,
+    "queues": [{"priority": 3, "messages": 4, "bytes": 90, "oldest_s": 1.5}],
+}
+HEADER = {"recording": 1, "node": "spot1", "boot": "b", "started": 1000.0, "payloads": False}
+LINES: list[dict[str, Any]] = [
+    {"t": 0.5, "kind": "sent", "topic": "telemetry", "priority": 3, "bytes": 10, "to": None, "reliable": False},
+    {"t": 1.0, "kind": "conditions", "name": "spot1", "peers": [PEER, {**PEER, "name": "husky1", "online": False}]},
+    {"t": 1.5, "kind": "place", "x": 3.0, "y": 4.0},
+    {"t": 2.0, "kind": "some-later-kind"},
+    {"t": 3.0, "kind": "conditions", "name": "spot1", "peers": []},
+]
+
+
+def written(path: Path, *lines: object, tail: str = "") -> Path:
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + tail)
+    return path
+
+
+def test_a_recording_alone_becomes_frames(tmp_path: Path) -> None:
+    file = written(tmp_path / "spot1.jsonl", HEADER, *LINES, tail='{"t": 4.0, "kind": "cond')
+    with open_recordings([file], tmp_path) as opened:
+        frames = list(opened.store.after(0.0))
+        assert [frame.time_s for frame in frames] == [1001.0, 1003.0]
+        (robot,) = frames[0].status["robots"]
+        # two peers, each with a queue
+        assert robot["queues"] == [{"priority": 3, "messages": 8, "bytes": 180, "oldest_s": 1.5}]
+        assert robot["topics"][0]["sent_ago_s"] == 0.5
+        assert robot["peers"][0]["round_trip_s"] == 0.03
+        (link,) = frames[0].document["links"]
+        assert (link["from"], link["to"], link["quality"]) == ("base", "spot1", 0.75)
+        assert frames[1].document["positions"]["spot1"]["x_m"] == 3.0
+        assert opened.fleet == "recording"
+
+
+def test_a_history_gains_what_a_robot_recorded_while_it_did_not_answer(tmp_path: Path) -> None:
+    def robot(name: str, *, answers: bool) -> dict[str, Any]:
+        health = "ok" if answers else "unreachable"
+        return {"name": name, "answers": answers, "health": health, "peers": None, "queues": None, "alarms": []}
+
+    history = tmp_path / "run.sqlite"
+    with FrameStore.open(history, 1e9, MIN_BYTES) as store:
+        for time_s in (1001.5, 1002.5, 1100.0):
+            robots = [robot("spot1", answers=time_s == 1002.5), robot("husky1", answers=False)]
+            store.append(Frame.of({"time_s": time_s, "fleet": "lab", "status": {"nodes": [], "robots": robots}}))
+    file = written(tmp_path / "spot1.jsonl", HEADER, *LINES)
+    with open_recordings([history, file], tmp_path) as opened:
+        first, second, last = opened.store.after(0.0)
+        assert opened.fleet == "lab"
+        spot, husky = first.status["robots"]
+        assert (spot["recorded"], spot["answers"], spot["health"]) == (True, False, "unreachable")
+        assert (spot["queues"][0]["messages"], spot["age_s"]) == (8, 0.5)
+        assert husky["queues"] is None
+        # it answered, and later its recording has nothing new
+        assert "recorded" not in second.status["robots"][0]
+        assert "recorded" not in last.status["robots"][0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ([], "line 1: expected the header of a recording of version 1"),
+        ([{"recording": 2}], "line 1: expected the header of a recording of version 1"),
+        ([{"recording": 1}], "line 1: expected node and started"),
+        ([HEADER], "expected lines of kind conditions, found none"),
+        ([HEADER, 7, *LINES], "line 2: expected a JSON object"),
+    ],
+)
+def test_what_is_no_recording_is_named(lines: list[object], expected: str, tmp_path: Path) -> None:
+    file = written(tmp_path / "broken.jsonl", *lines)
+    with pytest.raises(InputError) as raised, open_recordings([file], tmp_path):
+        pass
+    assert expected in str(raised.value)
+    assert str(file) in str(raised.value)
