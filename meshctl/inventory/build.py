@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,6 +18,7 @@ from meshctl.inventory.documents import (
     ComputerDocument,
     HardwareDocument,
     InventoryDocument,
+    LanDocument,
     MeshDocument,
     RobotDocument,
     SecretDocument,
@@ -26,6 +28,7 @@ from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, descend, position_of
 from meshctl.model import (
     ApplyPolicy,
@@ -68,7 +71,8 @@ def build(
         for robot in robots.values():
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
-    built = build_nodes(specs, hardware, meshes, robot_of)
+    lan_addresses = _lan_addresses(document, robots, root, diagnostics)
+    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses)
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -233,7 +237,39 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         is_base=document.is_base,
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
         fielded=document.fielded,
+        lan=document.lan.network if document.lan is not None else None,
     )
+
+
+def _lan_addresses(
+    document: InventoryDocument, robots: Mapping[str, Robot], root: MappingNode, diagnostics: list[Diagnostic]
+) -> dict[str, IPv4Interface]:
+    """The address of each radio in its robot's own LAN: as set, else the first ones in the order of `nodes`."""
+    found: dict[str, IPv4Interface] = {}
+    for name, robot in robots.items():
+        if robot.lan is None:
+            continue
+        lan = document.robots[name].lan
+        for node in lan.addresses.keys() - set(robot.nodes):
+            path = ("robots", name, "lan", "addresses", node)
+            place = position_of(root, path) or Position(root.file)
+            message = f"the robot has no radio '{node}'"
+            hint = did_you_mean(node, robot.nodes)
+            diagnostics.append(codes.error(codes.BAD_ADDRESS, place, message, path=".".join(path), hint=hint))
+        for index, node in enumerate(dict.fromkeys(robot.nodes)):
+            address = lan.addresses.get(node) or _host(lan, index)
+            if address is None:
+                place = position_of(root, ("robots", name, "lan")) or Position(root.file)
+                message = f"{lan.network} has no address for the radio '{node}'"
+                diagnostics.append(codes.error(codes.BAD_ADDRESS, place, message, path=f"robots.{name}.lan"))
+                break
+            found.setdefault(node, IPv4Interface((address, lan.network.prefixlen)))
+    return found
+
+
+def _host(lan: LanDocument, index: int) -> IPv4Address | None:
+    """The LAN's host address with `index` (from 0); None beyond its last."""
+    return lan.network[index + 1] if index + 2 < lan.network.num_addresses else None
 
 
 def _names(
@@ -268,6 +304,7 @@ def _computer(document: ComputerDocument) -> Computer:
         python=document.python,
         arch=document.arch,
         ros=document.ros,
+        gateway=document.gateway,
     )
 
 

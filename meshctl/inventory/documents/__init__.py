@@ -16,6 +16,7 @@ from meshctl.inventory.documents.radio import (
 from meshctl.inventory.documents.robot import (
     ApplyDocument,
     ComputerDocument,
+    LanDocument,
     OperatorsDocument,
     RobotDocument,
     SystemDocument,
@@ -34,6 +35,7 @@ __all__ = [
     "GroupDocument",
     "HardwareDocument",
     "InventoryDocument",
+    "LanDocument",
     "MeshDocument",
     "NodeDocument",
     "NodeLayer",
