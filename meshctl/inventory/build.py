@@ -20,8 +20,10 @@ from meshctl.inventory.documents import (
     InventoryDocument,
     LanDocument,
     MeshDocument,
+    OtherComputerDocument,
     RobotDocument,
     SecretDocument,
+    SshLayer,
     TopicDocument,
 )
 from meshctl.inventory.layers import NodeSpec
@@ -44,6 +46,7 @@ from meshctl.model import (
     Robot,
     SecretKind,
     SecretRef,
+    SshSettings,
     SystemSettings,
     Topic,
     UdpMesh,
@@ -238,6 +241,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
         fielded=document.fielded,
         lan=document.lan.network if document.lan is not None else None,
+        computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
     )
 
 
@@ -296,11 +300,18 @@ def _names(
     return tuple(made)
 
 
+def _other_computer(document: OtherComputerDocument) -> Computer:
+    return Computer(document.address, _computer_ssh(document.ssh))
+
+
+def _computer_ssh(document: SshLayer) -> SshSettings:
+    return ssh_settings({key: getattr(document, key) for key in document.model_fields_set}, user="")
+
+
 def _computer(document: ComputerDocument) -> Computer:
-    written = {key: getattr(document.ssh, key) for key in document.ssh.model_fields_set}
     return Computer(
         address=document.address,
-        ssh=ssh_settings(written, user=""),
+        ssh=_computer_ssh(document.ssh),
         python=document.python,
         arch=document.arch,
         ros=document.ros,

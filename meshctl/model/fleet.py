@@ -153,7 +153,8 @@ class Robot:
     """A robot, or the operator's base station (`is_base`): the udp_mesh peer `name`.
 
     `fielded` is the address of a robot that still runs the legacy udp_mesh, which meshctl does not manage. `lan` is the
-    subnet of the robot's own LAN, which its radios route; None: they bridge the mesh to its switch.
+    subnet of the robot's own LAN, which its radios route; None: they bridge the mesh to its switch. `computers` are the
+    others on its switch by name, which run no daemon.
     """
 
     name: str
@@ -163,6 +164,19 @@ class Robot:
     carries: tuple[str, ...] = ()
     fielded: IPv4Address | None = None
     lan: IPv4Network | None = None
+    computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def other_addresses(self) -> tuple[str, ...]:
+        """The addresses of its computers without a daemon."""
+        return tuple(str(computer.address.ip) for computer in self.computers.values())
+
+    def all_computers(self) -> Iterator[tuple[tuple[str, ...], str, Computer]]:
+        """All its computers, the daemon's first: the path below the robot, what it is, and its settings."""
+        if self.computer is not None:
+            yield ("computer",), f"the computer of {self.name}", self.computer
+        for name, computer in self.computers.items():
+            yield ("computers", name), f"{name} of {self.name}", computer
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "topic-silent": "it sends nothing on a topic for longer than the topic's rate and deadline allow",
         "topic-not-arriving": "a robot it hears sends on a topic, but nothing arrives",
         "disk": "low on disk space",
+        "computer-silent": "another computer on its switch does not answer",
         # the fleet
         "stranger": "a device that is not in the inventory is in the mesh",
         "not-compared": "a device could not be compared with the inventory, usually because a secret is missing",

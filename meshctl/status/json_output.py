@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from meshctl.robots.facts import RobotFacts
 from meshctl.status.last_known import typed
 from meshctl.status.preflight import Check, verdict
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
@@ -95,6 +96,10 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
         "is_base": robot.robot.is_base,
         "state": None if robot.state is None else robot.state.value,
         "radios": list(robot.robot.nodes),
+        "computers": [
+            {"name": name, "address": str(one.address.ip), "answers": _answers(robot.facts, str(one.address.ip))}
+            for name, one in robot.robot.computers.items()
+        ],
         "address": None if robot.robot.computer is None else str(robot.robot.computer.address.ip),
         "health": robot.health.value,
         "answers": robot.facts is not None,
@@ -162,6 +167,11 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
             for topic in robot.topics
         ],
     }
+
+
+def _answers(facts: RobotFacts | None, address: str) -> bool | None:
+    """Whether another computer of the robot answered; None if nothing pinged it."""
+    return None if facts is None or facts.answering is None else address in facts.answering
 
 
 def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:

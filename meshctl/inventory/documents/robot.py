@@ -28,6 +28,15 @@ class ComputerDocument(Document):
     the robot's LAN, else of the robot's first radio."""
 
 
+class OtherComputerDocument(Document):
+    """Another computer on the robot's switch, without a daemon."""
+
+    address: Interface
+    """Address with prefix length."""
+    ssh: SshLayer = Field(default_factory=SshLayer)
+    """SSH login, for `meshctl inventory export`."""
+
+
 class LanDocument(Document):
     """A robot's LAN with a subnet of its own, routed by the robot's radios instead of bridged into the mesh."""
 
@@ -43,7 +52,9 @@ class RobotDocument(Document):
     nodes: tuple[Text, ...] = ()
     """Radios mounted on the robot; may contain ranges."""
     computer: ComputerDocument = NOT_WRITTEN
-    """The robot's computer."""
+    """The robot's computer, where the udp_mesh daemon runs."""
+    computers: dict[Name, OtherComputerDocument] = Field(default_factory=dict)
+    """Other computers on its switch by name. The one that runs the daemon pings them for `meshctl status`."""
     is_base: Flag = False
     """True for the operator's base station."""
     carries: tuple[Text, ...] = ()

@@ -43,10 +43,9 @@ def stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...],
         if node.lan_address is not None:
             yield node.lan_address.ip, (lan_address_path(fleet, node), node.name)
     for robot in fleet.robots.values():
-        if robot.computer is not None:
-            path = ("robots", robot.name, "computer", "address")
-            yield robot.computer.address.ip, (path, f"the computer of {robot.name}")
-        elif robot.fielded is not None:
+        for place, what, computer in robot.all_computers():
+            yield computer.address.ip, (("robots", robot.name, *place, "address"), what)
+        if robot.computer is None and robot.fielded is not None:
             yield robot.fielded, (("robots", robot.name, "fielded"), f"the computer of {robot.name}")
 
 
@@ -96,8 +95,8 @@ def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         yield from _reserved(("nodes", node.name, "address"), node.address)
     for robot in fleet.robots.values():
-        if robot.computer is not None:
-            yield from _reserved(("robots", robot.name, "computer", "address"), robot.computer.address)
+        for place, _, computer in robot.all_computers():
+            yield from _reserved(("robots", robot.name, *place, "address"), computer.address)
 
 
 def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding]:
@@ -167,11 +166,11 @@ def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         around = dict.fromkeys(mesh.network for node in nodes for mesh in meshes_of(fleet, node))
         if robot.lan is not None:
             around = dict.fromkeys((robot.lan,))
-        if robot.computer is not None and around:
-            address = robot.computer.address.ip
+        for place, _, computer in robot.all_computers() if around else ():
+            address = computer.address.ip
             if not any(address in network for network in around):
                 expected = f"an address in {' or '.join(str(network) for network in around)}"
-                path = ("robots", robot.name, "computer", "address")
+                path = ("robots", robot.name, *place, "address")
                 message = "outside the network of its radios" if robot.lan is None else "outside the robot's LAN"
                 yield Finding(path, message, expected, str(address))
 

@@ -117,19 +117,17 @@ def _unusable(network: IPv4Network) -> bool:
 )
 def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
-        if robot.computer is None:
-            continue
-        address = robot.computer.address
-        path = ("robots", robot.name, "computer", "address")
-        if robot.lan is not None:
-            if address.ip in robot.lan and address.network != robot.lan:
-                expected = f"/{robot.lan.prefixlen} as in the robot's LAN"
-                yield Finding(path, "prefix length differs from the LAN's", expected, f"/{address.network.prefixlen}")
-            continue
-        for mesh in fleet.meshes.values():
-            if address.ip in mesh.network and address.network != mesh.network:
-                expected = f"/{mesh.network.prefixlen} as in mesh {mesh.name}"
-                yield Finding(path, "prefix length differs from the mesh's", expected, f"/{address.network.prefixlen}")
+        around = [("the robot's LAN", "the LAN's", robot.lan)] if robot.lan is not None else []
+        if not around:
+            around = [(f"mesh {mesh.name}", "the mesh's", mesh.network) for mesh in fleet.meshes.values()]
+        for place, _, computer in robot.all_computers():
+            address = computer.address
+            for where, whose, network in around:
+                if address.ip in network and address.network != network:
+                    path = ("robots", robot.name, *place, "address")
+                    expected = f"/{network.prefixlen} as in {where}"
+                    found = f"/{address.network.prefixlen}"
+                    yield Finding(path, f"prefix length differs from {whose}", expected, found)
 
 
 @fleet_rule(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from meshctl.inventory.explain import explain
+from meshctl.render.host_lists import host_entries
 from tests.meshctl.inventory.inventories import HEAD, fleet_of, load_text
 
 TEAM = """\
@@ -69,3 +70,15 @@ def test_a_lan_without_room_for_the_radios_is_an_error(tmp_path: Path) -> None:
     loaded = load_text(tmp_path, HEAD + with_lan("{network: 10.43.1.0/31}"))
     (diagnostic,) = loaded.diagnostics
     assert diagnostic.message == "10.43.1.0/31 has no address for the radio 'husky-front'"
+
+
+def test_a_robot_names_other_computers_on_its_switch(tmp_path: Path) -> None:
+    others = "computers: {jetson: {address: 10.43.1.11/24, ssh: {user: nvidia}}}, computer:"
+    fleet = fleet_of(tmp_path, with_lan("{network: 10.43.1.0/24}").replace("computer:", others))
+    found = [(path, what, str(one.address.ip)) for path, what, one in fleet.robots["husky"].all_computers()]
+    assert found == [
+        (("computer",), "the computer of husky", "10.43.1.10"),
+        (("computers", "jetson"), "jetson of husky", "10.43.1.11"),
+    ]
+    aliases = {entry.alias: entry.ssh.user for entry in host_entries(fleet, ())}
+    assert aliases == {"robot.husky": "", "robot.husky.jetson": "nvidia"}

@@ -109,7 +109,7 @@ def _online(lab: Lab, robot: str) -> set[str]:
     done = control.run(lab.fleet.directory, words)
     if done.exit_status != 0:
         return set()
-    return {peer["name"] for peer in json.loads(done.stdout)["peers"] if peer["online"]}
+    return {peer["name"] for peer in json.loads(done.stdout)["conditions"]["peers"] if peer["online"]}
 
 
 def test_a_changed_channel_is_provisioned_over_the_routed_mesh(routed: RoutedLab) -> None:
