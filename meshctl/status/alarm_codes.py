@@ -30,7 +30,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "alone": "deployed, but hears no other node",
         "no-path": "no path through the mesh to the base",
         "weak": "the quality of its path to the base is low",
-        "dropped": "a beacon marked as carried relays for others, or did when last seen",
+        "dropped": "a beacon marked as carried relays for others, or did when last seen, or is away from its robot",
         "cut-vertex": "others reach the base only through it",
         "bridge": "a LAN port or the mesh is not in a bridge",
         "flash": "low on flash storage",
