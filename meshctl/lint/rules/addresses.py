@@ -7,11 +7,13 @@ from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_a
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates
+from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, Node
 
+# so many nodes of a mesh, and all of them, outside its network: the network is wrong, not each address
+_WRONG_NETWORK_NODES = 3
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
 
@@ -75,10 +77,23 @@ def networks(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], IPv4Network]]:
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
 def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    outside: dict[str, list[Node]] = {}
     for node in fleet.managed():
-        networks = [mesh.network for mesh in meshes_of(fleet, node)]
-        if networks and not any(node.address.ip in network for network in networks):
-            expected = f"an address in {' or '.join(str(network) for network in networks)}"
+        meshes = meshes_of(fleet, node)
+        if meshes and not any(node.address.ip in mesh.network for mesh in meshes):
+            outside.setdefault(meshes[0].name, []).append(node)
+    for name, nodes in outside.items():
+        mesh = fleet.meshes[name]
+        if len(nodes) >= _WRONG_NETWORK_NODES and not any(
+            other.address.ip in mesh.network for other in fleet.members(name)
+        ):
+            # one typo in the network, rather than one in each address
+            message = f"contains no address of {join_limited([node.name for node in nodes])}"
+            expected = f"a network with {nodes[0].address.ip}"
+            yield Finding(("meshes", name, "network"), message, expected, str(mesh.network))
+            continue
+        for node in nodes:
+            expected = f"an address in {' or '.join(str(mesh.network) for mesh in meshes_of(fleet, node))}"
             yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
 
 

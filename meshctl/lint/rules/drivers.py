@@ -32,6 +32,7 @@ _DRIVERS = frozenset(
 # PCI buses and slots in the kernel's device paths: domain:bus, domain:bus:device.function, and `+1` for a second radio
 _PCI_BUS = re.compile(r"pci[0-9a-f]{4}:[0-9a-f]{2}")
 _PCI_SLOT = re.compile(r"[0-9a-f]{4}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7](\+\d+)?")
+_LIKE_PCI_BUS = re.compile(r"[a-z]*[0-9a-f]{4}:[0-9a-f]{2}")
 _LIKE_PCI_SLOT = re.compile(r"[0-9a-z]+:[0-9a-z:]+\.[0-9+]+")
 _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
 
@@ -133,6 +134,6 @@ def _is_device_path(path: str) -> bool:
 
 
 def _is_bad_pci(part: str) -> bool:
-    if part.startswith("pci"):
+    if part.startswith("pci") or _LIKE_PCI_BUS.fullmatch(part):
         return _PCI_BUS.fullmatch(part) is None
     return _LIKE_PCI_SLOT.fullmatch(part) is not None and _PCI_SLOT.fullmatch(part) is None
