@@ -45,7 +45,7 @@ bench: setup
 	$(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
 	$(VENV)-bench/bin/python -m benchmarks
 
-# A fleet on the kernel's own radios to practise on; `meshctl lab up` without --real starts in a second and needs no QEMU.
+# A fleet on the kernel's own radios to practice on; `meshctl lab up` without --real starts in a second and needs no QEMU.
 lab: setup
 	scripts/setup-lab
 	$(BIN)/meshctl lab up --real

@@ -37,8 +37,6 @@ _TICK_S = 0.0005
 _READY_S = 30.0
 _LINGER_S = 0.5
 
-Send = Callable[[int, bytes], Any]
-
 
 @asynccontextmanager
 async def _udp_mesh_node(name: str) -> Any:

@@ -73,5 +73,5 @@ def _site_path(link: str) -> str:
 
 
 def _relative(text: str, up: str) -> str:
-    """Generated pages name others as if they stood in docs/ itself."""
+    """Generated pages link to others as if they were in docs/ itself."""
     return _LINK.sub(lambda link: up + link[1] if link[1] not in pages() else link[1], text)

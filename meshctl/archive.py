@@ -32,10 +32,15 @@ class TarMember:
         return info
 
 
-def tar_of(members: Iterable[TarMember]) -> bytes:
-    """An uncompressed USTAR archive of the members in the order given."""
+def tar_of(members: Iterable[TarMember], copied: Iterable[tuple[tarfile.TarInfo, bytes]] = ()) -> bytes:
+    """An uncompressed USTAR archive of the members in the order given.
+
+    `copied` are members of another archive, with their content: they follow with their own owner, time and mode. Their
+    names may be longer than USTAR allows, so an archive that has them is in GNU format, as busybox's tar writes it.
+    """
     out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-        for member in members:
-            tar.addfile(member.info, io.BytesIO(member.content))
+    others = list(copied)
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT if others else tarfile.USTAR_FORMAT) as tar:
+        for info, content in [*((member.info, member.content) for member in members), *others]:
+            tar.addfile(info, io.BytesIO(content))
     return out.getvalue()

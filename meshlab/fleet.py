@@ -72,11 +72,6 @@ class VirtualNode:
         """
         return (self._fleet.directory / "nodes" / self.name / "flash" / "current").resolve()
 
-    @property
-    def console_log(self) -> Path:
-        """The output of its boot scripts, over all boots."""
-        return self._fleet.directory / "nodes" / self.name / "console.log"
-
     def console(self, lines: int = 40) -> str:
         """The last lines of its console: each boot, each boot script and its output."""
         return str(self._fleet.request("console", node=self.name, lines=lines)["text"])
@@ -320,8 +315,7 @@ class VirtualFleet:
 class QemuFleet(VirtualFleet):
     """A fleet in a QEMU machine, with the kernel's own radios, mesh and bridges.
 
-    The nodes' files are inside the machine: `VirtualNode.flash_path` and `console_log` do not exist on the host; use
-    `exec` and `console` instead.
+    The nodes' files are inside the machine: `VirtualNode.flash_path` does not exist on the host; use `exec` instead.
     """
 
     SUPERVISOR = "meshlab.qemu.host_proxy"

@@ -121,7 +121,7 @@ class LinkState:
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
         for link in path.links:
-            # TCP waits for lost segments and for lost acknowledgements alike
+            # TCP waits for lost segments and for lost acknowledgments alike
             arrives *= 1 - max(link.loss_to(link.a), link.loss_to(link.b))
         return Shape(
             sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None

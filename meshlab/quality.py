@@ -1,6 +1,6 @@
 """Frame loss on a link <-> BATMAN_IV's transmit quality (TQ), as net/batman-adv/bat_iv_ogm.c derives it from OGMs.
 
-A node's TQ towards a neighbor is the share of its own OGMs that the neighbor echoes back, less a penalty for link
+A node's TQ toward a neighbor is the share of its own OGMs that the neighbor echoes back, less a penalty for link
 asymmetry: tq = 255 * (1 - loss there) * (1 - loss back ** 3).
 """
 

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import re
 
-_EVERYWHERE = r"told|anew|whoever|somebody|nobody|mend(?:s|ed|ing)?|tells? of|cope[sd]? with|take up what"
+_EVERYWHERE = (
+    r"told|anew|whoever|somebody|nobody|mend(?:s|ed|ing)?|tells? of|cope[sd]? with|take up what|in vain|never heard of"
+    r"|towards|whilst|amongst|whence|half-way|such a one|lest|comes? to rest|goes on|as they told"
+)
 # in code these are also keys, names of functions and parts of sound sentences
-_IN_PAGES = r"tells?|of a node that|takes? up|taken up|carr(?:y|ied) out|neighbours?|behaviours?|colours?"
+_IN_PAGES = (
+    r"tells?|of a node that|takes? up|taken up|carr(?:y|ied) out|struck|of its own accord|again and again"
+    # British spellings
+    r"|neighbours?|behaviours?|colours?|favou?r(?:s|ed|ing)|honours?|cancelled|cancelling|labelled"
+    r"|travell(?:ed|ing)|practis(?:e|es|ed|ing)|licence|misspelt|grey|metres?|centres?"
+    r"|(?:recogn|organ|optim|initial|serial|synchron|normal|minim|maxim|real)is(?:e|es|ed|ing|ation)"
+)
 # words of the command line and of the lab's protocol, and names of lint rules
 _ALLOWED = re.compile(
     r"lab mend\b|`mend`|^mend$|([a-z]+-)+nobody|nobody(-[a-z]+)+|as nobody|^(nobody can log in|carried by nobody)$"

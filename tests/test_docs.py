@@ -127,6 +127,15 @@ def test_the_tutorial_shows_the_output_of_every_command() -> None:
         assert silent.match(line) or not line.startswith("$ ") or not following.startswith("$ "), line
 
 
+def test_every_picture_is_shown_and_made_by_a_script() -> None:
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    script = (ROOT / "scripts/pictures").read_text(encoding="utf-8")
+    pictures = [picture.stem for picture in (DOCS / "images").iterdir()]
+    assert len(pictures) > 5
+    assert [name for name in pictures if not any(f"images/{name}.svg" in text for text in texts)] == []
+    assert [name for name in pictures if f'"{name}"' not in script and f'"{name}.svg"' not in script] == []
+
+
 def test_the_site_lists_every_page() -> None:
     site = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
 

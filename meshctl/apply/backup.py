@@ -22,7 +22,7 @@ from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
-from meshctl.archive import TarMember
+from meshctl.archive import TarMember, tar_of
 from meshctl.device import openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
@@ -89,18 +89,14 @@ def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, by
 
     Raises InputError for a damaged archive.
     """
-    out = io.BytesIO()
-    with tarfile.open(fileobj=out, mode="w", format=tarfile.GNU_FORMAT) as new:
-        added = [TarMember(INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)]
-        added += [TarMember(path.lstrip("/"), content) for path, content in extra.items()]
-        for own in added:
-            new.addfile(own.info, io.BytesIO(own.content))
-        for member, content in _members(archive, "the archive"):
-            if member.isreg():
-                new.addfile(member, io.BytesIO(content))
-            elif member.issym():
-                new.addfile(member)
-    return gzip.compress(out.getvalue(), mtime=0)
+    added = [TarMember(INFO_NAME, json.dumps(info, indent=1).encode(), 0o600)]
+    added += [TarMember(path.lstrip("/"), content) for path, content in extra.items()]
+    kept = [(member, content) for member, content in _members(archive, "the archive") if _is_kept(member)]
+    return gzip.compress(tar_of(added, copied=kept), mtime=0)
+
+
+def _is_kept(member: tarfile.TarInfo) -> bool:
+    return member.isreg() or member.issym()
 
 
 def read_backup(data: bytes, file: str) -> Backup:

@@ -306,7 +306,7 @@ def confirm(change: ChangeInProgress, proof: SshConnection | None = None) -> boo
     """Confirm over a connection that was opened after the services had reloaded: that login is the proof that the node
     is reachable. `proof` is such a connection; otherwise a new one is opened, and goes to the pool.
 
-    False when the window ran out meanwhile. Raises Unreachable.
+    False if the window expired meanwhile. Raises Unreachable.
     """
     if proof is not None:
         return _confirm_over(change, proof)

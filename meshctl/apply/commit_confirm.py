@@ -1,7 +1,7 @@
 """Commit-confirm for one node: a change is confirmed after it has proven itself, or the node rolls it back.
 
 `run_change` arms and starts the change over the existing connection, then polls the node's dead-man's switch over new
-connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop goes on: it
+connections (`poll`) until the change is confirmed or rolled back. After a cut at any point the same loop continues: it
 reads the node's state and takes the next action. A listener receives the events of the change.
 """
 

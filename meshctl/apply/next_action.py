@@ -86,7 +86,7 @@ REASONS = {
     "abort": "it was aborted",
     "boot": "its power was cut, or it rebooted, before it was confirmed",
     "guard": "its timer was killed; its second timer took over",
-    "expired": "it was armed but not started before its operator's lock ran out",
+    "expired": "it was armed but not started before its operator's lock expired",
     "failed": "the files could not be written, or the packages could not be installed",
     "moved-on": "a file on it was changed by someone else",
     "operator": "it was canceled",

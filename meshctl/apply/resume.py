@@ -22,9 +22,9 @@ def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[
         seen = now.observed.observations.get(outcome.node)
         match plan.verdict:
             case Verdict.SAME:
-                what = "it is as desired"
+                what = "it matches the inventory"
             case Verdict.CHANGE:
-                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and is changed again"
+                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and will change again"
             case Verdict.REFUSED:
                 what = f"it answers and is refused: {plan.reason}"
             case Verdict.AWAY:

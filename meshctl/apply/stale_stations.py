@@ -1,6 +1,6 @@
 """Find stale station entries: those that neighbors hold of a radio that has restarted since. Pure.
 
-A radio that restarts counts its frames from 0. A neighbor keeps its block acknowledgement window and drops that node's
+A radio that restarts counts its frames from 0. A neighbor keeps its block acknowledgment window and drops that node's
 unicast frames until the numbers have caught up, while broadcasts pass and batman-adv sees a perfect link (docs/lab.md).
 Without its station entry it learns the node from the next beacon. Removing the entry of a radio that did *not* restart
 causes the same loss in the other direction. So the holder of an entry verifies it first: it removes the entry of a

@@ -66,7 +66,7 @@ Limit = Annotated[
         "--limit",
         "-l",
         metavar="NODES",
-        help="Only those that this selects too; repeat to narrow the selection further.",
+        help="Narrow the selection to nodes that match this, too; repeatable.",
     ),
 ]
 
@@ -216,7 +216,7 @@ def confirm(question: str) -> None:
     if not sys.stdin.isatty():
         raise InputError("not a terminal: cannot ask for confirmation", hint="review the plan, then pass --yes")
     if not typer.confirm(question):
-        echo("cancelled; nothing was changed", err=True)
+        echo("canceled; nothing was changed", err=True)
         raise typer.Exit(int(ExitCode.FINDINGS))
 
 

@@ -52,6 +52,7 @@ def deployed(
     """Mark dropped beacons as deployed; `meshctl status` then expects them to answer.
 
     Example: meshctl deployed husky1-b03 B4
+
     Example: meshctl deployed --from-mesh
     Example: meshctl deployed --watch 30
     """

@@ -27,7 +27,7 @@ def history(
     lab: Annotated[
         bool | None, typer.Option("--virtual/--real", help="Only runs in a lab, or only on real nodes.")
     ] = None,
-    diff: Annotated[bool, typer.Option("--diff", help="With a run number: show the differences of its files.")] = False,
+    diff: Annotated[bool, typer.Option("--diff", help="With a run number: show file diffs.")] = False,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number of runs.")] = 20,
     as_json: AsJson = False,
 ) -> None:

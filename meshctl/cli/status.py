@@ -71,7 +71,9 @@ def status(
     Exit code (of the devices shown): 0 healthy, 1 degraded, 3 a required device is unreachable, 2 could not run.
 
     Example: meshctl status --watch 5
+
     Example: meshctl status role:beacon --limit state:deployed
+
     Example: meshctl status --alarm any
     """
     attributes = {"group": group or (), "robot": robot or (), "role": role or (), "state": state or ()}
@@ -175,6 +177,7 @@ def preflight(
     Exit code: 0 go, 1 no-go, 2 could not run.
 
     Example: meshctl preflight
+
     Example: meshctl preflight robot:husky1 robot:husky2
     """
     fleet = fleet_view.fleet

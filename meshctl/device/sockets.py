@@ -28,7 +28,7 @@ def open_socket(endpoint: Endpoint, limits: Deadlines) -> socket.socket:
         raise Unreachable(
             f"{endpoint.label}: cannot connect: {error.strerror or error}", hint=_interface_hint(endpoint, error)
         ) from error
-    # between commands keepalives want no reply, so the kernel has to notice missing acknowledgements
+    # between commands keepalives want no reply, so the kernel has to notice missing acknowledgments
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 4 * limits.keepalive_s * 1000)
     return sock
 

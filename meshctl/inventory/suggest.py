@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from functools import lru_cache
 
 
 def nearest(wrong: str, known: Iterable[str]) -> str:
     """The known name most similar to `wrong`, or an empty string."""
     # Longer names are not typos, and the comparison is quadratic in their length.
-    if len(wrong) > 64:
-        return ""
-    names = list(known)
+    return "" if len(wrong) > 64 else _nearest(wrong, tuple(known))
+
+
+@lru_cache(maxsize=256)
+def _nearest(wrong: str, names: tuple[str, ...]) -> str:
     lowered = {name.lower(): name for name in names}
     exact = lowered.get(wrong.lower().replace("-", "_"))
     if exact is not None:

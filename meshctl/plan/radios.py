@@ -51,7 +51,7 @@ def restarting_radios(before: Package | None, after: Package | None) -> Radios:
 # mac80211.sh and wdev.uc; txpower was run on 24.10 and 25.12). Up to 22.03 netifd takes the whole radio down and up for
 # every difference (wireless.c: IFC_RELOAD).
 IN_PLACE = frozenset({"txpower", "distance", "rts", "frag", "country", "antenna_gain"})
-# Of these, the options that may break a weak link: less range, or a shorter wait for acknowledgements.
+# Of these, the options that may break a weak link: less range, or a shorter wait for acknowledgments.
 RANGE = frozenset({"txpower", "distance", "country", "antenna_gain"})
 
 

@@ -2,7 +2,7 @@
 
 The estimate is for the worst case: a cell in which every node hears every other, so all of them share one channel. Each
 node sends its own message once per interval and repeats everyone else's once, which makes the cost grow with the square
-of the number of nodes. Multicast frames go out once, at the multicast rate, without acknowledgement.
+of the number of nodes. Multicast frames go out once, at the multicast rate, without acknowledgment.
 """
 
 from __future__ import annotations

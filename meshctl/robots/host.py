@@ -50,7 +50,7 @@ _HINTS = {
     "moved": "run `meshctl robots diff`, then the command again",
     "not-installed": "run `meshctl robots deploy`",
     "service": "run `meshctl robots logs` for the reason",
-    "masked": "find out why, then `systemctl unmask` it there",
+    "masked": "find out why, then run `systemctl unmask` there",
     "check": "the release was not installed; the running one was not touched",
     "account": "check /etc/passwd there, and that its disk is writable",
     "no-release": "run `meshctl robots deploy`",

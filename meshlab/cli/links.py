@@ -101,7 +101,7 @@ def ground(
     directory: LabDirectory = None,
     as_json: AsJson = False,
 ) -> None:
-    """Load node positions, walls and links, which determine the fleet's links. Without FILE, show the current ones.
+    """Load node positions, walls and links for the fleet. Without FILE, show the current ones.
 
     Example: meshctl lab ground inventory/lab/ground.yaml
     """

@@ -47,13 +47,13 @@ class PeerConditions:
     loss: float
     """Fraction of packets to the peer that are lost, 0 to 1, smoothed."""
     sent_bits_per_s: float
-    """Wire bits of messages sent to the peer, with IP and UDP headers, without acknowledgements and control frames."""
+    """Wire bits of messages sent to the peer, with IP and UDP headers, without acknowledgments and control frames."""
     delivered_bits_per_s: float
     """Payload bits the peer acknowledged."""
     received_bits_per_s: float
     """Wire bits received from the peer."""
     arrived_bits_per_s: float | None
-    """Wire bits received by the peer from us, as reported in its acknowledgements."""
+    """Wire bits received by the peer from us, as reported in its acknowledgments."""
     peer_sends_bits_per_s: float | None
     """Wire bits that the peer reports sending to all nodes."""
     capacity_bits_per_s: float | None
@@ -68,7 +68,7 @@ class PeerConditions:
     """We hear the peer, but its heartbeats show that it does not hear us; if that lasts, it goes offline."""
     unanswered_for_s: float | None
     """How long nothing sent to the peer was acknowledged, even if it is heard; None if nothing awaits an
-    acknowledgement."""
+    acknowledgment."""
 
 
 @dataclass(slots=True)

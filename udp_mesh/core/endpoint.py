@@ -124,7 +124,8 @@ class Endpoint:
         """Accept a message for one peer, or (None) for the topic's destinations, or for all.
 
         For a reliable topic exactly one outcome event follows per destination. A message to all that fits one datagram
-        is broadcast and has no outcome. A peer never heard of is `UNKNOWN_PEER` unless an outbox may hold the message.
+        is broadcast and has no outcome. A peer that was never discovered is `UNKNOWN_PEER` unless an outbox
+        may hold the message.
         """
         return publish.send(self._state, topic, payload, destination, type_name, now)
 

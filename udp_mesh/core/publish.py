@@ -122,7 +122,7 @@ def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: in
         peer = state.peer_table.peers.get(name)
         if peer is None:
             if topic.outbox is Outbox.NONE and name not in topic.destinations:
-                return Rejected(RejectReason.UNKNOWN_PEER, f"{name} was never heard of")
+                return Rejected(RejectReason.UNKNOWN_PEER, f"{name} is not a known peer")
             if len(state.peer_table.peers) >= limits.peers:
                 return Rejected(RejectReason.QUEUE_FULL, f"limit of {limits.peers} peers reached")
             continue

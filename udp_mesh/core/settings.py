@@ -161,10 +161,10 @@ class Rates:
     twice_gap_s: float = 0.003
     """Between the two transmissions: longer than most loss bursts of a radio, short against a deadline."""
     ack_every_packets: int = 10
-    """Packets per acknowledgement under bulk: with 8 to 16, acknowledgements cost under 5 % of a half-duplex
+    """Packets per acknowledgment under bulk: with 8 to 16, acknowledgments cost under 5 % of a half-duplex
     channel."""
     ack_delay_s: float = 0.008
-    """Maximum delay of an acknowledgement; under bulk the sender requests most of them at once (see `ack_spacing`)."""
+    """Maximum delay of an acknowledgment; under bulk the sender requests most of them at once (see `ack_spacing`)."""
     pace_quantum_s: float = 0.003
     """Packets worth this much time are sent together; less costs CPU per wake-up, more costs latency."""
     pack_s: float = 0.003

@@ -1,8 +1,8 @@
 """The state shared by the parts of one node: settings, peers, queues, and who has something to send.
 
 The parts, in the order that bytes and messages pass them: `receive` and `frame_handlers` (datagrams in),
-`peer_lifecycle` (peers come and go), `publish` (messages in), `transmit` (datagrams out, timers), `node` (conditions
-out). Each consists of functions of this state and of `now`.
+`peer_lifecycle` (peers come and go), `publish` (messages in), `transmit` (datagrams out, timers), `endpoint`
+(conditions out). Each consists of functions of this state and of `now`.
 """
 
 from collections.abc import Iterator

@@ -40,7 +40,7 @@ from udp_mesh.wire.header import (
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 
 MAX_PACKET_NUMBER = (1 << 48) - 1
-"""An acknowledgement carries a packet number in 48 bits: 89 years at 100,000 packets a second."""
+"""An acknowledgment carries a packet number in 48 bits: 89 years at 100,000 packets a second."""
 
 SHORT_OVERHEAD_BYTES = SHORT_HEADER_BYTES + SEAL_TAG_BYTES
 """23 B: what a BROADCAST or DATA datagram adds to its frames."""

@@ -134,7 +134,7 @@ class Inbox:
         return True
 
     def take_read(self) -> None:
-        """Remove what programs have read. A message waits for its acknowledgement if one of its readers is to give
+        """Remove what programs have read. A message waits for its acknowledgment if one of its readers is to give
         it."""
         for key, held in list(self._held.items()):
             positions = list(held.reading.items())

@@ -264,7 +264,7 @@ def _decode_waiting(reader: Reader) -> tuple[Waiting, ...]:
 
 def _decode_ack(reader: Reader) -> Ack:
     largest = reader.integer(6, "largest packet")
-    delay_us = reader.integer(3, "acknowledgement delay")
+    delay_us = reader.integer(3, "acknowledgment delay")
     rate = reader.integer(4, "receive rate")
     width = reader.at_most(1, limits.ACK_BITMAP_BITS // 8, "bitmap length")
     missing = int.from_bytes(reader.take(width, "bitmap"), "little")

@@ -137,7 +137,7 @@ class Ack(NamedTuple):
     received: int
     """256-bit bitmap: bit i set means packet `largest - 1 - i` arrived. Bits below packet 0 are clear."""
     delay_us: int
-    """From the arrival of `largest` to this acknowledgement's sending, at most 2**24-1 us."""
+    """From the arrival of `largest` to this acknowledgment's sending, at most 2**24-1 us."""
     receive_rate: int
     """Wire bytes/s arriving from this peer, averaged over about 1 s (0: none, or not known yet)."""
     waiting: tuple[Waiting, ...] = ()

@@ -103,12 +103,12 @@ class PriorityMeshData:
 
 
 _ENCAPSULATION = _HEADER.pack(LegacyType.ACK, 0xFFFF, 0xFFFFFFFF, 0, 0)[:-2]
-"""An acknowledgement of a message that is never sent: unicast numbers end at 0x7fff, and broadcasts are not
+"""An acknowledgment of a message that is never sent: unicast numbers end at 0x7fff, and broadcasts are not
 acknowledged."""
 
 
 def encapsulate(data: bytes) -> bytes:
-    """Encapsulate a datagram that may reach legacy programs in the payload of an acknowledgement they ignore.
+    """Encapsulate a datagram that may reach legacy programs in the payload of an acknowledgment they ignore.
 
     A legacy program that receives a datagram of an unknown type, as by broadcast, crashes.
     """

@@ -47,7 +47,7 @@ MAX_RANGES = 64
 """Ranges of missing fragments in one Nack: bounds the repairs one datagram can ask for."""
 
 ACK_BITMAP_BITS = 256
-"""Packets that an acknowledgement covers below its largest number (32 B at most, 0 B if none is missing)."""
+"""Packets that an acknowledgment covers below its largest number (32 B at most, 0 B if none is missing)."""
 
 PRIORITY_LEVELS = 16
 """Priorities 0 (most urgent) to 15: four bits on the wire."""

@@ -148,7 +148,7 @@ class MeshDocument(Document):
     mcast_rate_kbps: Whole = Field(default=12000, ge=1000, le=54_000)
     """Multicast rate; a low one makes batman-adv prefer long weak links."""
     distance_m: Whole = Field(default=1000, ge=0, le=100_000)
-    """Longest link in meters; sets the acknowledgement timeout."""
+    """Longest link in meters; sets the acknowledgment timeout."""
     beacon_interval_tu: Whole = Field(default=100, ge=15, le=65_535)
     """802.11 beacon interval in time units of 1024 us."""
     mtu: Whole = Field(default=1560, ge=68, le=9000)

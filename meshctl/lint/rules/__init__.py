@@ -1,1 +1,1 @@
-"""The rules, one file for each thing they look at. Codes are stable: a code that is given up is never given again."""
+"""The rules, one file per subject. Codes are stable: a retired code is never reused."""

@@ -330,7 +330,7 @@ def broadcast_rate_low(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     "MC315",
     Severity.WARNING,
     "`distance_m` is too short",
-    why="""A radio ignores acknowledgements that arrive later than `distance_m` allows and retransmits delivered frames:
+    why="""A radio ignores acknowledgments that arrive later than `distance_m` allows and retransmits delivered frames:
     longer links lose nearly all their throughput.""",
     fix="Set `distance_m` to the longest expected link; a few hundred extra meters cost almost nothing.",
     failing="meshes: {main: {distance_m: 50}}",
@@ -348,7 +348,7 @@ def distance_short(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC316",
     Severity.WARNING,
     "`distance_m` is very long",
-    why="""After each lost frame the radio waits for the acknowledgement timeout before it retransmits: 30 km cost 200
+    why="""After each lost frame the radio waits for the acknowledgment timeout before it retransmits: 30 km cost 200
     microseconds each time, for every node of the cell.""",
     fix="Set `distance_m` to the longest expected link.",
     failing="meshes: {main: {distance_m: 60000}}",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from difflib import get_close_matches
 from pathlib import PurePath
 
 from meshctl import firmware
 from meshctl.diagnostics import Severity
+from meshctl.inventory.suggest import nearest
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import join_limited
 from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_package
@@ -296,7 +296,7 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                 judged[name] = suggest_package(name)
             meant = judged[name]
             if meant is not None:
-                hint = f"did you mean {meant}?"
+                hint = f"did you mean '{meant}'?"
                 yield Finding(packages_path(node, written), "unknown package", meant, name, hint)
 
 
@@ -322,10 +322,10 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if hint:
                 yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
-            near = get_close_matches(subtarget, sorted(SUBTARGETS[target]), 1)
-            for meant in near:
-                expected = f"{target}/{meant}"
-                yield Finding(path, "unknown subtarget", expected, profile.target, f"did you mean {expected}?")
+            near = nearest(subtarget, sorted(SUBTARGETS[target]))
+            if near:
+                expected = f"{target}/{near}"
+                yield Finding(path, "unknown subtarget", expected, profile.target, f"did you mean '{expected}'?")
 
 
 @fleet_rule(

@@ -19,7 +19,7 @@ _CONDUCTED_COUNTRIES = frozenset({"US", "AS", "CA", "GU", "MP", "PR", "VI"})
 _CONDUCTED_BANDS_MHZ = ((2400.0, 2483.5), (5725.0, 5850.0))
 # drive levels are whole dBm, and the database rounds to tenths of a mW
 _ROUNDING_DB = 0.05
-# beyond this difference a link loses acknowledgements long before data
+# beyond this difference a link loses acknowledgments long before data
 _ASYMMETRY_DB = 10.0
 # ratings are often rounded up: "1 W" can mean 28 dBm
 _CLASS_TOLERANCE_DB = 3.0
@@ -261,7 +261,7 @@ def beamwidth_contradicts(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "MC349",
     Severity.WARNING,
     "The transmit powers in a mesh are too far apart",
-    why="""Frames from the strong radio arrive, but acknowledgements from the weak one do not: the strong node keeps
+    why="""Frames from the strong radio arrive, but acknowledgments from the weak one do not: the strong node keeps
     retransmitting, and the link looks good in one direction only.""",
     fix="Bring the powers of the mesh's radios within 10 dB of each other.",
     failing="nodes: {b01: {radios: {radio0: {tx_power_dbm: 10}}}}",

@@ -3,35 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from difflib import get_close_matches
-from functools import lru_cache
 
 from meshctl.diagnostics import Severity
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Role
 
-# comparing with more names takes too long
+# A fleet may have as many wrong names as nodes: comparing each of them with all names takes too long.
 _MAX_COMPARED = 500
 _MAX_SHOWN_JUMPS = 8
 
 
 def suggest(names: Iterable[str], wrong: str) -> tuple[str, str]:
     """The `expected` text and the hint for `wrong`, which is not one of `names`."""
-    choices = tuple(sorted(names))
-    near = _nearest(choices, wrong)
-    return (
-        f"one of {join_limited(choices)}" if choices else "nothing, as none are defined",
-        f"did you mean {near}?" if near else "",
-    )
-
-
-@lru_cache(maxsize=256)
-def _nearest(choices: tuple[str, ...], wrong: str) -> str:
-    if len(choices) > _MAX_COMPARED:
-        return ""
-    return next(iter(get_close_matches(wrong, choices, 1)), "")
+    choices = sorted(names)
+    expected = f"one of {join_limited(choices)}" if choices else "nothing, as none are defined"
+    return expected, did_you_mean(wrong, choices) if len(choices) <= _MAX_COMPARED else ""
 
 
 def _unknown(fleet: Fleet, path: tuple[str, ...], names: Sequence[str]) -> Iterator[Finding]:

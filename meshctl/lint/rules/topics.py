@@ -326,7 +326,7 @@ def outbox_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC716",
     Severity.WARNING,
     "A best-effort topic has an outbox",
-    why="Best effort means now or never: kept messages would be sent once, without an acknowledgement.",
+    why="Best effort means now or never: kept messages would be sent once, without an acknowledgment.",
     fix="Set `reliable: true`, or remove the outbox.",
     failing="topics: {video: {outbox: all}}",
     passing="topics: {video: {outbox: none}}",

@@ -18,7 +18,7 @@ _ALL = "all"
 # subcarriers for 52, 80 MHz has 234, 160 MHz has 468
 _MCS7_MBPS = {20: 65.0, 40: 135.0, 80: 292.5, 160: 585.0}
 _MCS3_SHARE = 26.0 / 65.0
-# share of the physical rate left by preambles, contention, acknowledgements and headers
+# share of the physical rate left by preambles, contention, acknowledgments and headers
 _EFFICIENCY = 0.6
 # a message crosses about two links of the channel on its way through a chain of beacons
 _USUAL_HOPS = 2
@@ -299,7 +299,7 @@ def offline_too_soon(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     "MC740",
     Severity.WARNING,
     "A peer counts as offline only after minutes",
-    why="Until then its messages are sent in vain, and the operator sees it as online.",
+    why="Until then its messages are sent but do not arrive, and the operator sees it as online.",
     fix="Set `offline_after_s` to 10 or 20.",
     failing="udp_mesh: {offline_after_s: 300}",
     passing="udp_mesh: {offline_after_s: 10}",

@@ -234,7 +234,7 @@ wireless.default_radio0.device='radio0'
         (0, True, False, True),
         # missing all along: not what the change did
         (0, False, False, False),
-        # it goes on sending although it is off
+        # it continues to send although it is off
         (1, True, True, True),
         (1, True, False, False),
     ],

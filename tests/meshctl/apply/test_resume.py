@@ -26,8 +26,8 @@ def prepared(verdict: Verdict) -> Prepared:
 @pytest.mark.parametrize(
     ("verdict", "text"),
     [
-        (Verdict.SAME, "now it is as desired"),
-        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and is changed again"),
+        (Verdict.SAME, "now it matches the inventory"),
+        (Verdict.CHANGE, "now it runs its previous state (it was not confirmed in time) and will change again"),
         (Verdict.REFUSED, "now it answers and is refused: no board"),
         (Verdict.AWAY, "now it is still unreachable"),
     ],

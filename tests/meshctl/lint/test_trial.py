@@ -213,7 +213,7 @@ def test_a_zone_name_as_timezone_suggests_its_posix_string(tmp_path: Path) -> No
 
 def test_a_misspelled_zone_name_suggests_the_nearest(tmp_path: Path) -> None:
     (finding,) = _found("system: {zonename: America/Dever}", tmp_path)
-    assert (finding.code, finding.hint) == ("MC232", "did you mean America/Denver?")
+    assert (finding.code, finding.hint) == ("MC232", "did you mean 'America/Denver'?")
 
 
 def test_every_zone_of_the_table_has_a_posix_string() -> None:
@@ -283,11 +283,11 @@ def test_an_unknown_target_unlike_any_known_one_is_accepted(target: str, tmp_pat
 @pytest.mark.parametrize(
     ("fragment", "code", "hint"),
     [
-        ("hardware: {rocket: {target: ath79/genric}}", "MC833", "did you mean ath79/generic?"),
-        ("hardware: {rocket: {target: ath97/generic}}", "MC833", "did you mean ath79?"),
+        ("hardware: {rocket: {target: ath79/genric}}", "MC833", "did you mean 'ath79/generic'?"),
+        ("hardware: {rocket: {target: ath97/generic}}", "MC833", "did you mean 'ath79'?"),
         ("robots: {husky1: {computer: {arch: arm64}}}", "MC631", "write aarch64"),
         ("robots: {husky1: {computer: {ros: melodic}}}", "MC632", ""),
-        ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean kmod-ath9k?"),
+        ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean 'kmod-ath9k'?"),
     ],
 )
 def test_a_misspelling_gets_a_suggestion(fragment: str, code: str, hint: str, tmp_path: Path) -> None:

@@ -21,7 +21,6 @@ from meshctl.topology import Graph, Link, graph_of
 
 SALT = b"0123456789abcdef"
 FINGERPRINTS = Fingerprints(SALT)
-NEIGHBOUR = "02:00:00:00:01:00"
 PASS_PHRASE = "correct horse battery staple"
 INVENTORY = """\
 meshctl: 1

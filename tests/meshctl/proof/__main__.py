@@ -1,7 +1,7 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and says with which `--first` the next call
-goes on. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
+Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and prints the `--first` with which the
+next call continues. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def _report(path: Path, page: Path | None = None) -> int:
             sys.stdout.write(json.dumps(record, indent=1) + "\n")
     bad = [record for record in cases if not record["holds"]]
     bad += [record for record in records if record["part"] == "crowd" and (record["wrong"] or record["not new"])]
-    sys.stdout.write(f"{len(cases)} cases, {len(bad)} do not hold\n")
+    sys.stdout.write(f"{len(cases)} cases, {len(bad)} failed\n")
     return 1 if bad else 0
 
 

@@ -73,7 +73,7 @@ class Model:
     may_run: dict[str, frozenset[str]] = field(default_factory=dict)
 
     def update(self, target: str, runs: Iterable[Ended | None]) -> None:
-        """Runs of one round towards `target`; None is one that was killed, of which nothing is known."""
+        """Runs of one round to `target`; None is one that was killed, of which nothing is known."""
         results = [None if run is None else run.results for run in runs]
         for name, before in self.may_run.items():
             meanings = [OLD | NEW if of is None else MEANING[of.get(name, "uncertain")] for of in results]

@@ -110,7 +110,7 @@ def _last_word(run: Ended, name: str) -> str:
 
 
 def _verdicts(rig: Rig, struck: Mapping[str, tuple[str, str]], new: str) -> dict[str, str]:
-    """What meshctl sees of the nodes once they have come to rest without anybody's help.
+    """What meshctl sees of the nodes once they have settled without help.
 
     A node under its dead-man's switch does while meshctl looks (it clears what a dead meshctl left); one that has
     just begun to be flashed is up for another moment, then gone for a while.

@@ -167,12 +167,12 @@ def firmware(directory: Path) -> dict[str, str]:
 
 
 def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
-    """A Markdown table: what was struck, where, how often, and how it ended."""
+    """A Markdown table of the cases: operation, fault, step, and how they ended."""
     rows: dict[tuple[str, str, str], list[Mapping[str, object]]] = {}
     for record in records:
         key = (str(record["verb"]), str(record["kind"]), str(record["phase"]))
         rows.setdefault(key, []).append(record)
-    yield "| work | struck | during | cases | old | new | bricked | neither | out of reach | not resumed |"
+    yield "| operation | fault | step | cases | old | new | bricked | neither | unreachable | not resumed |"
     yield "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
     for (verb, kind, phase), cases in rows.items():
         old, new, bricked = (sum(case["state"] == state for case in cases) for state in ("old", "new", "bricked"))
@@ -183,21 +183,21 @@ def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
 
 
 def filled(page: str, rows: Iterable[str]) -> str:
-    """The page with these rows of `table` in place of those about the same work and strike; others stay."""
-    new = [row for row in rows if not row.startswith(("| work", "| ---"))]
+    """The page with these rows of `table` in place of those of the same operation and fault; others stay."""
+    new = [row for row in rows if not row.startswith(("| operation", "| ---"))]
     updated = {_subject(row) for row in new}
     lines = page.splitlines(keepends=True)
-    head = next(number for number, line in enumerate(lines) if line.startswith("| work |"))
+    head = next(number for number, line in enumerate(lines) if line.startswith("| operation |"))
     end = next(number for number, line in enumerate(lines[head:], head) if not line.startswith("|"))
     kept = [line for line in lines[head + 2 : end] if _subject(line) not in updated]
     rows = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
     return "".join([*lines[: head + 2], *rows, *lines[end:]])
 
 
-# flash and power-cut, for instance; in the order of the page
-_ORDER = [(work, struck) for work in ("apply", "flash") for struck in ("power-cut", "sever", "kill meshctl")]
+# operations and faults in the order of the page
+_ORDER = [(operation, fault) for operation in ("apply", "flash") for fault in ("power-cut", "sever", "kill meshctl")]
 
 
 def _subject(row: str) -> tuple[str, str]:
-    _, work, struck, *_ = (cell.strip() for cell in row.split("|"))
-    return work, struck
+    _, operation, fault, *_ = (cell.strip() for cell in row.split("|"))
+    return operation, fault

@@ -183,12 +183,12 @@ class Lab:
     def hops(self) -> dict[str, int]:
         """The number of hops from the base to each node, along the kernels' current routes."""
         others = self.NODES[1:]
-        towards = {name: self.originators(name).get("base", "") for name in others}
+        next_hops = {name: self.originators(name).get("base", "") for name in others}
         found = {"base": 0}
         for name in others:
             at, count = name, 0
             while at != "base" and count <= len(others):
-                at, count = towards.get(at, "base"), count + 1
+                at, count = next_hops.get(at, "base"), count + 1
             found[name] = count
         return found
 

@@ -189,7 +189,7 @@ def test_a_topic_limit_can_be_removed(run: Run) -> None:
             Exit.FAILED,
             "unknown topic: topic unknown is not declared (run `udp-mesh topics` for",
         ),
-        (["pub", "map", "x", "--to", "nobody"], Exit.FAILED, "nobody was never heard of (run `udp-mesh peers` for"),
+        (["pub", "map", "x", "--to", "nobody"], Exit.FAILED, "nobody is not a known peer (run `udp-mesh peers` for"),
         (["pub", "map", "x", "--file", "map.bin"], Exit.USAGE, "expected either a message or --file, found both"),
     ],
 )

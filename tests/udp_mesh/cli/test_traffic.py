@@ -173,7 +173,7 @@ def test_ping_succeeds_for_a_peer_and_fails_for_an_unknown_one(run: Run) -> None
     assert "2 of 2 answered" in run("ping", "bob", "--count", "2", "--interval", "0.01", "--timeout", "50")[1]
     code, text, complaint = run("ping", "nobody", "-c", "1000")
     assert (code, text) == (Exit.FAILED, "")
-    assert "nobody was never heard of (run `udp-mesh peers` for" in complaint
+    assert "nobody is not a known peer (run `udp-mesh peers` for" in complaint
     code, text, _ = run("ping", "nobody", "--json")
     assert (code, json.loads(text)) == (Exit.FAILED, {"peer": "nobody", "error": "unknown-peer"})
 

@@ -10,8 +10,9 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -19,6 +20,7 @@ from tests.udp_mesh.daemon.processes import RunningDaemon, collect, outcomes, po
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.client import MeshClient, MeshError, Message, mesh_client
 from udp_mesh.client.mesh_client import encode_frame
+from udp_mesh.core.events import Event
 from udp_mesh.core.settings import Limits
 from udp_mesh.daemon.interface import CONDITIONS_TOPIC
 
@@ -48,6 +50,31 @@ def test_messages_arrive_as_they_were_sent_and_their_outcome_is_reported(pair: P
     assert [message.payload for message in found] == [b"", b"ready", big]
     assert found[1] == Message("alice", "status", "std_msgs/String", b"ready", 0, False)
     assert ends == dict.fromkeys(numbers, "delivered")
+
+
+RECORDED_KEYS = Path(__file__).with_name("json_keys.json")
+"""Keys of every document, as paths (`peers[].name`), for scripts that read them: none may disappear."""
+
+
+def key_paths(value: Any, prefix: str = "") -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield f"{prefix}.{key}".lstrip(".")
+            yield from key_paths(inner, f"{prefix}.{key}".lstrip("."))
+    elif isinstance(value, list):
+        for inner in value:
+            yield from key_paths(inner, f"{prefix}[]")
+
+
+def test_recorded_json_keys_are_still_present(pair: Pair) -> None:
+    alice, _ = pair
+    with alice.client() as client:
+        client.request("ping", peer="bob", timeout_s=WAIT_S)
+        seen = {op: set(key_paths(client.request(op))) for op in ("status", "peers", "topics", "neighbours")}
+    seen |= {kind.__name__: {item.name for item in fields(kind)} for kind in get_args(Event)}
+    recorded: dict[str, list[str]] = json.loads(RECORDED_KEYS.read_text(encoding="utf-8"))
+    gone = {name: sorted(set(before) - seen[name]) for name, before in recorded.items()}
+    assert {name: missing for name, missing in gone.items() if missing} == {}
 
 
 def test_a_standalone_copy_of_the_client_module_sends_and_receives(pair: Pair, tmp_path: Path) -> None:
@@ -125,7 +152,7 @@ def test_a_client_that_sends_garbage_does_not_disturb_others(pair: Pair, raw: by
         client.request("peers")
 
 
-def test_a_message_above_the_limit_is_refused_and_the_connection_goes_on(pair: Pair) -> None:
+def test_a_message_above_the_limit_is_refused_and_the_connection_continues(pair: Pair) -> None:
     alice, bob = pair
     limit = Limits().message_bytes
     with alice.client() as sender, bob.client() as receiver:

@@ -128,7 +128,7 @@ def test_an_address_in_use_is_reported_and_retried() -> None:
     asyncio.run(main())
 
 
-def test_an_unexpected_exception_is_reported_and_the_transport_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_exception_is_reported_and_the_transport_continues(monkeypatch: pytest.MonkeyPatch) -> None:
     async def body(alice: Node, bob: Node) -> None:
         reported: list[str] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(str(context["exception"])))

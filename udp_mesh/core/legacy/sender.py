@@ -54,7 +54,7 @@ RESENT_REMEMBERED = 64
 """Fragments acknowledged after a retransmission that may be acknowledged again."""
 
 TIMEOUT_DECAY = 0.995
-"""Decay towards `MIN_TIMEOUT_S` per acknowledgement of a first attempt: it takes some hundred of them."""
+"""Decay toward `MIN_TIMEOUT_S` per acknowledgement of a first attempt: it takes some hundred of them."""
 
 
 @dataclass(slots=True)

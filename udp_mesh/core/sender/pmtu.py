@@ -240,7 +240,7 @@ class PmtuProbe:
 
     def due(self, now: float, loss: float) -> bool:
         """Whether to probe now. Call a few times a second, and only while the peer answers. `loss` is the loss rate
-        towards the peer."""
+        toward the peer."""
         if now < self._next_at:
             return False
         if not self._sent_probes:
