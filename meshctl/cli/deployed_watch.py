@@ -84,7 +84,7 @@ def _watch_one_version(
         confirmed = snapshots.confirmed(dropped)
         for name, why in snapshots.suspects.items():
             echo(f"{name}: {why}; marked if the next snapshot agrees", err=True)
-        for name in known.keys() - dropped.keys():
+        for name in sorted(known.keys() - dropped.keys()):
             echo(f"{name}: not confirmed", err=True)
         for name, why in confirmed.items():
             echo(f"{name}: {why}", err=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from meshctl.errors import InputError
 from meshctl.model import Computer, Fleet
 from meshctl.report.duration import duration
-from meshctl.resolve import computer_gateway
+from meshctl.resolve import computer_gateway, has_routed_lans
 from meshctl.robots.wheel_tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
@@ -171,7 +171,12 @@ def clock_warning(facts: HostFacts, now_s: float) -> tuple[str, str]:
 
 
 def routed_peers(fleet: Fleet, robot: str) -> dict[str, str]:
-    """The computers' addresses outside the network of the robot's computer, and their robots' names."""
+    """The computers' addresses outside the network of the robot's computer, and their robots' names.
+
+    None without routed LANs: separate meshes need no routes to each other.
+    """
+    if not has_routed_lans(fleet):
+        return {}
     network = computer_of(fleet, robot).address.network
     computers = ((peer.name, peer.computer) for peer in fleet.robots.values() if peer.computer is not None)
     return {str(other.address.ip): name for name, other in computers if other.address.ip not in network}

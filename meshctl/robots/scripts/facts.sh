@@ -1,5 +1,6 @@
-# facts [ADDRESS...]: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes nothing, and
-# reads little from the disk, since status calls it often. The addresses are those of others on its switch.
+# facts [ADDRESS...]: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes
+# nothing, and reads little from the disk, since status calls it often. The addresses are those of other computers on its
+# switch.
 echo "== services"
 for service in $all_units; do
 	# of a service that was never installed systemd knows ActiveState=inactive, UnitFileState= and LoadState=not-found

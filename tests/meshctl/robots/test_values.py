@@ -155,6 +155,8 @@ def test_a_missing_route_to_a_peer_is_reported_with_its_gateway() -> None:
     assert reason == "it has no route to rover2 (10.43.2.10), rover3 (10.42.0.23)"
     assert "through 10.43.1.1" in hint
     assert route_warning(parse_facts(PROBED), fleet, "rover1") == ("", "")
+    # separate meshes without routers between them need no routes
+    assert routed_peers(load_fleet(ROOT / "inventory/subt-final"), "husky1") == {}
 
 
 def test_required_disk_space_includes_a_reserve() -> None:
