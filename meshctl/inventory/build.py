@@ -25,6 +25,7 @@ from meshctl.inventory.documents import (
     SecretDocument,
     SshLayer,
     TopicDocument,
+    TopicLogDocument,
 )
 from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, ssh_settings
@@ -49,6 +50,7 @@ from meshctl.model import (
     SshSettings,
     SystemSettings,
     Topic,
+    TopicLog,
     UdpMesh,
 )
 
@@ -338,7 +340,12 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         outbox_bytes=document.outbox_bytes,
         outbox_on_disk=document.outbox_on_disk,
         repair=document.repair,
+        log=_log(document.log) if document.log is not None else None,
     )
+
+
+def _log(document: TopicLogDocument) -> TopicLog:
+    return TopicLog(document.max_items, document.max_bytes, document.max_age_s, document.copies)
 
 
 def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:

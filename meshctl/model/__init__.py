@@ -24,7 +24,7 @@ from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile,
 from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
 from meshctl.model.release import RELEASES, PackageTool, Release
 from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
-from meshctl.model.topic import Outbox, Topic, TopicClass
+from meshctl.model.topic import Outbox, Topic, TopicClass, TopicLog
 
 __all__ = [
     "MASK",
@@ -61,5 +61,6 @@ __all__ = [
     "SystemSettings",
     "Topic",
     "TopicClass",
+    "TopicLog",
     "UdpMesh",
 ]

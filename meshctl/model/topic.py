@@ -27,6 +27,17 @@ class Outbox(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class TopicLog:
+    """A topic's messages are items of a shared log: numbered, kept on disk by every robot within these limits, and
+    passed on until the topic's destinations have them. `copies` robots that reach each other carry an item."""
+
+    max_items: int = 10_000
+    max_bytes: int = 256 << 20
+    max_age_s: float | None = None
+    copies: int = 3
+
+
+@dataclass(frozen=True, slots=True)
 class Topic:
     """`priority` 0 is the most urgent, 15 the least. `sources` and `destinations` name robots; empty sources means
     every robot, the destination `all` means broadcast. `rate_hz` x `size_bytes` is the offered load per source."""
@@ -48,3 +59,4 @@ class Topic:
     outbox_bytes: int = 1_000_000
     outbox_on_disk: bool = False
     repair: bool = False
+    log: TopicLog | None = None

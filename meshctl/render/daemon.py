@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.errors import InputError
-from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, UdpMesh
+from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, TopicLog, UdpMesh
 from meshctl.resolve import has_routed_lans
 
 # Values that the daemon would reject (docs/render.md).
@@ -188,6 +188,9 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
     yield from ("", f"[topics.{_text(topic.name)}]")
     yield f"priority = {topic.priority}"
     yield f"reliable = {_boolean(topic.reliable)}"
+    if topic.log is not None:
+        yield from _log(topic, topic.log)
+        return
     destinations = _destinations(topic, robot)
     if destinations:
         yield f"destinations = [{', '.join(_text(name) for name in destinations)}]"
@@ -205,6 +208,22 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
         yield f"outbox_on_disk = {_boolean(topic.outbox_on_disk)}"
     if topic.repair:
         yield "repair = true"
+
+
+def _log(topic: Topic, log: TopicLog) -> Iterator[str]:
+    """A log's readers are the topic's destinations, on every robot."""
+    if topic.rate_limit_bytes_per_s is not None:
+        yield f"rate_limit_bytes_per_s = {topic.rate_limit_bytes_per_s}"
+    if topic.compression:
+        yield "compression = true"
+    yield from ("", f"[topics.{_text(topic.name)}.log]")
+    if "all" not in topic.destinations:
+        yield f"readers = [{', '.join(_text(name) for name in topic.destinations)}]"
+    yield f"max_items = {log.max_items}"
+    yield f"max_bytes = {log.max_bytes}"
+    if log.max_age_s is not None:
+        yield f"max_age_s = {_number(log.max_age_s)}"
+    yield f"copies = {log.copies}"
 
 
 def _destinations(topic: Topic, robot: str) -> tuple[str, ...]:

@@ -45,6 +45,7 @@ RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
     inspect.status,
     inspect.peers,
     inspect.topics,
+    inspect.logs,
     inspect.events,
     hosts.hosts,
     traffic.echo,
@@ -212,6 +213,7 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("status", inspect.status, "show links, peers and counters"),
         ("peers", inspect.peers, "show peers and their queues"),
         ("topics", inspect.topics, "show topics and their settings"),
+        ("logs", inspect.logs, "show shared logs and which nodes have their items"),
     ):
         parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
         parser.add_argument(

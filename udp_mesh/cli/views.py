@@ -139,8 +139,33 @@ def topics_view(reply: Json) -> str:
     return table(["topic", "priority", "delivery", "sent", "", "received", ""], rows) + f"\n{foot}"
 
 
+def logs_view(reply: Json) -> str:
+    """One line per log: what is here, and who has it or lacks it."""
+    rows = [
+        [
+            log["topic"],
+            log["source"],
+            f"{log['received_items']} of {log['known_items']}",
+            str(log["held_items"]),
+            size(log["held_bytes"]),
+            str(log["waiting_items"]),
+            ", ".join(f"{holder['name']} {holder['items']}" for holder in log["holders"]) or "-",
+            ", ".join(f"{reader} lacks {count}" for reader, count in log["missing_readers"].items()) or "-",
+        ]
+        for log in reply["logs"]
+    ]
+    lines = [f"NOT ON DISK: {reply['disk']}"] if reply["disk"] else []
+    if not rows:
+        return "\n".join([*lines, "no log has items yet"])
+    head = ["log", "source", "received", "on disk", "", "not taken", "others have", "missing"]
+    return "\n".join([*lines, table(head, rows)])
+
+
 def _delivery(topic: Json) -> str:
     words = ["reliable" if topic["reliable"] else "best effort"]
+    if topic["log"] is not None:
+        readers = topic["log"]["readers"]
+        words = ["log" + (f" for {', '.join(readers)}" if readers else "")]
     if topic["keep_last"] is not None:
         words.append(f"last {topic['keep_last']}")
     if topic["deadline_s"] is not None:

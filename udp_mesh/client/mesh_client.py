@@ -56,6 +56,8 @@ class Message(NamedTuple):
     broadcast: bool
     receipt: Optional[int] = None
     """To pass to `MeshClient.acknowledge` once the message is processed. None: nothing waits for that."""
+    number: Optional[int] = None
+    """Its number in its source's log, if the topic is one: (source, topic, number) names the item."""
 
 
 def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
@@ -311,4 +313,5 @@ def as_message(frame: Frame) -> Optional[Message]:
         int(header["priority"]),
         bool(header["broadcast"]),
         header.get("receipt"),
+        header.get("number"),
     )

@@ -15,6 +15,10 @@ from udp_mesh.core.events import Event, MessageId, Receipt, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
+from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.logs.messages import LOG_PREFIX
+from udp_mesh.core.logs.store import LogStore, MemoryLogStore
+from udp_mesh.core.logs.topics import with_log_topics
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.session import Peer, Session
@@ -22,7 +26,9 @@ from udp_mesh.core.receive import receive_datagram
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, LinkInfo, Settings
+from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
+from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
 from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
@@ -45,15 +51,25 @@ class Endpoint:
         rng: RandomSource,
         now: float,
         store: Store | None = None,
+        log_store: LogStore | None = None,
         legacy_positions: Mapping[str, ReceivePosition] = MappingProxyType({}),
     ) -> None:
-        """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory).
-        `legacy_positions` are those of the previous run."""
+        """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory),
+        `log_store` the items of logs (None: in memory). `legacy_positions` are those of the previous run."""
         if len(boot_id) != BOOT_ID_BYTES:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
-        self._state = State(settings, boot_id, rng, now, store)
+        self._state = State(with_log_topics(settings), boot_id, rng, now, store)
         self._legacy = LegacyPeers(self._state, legacy_positions)
+        self._log_store = log_store
+        self._logs: SharedLogs | None = None
+        self._start_logs(settings, now)
         reconfigure.restore_outboxes(self._state, now)
+
+    def _start_logs(self, settings: Settings, now: float) -> None:
+        """Once a topic is a log; a node without logs does no work for them."""
+        if self._logs is None and any(topic.log is not None for topic in settings.topics):
+            seed = self._state.rng.getrandbits(8 * SEED_BYTES).to_bytes(SEED_BYTES, "big")
+            self._logs = SharedLogs(self._state, settings, self._log_store or MemoryLogStore(seed), now)
 
     @property
     def settings(self) -> Settings:
@@ -76,6 +92,8 @@ class Endpoint:
 
         Call again while it `has_datagrams`. A driver whose socket is full limits `max_bytes`.
         """
+        if self._logs is not None:
+            self._logs.process(now)
         out = transmit.collect(self._state, now, max_bytes)
         if self._legacy:
             out = self._legacy.encapsulate_broadcasts(out)
@@ -87,9 +105,11 @@ class Endpoint:
     def next_timer(self) -> float | None:
         """When `handle_timer` is due next (None: never). Cheap; may be in the past."""
         at = transmit.next_timer(self._state)
-        if self._legacy and at is not None:
-            return min(at, self._legacy.next_at())
-        return at
+        if at is None:
+            return None
+        if self._legacy:
+            at = min(at, self._legacy.next_at())
+        return at if self._logs is None else min(at, self._logs.next_at)
 
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`. Calling early or late is harmless."""
@@ -100,6 +120,8 @@ class Endpoint:
     @property
     def has_datagrams(self) -> bool:
         """Whether `datagrams_to_send` may return something. False right after it returned everything."""
+        if self._logs is not None and self._logs.has_work:
+            return True
         return bool(self._legacy) or transmit.has_datagrams(self._state)
 
     def is_due_before(self, at: float) -> bool:
@@ -112,10 +134,14 @@ class Endpoint:
 
         True after most bulk datagrams, of which only every few request an acknowledgement.
         """
+        if self._logs is not None and self._logs.has_work:
+            return False
         return not self._legacy and transmit.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
+        if self._logs is not None:
+            return self._logs.next_event()
         return self._state.event_queue.next_event()
 
     def send(
@@ -127,6 +153,8 @@ class Endpoint:
         is broadcast and has no outcome. A peer that was never discovered is `UNKNOWN_PEER` unless an outbox
         may hold the message.
         """
+        if self._logs is not None and self._logs.is_log(topic):
+            return self._logs.send(topic, payload, destination, type_name, now)
         return publish.send(self._state, topic, payload, destination, type_name, now)
 
     def link_up(self, link: LinkInfo, now: float) -> None:
@@ -142,9 +170,16 @@ class Endpoint:
 
         Drops no accepted message. Raises ValueError if the name or port changed: that requires a restart.
         """
-        lines = reconfigure.apply(self._state, settings, now)
+        lines = reconfigure.apply(self._state, with_log_topics(settings), now)
         self._legacy.apply()
-        return lines
+        self._start_logs(settings, now)
+        if self._logs is not None:
+            self._logs.apply(settings)
+        return [line for line in lines if not line.startswith(f"topic {LOG_PREFIX}")]
+
+    def logs(self) -> tuple[LogConditions, ...]:
+        """A snapshot of each shared log."""
+        return () if self._logs is None else self._logs.conditions()
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
@@ -152,12 +187,16 @@ class Endpoint:
 
     def confirm(self, receipt: Receipt) -> None:
         """A received message is safe: the application took it, or it is on disk. Its sender reports it as delivered."""
+        if self._logs is not None and self._logs.confirm(receipt):
+            return
         session = self._state.peer_table.sessions.get(receipt.boot_id)
         if session is not None and session.receiver.confirm(receipt.message_id):
             self._state.schedule_control(session)
 
     def request_again(self, receipt: Receipt) -> None:
         """A received message could not be kept: its sender is to send it again."""
+        if self._logs is not None and self._logs.request_again(receipt):
+            return
         session = self._state.peer_table.sessions.get(receipt.boot_id)
         if session is not None and session.receiver.request_again(receipt.message_id):
             for refusal in session.receiver.refusals:
@@ -187,6 +226,8 @@ class Endpoint:
         """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
         transmit.flush_packed(self._state, now)
         reconfigure.close(self._state, now)
+        if self._logs is not None:
+            self._logs.process(now)
 
 
 def _snapshot(state: State, now: float) -> Conditions:

@@ -20,6 +20,7 @@ class RejectReason(Enum):
     UNKNOWN_PEER = "unknown peer"
     TOO_LARGE = "too large"
     QUEUE_FULL = "queue full"
+    LOG_FULL = "log full"
     RATE_LIMIT = "rate limit"
     CLOSED = "closed"
 
@@ -40,6 +41,9 @@ class ExpiryReason(Enum):
     REFUSED = "refused by the receiver"
     CLOSED = "node closed"
     OUTBOX_FULL = "outbox full"
+    LOG_FULL = "log full"
+    TOO_OLD = "older than the log keeps"
+    DISK = "disk error"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +129,8 @@ class MessageReceived:
     priority: int
     broadcast: bool
     receipt: Receipt | None = None
+    number: int | None = None
+    """Its number in the source's log, if the topic is a log: a program that keeps it sees each item once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +164,26 @@ class MessagePeerLost:
 
 
 @dataclass(frozen=True, slots=True)
+class LogItemHeld:
+    """Another node now has an item of this node's log on disk, to pass it on. A reader's is a `MessageDelivered`."""
+
+    message_id: MessageId
+    holder: str
+    topic: str
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class LogItemDropped:
+    """An item was removed from this node's log before all of its readers were known to have it."""
+
+    topic: str
+    source: str
+    number: int
+    reason: ExpiryReason
+
+
+@dataclass(frozen=True, slots=True)
 class TopicStarved:
     """Messages of the topic have waited this long because more urgent ones are always sent first."""
 
@@ -188,6 +214,8 @@ Event = (
     | MessageDelivered
     | MessageExpired
     | MessagePeerLost
+    | LogItemHeld
+    | LogItemDropped
     | TopicStarved
     | PathNarrowed
 )

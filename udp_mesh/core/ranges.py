@@ -41,6 +41,43 @@ class RangeSet:
             firsts.insert(place, number)
             lasts.insert(place, number)
 
+    def add_range(self, first: int, last: int) -> None:
+        """Add every number from `first` to `last`."""
+        if last < first:
+            return
+        firsts, lasts = self._firsts, self._lasts
+        begin = bisect_right(firsts, first) - 1
+        if begin < 0 or lasts[begin] < first - 1:
+            begin += 1
+        end = bisect_right(firsts, last + 1)
+        if begin < end:
+            first, last = min(first, firsts[begin]), max(last, lasts[end - 1])
+        firsts[begin:end] = [first]
+        lasts[begin:end] = [last]
+
+    def without(self, other: "RangeSet") -> list[tuple[int, int]]:
+        """The ranges of this set's numbers that `other` does not contain, ascending."""
+        missing: list[tuple[int, int]] = []
+        taken = other.ranges()
+        place = 0
+        for first, last in self.ranges():
+            while place < len(taken) and taken[place][1] < first:
+                place += 1
+            look = place
+            while look < len(taken) and taken[look][0] <= last:
+                if taken[look][0] > first:
+                    missing.append((first, taken[look][0] - 1))
+                first = taken[look][1] + 1
+                look += 1
+            if first <= last:
+                missing.append((first, last))
+        return missing
+
+    @property
+    def count(self) -> int:
+        """How many numbers it contains."""
+        return sum(last - first + 1 for first, last in self.ranges())
+
     def ranges(self) -> list[tuple[int, int]]:
         """(first, last) of each range, ascending."""
         return list(zip(self._firsts, self._lasts, strict=True))

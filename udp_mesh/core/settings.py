@@ -9,7 +9,7 @@ from enum import Enum
 from typing import Literal
 
 from udp_mesh.crypto import Key
-from udp_mesh.wire.limits import MAX_NAME_BYTES, MAX_TOPIC_BYTES, MAX_TYPE_BYTES, PRIORITY_LEVELS
+from udp_mesh.wire.limits import MAX_LOG_TOPIC_BYTES, MAX_NAME_BYTES, MAX_TOPIC_BYTES, MAX_TYPE_BYTES, PRIORITY_LEVELS
 
 Address = tuple[str, int]
 """IPv4 or IPv6 host and UDP port."""
@@ -35,6 +35,10 @@ def _check_name(name: str, what: str, limit_bytes: int) -> None:
         raise ValueError(f"{what} {name!r}: expected 1 to {limit_bytes} bytes")
     if not is_name(name, limit_bytes):
         raise ValueError(f"{what} {name!r}: expected no white space and no control characters")
+
+
+def _written(value: object) -> object:
+    return value.value if isinstance(value, Enum) else value
 
 
 class Outbox(Enum):
@@ -76,6 +80,35 @@ MIN_LINK_MTU = 200
 """Smallest IP MTU in bytes that leaves room for headers and a useful payload."""
 
 
+MAX_COPIES = 64
+"""More carriers of one item than any team needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """A topic whose items are numbered, kept and passed on by every node that declares it, until its readers have them.
+
+    `readers` are the nodes whose programs get the items (empty: all nodes with the topic). Each node keeps the newest
+    items up to `max_items`, `max_bytes` and `max_age_s` (None: no limit), counted from when it stored them. `copies` is
+    how many nodes that reach each other carry an item, besides its source and readers (0: none).
+    """
+
+    readers: tuple[str, ...] = ()
+    max_items: int = 10_000
+    max_bytes: int = 256 << 20
+    max_age_s: float | None = None
+    copies: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("max_items", "max_bytes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"log.{name}: expected at least 1, found {getattr(self, name)}")
+        if not 0 <= self.copies <= MAX_COPIES:
+            raise ValueError(f"log.copies: expected 0 to {MAX_COPIES}, found {self.copies}")
+        if self.max_age_s is not None and self.max_age_s <= 0:
+            raise ValueError(f"log.max_age_s: expected a positive time, found {self.max_age_s}")
+
+
 @dataclass(frozen=True, slots=True)
 class Topic:
     """How the messages of one topic are sent.
@@ -98,6 +131,7 @@ class Topic:
     outbox_bytes: int = 16 << 20
     outbox_on_disk: bool = False
     repair: bool = False
+    log: Log | None = None
 
     @property
     def keeps_on_disk(self) -> bool:
@@ -116,6 +150,26 @@ class Topic:
             raise ValueError(f"topic {self.name}: expected a positive rate limit, found {self.rate_limit_bytes_per_s}")
         if self.outbox_bytes < 0:
             raise ValueError(f"topic {self.name}: expected outbox_bytes of at least 0, found {self.outbox_bytes}")
+        if self.log is not None:
+            self._check_log()
+
+    def _check_log(self) -> None:
+        """Raises ValueError for what contradicts a log: its items wait in it, for all its readers."""
+        if len(self.name.encode()) > MAX_LOG_TOPIC_BYTES:
+            raise ValueError(f"topic {self.name}: expected at most {MAX_LOG_TOPIC_BYTES} bytes for the name of a log")
+        if not self.reliable:
+            raise ValueError(f"topic {self.name}: expected reliable = true for a log, found false")
+        for name, unset in (
+            ("keep_last", None),
+            ("deadline_s", None),
+            ("destinations", ()),
+            ("outbox", Outbox.NONE),
+            ("repair", False),
+        ):
+            if getattr(self, name) != unset:
+                raise ValueError(
+                    f"topic {self.name}: expected no {name} for a log, found {_written(getattr(self, name))}"
+                )
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from udp_mesh.daemon.neighbours import (
     read_neighbour,
 )
 from udp_mesh.daemon.service import Service
-from udp_mesh.daemon.status import conditions_json, plain, show_address, topic_json, topics_json
+from udp_mesh.daemon.status import conditions_json, log_json, plain, show_address, topic_json, topics_json
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
@@ -197,6 +197,10 @@ def topics(service: Service, _client: Client, _header: Header, _: bytes) -> Head
     }
 
 
+def logs(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
+    return {"logs": [log_json(log) for log in service.driver.node.logs()], "disk": service.log_store.problem}
+
+
 def metrics_page(service: Service, client: Client, header: Header, _: bytes) -> None:
     client.reply(header.get("id"), render_metrics(service).encode())
 
@@ -209,6 +213,7 @@ def render_metrics(service: Service) -> str:
         "datagrams_lost_on_full_socket": driver.output.lost_on_full_socket,
         "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
         "outbox_messages_refused_by_disk": service.store.refused,
+        "log_items_refused_by_disk": service.log_store.refused,
     }
     visible = {name: count for name, count in service.counts.items() if not name.startswith(RESERVED_PREFIX)}
     about = {
@@ -217,7 +222,8 @@ def render_metrics(service: Service) -> str:
         "wire_version": str(WIRE_VERSION),
         "boot": service.boot_id.hex(),
     }
-    return metrics.render(driver.conditions(), visible, extra, about=about, uptime_s=driver.now() - service.started)
+    uptime_s = driver.now() - service.started
+    return metrics.render(driver.conditions(), visible, extra, logs=driver.node.logs(), about=about, uptime_s=uptime_s)
 
 
 # Change
@@ -346,6 +352,7 @@ COMMANDS = {
     "status": status,
     "peers": peers,
     "topics": topics,
+    "logs": logs,
     "metrics": metrics_page,
     "set-topic": set_topic,
     "drop-topic": drop_topic,

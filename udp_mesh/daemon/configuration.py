@@ -19,8 +19,10 @@ from typing import Literal
 
 from udp_mesh.core.settings import (
     DEFAULT_PORT,
+    MAX_COPIES,
     Address,
     Limits,
+    Log,
     Outbox,
     Rates,
     Settings,
@@ -240,13 +242,36 @@ def read_topic(name: str, table: Table) -> Topic:
         outbox_on_disk=table.boolean("outbox_on_disk", default.outbox_on_disk),
         repair=table.boolean("repair", default.repair),
     )
+    log = _read_log(table.table("log")) if table.has("log") else None
     table.finish()
     for destination in topic.destinations:
         if not is_node_name(destination):
             table.report("destinations", f"node names, each {NODE_NAME}", destination)
     if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
         table.report("outbox_on_disk", 'outbox = "last" or "all" as well', topic.outbox_on_disk)
-    return dataclasses.replace(topic, name=name) if good_name else topic
+    try:
+        return dataclasses.replace(topic, name=name if good_name else topic.name, log=log)
+    except ValueError as error:
+        _, _, text = str(error).partition(": expected ")
+        expected, _, found = text.rpartition(", found ")
+        table.source.report(table.path, expected, found)
+        return topic
+
+
+def _read_log(table: Table) -> Log:
+    default = Log()
+    log = Log(
+        readers=table.texts("readers"),
+        max_items=_or(table.integer("max_items", None, 1, 1 << 24), default.max_items),
+        max_bytes=_or(table.integer("max_bytes", None, 1, 1 << 40), default.max_bytes),
+        max_age_s=table.number("max_age_s", None, 1.0, 1e9),
+        copies=_or(table.integer("copies", None, 0, MAX_COPIES), default.copies),
+    )
+    table.finish()
+    for reader in log.readers:
+        if not is_node_name(reader):
+            table.report("readers", f"node names, each {NODE_NAME}", reader)
+    return log
 
 
 def _or(value: int | None, default: int) -> int:
@@ -325,6 +350,18 @@ def _read_path(table: Table, key: str, default: Path) -> Path:
     return Path(text) if text else default
 
 
+def _unparsed(value: object) -> object:
+    """A topic's field as it is written in a configuration."""
+    match value:
+        case Outbox():
+            return value.value
+        case Log():
+            fields = ((entry.name, getattr(value, entry.name)) for entry in dataclasses.fields(value))
+            return {name: list(item) if isinstance(item, tuple) else item for name, item in fields if item is not None}
+        case _:
+            return value
+
+
 def topic_from_values(name: str, values: dict[str, object], current: Topic | None) -> Topic:
     """A topic from a request's fields; missing fields keep the value in `current`. Raises ConfigurationError."""
     merged: dict[str, object] = {}
@@ -332,7 +369,7 @@ def topic_from_values(name: str, values: dict[str, object], current: Topic | Non
         for entry in dataclasses.fields(Topic):
             value = getattr(current, entry.name)
             if entry.name != "name" and value is not None:
-                merged[entry.name] = value.value if isinstance(value, Outbox) else value
+                merged[entry.name] = _unparsed(value)
         merged["destinations"] = list(current.destinations)
     merged.update(values)
     source = Source("command", {})

@@ -17,17 +17,10 @@ from types import MappingProxyType
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.endpoint import Endpoint
-from udp_mesh.core.events import (
-    Event,
-    MessageId,
-    PeerAddressChanged,
-    PeerOffline,
-    PeerOnline,
-    PeerRestarted,
-    Rejected,
-)
+from udp_mesh.core.events import Event, MessageId, PeerAddressChanged, PeerOffline, PeerOnline, PeerRestarted, Rejected
 from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
+from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
 from udp_mesh.daemon.link_output import LinkOutput
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
@@ -71,13 +64,21 @@ class Driver:
         rng: RandomSource,
         on_event: Callable[[Event], None],
         store: Store | None = None,
+        log_store: LogStore | None = None,
         legacy_positions: Mapping[str, ReceivePosition] = MappingProxyType({}),
         urgent_dscp: int = 0,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
+        now = self._clock()
         self.node = Endpoint(
-            settings, boot_id=boot_id, rng=rng, now=self._clock(), store=store, legacy_positions=legacy_positions
+            settings,
+            boot_id=boot_id,
+            rng=rng,
+            now=now,
+            store=store,
+            log_store=log_store,
+            legacy_positions=legacy_positions,
         )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}

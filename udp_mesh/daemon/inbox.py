@@ -7,6 +7,7 @@
    subscribes.
 
 A message that the disk does not take is confirmed when a program took it; without one, its sender sends it again later.
+An item of a log is on disk already, in the log: it is only noted here, and read again when a program subscribes.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ class _Held:
     receipt: Receipt | None
     """Set until the sender is informed that the message is safe."""
     on_disk: bool
+    logged: bool = False
+    """It is an item of a log."""
     reading: dict[Client, int | None] = field(default_factory=dict)
     """Programs that it was sent to: the position in the client's stream at which it is read, or None if the client is
     to acknowledge it."""
@@ -70,9 +73,12 @@ class Inbox:
             self._next_key = message.key + 1
 
     def add(self, message: MessageReceived) -> int:
-        """Write a message with a receipt to the disk. Returns its key."""
+        """Write a message with a receipt to the disk, unless it is in a log. Returns its key."""
         key = self._next_key
         self._next_key += 1
+        if message.number is not None:
+            self._held[key] = _Held(message.topic, message.receipt, on_disk=False, logged=True)
+            return key
         stored = StoredMessage(key, message.source, message.topic, message.type_name, message.payload, None)
         self._held[key] = _Held(message.topic, message.receipt, on_disk=self._store.put(stored))
         return key
@@ -80,13 +86,13 @@ class Inbox:
     def on_distributed(self, key: int) -> None:
         """The message was sent to all programs subscribed now."""
         held = self._held.get(key)
-        if held is not None and not held.on_disk and not held.reading:
+        if held is not None and not held.on_disk and not held.logged and not held.reading:
             self._drop(key, held)
         self.take_read()
 
     async def flush(self) -> None:
         """Wait until everything added so far is on disk, then confirm it."""
-        waiting = [key for key, held in self._held.items() if held.receipt is not None]
+        waiting = [key for key, held in self._held.items() if held.receipt is not None and not held.logged]
         await self._flusher.flush()
         for key in waiting:
             held = self._held.get(key)
@@ -121,6 +127,16 @@ class Inbox:
         held = self._held.get(key)
         return held is not None and not held.reading
 
+    def request_item(self, key: int) -> bool:
+        """If the message is an item of a log, have it read and delivered again. Returns whether it is one."""
+        held = self._held.get(key)
+        if held is None or not held.logged:
+            return False
+        del self._held[key]
+        if held.receipt is not None:
+            self._request_again(held.receipt)
+        return True
+
     def read(self, key: int) -> StoredMessage | None:
         """The message from the disk. Blocks; None if it cannot be read."""
         return self._store.read(key)
@@ -147,13 +163,14 @@ class Inbox:
         del self._held[key]
         if held.receipt is not None:
             self._confirm(held.receipt)
-        self._store.remove(key)
+        if not held.logged:
+            self._store.remove(key)
 
     def client_gone(self, client: Client) -> None:
         """What the client has not taken goes to another one."""
         self.take_read()
         for key, held in list(self._held.items()):
-            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk:
+            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk and not held.logged:
                 self._drop(key, held)
 
     def topics(self) -> Iterator[str]:

@@ -7,6 +7,7 @@ replacing it would make some file systems write it at once.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import os
@@ -52,3 +53,21 @@ def save_positions(path: Path, positions: Mapping[str, ReceivePosition]) -> None
         os.pwrite(descriptor, data.ljust(os.fstat(descriptor).st_size), 0)
     finally:
         os.close(descriptor)
+
+
+class PositionsFile:
+    """The positions of this run, saved whenever they have changed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.saved: Mapping[str, ReceivePosition] = load_positions(path)
+
+    async def save(self, positions: Mapping[str, ReceivePosition]) -> None:
+        """Save the positions, if they changed. A disk that refuses them is logged."""
+        if positions == self.saved:
+            return
+        self.saved = positions
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
+        except OSError as error:
+            log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)

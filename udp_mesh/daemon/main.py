@@ -58,7 +58,7 @@ async def run(configuration: Configuration) -> None:
             await metrics.start()
         service.start()
         if daemon.user is not None:
-            drop_privileges(daemon.user, (daemon.state_directory,))
+            drop_privileges(daemon.user, (daemon.state_directory, *service.log_store.files))
         await _serve(service, notifier)
     finally:
         notifier.stopping()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.daemon.status import TopicCount
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -47,6 +48,7 @@ def render(
     topics: Mapping[str, TopicCount],
     extra: Mapping[str, float],
     *,
+    logs: Iterable[LogConditions] = (),
     about: Mapping[str, str],
     uptime_s: float,
 ) -> str:
@@ -81,9 +83,33 @@ def render(
         samples = [({"topic": topic}, float(getattr(count, field_name))) for topic, count in sorted(topics.items())]
         help_text = f"{field_name.replace('_', ' ').capitalize()} of the topic."
         _family(lines, f"topic_{field_name}_total", "counter", help_text, samples)
+    lines += _log_lines(tuple(logs))
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"
+
+
+_LOG_GAUGES: tuple[tuple[str, str, Callable[[LogConditions], int]], ...] = (
+    ("log_held_items", "Items of the log on disk here.", lambda log: log.held_items),
+    ("log_held_bytes", "Bytes of the log on disk here.", lambda log: log.held_bytes),
+    ("log_newest_number", "Highest number of the log that arrived here.", lambda log: log.newest),
+    ("log_known_items", "Items that exist, as far as this node has heard.", lambda log: log.known_items),
+    ("log_waiting_items", "Items that no local program has taken.", lambda log: log.waiting_items),
+)
+
+
+def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
+    lines: list[str] = []
+    for name, help_text, read in _LOG_GAUGES:
+        samples = [({"topic": log.topic, "source": log.source, "log": log.log_id.hex()[:8]}, read(log)) for log in logs]
+        _family(lines, name, "gauge", help_text, samples)
+    missing = [
+        ({"topic": log.topic, "source": log.source, "log": log.log_id.hex()[:8], "reader": reader}, float(count))
+        for log in logs
+        for reader, count in log.missing_readers
+    ]
+    _family(lines, "log_missing_items", "gauge", "Items that a reader is not known to have.", missing)
+    return lines
 
 
 def _family(lines: list[str], name: str, kind: str, help_text: str, samples: Iterable[Sample]) -> None:

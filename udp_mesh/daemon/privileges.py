@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def drop_privileges(user: str, owned: tuple[Path, ...]) -> None:
-    """Gives the `owned` directories to the user and switches to it irrevocably.
+    """Gives the `owned` files and directories to the user and switches to it irrevocably.
 
     Raises OSError if the user does not exist or this process is not root.
     """
@@ -19,7 +19,8 @@ def drop_privileges(user: str, owned: tuple[Path, ...]) -> None:
     if os.geteuid() == entry.pw_uid:
         return
     for path in owned:
-        path.mkdir(parents=True, exist_ok=True)
+        if not path.is_file():
+            path.mkdir(parents=True, exist_ok=True)
         os.chown(path, entry.pw_uid, entry.pw_gid)
     os.initgroups(user, entry.pw_gid)
     os.setresgid(entry.pw_gid, entry.pw_gid, entry.pw_gid)

@@ -33,7 +33,8 @@ from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
-from udp_mesh.daemon.legacy_positions import load_positions, save_positions
+from udp_mesh.daemon.legacy_positions import PositionsFile
+from udp_mesh.daemon.log_store import SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
@@ -61,8 +62,8 @@ class Service:
             configuration.daemon.state_directory / "outbox", configuration.daemon.outbox_disk_bytes
         )
         self._flusher = Flusher(self.store)
-        self._positions_file = configuration.daemon.state_directory / "legacy-positions.json"
-        self._positions = load_positions(self._positions_file)
+        self.log_store = SqliteLogStore(configuration.daemon.state_directory / "logs" / "items.db", wall_clock)
+        self._legacy_positions = PositionsFile(configuration.daemon.state_directory / "legacy-positions.json")
         self.driver = Driver(
             configuration.settings,
             configuration.links,
@@ -70,9 +71,11 @@ class Service:
             rng=rng,
             on_event=self._event,
             store=self.store,
-            legacy_positions=self._positions,
+            log_store=self.log_store,
+            legacy_positions=self._legacy_positions.saved,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
+        self.log_store.on_done = self.driver.send_soon
         self.inbox = Inbox(
             DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
             self._confirm,
@@ -110,10 +113,11 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
-        await self._save_positions()
+        await self._legacy_positions.save(self.driver.node.legacy_positions())
         await self.stop_recording()
         await asyncio.get_running_loop().run_in_executor(None, self.store.close)
         await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
+        await asyncio.get_running_loop().run_in_executor(None, self.log_store.close)
 
     # Requests (called by the local API)
 
@@ -181,11 +185,19 @@ class Service:
             self._outcomes[outcome] = client
             if len(self._outcomes) > MAX_OUTCOMES:
                 self._outcomes.popitem(last=False)
-        # A message that is not stored does not wait for those that are.
+        if settings is not None and settings.log is not None:
+            return self._logged(outcome)
         return self._flushed(outcome) if self.store.puts > stored else outcome
 
     async def _flushed(self, message: int) -> int:
         await self._flusher.flush()
+        return message
+
+    async def _logged(self, message: int) -> int:
+        """The item is on disk. Raises RequestError if the disk refused it."""
+        problem = await self.log_store.flush()
+        if problem is not None:
+            raise RequestError("log-not-stored", f"the log is not on disk: {problem}")
         return message
 
     def topic(self, name: str) -> Topic | None:
@@ -352,7 +364,7 @@ class Service:
         if self.store.needs_flush:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
-        self._spawn(self._save_positions())
+        self._spawn(self._legacy_positions.save(self.driver.node.legacy_positions()))
         self.inbox.take_read()
         self.subscriptions.pass_on_held()
         clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))
@@ -370,17 +382,6 @@ class Service:
             }
             for client in clients:
                 client.send_event(header)
-
-    async def _save_positions(self) -> None:
-        """Saves what was received from legacy peers, if there are any and it changed."""
-        positions = self.driver.node.legacy_positions()
-        if positions == self._positions:
-            return
-        self._positions = positions
-        try:
-            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._positions_file, positions)
-        except OSError as error:
-            log.warning("legacy-positions-not-saved path=%s error=%s", self._positions_file, error)
 
     def _count(self, topic: str) -> TopicCount:
         count = self.counts.get(topic)

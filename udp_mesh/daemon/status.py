@@ -13,6 +13,7 @@ from pathlib import Path
 
 from udp_mesh.core.conditions import Conditions, PeerConditions
 from udp_mesh.core.events import Event
+from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.settings import Address, Settings, Topic
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
@@ -99,6 +100,14 @@ def conditions_json(conditions: Conditions) -> Json:
             for stranger in conditions.strangers
         ],
     }
+
+
+def log_json(log: LogConditions) -> Json:
+    """One shared log as this node sees it."""
+    fields = plain(log)
+    assert isinstance(fields, dict)
+    fields["missing_readers"] = dict(log.missing_readers)
+    return fields
 
 
 @dataclasses.dataclass(slots=True)

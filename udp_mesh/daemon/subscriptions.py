@@ -80,7 +80,9 @@ class Subscriptions:
 
     def distribute(self, message: MessageReceived) -> None:
         """Send a message to the clients subscribed to its topic. One with a receipt goes through the inbox."""
-        header = _header(message.source, message.topic, message.type_name, message.priority, message.broadcast)
+        header = _header(
+            message.source, message.topic, message.type_name, message.priority, message.broadcast, message.number
+        )
         clients = self.clients(message.topic)
         if message.receipt is None:
             if clients:
@@ -109,16 +111,19 @@ class Subscriptions:
     async def _send_from_disk(self) -> None:
         try:
             for key in self._inbox.waiting(lambda topic: bool(self.clients(topic))):
+                if self._inbox.request_item(key):
+                    continue
                 held = await asyncio.get_running_loop().run_in_executor(None, self._inbox.read, key)
                 if held is not None and self._inbox.is_waiting(key):
-                    header = _header(held.peer, held.topic, held.type_name, self._priority(held.topic), False)
+                    priority = self._priority(held.topic)
+                    header = _header(held.peer, held.topic, held.type_name, priority, False, None)
                     self._send_held(self.clients(held.topic), key, header, held.payload)
         finally:
             self._passing_on = False
 
 
-def _header(source: str, topic: str, type_name: str, priority: int, broadcast: bool) -> Header:
-    return {
+def _header(source: str, topic: str, type_name: str, priority: int, broadcast: bool, number: int | None) -> Header:
+    header: Header = {
         "event": "message",
         "source": source,
         "topic": topic,
@@ -126,3 +131,6 @@ def _header(source: str, topic: str, type_name: str, priority: int, broadcast: b
         "priority": priority,
         "broadcast": broadcast,
     }
+    if number is not None:
+        header["number"] = number
+    return header

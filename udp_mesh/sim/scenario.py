@@ -6,18 +6,18 @@ line, what was expected and what was found; unknown keys are problems.
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
-from udp_mesh.core.settings import Outbox, Settings, Topic
+from udp_mesh.core.settings import MAX_COPIES, Log, Outbox, Settings, Topic
 from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
+from udp_mesh.sim.yaml_entry import Entry
 
 _MAX_SHOWN_PROBLEMS = 20
 _MAX_BYTES = 1 << 20
@@ -92,87 +92,6 @@ class Scenario:
     window: Literal["adaptive"] | int
 
 
-class _Entry:
-    """One YAML node: typed access, with problems collected in `problems`."""
-
-    def __init__(self, node: yaml.Node | None, file: str, what: str, problems: list[str]) -> None:
-        self.node, self.file, self.what, self.problems = node, file, what, problems
-
-    def problem(self, expected: str, found: object = None) -> None:
-        line = 1 if self.node is None else self.node.start_mark.line + 1
-        seen = self._found() if found is None else repr(found)
-        self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {seen}")
-
-    def _found(self) -> str:
-        match self.node:
-            case None:
-                return "nothing"
-            case yaml.ScalarNode():
-                return repr(self.node.value)
-            case yaml.SequenceNode():
-                return "a list"
-        return "a mapping"
-
-    def mapping(self, known: tuple[str, ...] | None) -> dict[str, _Entry]:
-        """The entries of a mapping; keys that are not in `known` (None: any key) are problems."""
-        if self.node is None:
-            return {}
-        if not isinstance(self.node, yaml.MappingNode):
-            self.problem("a mapping")
-            return {}
-        entries: dict[str, _Entry] = {}
-        for key, value in self.node.value:
-            name = str(key.value) if isinstance(key, yaml.ScalarNode) else ""
-            entry = _Entry(value, self.file, f"{self.what}.{name}" if self.what else name, self.problems)
-            if known is not None and name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                meant = f" (did you mean '{near[0]}'?)" if near else ""
-                _Entry(key, self.file, self.what, self.problems).problem(f"one of {', '.join(known)}{meant}", name)
-            elif name in entries:
-                entry.problem("each key once", name)
-            else:
-                entries[name] = entry
-        return entries
-
-    def items(self) -> Iterator[_Entry]:
-        if self.node is None:
-            return
-        if not isinstance(self.node, yaml.SequenceNode):
-            self.problem("a list")
-            return
-        for number, child in enumerate(self.node.value):
-            yield _Entry(child, self.file, f"{self.what}[{number}]", self.problems)
-
-    def text(self, default: str = "", one_of: tuple[str, ...] | None = None) -> str:
-        if self.node is None:
-            return default
-        if not isinstance(self.node, yaml.ScalarNode) or (one_of is not None and self.node.value not in one_of):
-            self.problem("text" if one_of is None else f"one of {', '.join(one_of)}")
-            return default
-        return str(self.node.value)
-
-    def number(self, default: float, minimum: float = 0.0, maximum: float = 1e9) -> float:
-        if self.node is None:
-            return default
-        try:
-            value = float(self.node.value) if isinstance(self.node, yaml.ScalarNode) else math.nan
-        except ValueError:
-            value = math.nan
-        if not minimum <= value <= maximum:
-            self.problem(f"a number of at {f'most {maximum:g}' if value > maximum else f'least {minimum:g}'}")
-            return default
-        return value
-
-    def integer(self, default: int, minimum: int = 0, maximum: int = 1_000_000_000) -> int:
-        value = self.number(default, minimum, maximum)
-        if value != int(value):
-            self.problem("an integer")
-        return int(value)
-
-    def flag(self) -> bool:
-        return self.text("false", ("true", "false")) == "true"
-
-
 def load(path: Path) -> Scenario:
     """Loads a scenario. Raises ScenarioError with every problem found."""
     try:
@@ -202,7 +121,7 @@ def parse(raw: bytes, file: str) -> Scenario:
         found = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise ScenarioError(f"{file}:{line}: expected YAML, found a syntax error: {found}") from error
     problems: list[str] = []
-    scenario = _scenario(_Entry(root, file, "", problems), Path(file).stem)
+    scenario = _scenario(Entry(root, file, "", problems), Path(file).stem)
     if problems:
         more = [f"... and {len(problems) - _MAX_SHOWN_PROBLEMS} more"] if len(problems) > _MAX_SHOWN_PROBLEMS else []
         raise ScenarioError("\n".join([*problems[:_MAX_SHOWN_PROBLEMS], *more]))
@@ -215,13 +134,13 @@ _KEYS = (
 )  # fmt: skip
 
 
-def _scenario(at: _Entry, name: str) -> Scenario:
+def _scenario(at: Entry, name: str) -> Scenario:
     if at.node is None:
         at.problem("a mapping")
     keys = at.mapping(_KEYS)
-    nothing = _Entry(None, at.file, "", at.problems)
+    nothing = Entry(None, at.file, "", at.problems)
 
-    def get(key: str) -> _Entry:
+    def get(key: str) -> Entry:
         return keys.get(key, nothing)
 
     robot_entries = get("robots").mapping(None)
@@ -263,7 +182,7 @@ def _scenario(at: _Entry, name: str) -> Scenario:
     )
 
 
-def _pair(at: _Entry) -> tuple[float, float]:
+def _pair(at: Entry) -> tuple[float, float]:
     values = [item.number(0.0, minimum=-1e6, maximum=1e6) for item in at.items()]
     if len(values) != 2:
         at.problem("[x, y] in meters")
@@ -271,7 +190,7 @@ def _pair(at: _Entry) -> tuple[float, float]:
     return (values[0], values[1])
 
 
-def _trajectory(at: _Entry, more: tuple[str, ...]) -> Trajectory:
+def _trajectory(at: Entry, more: tuple[str, ...]) -> Trajectory:
     """`[x, y]`, or `{at: [x, y]}`, or `{path: [[seconds, x, y], ...]}`."""
     if isinstance(at.node, yaml.SequenceNode):
         return stationary(_pair(at))
@@ -292,7 +211,7 @@ def _trajectory(at: _Entry, more: tuple[str, ...]) -> Trajectory:
         return stationary((0.0, 0.0))
 
 
-def _numbers(at: _Entry, made: Any) -> dict[str, Any]:
+def _numbers(at: Entry, made: Any) -> dict[str, Any]:
     known = tuple(item.name for item in fields(made) if item.name != "walls")
     entries = at.mapping((*known, "walls") if isinstance(made, PathLoss) else known)
     values: dict[str, Any] = {}
@@ -310,11 +229,11 @@ def _numbers(at: _Entry, made: Any) -> dict[str, Any]:
     return values
 
 
-def _channel(at: _Entry) -> RadioChannel:
+def _channel(at: Entry) -> RadioChannel:
     return RadioChannel(**_numbers(at, RadioChannel()))
 
 
-def _path_loss(at: _Entry) -> PathLoss:
+def _path_loss(at: Entry) -> PathLoss:
     walls = []
     entries = at.mapping(None)
     for item in entries["walls"].items() if "walls" in entries else ():
@@ -330,10 +249,10 @@ def _path_loss(at: _Entry) -> PathLoss:
     return air
 
 
-def _topic(name: str, at: _Entry, robots: tuple[str, ...]) -> Topic:
+def _topic(name: str, at: Entry, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
-        "outbox", "repair",
+        "outbox", "repair", "log",
     )  # fmt: skip
     entries = at.mapping(keys)
     values: dict[str, Any] = {}
@@ -347,6 +266,8 @@ def _topic(name: str, at: _Entry, robots: tuple[str, ...]) -> Topic:
                 values[key] = Outbox(entry.text("none", tuple(kind.value for kind in Outbox)))
             case "destinations":
                 values[key] = tuple(item.text(one_of=robots) for item in entry.items())
+            case "log":
+                values[key] = _log(entry, robots)
             case "priority":
                 values[key] = entry.integer(8, maximum=15)
             case _:
@@ -358,12 +279,28 @@ def _topic(name: str, at: _Entry, robots: tuple[str, ...]) -> Topic:
         return Topic("unusable")
 
 
-def _flow(at: _Entry, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
+def _log(at: Entry, robots: tuple[str, ...]) -> Log:
+    entries = at.mapping(("readers", "max_items", "max_bytes", "max_age_s", "copies"))
+    values: dict[str, Any] = {}
+    for key, entry in entries.items():
+        match key:
+            case "readers":
+                values[key] = tuple(item.text(one_of=robots) for item in entry.items())
+            case "max_age_s":
+                values[key] = entry.number(1.0, minimum=1e-3)
+            case "copies":
+                values[key] = entry.integer(3, maximum=MAX_COPIES)
+            case _:
+                values[key] = entry.integer(1, minimum=1)
+    return Log(**values)
+
+
+def _flow(at: Entry, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
     keys = ("topic", "sources", "destination", "period_s", "size_bytes", "spread", "start_s", "stop_s")
     entries = at.mapping(keys)
-    nothing = _Entry(None, at.file, at.what, at.problems)
+    nothing = Entry(None, at.file, at.what, at.problems)
 
-    def get(key: str) -> _Entry:
+    def get(key: str) -> Entry:
         return entries.get(key, nothing)
 
     for key in ("topic", "period_s", "size_bytes"):
@@ -382,7 +319,7 @@ def _flow(at: _Entry, topics: tuple[str, ...], robots: tuple[str, ...]) -> Flow:
     )
 
 
-def _incident(at: _Entry, robots: tuple[str, ...], relays: tuple[str, ...]) -> Incident:
+def _incident(at: Entry, robots: tuple[str, ...], relays: tuple[str, ...]) -> Incident:
     entries = at.mapping(("at_s", "what", "who"))
     for key in ("at_s", "what", "who"):
         if key not in entries:

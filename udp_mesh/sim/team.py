@@ -23,7 +23,9 @@ from udp_mesh.core.events import (
     MessagePeerLost,
     Rejected,
 )
+from udp_mesh.core.logs.store import MemoryLogStore
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
 
@@ -95,6 +97,8 @@ class Team:
         names = [*robots, *relays]
         self.medium = Medium(self.event_queue, channel, names, loss, self._deliver, random.Random(self._rng.random()))
         self._addresses: dict[str, str] = {}
+        self._log_stores: dict[str, MemoryLogStore] = {}
+        """The robots' disks, which outlast a crash."""
         self._members: dict[str, _Robot] = {}
         for number, (name, settings) in enumerate(robots.items(), 1):
             address = f"10.0.{number // 250}.{number % 250 + 1}"
@@ -106,9 +110,17 @@ class Team:
     def _started(self, name: str, address: str, settings: Settings, run: int) -> _Robot:
         link = LinkInfo(LINK, LinkKind.BROADCAST, (address, settings.port), (BROADCAST, settings.port))
         boot_id = self._rng.randbytes(16)
-        node = Endpoint(settings, boot_id=boot_id, rng=random.Random(self._rng.random()), now=self.event_queue.now)
+        rng = random.Random(self._rng.random())
+        store = self._log_store(name, settings)
+        node = Endpoint(settings, boot_id=boot_id, rng=rng, now=self.event_queue.now, log_store=store)
         node.link_up(link, self.event_queue.now)
         return _Robot(name, address, node, link, run)
+
+    def _log_store(self, name: str, settings: Settings) -> MemoryLogStore | None:
+        if name not in self._log_stores and any(topic.log is not None for topic in settings.topics):
+            seed = self._rng.randbytes(SEED_BYTES)
+            self._log_stores[name] = MemoryLogStore(seed, clock=lambda: self.event_queue.now)
+        return self._log_stores.get(name)
 
     # Called by the scenario
 

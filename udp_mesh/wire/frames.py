@@ -33,6 +33,8 @@ class Feature:
     """Answers messages that have `MessageFlag.CONFIRM` with `Delivered` once they are safe."""
     COMPACT = 16
     """Accepts compact fragments."""
+    LOGS = 32
+    """Has topics that are shared logs, and takes part in passing on their items."""
 
 
 class Waiting(NamedTuple):

@@ -17,6 +17,9 @@ peer."""
 MAX_TOPIC_BYTES = 255
 """A topic's name: ROS names are shorter; bounds the memory of the table of announced topics."""
 
+MAX_LOG_TOPIC_BYTES = MAX_TOPIC_BYTES - 10
+"""A log's name: its items travel on a reserved topic, whose prefix needs ten bytes."""
+
 MAX_TYPE_BYTES = 255
 """A topic's type name (`pkg/Type`, optionally with a checksum): same reason as MAX_TOPIC_BYTES."""
 

@@ -22,6 +22,7 @@ from meshctl.inventory.documents.robot import (
     RobotDocument,
     SystemDocument,
     TopicDocument,
+    TopicLogDocument,
     UdpMeshDocument,
 )
 from meshctl.inventory.documents.root import InventoryDocument
@@ -50,5 +51,6 @@ __all__ = [
     "SshLayer",
     "SystemDocument",
     "TopicDocument",
+    "TopicLogDocument",
     "UdpMeshDocument",
 ]

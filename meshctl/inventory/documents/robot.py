@@ -132,6 +132,19 @@ class UdpMeshDocument(Document):
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
 
 
+class TopicLogDocument(Document):
+    """A shared log: every robot keeps the topic's items within these limits and passes them on."""
+
+    max_items: Whole = Field(default=10_000, ge=1, le=16_000_000)
+    """Maximum number of items on each robot."""
+    max_bytes: Whole = Field(default=268_435_456, ge=1, le=1_000_000_000_000)
+    """Maximum size of the items on each robot."""
+    max_age_s: Real = Field(default=NOT_WRITTEN, ge=1, le=1_000_000_000)
+    """Seconds after which a robot drops an item. Default: no limit."""
+    copies: Whole = Field(default=3, ge=0, le=64)
+    """How many robots that reach each other carry an item, besides its source and its destinations."""
+
+
 class TopicDocument(Document):
     """A topic that udp_mesh carries."""
 
@@ -167,3 +180,5 @@ class TopicDocument(Document):
     """Keep the outbox across restarts."""
     repair: Flag = False
     """Let receivers request lost broadcasts again."""
+    log: TopicLogDocument = NOT_WRITTEN
+    """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""

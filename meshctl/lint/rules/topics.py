@@ -1,4 +1,4 @@
-"""Topics: priorities, destinations, delivery (MC701 to MC718)."""
+"""Topics: priorities, destinations, delivery (MC701 to MC719)."""
 
 from __future__ import annotations
 
@@ -372,3 +372,28 @@ def topic_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         if _TOPIC.fullmatch(topic.name) is None:
             expected = "letters, digits and underscores, parts joined by /"
             yield Finding(_path(topic), "not a valid ROS name", expected, topic.name)
+
+
+@fleet_rule(
+    "MC719",
+    Severity.ERROR,
+    "A log has settings that contradict it",
+    why="""The items of a shared log wait in the log itself, for all their readers. The daemon refuses a topic that is a
+    log and also best effort, limited to its last messages, or kept in an outbox.""",
+    fix="Remove the other setting, or `log`.",
+    failing="topics: {artifacts: {log: {}, outbox: all}}",
+    passing="topics: {artifacts: {log: {}, outbox: none}}",
+)
+def log_contradicted(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.log is None:
+            continue
+        for key, found, is_set in (
+            ("reliable", "false", not topic.reliable),
+            ("keep_last", str(topic.keep_last), bool(topic.keep_last)),
+            ("deadline_s", f"{topic.deadline_s} s", topic.deadline_s is not None),
+            ("outbox", topic.outbox.value, topic.outbox is not Outbox.NONE),
+            ("repair", "true", topic.repair),
+        ):
+            if is_set:
+                yield Finding(_path(topic, key), f"{topic.name} is a shared log", f"no {key} beside log", found)

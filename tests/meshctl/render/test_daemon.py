@@ -14,7 +14,19 @@ from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.model import Computer, Fleet, Outbox, Robot, Secret, SecretKind, SecretRef, Topic, TopicClass, UdpMesh
+from meshctl.model import (
+    Computer,
+    Fleet,
+    Outbox,
+    Robot,
+    Secret,
+    SecretKind,
+    SecretRef,
+    Topic,
+    TopicClass,
+    TopicLog,
+    UdpMesh,
+)
 from meshctl.render.daemon import daemon_config, daemon_keys
 from tests.meshctl.render import fleets
 from udp_mesh.core import settings as core
@@ -79,6 +91,23 @@ def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:
         outbox_on_disk=True,
     )
     assert topics["video"] == core.Topic("video", 9, reliable=False, destinations=("base",), repair=True)
+
+
+def test_the_destinations_of_a_log_are_its_readers(tmp_path: Path) -> None:
+    """At the base, too, which reads it: a log has the same readers everywhere."""
+    log = TopicLog(max_items=500, max_bytes=1_000_000, max_age_s=3600, copies=2)
+    artifacts = Topic("artifacts", 4, destinations=("base",), compression=True, rate_limit_bytes_per_s=9000, log=log)
+    for robot in ("base", "spot"):
+        topics = {topic.name: topic for topic in loaded(fleet(artifacts), robot, tmp_path).settings.topics}
+        assert topics["artifacts"] == core.Topic(
+            "artifacts",
+            4,
+            compression=True,
+            rate_limit_bytes_per_s=9000,
+            log=core.Log(readers=("base",), max_items=500, max_bytes=1_000_000, max_age_s=3600, copies=2),
+        )
+    everybody = loaded(fleet(Topic("artifacts", 4, log=TopicLog())), "spot", tmp_path).settings.topics
+    assert core.Topic("artifacts", 4, log=core.Log()) in everybody
 
 
 def test_without_broadcast_all_other_robots_are_neighbors(tmp_path: Path) -> None:

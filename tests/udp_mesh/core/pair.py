@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event
 from udp_mesh.core.interfaces import Datagram, Store
+from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.settings import Address, LinkInfo, LinkKind, Settings, Topic
 from udp_mesh.crypto import Key
 
@@ -79,10 +80,18 @@ class World:
         self._calls: list[tuple[float, int, Callable[[], object]]] = []
         self._serial = 0
 
-    def add(self, config: Settings, *, address: str | None = None, store: Store | None = None) -> Endpoint:
+    def add(
+        self,
+        config: Settings,
+        *,
+        address: str | None = None,
+        store: Store | None = None,
+        log_store: LogStore | None = None,
+    ) -> Endpoint:
         """Start (or restart) a node on link `mesh`."""
         name = config.name
-        node = Endpoint(config, boot_id=self.rng.randbytes(16), rng=self.rng, now=self.now, store=store)
+        boot_id = self.rng.randbytes(16)
+        node = Endpoint(config, boot_id=boot_id, rng=self.rng, now=self.now, store=store, log_store=log_store)
         host = address or (self.addresses[name][0] if name in self.addresses else f"10.0.0.{len(self.addresses) + 1}")
         self.addresses[name] = (host, 8700)
         self.nodes[name] = node

@@ -33,6 +33,28 @@ def test_a_range_set_equals_a_plain_set(numbers: list[int]) -> None:
     assert all(before[1] + 1 < after[0] for before, after in pairwise(pairs))
 
 
+@given(
+    st.lists(st.tuples(st.integers(0, 60), st.integers(0, 12))),
+    st.lists(st.tuples(st.integers(0, 60), st.integers(0, 12))),
+)
+def test_ranges_of_a_range_set_equal_plain_sets(one: list[tuple[int, int]], other: list[tuple[int, int]]) -> None:
+    sets = []
+    for pieces in (one, other):
+        ranges = RangeSet()
+        plain: set[int] = set()
+        for first, length in pieces:
+            ranges.add_range(first, first + length - 1)
+            plain.update(range(first, first + length))
+        assert {number for number in range(80) if number in ranges} == plain
+        assert ranges.count == len(plain)
+        assert all(before[1] + 1 < after[0] for before, after in pairwise(ranges.ranges()))
+        sets.append((ranges, plain))
+    (left, plain_left), (right, plain_right) = sets
+    missing = left.without(right)
+    assert {number for first, last in missing for number in range(first, last + 1)} == plain_left - plain_right
+    assert all(first <= last for first, last in missing)
+
+
 def fragments_of(body: bytes, size: int, message_id: int = 1) -> list[Fragment]:
     chunks = [body[start : start + size] for start in range(0, len(body), size)] or [b""]
     head = MessageHead(len(body), len(chunks), 0, 3, RELIABLE)

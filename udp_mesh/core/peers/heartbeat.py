@@ -23,7 +23,12 @@ OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT
 
 def own_features(settings: Settings) -> int:
     """What this node announces."""
-    return OWN_FEATURES | Feature.CONFIRM if settings.confirms else OWN_FEATURES
+    features = OWN_FEATURES
+    if settings.confirms:
+        features |= Feature.CONFIRM
+    if any(topic.log is not None for topic in settings.topics):
+        features |= Feature.LOGS
+    return features
 
 
 REPLY_WITHIN_S = 0.1

@@ -1,0 +1,288 @@
+"""Items of shared logs on disk: one SQLite database, written by one thread in batches.
+
+`put`, `get`, `take` and `drop` queue a job; the thread does all that wait in one transaction (WAL, `synchronous=FULL`:
+what is reported as stored survives a power cut), then reports the results on the event loop. However slow the disk, the
+loop never waits for it. A damaged database is renamed and a new one begun, with a new identity: the secret of this
+node's logs is in the database, so that no number is ever used twice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import queue
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+from udp_mesh.core.logs.item import ItemId, LogKey
+from udp_mesh.core.logs.messages import Ranges
+from udp_mesh.core.logs.store import LogContents, StoredItem
+from udp_mesh.crypto.signing import SEED_BYTES
+
+log = logging.getLogger(__name__)
+
+MAX_BATCH = 256
+"""Jobs in one transaction: a long one delays the answers."""
+LOG_AGAIN_S = 60.0
+"""Minimum interval between two log lines about a failing disk."""
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS logs (
+    id INTEGER PRIMARY KEY, topic TEXT NOT NULL, source TEXT NOT NULL, log_id BLOB NOT NULL,
+    dropped TEXT NOT NULL DEFAULT '[]', UNIQUE (topic, source, log_id));
+CREATE TABLE IF NOT EXISTS items (
+    position INTEGER PRIMARY KEY AUTOINCREMENT, log INTEGER NOT NULL REFERENCES logs (id), number INTEGER NOT NULL,
+    data BLOB NOT NULL, stored_s REAL NOT NULL, taken INTEGER NOT NULL, UNIQUE (log, number));
+"""
+_VERSION = 1
+
+Job = Callable[[sqlite3.Connection], Callable[[], None] | None]
+"""Runs in the thread, within a transaction; returns what to call on the loop once it is committed."""
+
+
+class SqliteLogStore:
+    """The core's `LogStore` over a file (created by `load`, readable only by its owner). `on_done` is called on the
+    loop after results were reported; `wall_clock` is Unix time in seconds."""
+
+    def __init__(self, path: Path, wall_clock: Callable[[], float]) -> None:
+        self.path = path
+        self.on_done: Callable[[], None] = lambda: None
+        self.refused = 0
+        """Items not stored because the disk is full or failed."""
+        self.problem: str | None = None
+        """Why the last item was not stored; None after one was."""
+        self._unreported: str | None = None
+        """The same, since the last `flush`."""
+        self._memory_only: str | None = None
+        """Why items are kept in memory only."""
+        self._wall_clock = wall_clock
+        self._jobs: queue.SimpleQueue[tuple[Job, Callable[[], None]] | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._logged_at = float("-inf")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The database's files that exist."""
+        names = (self.path.parent, self.path, *(Path(f"{self.path}{suffix}") for suffix in ("-wal", "-shm")))
+        return tuple(path for path in names if path.exists())
+
+    def unix_ms(self) -> int:
+        return int(self._wall_clock() * 1000)
+
+    def load(self) -> LogContents:
+        """Opens the database, or a new one. If the disk takes neither, items are kept for this run only, and a line is
+        logged."""
+        try:
+            connection, contents = self._open(str(self.path))
+        except sqlite3.DatabaseError as error:
+            if _is_damaged(error):
+                damaged = self.path.with_suffix(f".damaged-{int(self._wall_clock())}")
+                log.error("log-damaged path=%s renamed=%s error=%s", self.path, damaged, error)
+                with contextlib.suppress(OSError):
+                    self.path.rename(damaged)
+                for suffix in ("-wal", "-shm"):
+                    Path(f"{self.path}{suffix}").unlink(missing_ok=True)
+                connection, contents = self._open_or_memory()
+            else:
+                connection, contents = self._in_memory(error)
+        except OSError as error:
+            connection, contents = self._in_memory(error)
+        self._loop = asyncio.get_running_loop()
+        self._thread = threading.Thread(target=self._run, args=(connection,), name="log-store", daemon=True)
+        self._thread.start()
+        return contents
+
+    def _open_or_memory(self) -> tuple[sqlite3.Connection, LogContents]:
+        try:
+            return self._open(str(self.path))
+        except (sqlite3.Error, OSError) as error:
+            return self._in_memory(error)
+
+    def _in_memory(self, error: Exception) -> tuple[sqlite3.Connection, LogContents]:
+        log.error("log-unusable path=%s error=%s: items are kept in memory only", self.path, error)
+        self._memory_only = str(error)
+        return self._open(":memory:")
+
+    def _open(self, name: str) -> tuple[sqlite3.Connection, LogContents]:
+        if name != ":memory:":
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            os.close(os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600))
+        connection = sqlite3.connect(name, isolation_level=None, check_same_thread=False)
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = FULL")
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if version > _VERSION:
+                raise OSError(f"expected a log of version {_VERSION} or earlier, found {version}")
+            connection.executescript(_SCHEMA)
+            connection.execute(f"PRAGMA user_version = {_VERSION}")
+            connection.execute("INSERT OR IGNORE INTO meta VALUES ('seed', ?)", (os.urandom(SEED_BYTES),))
+            return connection, self._contents(connection)
+        except BaseException:
+            connection.close()
+            raise
+
+    def _contents(self, connection: sqlite3.Connection) -> LogContents:
+        (seed,) = connection.execute("SELECT value FROM meta WHERE name = 'seed'").fetchone()
+        keys, dropped = {}, []
+        for number, topic, source, log_id, ranges in connection.execute("SELECT * FROM logs"):
+            keys[number] = LogKey(topic, source, bytes(log_id))
+            dropped.append((keys[number], tuple((int(first), int(last)) for first, last in json.loads(ranges))))
+        now = self._wall_clock()
+        rows = connection.execute("SELECT log, number, length(data), stored_s, taken FROM items ORDER BY position")
+        items = tuple(
+            StoredItem(ItemId(keys[log_number], number), size, max(0.0, now - stored_s), bool(taken))
+            for log_number, number, size, stored_s, taken in rows
+        )
+        return LogContents(bytes(seed), items, tuple(entry for entry in dropped if entry[1]))
+
+    # Jobs
+
+    def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
+        stored_s = self._wall_clock()
+
+        def insert(connection: sqlite3.Connection) -> Callable[[], None]:
+            connection.execute(
+                "INSERT OR REPLACE INTO items (log, number, data, stored_s, taken) VALUES (?, ?, ?, ?, ?)",
+                (_log_number(connection, item.log), item.number, data, stored_s, taken),
+            )
+            return stored
+
+        def stored() -> None:
+            self.problem = self._memory_only
+            done(True)
+
+        def failed() -> None:
+            self.refused += 1
+            done(False)
+
+        self._jobs.put((insert, failed))
+
+    def get(self, item: ItemId, done: Callable[[bytes | None], None]) -> None:
+        def select(connection: sqlite3.Connection) -> Callable[[], None]:
+            row = connection.execute(
+                "SELECT data FROM items WHERE log = ? AND number = ?", (_log_number(connection, item.log), item.number)
+            ).fetchone()
+            return lambda: done(None if row is None else bytes(row[0]))
+
+        self._jobs.put((select, lambda: done(None)))
+
+    def take(self, item: ItemId) -> None:
+        def update(connection: sqlite3.Connection) -> None:
+            where = (_log_number(connection, item.log), item.number)
+            connection.execute("UPDATE items SET taken = 1 WHERE log = ? AND number = ?", where)
+
+        self._jobs.put((update, lambda: None))
+
+    def drop(self, items: Iterable[ItemId], dropped: Iterable[tuple[LogKey, Ranges]]) -> None:
+        gone, remembered = tuple(items), tuple(dropped)
+
+        def delete(connection: sqlite3.Connection) -> None:
+            for item in gone:
+                where = (_log_number(connection, item.log), item.number)
+                connection.execute("DELETE FROM items WHERE log = ? AND number = ?", where)
+            for key, ranges in remembered:
+                text = json.dumps(ranges, separators=(",", ":"))
+                connection.execute("UPDATE logs SET dropped = ? WHERE id = ?", (text, _log_number(connection, key)))
+
+        self._jobs.put((delete, lambda: None))
+
+    async def flush(self) -> str | None:
+        """Waits until everything queued so far was done. Returns why an item since the last call was not stored, or
+        None."""
+        future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
+
+        def finish() -> None:
+            problem, self._unreported = self._unreported or self._memory_only, None
+            if not future.done():
+                future.set_result(problem)
+
+        self._jobs.put((lambda connection: finish, finish))
+        return await future
+
+    def close(self) -> None:
+        """Waits until everything queued is done."""
+        if self._thread is not None:
+            self._jobs.put(None)
+            self._thread.join()
+            self._thread = None
+
+    # The thread
+
+    def _run(self, connection: sqlite3.Connection) -> None:
+        with contextlib.closing(connection):
+            while (first := self._jobs.get()) is not None:
+                batch, last = [first], False
+                while len(batch) < MAX_BATCH and not last:
+                    try:
+                        following = self._jobs.get_nowait()
+                    except queue.Empty:
+                        break
+                    if following is None:
+                        last = True
+                    else:
+                        batch.append(following)
+                self._report(self._commit(connection, batch))
+                if last:
+                    return
+
+    def _commit(
+        self, connection: sqlite3.Connection, batch: list[tuple[Job, Callable[[], None]]]
+    ) -> list[Callable[[], None]]:
+        """Does a batch in one transaction; returns what to call on the loop."""
+        try:
+            connection.execute("BEGIN IMMEDIATE")
+            results = [job(connection) for job, _ in batch]
+            connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            with contextlib.suppress(sqlite3.Error):
+                connection.execute("ROLLBACK")
+            if len(batch) > 1:
+                # One large item may not fit where small ones do, and reading needs no space.
+                return [call for job in batch for call in self._commit(connection, [job])]
+            now = time.monotonic()
+            if now - self._logged_at >= LOG_AGAIN_S:
+                self._logged_at = now
+                log.error("log-write-failed path=%s error=%s", self.path, error)
+            return [partial(self._failed, str(error), batch[0][1])]
+        return [result for result in results if result is not None]
+
+    def _failed(self, problem: str, call: Callable[[], None]) -> None:
+        self.problem = self._unreported = problem
+        call()
+
+    def _report(self, calls: list[Callable[[], None]]) -> None:
+        def report() -> None:
+            for call in calls:
+                call()
+            self.on_done()
+
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):
+            # The loop is closed: no caller waits for the results.
+            self._loop.call_soon_threadsafe(report)
+
+
+def _log_number(connection: sqlite3.Connection, key: LogKey) -> int:
+    row = connection.execute(
+        "SELECT id FROM logs WHERE topic = ? AND source = ? AND log_id = ?", (key.topic, key.source, key.log_id)
+    ).fetchone()
+    if row is None:
+        row = connection.execute(
+            "INSERT INTO logs (topic, source, log_id) VALUES (?, ?, ?) RETURNING id",
+            (key.topic, key.source, key.log_id),
+        ).fetchone()
+    return int(row[0])
+
+
+def _is_damaged(error: sqlite3.DatabaseError) -> bool:
+    """Whether the file is no sound database, rather than out of reach for now."""
+    return error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
