@@ -25,14 +25,17 @@ socket = "/run/mesh-{robot}/socket"
 state_directory = "/run/mesh-{robot}"
 END
 (umask 077; echo {key} >/run/mesh-{robot}/fleet.key)
+ip netns exec pc.{robot} env PYTHONPATH=/opt/telemetry python3 /run/mesh.py run /run/mesh-{robot}/udp-mesh.toml \
+    >/run/mesh-{robot}/log 2>&1 </dev/null &
+echo $! >>/run/mesh-pids
+"""
+# once, before any daemon reads it
+_PROGRAM = """
 cat >/run/mesh.py <<'END'
 import sys
 from udp_mesh.cli.main import main
 sys.exit(main(sys.argv[1:]))
 END
-ip netns exec pc.{robot} env PYTHONPATH=/opt/telemetry python3 /run/mesh.py run /run/mesh-{robot}/udp-mesh.toml \
-    >/run/mesh-{robot}/log 2>&1 </dev/null &
-echo $! >>/run/mesh-pids
 """
 _LISTEN = """
 cat >/tmp/listen.py <<'END'
@@ -91,6 +94,7 @@ def test_broadcasts_of_a_sensor_stay_in_the_robots_lan(routed: RoutedLab) -> Non
 def test_the_daemons_meet_with_the_rendered_configuration(routed: RoutedLab) -> None:
     fleet = load_fleet(routed.inventory)
     put_programs(routed)
+    on_machine(routed, _PROGRAM)
     for robot in COMPUTERS:
         config = daemon_config(fleet, robot).decode()
         on_machine(routed, _DAEMON.format(robot=robot, config=config, key="be" * 32))
