@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import typing
 from types import NoneType
 from typing import Any
+
+_PARTS_OF_HISTOGRAM = re.compile("_(bucket|sum|count)$")
 
 
 def metrics_page() -> str:
     """Every metric family that the daemon can print, except its process's own counters."""
     from udp_mesh.core.conditions import Conditions
+    from udp_mesh.daemon.latencies import Histogram
     from udp_mesh.daemon.metrics import render
     from udp_mesh.daemon.status import TopicCount
 
-    text = render(_sample(Conditions), {"map": _sample(TopicCount)}, {}, about={"version": "1"}, uptime_s=1.0)
+    latencies = {0: Histogram()}
+    text = render(
+        *(_sample(Conditions), {"map": _sample(TopicCount)}, {}),
+        about={"version": "1"},
+        uptime_s=1.0,
+        latencies=latencies,
+    )
     families: dict[str, tuple[str, str, str]] = {}
     help_texts: dict[str, str] = {}
     for line in text.splitlines():
@@ -25,6 +35,10 @@ def metrics_page() -> str:
             families[words[2]] = (words[3], "", help_texts[words[2]])
         else:
             name, brace, labels = words[0].partition("{")
+            name = _PARTS_OF_HISTOGRAM.sub("", name) if name not in families else name
+            # the buckets come first, and have all labels
+            if families[name][1]:
+                continue
             kind, _, meaning = families[name]
             names = ", ".join(f"`{label.split('=')[0]}`" for label in labels.rstrip("}").split(",")) if brace else ""
             families[name] = (kind, names, meaning)

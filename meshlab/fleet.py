@@ -23,7 +23,7 @@ from typing import Any, Self
 
 from meshctl.device.connection import Completed, Endpoint
 from meshctl.errors import InputError
-from meshlab import fleet_directory, rootfs
+from meshlab import fleet_directory, propagation_file, rootfs
 from meshlab.addresses import bench_of, loopback_of
 from meshlab.client import is_running, request
 from meshlab.errors import LabError
@@ -272,6 +272,12 @@ class VirtualFleet:
     @property
     def node_names(self) -> tuple[str, ...]:
         return tuple(self.spec.names)
+
+    @property
+    def positions(self) -> dict[str, tuple[float, float]]:
+        """Where its nodes are, in meters; empty without a radio environment."""
+        path = self.directory / propagation_file.FLEET_FILE
+        return {name: one.at for name, one in propagation_file.load(path).positions.items()} if path.exists() else {}
 
     def bench_endpoint(self, name: str) -> Endpoint:
         """`VirtualNode.bench` of the node called `name`."""

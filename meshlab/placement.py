@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 
+from meshctl.placement.path_loss import Point
 from meshlab import propagation_file
 from meshlab.errors import LabError
 from meshlab.fleet import VirtualFleet, VirtualNode
-from meshlab.propagation import Point, RadioEnvironment, links_of
+from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.state import Power
 
-_FILE_NAME = "ground.json"
 _LOCK_NAME = "ground.lock"
 # some 250 bytes each, so that a request stays below 128 KiB (`node_runner.MESSAGE_BYTES`)
 _LINKS_PER_REQUEST = 300
@@ -27,7 +27,7 @@ _PARALLEL_FLUSHES = 8
 
 def current_environment(fleet: VirtualFleet) -> RadioEnvironment:
     """The fleet's radio environment; until one is set, the links it was started with."""
-    path = fleet.directory / _FILE_NAME
+    path = fleet.directory / propagation_file.FLEET_FILE
     return propagation_file.load(path) if path.exists() else RadioEnvironment(links=fleet.spec.links)
 
 
@@ -78,8 +78,8 @@ def _apply(fleet: VirtualFleet, environment: RadioEnvironment) -> None:
     parts = [links[first : first + _LINKS_PER_REQUEST] for first in range(0, len(links), _LINKS_PER_REQUEST)] or [[]]
     for number, part in enumerate(parts, 1):
         fleet.request("links", part=part, is_last=number == len(parts))
-    path = fleet.directory / _FILE_NAME
-    new = path.with_name(f"{_FILE_NAME}.new")
+    path = fleet.directory / propagation_file.FLEET_FILE
+    new = path.with_name(f"{propagation_file.FLEET_FILE}.new")
     new.write_text(propagation_file.dump(environment), encoding="utf-8")
     new.replace(path)
 

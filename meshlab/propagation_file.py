@@ -2,7 +2,7 @@
 
     nodes: {base: [0, 0], b01: {at: [80, 0], tx_power_dbm: 33}}      # meters
     walls: [{a: [40, 10], b: [200, 10], loss_db: 40}]
-    air: {exponent: 3.5}                                             # keys: `propagation.PathLossModel`
+    air: {exponent: 3.5}                                             # keys: `path_loss.PathLossModel`
     links: [{between: [base, b01], loss: 30%, loss_back: 5%}]        # keys: `spec.LinkSpec`
 
 An explicit link does not depend on its nodes' positions. docs/lab-ground.md describes the format.
@@ -15,21 +15,15 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from meshlab.propagation import NodePosition, PathLossModel, RadioEnvironment, Wall
+from meshctl.inventory.yaml_entries import YamlEntry, parse_text, read
+from meshctl.placement.ground import GROUND_KEYS, air_json, ground_in
+from meshlab.propagation import RadioEnvironment
 from meshlab.quality import TQ_MAX
 from meshlab.spec import LinkSpec
-from meshlab.yaml_entries import YamlEntry, parse_text, read
 
+FLEET_FILE = "ground.json"
+"""A running fleet's radio environment, in its directory."""
 _LINK_KEYS = tuple(item.name for item in fields(LinkSpec) if item.name not in ("a", "b"))
-# the plausible range of each number of `PathLossModel`
-_PATH_LOSS_BOUNDS = {
-    "tx_power_dbm": (-20.0, 60.0),
-    "antenna_gain_dbi": (-20.0, 40.0),
-    "frequency_mhz": (100.0, 100_000.0),
-    "exponent": (1.0, 10.0),
-    "sensitivity_dbm": (-150.0, 0.0),
-    "fading_db": (0.1, 30.0),
-}
 
 
 def load(path: Path) -> RadioEnvironment:
@@ -43,7 +37,7 @@ def parse(text: str, file: str) -> RadioEnvironment:
 
 
 def _environment(root: YamlEntry) -> RadioEnvironment:
-    environment = environment_in(root.mapping(("nodes", "walls", "air", "links")))
+    environment = environment_in(root.mapping((*GROUND_KEYS, "links")))
     if not root.is_present:
         root.problem("a mapping")
     root.finish()
@@ -52,7 +46,7 @@ def _environment(root: YamlEntry) -> RadioEnvironment:
 
 def environment_in(keys: dict[str, YamlEntry]) -> RadioEnvironment:
     """The radio environment of the entries `nodes`, `walls`, `air` and `links`, which collect the problems."""
-    positions = {name: _position(entry) for name, entry in keys["nodes"].mapping().items()}
+    ground = ground_in(keys)
     links: dict[frozenset[str], LinkSpec] = {}
     for entry in keys["links"].items():
         link = _link(entry)
@@ -60,36 +54,7 @@ def environment_in(keys: dict[str, YamlEntry]) -> RadioEnvironment:
             entry.problem("each pair once", f"{link.a}-{link.b} again")
         elif link is not None:
             links[link.ends] = link
-    return RadioEnvironment(
-        positions, tuple(_wall(entry) for entry in keys["walls"].items()), _path_loss(keys["air"]), (*links.values(),)
-    )
-
-
-def _position(entry: YamlEntry) -> NodePosition:
-    """`[x, y]`, or `{at: [x, y], tx_power_dbm: 33}`."""
-    if entry.is_list:
-        return NodePosition(entry.point())
-    keys = entry.mapping(("at", "tx_power_dbm"), required=("at",))
-    power = keys["tx_power_dbm"]
-    minimum, maximum = _PATH_LOSS_BOUNDS["tx_power_dbm"]
-    return NodePosition(
-        keys["at"].point() if keys["at"].is_present else (0.0, 0.0),
-        power.number(0.0, minimum, maximum) if power.is_present else None,
-    )
-
-
-def _wall(entry: YamlEntry) -> Wall:
-    keys = entry.mapping(("a", "b", "loss_db"), required=("a", "b"))
-    ends = [keys[end].point() if keys[end].is_present else (0.0, 0.0) for end in ("a", "b")]
-    return Wall(ends[0], ends[1], keys["loss_db"].number(Wall(ends[0], ends[1]).loss_db, 0.0, 1000.0))
-
-
-def _path_loss(entry: YamlEntry) -> PathLossModel:
-    keys = entry.mapping(tuple(_PATH_LOSS_BOUNDS))
-    standard = asdict(PathLossModel())
-    return PathLossModel(
-        **{name: keys[name].number(standard[name], *bounds) for name, bounds in _PATH_LOSS_BOUNDS.items()}
-    )
+    return RadioEnvironment(ground.positions, ground.walls, ground.air, (*links.values(),))
 
 
 def _link(entry: YamlEntry) -> LinkSpec | None:
@@ -128,7 +93,7 @@ def dump(environment: RadioEnvironment) -> str:
     content = {
         "nodes": {name: given(place) for name, place in environment.positions.items()},
         "walls": [asdict(wall) for wall in environment.walls],
-        "air": asdict(environment.path_loss),
+        "air": air_json(environment.path_loss),
         "links": links,
     }
     return json.dumps(content, indent=1) + "\n"

@@ -14,8 +14,10 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from types import MappingProxyType
 
+from meshctl.placement.ground import NodePosition
+from meshctl.placement.path_loss import Point
 from meshctl.topology import Link, graph_of
-from meshlab.propagation import NodePosition, Point, RadioEnvironment, links_of
+from meshlab.propagation import RadioEnvironment, links_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from meshctl.inventory.yaml_entries import YamlEntry, parse_text, read
 from meshlab import propagation_file
 from meshlab.propagation import RadioEnvironment
 from meshlab.scenario import Deployment, PowerEvent, Scenario, Trajectory, trajectory
-from meshlab.yaml_entries import YamlEntry, parse_text, read
 
 _ENVIRONMENT_KEYS = ("nodes", "walls", "air", "links")
 _KEYS = ("name", "base", "ground", *_ENVIRONMENT_KEYS, "duration_s", "step_s", "robots", "beacons", "incidents")

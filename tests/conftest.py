@@ -10,6 +10,7 @@ from importlib.metadata import version
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.meshctl.monitor.prometheus_program import NEEDS_PROMETHEUS, expects_prometheus
 from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
 from tests.udp_mesh.bridges.ros2_processes import NEEDS_ROS2, PYTHON, expects_ros2
 
@@ -50,7 +51,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("tried again")
         for reason in reasons:
             terminalreporter.line(reason)
-    if not expects_ros() or not expects_ros2():
+    if not expects_ros() or not expects_ros2() or not expects_prometheus():
         terminalreporter.section("not tested here")
     if not expects_ros2():
         terminalreporter.line(
@@ -61,4 +62,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.line(
             f"ROS 1: {ROS_PYTHON} has no rospy and rosmaster, so tests/udp_mesh/bridges/test_ros1_quick.py was not"
             f" collected. scripts/setup-ros installs them (Debian, Ubuntu); {NEEDS_ROS}=1 makes it fail instead."
+        )
+    if not expects_prometheus():
+        terminalreporter.line(
+            "Prometheus: there is no prometheus in PATH, so tests/meshctl/monitor/test_prometheus.py was not"
+            f" collected. scripts/setup-prometheus installs it (Debian, Ubuntu); {NEEDS_PROMETHEUS}=1 makes it fail"
+            " instead."
         )

@@ -35,6 +35,18 @@ def test_every_source_file_that_a_page_names_exists(page: Path) -> None:
     assert missing == set() or page.name in FOREIGN
 
 
+def test_every_claim_of_the_threat_model_names_existing_tests() -> None:
+    text = (DOCS / "threat-model.md").read_text(encoding="utf-8")
+    tests = ROOT / "tests" / "udp_mesh"
+    files = set(re.findall(r"`((?:\w+/)+test_\w+\.py)`", text))
+    assert len(files) > 15
+    assert {name for name in files if not (tests / name).is_file()} == set()
+    sources = "".join(path.read_text(encoding="utf-8") for path in tests.rglob("test_*.py"))
+    functions = set(re.findall(r"`(test_\w+)", text))
+    assert functions
+    assert {name for name in functions if f"def {name}(" not in sources} == set()
+
+
 def test_node_assumptions_reference_existing_files_and_identifiers() -> None:
     """The tables of node-assumptions.md name files relative to meshctl/ or to the scripts that run on a node."""
     text = (DOCS / "facts/node-assumptions.md").read_text(encoding="utf-8")
@@ -130,7 +142,10 @@ def test_the_tutorial_shows_the_output_of_every_command() -> None:
 def test_every_picture_is_shown_and_made_by_a_script() -> None:
     texts = [page.read_text(encoding="utf-8") for page in PAGES]
     script = (ROOT / "scripts/pictures").read_text(encoding="utf-8")
-    pictures = [picture.stem for picture in (DOCS / "images").iterdir()]
+    # Those of the links are made, and compared with the list of links, by benchmarks/unfamiliar_links and its test.
+    links = [f"links/{picture.stem}" for picture in (DOCS / "images/links").iterdir()]
+    assert [name for name in links if not any(f"images/{name}.svg" in text for text in texts)] == []
+    pictures = [picture.stem for picture in (DOCS / "images").iterdir() if picture.is_file()]
     assert len(pictures) > 5
     assert [name for name in pictures if not any(f"images/{name}.svg" in text for text in texts)] == []
     assert [name for name in pictures if f'"{name}"' not in script and f'"{name}.svg"' not in script] == []

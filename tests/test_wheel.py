@@ -53,6 +53,8 @@ def test_the_wheel_carries_templates_examples_pages_scripts_and_scenarios(wheel:
         "meshctl/_shipped/inventory/lab/fleet.yaml",
         "meshctl/_shipped/lint/MC",
         "meshctl/device/scripts/",
+        "meshctl/monitor/prometheus/alerts.yml",
+        "meshctl/monitor/prometheus/dashboard.json",
         "meshlab/node_root/",
         "udp_mesh/sim/scenarios/final-run.yaml",
         "udp_mesh/daemon/units/",

@@ -36,8 +36,11 @@ from meshctl.render.rendered import MARKER_PATH
 
 # The lock outlives the confirm window by this much, for the actions after it.
 LOCK_SLACK_S = 60
-# reload_config returns before netifd starts: procd collects events for 1 s, then interfaces go down and come up.
-SETTLE_S = 3.0
+# The first look at a node whose connection the change has cut: before, its services cannot have reloaded, because procd
+# collects events for 1 s, and a login would slow them down. Not a settling time: the reload's end is observed.
+FIRST_LOOK_S = 3.0
+# The reload of a package change sends its events and does not wait for them.
+PACKAGES_SETTLE_S = 3.0
 # The change starts after this delay, so that the answer to `apply` arrives before the connection may be cut.
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # How long a node that keeps its address is waited for over the connection that sent the change.
@@ -104,9 +107,9 @@ class ChangeInProgress:
         return self.extra_s > 0 or any(change.path not in harmless for change in self.ctx.plan.files)
 
     @property
-    def settle_s(self) -> float:
-        """How long the change must be applied before an observation counts as its effect."""
-        return SETTLE_S if self.ctx.plan.cut > Cut.LOGIN else 0.0
+    def first_look_s(self) -> float:
+        """How long after its start the node is first looked at."""
+        return FIRST_LOOK_S if self.ctx.plan.cut > Cut.LOGIN else 0.0
 
 
 def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) -> ChangeInProgress:
@@ -257,7 +260,7 @@ def observe_and_decide(
         change.login_refused = change.connect_error = ""
         change.listener.observed()
     change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
-    if age_s is not None and age_s < change.settle_s:
+    if change.extra_s and age_s is not None and age_s < PACKAGES_SETTLE_S:
         change.unmet = (*change.unmet, "its services may still be reloading")
     return next_action(
         change.id,

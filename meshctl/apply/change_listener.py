@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
 from contextlib import AbstractContextManager
 from typing import Protocol
 
@@ -13,9 +13,13 @@ from meshctl.device.ssh import SshConnection
 class ChangeListener(Protocol):
     """Receives the events of one node's change. No event alters the outcome of the change.
 
-    `armed` comes first, or never in a change of a whole mesh. Then `started`, again for each new attempt; `waiting`,
+    `armed` comes first, in a simultaneous change after `restarting`; or never, if a whole mesh
+    changes its cell. Then `started`, again for each new attempt; `waiting`,
     `connecting`, `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
     """
+
+    def restarting(self, names: Iterable[str]) -> None:
+        """The radios of these nodes restart at the same moment: they keep no station entry from before."""
 
     def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
         """The change starts next and ends within `for_s`; the node still forwards its neighbors' frames.

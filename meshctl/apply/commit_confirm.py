@@ -84,7 +84,7 @@ def poll(change: ChangeInProgress) -> Outcome:
     run_context = change.ctx.run
     backoff = Backoff(_limit_s(change), run_context.interrupt)
     if not change.is_reloaded:
-        run_context.interrupt.wait(change.settle_s)
+        run_context.interrupt.wait(change.first_look_s)
     proof: SshConnection | None = None
     try:
         while not backoff.is_over:
@@ -182,7 +182,7 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
 
 def _limit_s(change: ChangeInProgress) -> float:
     """The time within which the change is confirmed or rolled back."""
-    return change.settle_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
+    return change.first_look_s + change.extra_s + change.window_s + GRACE_AFTER_WINDOW_S
 
 
 def _notify_end(change: ChangeInProgress, outcome: Outcome) -> None:

@@ -173,8 +173,8 @@ def _run_stage(
     images: Mapping[str, Path],
 ) -> dict[str, Outcome]:
     observer = Tee((_journaling(run_context.journal_run), run_context.observer))
-    if stage.kind is StageKind.SWITCH:
-        ended = _switch_stage(stage, contexts, plan, run_context, observer)
+    if stage.kind.is_simultaneous:
+        ended = _simultaneous_stage(stage, contexts, plan, run_context, observer)
         for outcome in ended.values():
             budget.count(outcome)
         return ended
@@ -226,7 +226,7 @@ def _connection(ctx: NodeContext) -> SshConnection:
     )
 
 
-def _switch_stage(
+def _simultaneous_stage(
     stage: Stage, contexts: Mapping[str, NodeContext], plan: Plan, run_context: RunContext, observer: Observer
 ) -> dict[str, Outcome]:
     """Install packages first, which interrupts nothing; then change all nodes simultaneously."""
@@ -235,16 +235,21 @@ def _switch_stage(
         observer(Event(EventKind.STARTED, name, time.time()))
     failed = _packages_first(stage, contexts)
     if failed:
-        reason = f"the mesh change was canceled: packages could not be installed on {', '.join(failed)}"
+        what = "the mesh change" if stage.kind is StageKind.SWITCH else "the simultaneous change"
+        reason = f"{what} was canceled: packages could not be installed on {', '.join(failed)}"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
-        ended = commit_mesh(
-            run_context,
-            [contexts[name] for name in stage.nodes],
-            quorum=run_context.fleet.apply.quorum,
-            parallel=min(nodes_in_work(run_context.fleet.apply.parallel), MESH_SLOTS[1]),
-            entry=plan.entry,
-        )
+        with_files = [name for name in stage.nodes if contexts[name].plan.files]
+        ended = {name: Outcome(name, Result.DONE) for name in stage.nodes}
+        if with_files:
+            ended |= commit_mesh(
+                run_context,
+                [contexts[name] for name in with_files],
+                quorum=run_context.fleet.apply.quorum,
+                parallel=min(nodes_in_work(run_context.fleet.apply.parallel), MESH_SLOTS[1]),
+                entry=plan.entry,
+                together=stage.kind is StageKind.TOGETHER,
+            )
     took_s = round(time.monotonic() - began, 3)
     updated = {name: replace(outcome, duration_s=took_s) for name, outcome in ended.items()}
     for outcome in updated.values():

@@ -133,7 +133,10 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     name = iface.get("ifname")
     link = next((found for found in after.links or () if found.ifname == name), None)
     if link is None:
-        return [f"{name} does not exist"]
+        radio = next((found for found in after.radios or () if found.name == iface.get("device")), None)
+        # netifd tries no more until the next change or `wifi up`
+        given_up = f": netifd gave up setting up {radio.name}" if radio is not None and radio.setup_failed else ""
+        return [f"{name} does not exist{given_up}"]
     # `up` in netifd does not mean that the cell was joined (openwrt-facts.md section 5)
     if link.joined is False:
         return [f"{name} has not joined its cell"]

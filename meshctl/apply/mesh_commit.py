@@ -1,16 +1,19 @@
-"""Change a whole mesh simultaneously, all or nothing: arm, schedule, prove, then confirm or roll back.
+"""Change many nodes simultaneously, all or nothing: arm, schedule, prove, then confirm or roll back.
 
 `commit_mesh` arms every participant (`_arm`) and schedules the same moment on all, as the uptime of each node measured
-just before (`_schedule`), so no clock has to be set. Then it looks for all of them in the new cell (`_decide`). When
-all have proven themselves they are confirmed; at the deadline a quorum of each mesh that includes the base is enough.
-Otherwise the reachable nodes are rolled back, the farthest first, and the others by their own timers.
+just before (`_schedule`), so no clock has to be set. Then it looks for all of them (`_decide`), in the new cell if they
+change it. When all have proven themselves they are confirmed; when the others have failed, and at the deadline, a
+quorum of each mesh that includes the base is enough. Otherwise all are rolled back, nodes out of reach by their own
+timers.
+
+A node that leaves its cell and does not prove itself is left behind there. One that keeps its cell (`together`) rolls
+back alone, and is reached as before.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -26,10 +29,12 @@ from meshctl.apply.change_in_progress import (
     start,
     unlock,
 )
-from meshctl.apply.commit_confirm import poll
+from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.next_action import Action
-from meshctl.device.openwrt import UptimeSample, measure_uptime
+from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum, unmet_of
+from meshctl.device.openwrt import measure_uptime
+from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
@@ -40,33 +45,8 @@ LEAD_ROUND_TRIPS = 6
 LEAD_S = 2.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
-# Each of the others has its own reason in its own outcome.
-MAX_NAMED = 3
 # The fact in the outcome of a node left in the old cell: what differs between its cell and the mesh's.
 LEFT_BEHIND = "left_behind"
-
-
-@dataclass(slots=True)
-class Participant:
-    """One node of the mesh change. `failure` is why it cannot take part."""
-
-    ctx: NodeContext
-    change: ChangeInProgress | None = None
-    clock: UptimeSample | None = None
-    failure: Outcome | None = None
-    is_scheduled: bool = False
-    is_unreachable: bool = False
-    is_proven: bool = False
-    is_confirmed: bool = False
-
-    @property
-    def name(self) -> str:
-        return self.ctx.name
-
-    @property
-    def meshes(self) -> tuple[str, ...]:
-        """The meshes whose cell this node changes."""
-        return self.ctx.plan.parted_from
 
 
 @dataclass(slots=True)
@@ -78,7 +58,16 @@ class _MeshCommit:
     window_s: int
     parallel: int
     entry: str
+    is_together: bool
     pool: ThreadPoolExecutor = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        return "the simultaneous change" if self.is_together else "the mesh change"
+
+    @property
+    def success(self) -> str:
+        return "passed their checks" if self.is_together else "rejoined"
 
     def each(self, participants: Iterable[Participant], act: Callable[[Participant], None]) -> None:
         """Run `act` for all, `parallel` at a time, and wait; an unexpected exception is raised."""
@@ -87,51 +76,32 @@ class _MeshCommit:
 
 
 def commit_mesh(
-    run_context: RunContext, contexts: Sequence[NodeContext], *, quorum: float, parallel: int, entry: str
+    run_context: RunContext,
+    contexts: Sequence[NodeContext],
+    *,
+    quorum: float,
+    parallel: int,
+    entry: str,
+    together: bool = False,
 ) -> dict[str, Outcome]:
     """Apply the file changes of these nodes simultaneously. Returns each node's outcome; raises nothing for a node."""
-    participants = [Participant(ctx) for ctx in contexts]
+    participants = [Participant(ctx, together) for ctx in contexts]
     window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
-        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, pool)
+        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, together, pool)
         commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
-            return _cancel(commit, canceled_because(participants, "armed"))
+            return _cancel(commit, canceled_because(participants, "armed", commit.name))
         _schedule(commit)
         if not all(participant.is_scheduled for participant in participants):
-            return _cancel(commit, canceled_because(participants, "scheduled"))
+            return _cancel(commit, canceled_because(participants, "scheduled", commit.name))
         needed = quorum_of(participants, quorum)
         quorum_text = ", ".join(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
         )
-        run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must rejoin")
+        must = "pass their checks" if together else "rejoin"
+        run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must {must}")
         return _decide(commit, needed)
-
-
-def canceled_because(participants: Iterable[Participant], step: str) -> str:
-    """Why no node changes: the participants that could not be armed or scheduled, each with its reason."""
-    failed = [
-        f"{participant.name} could not be {step}: {participant.failure.reason}"
-        for participant in participants
-        if participant.failure is not None
-    ]
-    if not failed:
-        return "the mesh change was canceled: interrupted"
-    more = f"; and {len(failed) - MAX_NAMED} more" if len(failed) > MAX_NAMED else ""
-    return f"the mesh change was canceled: {'; '.join(failed[:MAX_NAMED])}{more}"
-
-
-def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
-    """How many nodes of each changing mesh must rejoin it."""
-    counts = Counter(mesh for participant in participants for mesh in participant.meshes)
-    return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
-
-
-def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int]) -> str:
-    """Which meshes are below their quorum; empty when none is."""
-    there = Counter(mesh for participant in proven for mesh in participant.meshes)
-    short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
-    return "; ".join(f"{there[mesh]} of mesh {mesh} rejoined, {count} required" for mesh, count in short.items())
 
 
 def _arm(commit: _MeshCommit, participant: Participant) -> None:
@@ -140,9 +110,21 @@ def _arm(commit: _MeshCommit, participant: Participant) -> None:
         with commit.run.connections.borrow(ctx.node) as connection:
             participant.change = new_change(ctx, connection.endpoint, window_s=commit.window_s)
             arm(participant.change, connection)
+            if commit.is_together:
+                _watch_unchanged(commit, participant.change, connection)
             participant.clock = measure_uptime(connection)
     except NodeError as error:
         participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)
+
+
+def _watch_unchanged(commit: _MeshCommit, change: ChangeInProgress, connection: SshConnection) -> None:
+    """Neighbors that keep their radios up keep their station entries of this node's radios as well."""
+    if not change.radios:
+        return
+    change.listener.restarting(
+        [other.name for other in commit.participants if other.change is not None and other.change.radios]
+    )
+    change.listener.armed(connection, for_s=commit.window_s + GRACE_AFTER_WINDOW_S)
 
 
 def _schedule(commit: _MeshCommit) -> None:
@@ -199,15 +181,19 @@ def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
 
 
 def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome]:
-    """Observe the participants in the new cell until all have proven themselves or time is up; then decide, once."""
+    """Observe the participants until each has proven itself or failed, or time is up; then decide, once."""
     backoff = Backoff(commit.window_s * (1 - CONFIRM_SHARE), commit.run.interrupt)
     commit.run.interrupt.wait(
-        max(participant.change.settle_s for participant in commit.participants if participant.change is not None)
+        max(participant.change.first_look_s for participant in commit.participants if participant.change is not None)
     )
     while True:
-        commit.each([participant for participant in commit.participants if not participant.is_proven], _prove)
+        commit.each([participant for participant in commit.participants if not participant.is_decided], _prove)
         proven = [participant for participant in commit.participants if participant.is_proven]
-        if len(proven) == len(commit.participants) or backoff.is_over or commit.run.interrupt.leaving:
+        if (
+            all(participant.is_decided for participant in commit.participants)
+            or backoff.is_over
+            or commit.run.interrupt.leaving
+        ):
             break
         _notify_unreachable(commit, proven)
         backoff.pause()
@@ -216,21 +202,12 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
         or any(m.name == commit.entry for m in proven)
         or all(m.name != commit.entry for m in commit.participants)
     )
-    why = short_of_quorum(proven, needed) if has_entry else "the base did not come back"
+    why = short_of_quorum(proven, needed, commit.success) if has_entry else "the base did not come back"
     if not why:
         return _confirm_all(commit)
     unproven = [unmet_of(participant) for participant in commit.participants if not participant.is_proven]
     commit.run.note(f"{why}; rolling back: {'; '.join(unproven)}")
     return _roll_back(commit, why)
-
-
-def unmet_of(participant: Participant) -> str:
-    """`b01: it has no route to the base`: why a participant had not proven itself in its latest observation."""
-    change = participant.change
-    if change is None or participant.is_unreachable or not change.unmet:
-        last_error = "" if change is None else change.last_error
-        return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
-    return f"{participant.name}: {', '.join(change.unmet)}"
 
 
 def _notify_unreachable(commit: _MeshCommit, proven: Sequence[Participant]) -> None:
@@ -252,7 +229,9 @@ def _prove(participant: Participant) -> None:
     if change is None or connection is None:
         return
     try:
-        participant.is_proven = observe_and_decide(change, connection) is Action.CONFIRM
+        action = observe_and_decide(change, connection)
+        participant.is_proven = action is Action.CONFIRM
+        participant.has_failed = action in (Action.ABORT, Action.WENT_BACK)
         if change.last is not None:
             participant.ctx.run.record(participant.name, change.last)
     except NodeError as error:
@@ -262,10 +241,10 @@ def _prove(participant: Participant) -> None:
 
 
 def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
-    """Confirm the proven participants, and late ones until the window ends; the others are left behind."""
+    """Confirm the proven participants, and late ones until the window ends; the others roll back."""
 
     def confirm_one(participant: Participant) -> None:
-        if not participant.is_proven:
+        if not participant.is_decided:
             _prove(participant)
         if participant.change is None or not participant.is_proven:
             return
@@ -276,21 +255,31 @@ def _confirm_all(commit: _MeshCommit) -> dict[str, Outcome]:
 
     backoff = Backoff(commit.window_s * CONFIRM_SHARE, commit.run.interrupt)
     while not backoff.is_over:
-        commit.each([participant for participant in commit.participants if not participant.is_confirmed], confirm_one)
-        if all(participant.is_confirmed for participant in commit.participants) or commit.run.interrupt.leaving:
+        left = [p for p in commit.participants if not p.is_confirmed and not p.has_failed]
+        commit.each(left, confirm_one)
+        if all(p.is_confirmed or p.has_failed for p in left) or commit.run.interrupt.leaving:
             break
         backoff.pause()
-    return {participant.name: _confirmed_outcome(participant) for participant in commit.participants}
+    ended: dict[str, Outcome] = {}
+
+    def end_one(participant: Participant) -> None:
+        ended[participant.name] = _confirmed_outcome(participant)
+
+    commit.each(commit.participants, end_one)
+    return {participant.name: ended[participant.name] for participant in commit.participants}
 
 
 def _confirmed_outcome(participant: Participant) -> Outcome:
+    change = participant.change
     if participant.is_confirmed:
+        if participant.is_together and change is not None:
+            change.listener.ended(change.last)
         return Outcome(participant.name, Result.DONE)
-    unmet = (
-        "; ".join(participant.change.unmet)
-        if participant.change is not None and participant.change.unmet
-        else "it was not observed"
-    )
+    if not participant.leaves_cell and change is not None:
+        # it is where it was, so its way back can be observed
+        change.is_abandoned = True
+        return poll(change)
+    unmet = "; ".join(change.unmet) if change is not None and change.unmet else "it was not observed"
     return Outcome(
         participant.name,
         Result.UNCERTAIN,
@@ -301,23 +290,31 @@ def _confirmed_outcome(participant: Participant) -> Outcome:
 
 
 def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
-    """Roll the reachable nodes back, the farthest first so that the path to the others lasts; then poll them all."""
+    """Roll the reachable nodes back, then poll them all. Nodes that go back to another cell do so the farthest first,
+    so that the path to the others lasts."""
     unmet = {
         participant.name: unmet_of(participant) for participant in commit.participants if not participant.is_proven
     }
-    for participant in commit.participants:
+
+    def abort_one(participant: Participant) -> None:
         if participant.change is None:
-            continue
+            return
         participant.change.is_abandoned = True
         connection = connect(participant.change)
         if connection is None:
-            continue
+            return
         try:
             abort(participant.change, connection)
         except NodeError as error:
             participant.change.last_error = str(error)
         finally:
             connection.close()
+
+    if any(participant.leaves_cell for participant in commit.participants):
+        for participant in commit.participants:
+            abort_one(participant)
+    else:
+        commit.each(commit.participants, abort_one)
     ended: dict[str, Outcome] = {}
 
     def poll_one(participant: Participant) -> None:
@@ -327,7 +324,10 @@ def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
     commit.each(commit.participants, poll_one)
     return {
         participant.name: _rolled_back_outcome(
-            ended.get(participant.name), participant.name, why, unmet.get(participant.name, "")
+            ended.get(participant.name),
+            participant.name,
+            f"{'all nodes were' if commit.is_together else 'the whole mesh was'} rolled back: {why}",
+            unmet.get(participant.name, ""),
         )
         for participant in commit.participants
     }
@@ -337,7 +337,5 @@ def _rolled_back_outcome(outcome: Outcome | None, name: str, why: str, gap: str)
     if outcome is None:
         return Outcome(name, Result.PENDING, why)
     if outcome.result is Result.ROLLED_BACK:
-        return Outcome(
-            name, Result.ROLLED_BACK, f"the whole mesh was rolled back: {'; '.join(filter(None, (why, gap)))}"
-        )
+        return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (why, gap))))
     return outcome

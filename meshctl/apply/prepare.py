@@ -25,6 +25,7 @@ from meshctl.nodes.slots import nodes_in_work
 from meshctl.plan import Cut, DesiredState, NodePlan, Plan, Verdict, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.plan.seen import package_of
+from meshctl.plan.ways import Pace
 from meshctl.topology import mesh_macs
 
 
@@ -36,6 +37,8 @@ class PlanOptions:
     leave_behind: tuple[str, ...] = ()
     accept_cuts: tuple[str, ...] = ()
     entry: str = ""
+    # all nodes of running meshes change simultaneously
+    together: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +97,8 @@ def prepare(
         _remember(journal, fleet, others)
         seen = replace(seen, observations={**seen.observations, **others.observations})
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
-    return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided)
+    pace = Pace.of(journal.change_durations_s(fleet.name))
+    return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace)
 
 
 def _remember(journal: Journal, fleet: Fleet, seen: FleetObservation) -> None:
@@ -208,6 +212,7 @@ def _with_fleet_plan(
     *,
     salt: bytes,
     choices: PlanOptions,
+    pace: Pace | None = None,
 ) -> Prepared:
     plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
@@ -222,6 +227,8 @@ def _with_fleet_plan(
         entry=choices.entry,
         leave_behind=choices.leave_behind,
         accept_cuts=choices.accept_cuts,
+        together=choices.together,
+        pace=pace,
         never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
     return Prepared(plan, single.desired, seen, salt)

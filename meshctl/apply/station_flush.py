@@ -88,6 +88,8 @@ class StationFlush:
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
+    # nodes whose radios restart at the same moment and keep no entry from before
+    _restarting: frozenset[str] = frozenset()
     # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
     _journaled_steps: set[str] = field(default_factory=set)
     _reported: set[str] = field(default_factory=set)
@@ -105,6 +107,10 @@ class StationFlush:
     def node(self) -> str:
         return self.ctx.name
 
+    def restarting(self, names: Iterable[str]) -> None:
+        """The radios of these nodes restart at the same moment: they keep no station entry from before."""
+        self._restarting = frozenset(names) - {self.node}
+
     def armed(self, connection: SshConnection | None, *, for_s: float) -> None:
         """Start watches on the node itself and on the nodes reached through it. Raises Unreachable."""
         if not self.radios:
@@ -117,7 +123,7 @@ class StationFlush:
         """Start watches on the nodes reached through this one."""
         run_context = self.ctx.run
         hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
-        names = [name for name in self._holders if name in hidden]
+        names = [name for name in self._holders if name in hidden and name not in self._restarting]
         answers = self._query(
             "watch neighbor station entries",
             {name: partial(watch_script, self.node, self._holders[name], for_s=for_s) for name in names},
@@ -133,6 +139,9 @@ class StationFlush:
         """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
         node removes its own, and both count from 0."""
         entries = own_entries(self.node, self.ctx.before, self.radios)
+        if self._restarting:
+            owners = self.ctx.run.mac_owners
+            entries = tuple(entry for entry in entries if owners.get(entry.mac.lower()) not in self._restarting)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
 
@@ -242,7 +251,8 @@ class StationFlush:
         for name in others:
             if name != self.node and name in run_context.fleet.nodes:
                 asked.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
-        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if name not in self._watching and asked[name]}
+        silent = self._watching | self._restarting
+        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if name not in silent and asked[name]}
 
     def _flush(
         self, asked: Mapping[str, Sequence[StationEntry]], since_s: float, *, has_restarted: bool = False

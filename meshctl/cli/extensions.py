@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -28,6 +28,10 @@ class LabFleet(Protocol):
 
     def endpoint(self, address: str) -> Endpoint:
         """The local endpoint of the node with `address`."""
+
+    @property
+    def positions(self) -> Mapping[str, tuple[float, float]]:
+        """Where its nodes are, in meters, if it has positions."""
 
     def bench_endpoint(self, name: str) -> Endpoint:
         """The local endpoint of the factory address of node `name`."""

@@ -35,6 +35,12 @@ LeaveBehind = Annotated[
 AcceptCut = Annotated[
     str, typer.Option("--accept-cut", help="Cut vertices (a,b,... or all) that may be flashed anyway.")
 ]
+Together = Annotated[
+    bool,
+    typer.Option(
+        "--together", help="Change all nodes of running meshes at one moment; all roll back unless a quorum is well."
+    ),
+]
 Brief = Annotated[bool, typer.Option("--brief/--full", help="Hide file diffs.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation.")]
 Rate = Annotated[float | None, typer.Option("--rate", help="Upload limit per node in kB/s.")]
@@ -46,6 +52,7 @@ def plan(
     inventory: InventoryPath = Path(),
     out: Annotated[Path | None, typer.Option("--out", help="Save the plan for `meshctl apply`.")] = None,
     no_firmware: NoFirmware = False,
+    together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
     brief: Brief = False,
@@ -57,7 +64,7 @@ def plan(
 
     Example: meshctl plan 'husky1-*' --out plan.json
     """
-    choices = choices_of(no_firmware, leave_behind, accept_cut)
+    choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         prepared = prepare_plan(opened, nodes, choices, limits=limit)
         if out is not None:
@@ -105,6 +112,7 @@ def provision(
     dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
+    together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
     rate: Rate = None,
@@ -115,9 +123,9 @@ def provision(
 ) -> None:
     """Plan, confirm and apply: bring nodes to the state in the inventory without losing contact to any.
 
-    Example: meshctl provision 'b*' --leave-behind b07
+    Example: meshctl provision 'b*' --together
     """
-    choices = choices_of(no_firmware, leave_behind, accept_cut)
+    choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         prepared = prepare_plan(opened, nodes, choices, limits=limit)
         if check:
@@ -132,6 +140,10 @@ def resume(
     inventory: InventoryPath = Path(),
     dry_run: DryRun = False,
     yes: Yes = False,
+    together: Annotated[
+        bool | None,
+        typer.Option("--together/--in-order", help="All at one moment, or stage by stage; default: as the run was."),
+    ] = None,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
     rate: Rate = None,
@@ -173,6 +185,7 @@ def resume(
             bool(recorded.get("with_firmware", True)),
             (*recorded.get("leave_behind", ()), *added.leave_behind),
             (*recorded.get("accept_cuts", ()), *added.accept_cuts),
+            together=bool(recorded.get("together", False)) if together is None else together,
         )
         prepared = prepare_plan(opened, names, choices)
         for line in bench_advice(record, prepared.plan):

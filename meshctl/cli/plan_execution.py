@@ -31,8 +31,8 @@ class PlanRefused(MeshctlError):
     exit_code = ExitCode.FINDINGS
 
 
-def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str) -> PlanOptions:
-    return PlanOptions(not no_firmware, _names(leave_behind), _names(accept_cut))
+def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str, together: bool = False) -> PlanOptions:
+    return PlanOptions(not no_firmware, _names(leave_behind), _names(accept_cut), together=together)
 
 
 def _names(text: str) -> tuple[str, ...]:

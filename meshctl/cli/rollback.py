@@ -24,7 +24,7 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.output import echo
-from meshctl.cli.plan import AcceptCut, Brief, LeaveBehind, Rate, Yes
+from meshctl.cli.plan import AcceptCut, Brief, LeaveBehind, Rate, Together, Yes
 from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_execute, prepare_plan
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
@@ -49,6 +49,7 @@ def rollback(
     inventory: InventoryPath = Path(),
     dry_run: DryRun = False,
     yes: Yes = False,
+    together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
     rate: Rate = None,
@@ -70,7 +71,7 @@ def rollback(
         renderer = opened.renderer
         earlier = EarlierStates(opened.fleet, renderer.secrets, renderer.templates, states)
         opened = replace(opened, renderer=earlier)
-        choices = choices_of(True, leave_behind, accept_cut)
+        choices = choices_of(True, leave_behind, accept_cut, together)
         prepared = prepare_plan(opened, list(states), choices)
         try:
             confirm_and_execute(

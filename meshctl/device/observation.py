@@ -92,6 +92,8 @@ class WirelessLink:
     tx_power_dbm: float | None = None
     joined: bool | None = None
     """From `iw dev IF link`: whether an IBSS is joined; None if iw does not report it for this mode."""
+    phy: str = ""
+    """The radio it runs on, as /sys/class/ieee80211 names it: `phy0`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +114,35 @@ class Station:
     expected_mbit_s: float | None = None
     # the age of the entry
     connected_s: int | None = None
+    signal_avg_dbm: int | None = None
+    chain_signals_dbm: tuple[int, ...] = ()
+    """Of the last frame, by receive chain."""
+    rx_packets: int | None = None
+    tx_mcs: str = ""
+    """As iw writes it: `MCS 15`, `VHT-MCS 8 NSS 2`; empty for a rate without one."""
+    rx_mcs: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSurvey:
+    """The channel in use, as a radio measures it (`iw dev IF survey dump`). The times are counted since the radio came
+    up or changed its channel; `busy_ms` includes its own frames."""
+
+    ifname: str
+    frequency_mhz: int
+    noise_dbm: int | None = None
+    active_ms: int | None = None
+    busy_ms: int | None = None
+    receive_ms: int | None = None
+    transmit_ms: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """Packets queued in mac80211 by radio (`phy0`), and temperatures in degrees Celsius by radio or thermal zone."""
+
+    queued_packets: Mapping[str, int]
+    temperatures_c: Mapping[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +255,8 @@ class Observation:
     overlay: Space | None = None
     root_in_ram: bool | None = None
     """Whether / is still in memory because the flash is not formatted yet (first boot)."""
+    root_read_only: bool | None = None
+    """Whether / cannot be written: failsafe mode, or a failing flash."""
     tmp: Space | None = None
     macs: Mapping[str, str] | None = None
     """Interface name -> MAC address, from /sys/class/net."""
@@ -232,6 +265,9 @@ class Observation:
     radios: tuple[RadioState, ...] | None = None
     links: tuple[WirelessLink, ...] | None = None
     stations: tuple[Station, ...] | None = None
+    surveys: tuple[ChannelSurvey, ...] | None = None
+    """One per interface whose driver reports one."""
+    sensors: Sensors | None = None
     supplicants: tuple[str, ...] | None = None
     """The radio interfaces that wpa_supplicant runs; a mesh interface without it is unencrypted."""
     interfaces: tuple[NetInterface, ...] | None = None
@@ -239,6 +275,8 @@ class Observation:
     mesh: MeshInfo | None = None
     neighbours: tuple[MeshNeighbour, ...] | None = None
     originators: tuple[Originator, ...] | None = None
+    mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
+    """Interface of batman-adv -> its counters (`batctl statistics`)."""
     package_tool: str | None = None
     packages: Mapping[str, str] | None = None
     """Installed package -> version."""

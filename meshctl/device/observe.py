@@ -18,6 +18,7 @@ from meshctl.device.framing import quoted
 from meshctl.device.observation import (
     BoardInfo,
     ChangeStatus,
+    ChannelSurvey,
     FileInfo,
     MeshInfo,
     MeshNeighbour,
@@ -114,7 +115,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
     reader = _OutputReader(sections)
     board, release = _board(reader)
     space = reader.read("df", system.parse_df) or {}
-    links, stations = _wireless(reader)
+    links, stations, surveys = _wireless(reader)
     mesh, neighbours, originators = _mesh(reader)
     macs = reader.read("macs", system.parse_macs)
     indexes = reader.read("macs", system.parse_indexes, required=False) or {}
@@ -134,18 +135,22 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         memory=reader.read("meminfo", system.parse_meminfo),
         overlay=_space(space, "/"),
         root_in_ram=reader.read("root", system.parse_root, required=False),
+        root_read_only=reader.read("root", system.parse_read_only_root, required=False),
         tmp=_space(space, "/tmp"),
         macs=None if macs is None else MappingProxyType(macs),
         ifindexes=MappingProxyType({name: index for index, name in indexes.items()}) if indexes else None,
         radios=reader.read("ubus.wireless", ubus.parse_wireless),
         links=links,
         stations=stations,
+        surveys=surveys,
+        sensors=reader.read("sensors", system.parse_sensors, required=False),
         supplicants=reader.read("supplicants", lambda text: tuple(text.split()), required=False),
         interfaces=reader.read("ubus.interfaces", ubus.parse_interfaces),
         bridges=reader.read("bridges", system.parse_bridges),
         mesh=mesh,
         neighbours=neighbours,
         originators=originators,
+        mesh_statistics=_statistics(reader),
         package_tool=reader.read("package_tool", packages.parse_package_tool, required=has_tool),
         packages=None if installed is None else MappingProxyType(installed),
         uci=_uci(reader),
@@ -184,15 +189,23 @@ def _space(space: Mapping[str, Space], path: str) -> Space | None:
     return space.get(path) or space.get("/")
 
 
-def _wireless(reader: _OutputReader) -> tuple[tuple[WirelessLink, ...] | None, tuple[Station, ...] | None]:
+def _wireless(
+    reader: _OutputReader,
+) -> tuple[tuple[WirelessLink, ...] | None, tuple[Station, ...] | None, tuple[ChannelSurvey, ...] | None]:
     links = reader.read("iw.dev", iw.parse_iw_dev)
     if links is None:
-        return None, None
+        return None, None, None
     joined = tuple(iw.with_link(link, reader.read(f"iw.link {link.ifname}", str) or "") for link in links)
     stations: list[Station] = []
     for link in links:
         stations += reader.read(f"iw.stations {link.ifname}", iw.parse_stations) or ()
-    return joined, tuple(stations)
+    surveys = [
+        survey
+        for name in reader.names("iw.survey")
+        # some drivers have none, and a radio that is down is on no channel
+        if (survey := iw.parse_survey((reader.body(f"iw.survey {name}") or b"").decode("utf-8", "replace")))
+    ]
+    return joined, tuple(stations), tuple(surveys) if reader.names("iw.survey") else None
 
 
 def _mesh(
@@ -231,6 +244,15 @@ def _mesh(
         None if neighbours is None else tuple(neighbours),
         None if originators is None else tuple(originators),
     )
+
+
+def _statistics(reader: _OutputReader) -> Mapping[str, Mapping[str, int]] | None:
+    found = {
+        name: counters
+        for name in reader.names("batctl.statistics")
+        if (counters := reader.read(f"batctl.statistics {name}", batctl.parse_statistics, required=False))
+    }
+    return MappingProxyType(found) if found else None
 
 
 def _uci(reader: _OutputReader) -> Mapping[str, str] | None:

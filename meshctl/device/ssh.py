@@ -11,6 +11,7 @@ import logging
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from types import TracebackType
 
 import paramiko
@@ -31,6 +32,7 @@ from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
 from meshctl.device.ssh_channel import collect, ignoring_closed, open_session, sending_stdin
+from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.errors import MeshctlError
 from meshctl.model import Release
@@ -59,12 +61,13 @@ def connect(
     via: SshConnection | None = None,
     release: Release | None = None,
     legacy_rsa_sha1: bool = False,
+    meter: TrafficMeter | None = None,
 ) -> SshConnection:
     """An authenticated connection to `endpoint`, through the node of `via` if given.
 
-    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; otherwise it is used only if the server offers nothing else
-    and the node's `release` is 19.07. Raises Unreachable, Timeout, ConnectionLost, IncompatibleServer, HostKeyUnknown,
-    HostKeyChanged, AuthenticationRefused, and InputError for an unusable key file.
+    `legacy_rsa_sha1` offers RSA with SHA-1 from the start; otherwise it is used only if the server offers nothing
+    else and the node's `release` is 19.07. `meter` counts its bytes. Raises Unreachable, Timeout, ConnectionLost,
+    IncompatibleServer, HostKeyUnknown, HostKeyChanged, AuthenticationRefused, and InputError for an unusable key file.
     """
     limits = deadlines or Deadlines()
     legacy = legacy_rsa_sha1
@@ -74,7 +77,7 @@ def connect(
         allowed: tuple[str, ...] = ()
         while True:
             try:
-                transport, activity = _handshake(endpoint, limits, trust, via, legacy=legacy)
+                transport, activity = _handshake(endpoint, limits, trust, via, meter, legacy=legacy)
             except _OnlySha1 as error:
                 if legacy or release is not Release.V19_07:
                     raise IncompatibleServer(
@@ -144,11 +147,18 @@ def _timeout_error(endpoint: Endpoint, watchdog: Watchdog, seconds: float, silen
 
 
 def _handshake(
-    endpoint: Endpoint, limits: Deadlines, trust: HostKeyPolicy, via: SshConnection | None, *, legacy: bool
+    endpoint: Endpoint,
+    limits: Deadlines,
+    trust: HostKeyPolicy,
+    via: SshConnection | None,
+    meter: TrafficMeter | None,
+    *,
+    legacy: bool,
 ) -> tuple[paramiko.Transport, ActivityStream]:
     known = trust.known(endpoint)
     stream = open_socket(endpoint, limits) if via is None else via.tunnel(endpoint)
-    activity = ActivityStream(stream, poll_s=min(MAX_POLL_S, limits.ask_s / 2))
+    count = partial((meter or TrafficMeter()).add, endpoint.identity)
+    activity = ActivityStream(stream, poll_s=min(MAX_POLL_S, limits.ask_s / 2), count=count)
     transport = (LegacyTransport if legacy else paramiko.Transport)(activity)  # type: ignore[arg-type]
     transport.daemon = True
     transport.banner_timeout = transport.handshake_timeout = limits.handshake_s * 2  # ours comes first

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
-from meshctl.fleet.journal_file import BUSY_TIMEOUT_S, JournalFile
 from meshctl.fleet.outcome import Outcome, Result
 from meshctl.fleet.process import owner, process_lives, this_process
+from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, Schema, SqliteFile
 
 # During a run nodes wait to be confirmed, so a locked journal is written later.
 STEP_TIMEOUT_S = 1.0
@@ -36,6 +36,29 @@ _LAB_SEPARATOR = "\x1f"
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 # Outcomes that leave the result of an earlier change unknown.
 _END_UNKNOWN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
+_SCHEMA = Schema(
+    name="journal",
+    version=1,
+    space_hint="set XDG_STATE_HOME to a directory on a writable disk with free space",
+    statements="""
+CREATE TABLE runs (
+    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
+    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE TABLE outcomes (
+    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
+    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
+) STRICT;
+CREATE TABLE steps (
+    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
+    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE INDEX steps_of_run ON steps(run, node);
+CREATE TABLE nodes (
+    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
+) STRICT;
+""",
+)
 _REMEMBER = (
     "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
     " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s"
@@ -97,7 +120,7 @@ class Journal:
         self.path = path
         self.lab = lab
         self._pinned = pinned
-        self._file = JournalFile(path)
+        self._file = SqliteFile(path, _SCHEMA)
 
     def __enter__(self) -> Journal:
         return self
@@ -192,6 +215,18 @@ class Journal:
             (self._key(fleet),),
         )
         return dict(rows)
+
+    def change_durations_s(self, fleet: str, *, limit: int = 100) -> tuple[float, ...]:
+        """How long the latest confirmed changes of one node's files took, from staging to the proof."""
+        rows = self._file.read(
+            "SELECT SUM(steps.duration_s) FROM steps JOIN runs ON runs.id = steps.run"
+            " JOIN outcomes ON outcomes.run = steps.run AND outcomes.node = steps.node"
+            " WHERE fleet = ?1 AND command NOT LIKE 'robots %' AND outcomes.result = ?2"
+            " AND step IN ('stage', 'arm', 'apply', 'prove') GROUP BY steps.run, steps.node"
+            " HAVING SUM(step = 'prove') = 1 ORDER BY steps.run DESC LIMIT ?3",
+            (self._key(fleet), Result.DONE.value, limit),
+        )
+        return tuple(duration_s for (duration_s,) in rows)
 
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Store the facts of a node; older facts never replace newer ones."""

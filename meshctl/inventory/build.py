@@ -28,7 +28,7 @@ from meshctl.inventory.documents import (
     TopicLogDocument,
 )
 from meshctl.inventory.layers import NodeSpec
-from meshctl.inventory.nodes import build_nodes, ssh_settings
+from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.suggest import did_you_mean
@@ -244,6 +244,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         fielded=document.fielded,
         lan=document.lan.network if document.lan is not None else None,
         computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
+        position=fixed_position(document.position),
     )
 
 

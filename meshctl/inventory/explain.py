@@ -53,6 +53,10 @@ def _values(node: Node) -> Iterator[tuple[str, str]]:
     for option, value in node.extra_uci.items():
         yield f"extra_uci.{option}", value
     yield "gateway", "" if node.gateway is None else str(node.gateway)
+    if node.position is not None:
+        for axis in ("x_m", "y_m", "z_m"):
+            value = getattr(node.position, axis)
+            yield f"position.{axis}", "" if value is None else f"{value:g}"
 
 
 def _radio_values(radio: Radio) -> Iterator[tuple[str, str]]:

@@ -15,10 +15,10 @@ from typing import Any
 from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import codes
 from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
-from meshctl.inventory.documents import RadioLayer, SshLayer
+from meshctl.inventory.documents import PositionDocument, RadioLayer, SshLayer
 from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Band, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
+from meshctl.model import Band, FixedPosition, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
 
 # Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")
@@ -160,6 +160,7 @@ class _Building:
             packages=tuple(values.get("packages", ())),
             extra_uci=MappingProxyType(values.get("extra_uci", {})),
             gateway=values.get("gateway"),
+            position=fixed_position(values.get("position")),
         )
         network = self.meshes[first_mesh].network if first_mesh is not None else None
         return _Template(node, values["address"], address_layer, values.get("hostname", ""), network)
@@ -246,6 +247,10 @@ def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:
     """The mesh of each band with exactly one, the default for its radios."""
     counts = Counter(mesh.band for mesh in meshes.values())
     return {mesh.band: mesh.name for mesh in meshes.values() if counts[mesh.band] == 1}
+
+
+def fixed_position(document: PositionDocument | None) -> FixedPosition | None:
+    return None if document is None else FixedPosition(document.x_m, document.y_m, document.z_m)
 
 
 def ssh_settings(values: Mapping[str, Any], *, user: str) -> SshSettings:

@@ -7,6 +7,7 @@ value.
 from meshctl.model.fleet import (
     ApplyPolicy,
     Computer,
+    FixedPosition,
     Fleet,
     MissingOrigin,
     Node,
@@ -37,6 +38,7 @@ __all__ = [
     "Computer",
     "Encryption",
     "Firmware",
+    "FixedPosition",
     "Fleet",
     "HardwareProfile",
     "Mesh",

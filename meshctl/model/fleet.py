@@ -87,6 +87,15 @@ class SshSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class FixedPosition:
+    """Where a device stands for the whole mission, in meters in the frame of the fleet's map; `z_m` None: unknown."""
+
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Node:
     """One radio device. `address` is its management address with the prefix length, in its mesh's network.
 
@@ -114,6 +123,7 @@ class Node:
     extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     gateway: IPv4Address | None = None
     lan_address: IPv4Interface | None = None
+    position: FixedPosition | None = None
 
     @property
     def unswitched_ports(self) -> tuple[str, ...]:
@@ -165,6 +175,7 @@ class Robot:
     fielded: IPv4Address | None = None
     lan: IPv4Network | None = None
     computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
+    position: FixedPosition | None = None
 
     @property
     def other_addresses(self) -> tuple[str, ...]:

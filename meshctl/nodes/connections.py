@@ -19,6 +19,7 @@ from meshctl.device.authentication import own_keys
 from meshctl.device.connection import Credentials, Deadlines, Endpoint, OwnKey
 from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.inventory.file_paths import file_path
@@ -60,6 +61,7 @@ class ConnectionPool:
     bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
+    meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
     slots: ChannelSlots = field(default_factory=ChannelSlots, repr=False)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
@@ -120,6 +122,7 @@ class ConnectionPool:
                     deadlines=deadlines or self.deadlines,
                     via=via,
                     release=node.release,
+                    meter=self.meter,
                 )
                 self.slots.login_ended(node.name, time.monotonic() - began_s)
                 return connection

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from meshctl.model import Fleet
-from meshctl.plan.order import MeshContext, stages_of
+from meshctl.plan.order import MeshContext, stages_of, stages_together
 from meshctl.plan.switch import MeshSwitches, switches
-from meshctl.plan.values import Cut, NodePlan, Plan, StageKind, Verdict
+from meshctl.plan.values import Cut, NodePlan, Plan, Stage, StageKind, Verdict
+from meshctl.plan.ways import Pace, ways_of
 from meshctl.topology import Graph
 
 
@@ -23,11 +24,14 @@ def fleet_plan(
     leave_behind: Iterable[str] = (),
     never_meshed: Iterable[str] = (),
     accept_cuts: Iterable[str] = (),
+    together: bool = False,
+    pace: Pace | None = None,
 ) -> Plan:
     """The stages for these nodes. `entry` is the node through which the mesh is reached (default: the base).
 
     `unchanged` are other members of their meshes, which show the cell that the mesh runs. `leave_behind` acknowledges
     nodes that are off during a change of their mesh, `accept_cuts` cut vertices that may be flashed; `all` means any.
+    `together`: all nodes of running meshes change simultaneously. `pace` is that of earlier changes.
     """
     base = fleet.base_node
     stand_on = entry or (base.name if base is not None else "")
@@ -36,8 +40,19 @@ def fleet_plan(
         graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
-    stages = stages_of(todo, surroundings, found.nodes)
+    in_order = stages_of(todo, surroundings, found.nodes)
+    at_once = stages_together(todo, surroundings, found.nodes)
+    stages = at_once if together else in_order
     refusal, hint = _refusal(found, plans, graph, stand_on, frozenset(accept_cuts))
+    if together and not refusal:
+        refusal, hint = _refused_together(at_once, plans)
+    windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
+    measured = pace or Pace()
+    ways = (
+        ()
+        if any(plan.firmware is not None for plan in todo)
+        else ways_of(in_order, at_once, plans, measured, quorum=fleet.apply.quorum, window_s=max(windows, default=0))
+    )
     notes = [
         f"{name}: alone in its cell; it rejoins its mesh ({', '.join(plans[name].splits)})"
         for name in plans
@@ -51,7 +66,35 @@ def fleet_plan(
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
     ]
-    return Plan(fleet.name, now_s, stand_on, MappingProxyType(dict(plans)), stages, tuple(notes), refusal, hint)
+    return Plan(
+        fleet.name,
+        now_s,
+        stand_on,
+        MappingProxyType(dict(plans)),
+        stages,
+        tuple(notes),
+        refusal,
+        hint,
+        ways,
+        measured.text if ways else "",
+    )
+
+
+def _refused_together(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) -> tuple[str, str]:
+    """Firmware cannot be part of a simultaneous change: the dead-man's switch does not undo a flash."""
+    flashed = [
+        name
+        for stage in stages
+        if stage.kind is StageKind.TOGETHER
+        for name in stage.nodes
+        if plans[name].firmware is not None
+    ]
+    if not flashed:
+        return "", ""
+    return (
+        f"the firmware of {', '.join(flashed)} changes, and a flash cannot be rolled back with the others",
+        "change firmware first, without --together; or leave it as it is with --no-firmware",
+    )
 
 
 def _refusal(

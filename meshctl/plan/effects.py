@@ -62,6 +62,8 @@ def _radio(change: RadioChange) -> Effect:
     options = ", ".join(change.options)
     if change.restarts:
         return Effect("wifi", Cut.MESH, f"{change.radio} restarts: {options}")
+    if change.rejoins:
+        return Effect("wifi", Cut.MESH, f"the interfaces of {change.radio} leave their networks and return: {options}")
     if change.may_lose_range:
         return Effect("wifi", Cut.WEAK_LINKS, f"{change.radio}: {options} set without a restart")
     return Effect("wifi", Cut.NOTHING, f"{change.radio}: {options} set without a restart")

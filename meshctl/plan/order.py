@@ -2,7 +2,8 @@
 
 `stages_of` orders the nodes to change by the observed mesh: nodes outside any running mesh (nothing is cut), then
 whole-mesh changes, then the running mesh from its far end, with each cut vertex alone, and the entry node last. If the
-policy asks for it, the first stage of a kind is a canary.
+policy asks for it, the first stage of a kind is a canary. `stages_together` changes all nodes of running meshes in one
+stage instead.
 """
 
 from __future__ import annotations
@@ -38,14 +39,44 @@ def stages_of(
     harmless = [plan for plan in todo if plan.is_meshed and plan.cut <= Cut.LOGIN]
     cutting = [plan for plan in todo if plan.is_meshed and plan.cut > Cut.LOGIN]
     return (
-        *_together(free, context.policy, "outside any running mesh: nothing in use is interrupted"),
+        *_in_parallel(free, context.policy, "outside any running mesh: nothing in use is interrupted"),
         *(_switch(mesh, nodes, context) for mesh, nodes in (switches or {}).items()),
-        *_together(harmless, context.policy, "interrupts nothing"),
+        *_in_parallel(harmless, context.policy, "interrupts nothing"),
         *_rolling(cutting, context),
     )
 
 
-def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
+def stages_together(
+    plans: Iterable[NodePlan], context: MeshContext, switches: Mapping[str, Sequence[str]] | None = None
+) -> tuple[Stage, ...]:
+    """The stages of these plans if all nodes of running meshes change simultaneously: first the nodes outside."""
+    switched = {name for nodes in (switches or {}).values() for name in nodes}
+    todo = sorted(plans, key=lambda plan: plan.node)
+    free = [plan for plan in todo if not plan.is_meshed and plan.node not in switched]
+    at_once = [plan for plan in todo if plan.is_meshed or plan.node in switched]
+    meshes = tuple(dict.fromkeys(mesh for plan in at_once for mesh in plan.meshes))
+    count = len(at_once)
+    each = " of each mesh" if len(meshes) > 1 else ""
+    stage = Stage(
+        StageKind.TOGETHER,
+        _entry_last((plan.node for plan in at_once), context),
+        f"{count} node{'s' if count != 1 else ''} simultaneously, rolled back unless {context.policy.quorum:.0%}{each} "
+        "pass their checks",
+        mesh=", ".join(meshes),
+    )
+    return (
+        *_in_parallel(free, context.policy, "outside any running mesh: nothing in use is interrupted"),
+        *((stage,) if at_once else ()),
+    )
+
+
+def _entry_last(names: Iterable[str], context: MeshContext) -> tuple[str, ...]:
+    """The farthest first, the entry node last."""
+    order = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
+    return tuple(sorted(names, key=lambda name: (name == context.entry, order.get(name, -1), name)))
+
+
+def _in_parallel(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
     """All in one stage (the executor limits the parallelism), after a canary."""
     names = [plan.node for plan in plans]
     # factory devices need no canary: they have no configuration to lose
@@ -56,14 +87,11 @@ def _together(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tu
 
 
 def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
-    order = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
-    last = [name for name in nodes if name == context.entry]
-    names = sorted((name for name in nodes if name != context.entry), key=lambda name: (order.get(name, -1), name))
     count = len(nodes)
     what = f"meshes {mesh} change their cells" if "," in mesh else f"mesh {mesh} changes its cell"
     return Stage(
         StageKind.SWITCH,
-        (*names, *last),
+        _entry_last(nodes, context),
         f"{what}: {count} node{'s' if count > 1 else ''} simultaneously, rolled back unless "
         f"{context.policy.quorum:.0%} rejoin",
         mesh=mesh,

@@ -43,6 +43,15 @@ def failed_precondition(
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
 
+def _writable(case: _Checked) -> FailedPrecondition | None:
+    if not case.seen.root_read_only:
+        return None
+    return FailedPrecondition(
+        "its root file system is read-only: it is in failsafe mode, or its flash has failed",
+        "power-cycle it without holding a button; if that does not help, write the firmware again",
+    )
+
+
 def _observed(case: _Checked) -> FailedPrecondition | None:
     if case.seen.uci is None or case.seen.board is None:
         missing = "its configuration" if case.seen.uci is None else "its board"
@@ -133,6 +142,8 @@ def _other_operator(case: _Checked) -> FailedPrecondition | None:
 
 
 _CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
+    # in failsafe mode ubus does not answer either
+    _writable,
     _observed,
     _board,
     _release,

@@ -37,11 +37,15 @@ EVERY_RADIO = Radios(every=True)
 
 def restarting_radios(before: Package | None, after: Package | None) -> Radios:
     """The radios that may restart when /etc/config/wireless becomes `after`: those whose section or an interface
-    differs; all radios if a package is unreadable."""
+    differs, be it in the order of options; all radios if a package is unreadable."""
     if before is None or after is None:
         return EVERY_RADIO
     new = _by_device(after)
-    differing = [parts for name, parts in _by_device(before).items() if parts != new.get(name)]
+    differing = [
+        parts
+        for name, parts in _by_device(before).items()
+        if parts != new.get(name) or _reordered(parts, new.get(name, ()))
+    ]
     faces = [section for parts in differing for section in parts if section.type == "wifi-iface"]
     ifnames = frozenset(section.get("ifname") for section in faces)
     return EVERY_RADIO if "" in ifnames else Radios(ifnames)
@@ -58,12 +62,17 @@ RANGE = frozenset({"txpower", "distance", "country", "antenna_gain"})
 @dataclass(frozen=True, slots=True)
 class RadioChange:
     """The change of one radio: `options` differ, in its section or its interfaces'. `restarts`: its interfaces go down
-    and up; `may_lose_range`: they stay up, with less range."""
+    and up; `may_lose_range`: they stay up, with less range; `rejoins`: they stay on the air, but leave their network
+    (bat0) and return. ORDER among `options`: options that are equal stand in another order."""
 
     radio: str
     options: tuple[str, ...]
     restarts: bool
     may_lose_range: bool = False
+    rejoins: bool = False
+
+
+ORDER = "order of options"
 
 
 def radio_changes(before: Package, after: Package, release: Release) -> tuple[RadioChange, ...]:
@@ -72,7 +81,12 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
     changes = []
     for name, parts in {**old, **new}.items():
         old_parts, new_parts = old.get(name, ()), new.get(name, ())
-        if old_parts == new_parts:
+        reordered = _reordered(old_parts, new_parts)
+        # netifd compares settings byte by byte, in the order of the file: up to 22.03 a difference restarts the radio,
+        # on 23.05 and 24.10 one in an interface's section reconnects that (wireless.c); 25.12 compares by name
+        moved_device = release < Release.V23_05 and bool(reordered)
+        moved_faces = release < Release.V25_12 and "wifi-iface" in reordered
+        if old_parts == new_parts and not moved_device and not moved_faces:
             continue
         device = _differing(old_parts[:1], new_parts[:1])
         faces = _differing(old_parts[1:], new_parts[1:])
@@ -82,8 +96,21 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
             in_place.discard("country")
         restarts = release < Release.V23_05 or bool(faces) or not device <= in_place
         loses = bool(device & RANGE) and not _is_stronger(device, old_parts[0], new_parts[0])
-        changes.append(RadioChange(name, tuple(sorted(device | faces)), restarts, not restarts and loses))
+        options = (*sorted(device | faces), *((ORDER,) if moved_device or moved_faces else ()))
+        changes.append(RadioChange(name, options, restarts, not restarts and loses, not restarts and moved_faces))
     return tuple(changes)
+
+
+def _reordered(old: tuple[Section, ...], new: tuple[Section, ...]) -> set[str]:
+    """The types of sections whose common options stand in another order."""
+    before = {section.name: section for section in old}
+    found = set()
+    for section in new:
+        options = {} if (match := before.get(section.name)) is None else match.options
+        common = section.options.keys() & options.keys()
+        if [name for name in options if name in common] != [name for name in section.options if name in common]:
+            found.add(section.type)
+    return found
 
 
 def _differing(old: tuple[Section, ...], new: tuple[Section, ...]) -> set[str]:

@@ -25,6 +25,7 @@ from meshctl.plan.values import (
     Stage,
     StageKind,
     Verdict,
+    Way,
 )
 
 FORMAT = "meshctl-plan"
@@ -56,6 +57,8 @@ def dump(saved: SavedPlan) -> str:
         "refusal": plan.refusal,
         "refusal_hint": plan.refusal_hint,
         "notes": plan.notes,
+        "ways": [{**_plain(way), "recommended": way.is_recommended} for way in plan.ways],
+        "pace": plan.pace,
         "stages": [_plain(stage) for stage in plan.stages],
         "nodes": [_plain(node) for node in plan.nodes.values()],
     }
@@ -92,6 +95,9 @@ def load(text: str, file: str) -> SavedPlan:
             _texts(document["notes"]),
             str(document["refusal"]),
             str(document["refusal_hint"]),
+            # plans of earlier versions have none
+            tuple(_way(way) for way in document.get("ways", ())),
+            str(document.get("pace", "")),
         )
         unknown = [name for stage in plan.stages for name in stage.nodes if name not in plan.nodes]
         if unknown:
@@ -136,6 +142,17 @@ def _stage(data: Mapping[str, Any]) -> Stage:
     )
 
 
+def _way(data: Mapping[str, Any]) -> Way:
+    return Way(
+        str(data["name"]),
+        int(data["stages"]),
+        float(data["estimated_s"]),
+        int(data["outages"]),
+        str(data["risk"]),
+        str(data["reason"]),
+    )
+
+
 def _texts(items: Any) -> tuple[str, ...]:
     if not isinstance(items, list):
         raise TypeError(f"expected a list, found {items!r}")
@@ -158,15 +175,16 @@ def stale_reason(agreed: NodePlan, now: NodePlan) -> str:
 def as_agreed(agreed: Plan, now: Plan) -> Plan:
     """The saved plan as far as it still applies: stale nodes are refused, unreachable ones are left out.
 
-    `now` is a fresh plan under the same salt. A mesh change in which not all nodes can take part is refused.
+    `now` is a fresh plan under the same salt. A simultaneous change in which not all nodes can take part is refused.
     """
     nodes = {name: _still(old, now.nodes[name]) for name, old in agreed.nodes.items()}
     stages, refusal = [], agreed.refusal
     for stage in agreed.stages:
         ready = tuple(name for name in stage.nodes if nodes[name].verdict is Verdict.CHANGE)
-        if stage.kind is StageKind.SWITCH and len(ready) < len(stage.nodes):
+        if stage.kind.is_simultaneous and len(ready) < len(stage.nodes):
             absent = ", ".join(sorted(set(stage.nodes) - set(ready)))
-            refusal = f"mesh {stage.mesh} changes its cell simultaneously, but {absent} cannot take part as planned"
+            what = "its cell simultaneously" if stage.kind is StageKind.SWITCH else "its nodes simultaneously"
+            refusal = f"mesh {stage.mesh} changes {what}, but {absent} cannot take part as planned"
         if ready:
             stages.append(replace(stage, nodes=ready))
     return replace(agreed, nodes=MappingProxyType(nodes), stages=tuple(stages), refusal=refusal)

@@ -115,19 +115,26 @@ class NodePlan:
 
 class StageKind(Enum):
     """CANARY: one node alone, as a test. FREE: interrupts nothing in use. ROLLING: at most `max_down` at a time.
-    SWITCH: a whole mesh simultaneously. LAST: the entry node."""
+    SWITCH: a whole mesh simultaneously, because its cell changes. TOGETHER: all nodes of running meshes simultaneously,
+    because the operator asked for it. LAST: the entry node."""
 
     CANARY = "canary"
     FREE = "free"
     ROLLING = "rolling"
     SWITCH = "switch"
+    TOGETHER = "together"
     LAST = "last"
+
+    @property
+    def is_simultaneous(self) -> bool:
+        """Whether its nodes change at one moment, and all of them roll back without a quorum."""
+        return self in (StageKind.SWITCH, StageKind.TOGETHER)
 
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Nodes changed together; the next stage starts when all of them have ended. `mesh` is set for a SWITCH: one mesh,
-    or all that change with it (`main, far`)."""
+    """Nodes changed together; the next stage starts when all of them have ended. `mesh` is set for a SWITCH and for
+    TOGETHER: one mesh, or all that change with it (`main, far`)."""
 
     kind: StageKind
     nodes: tuple[str, ...]
@@ -137,8 +144,29 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
+class Way:
+    """One of two ways to execute a plan: `in order` or `together`. `outages` is how often the worst affected node is
+    down or without a path to the entry; `reason` is set for the recommended way."""
+
+    name: str
+    stages: int
+    estimated_s: float
+    outages: int
+    risk: str
+    reason: str = ""
+
+    @property
+    def is_recommended(self) -> bool:
+        return bool(self.reason)
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
-    """The plan of a fleet. `entry` is the node through which the mesh is reached; `notes` concern the whole fleet."""
+    """The plan of a fleet. `entry` is the node through which the mesh is reached; `notes` concern the whole fleet.
+
+    `ways` are both ways to execute it, if they differ; `stages` are those of the one that was chosen. `pace` says where
+    their times come from.
+    """
 
     fleet: str
     created_s: float
@@ -149,6 +177,8 @@ class Plan:
     # why the plan as a whole must not be applied
     refusal: str = ""
     refusal_hint: str = ""
+    ways: tuple[Way, ...] = ()
+    pace: str = ""
 
     def of(self, verdict: Verdict) -> tuple[NodePlan, ...]:
         return tuple(node for node in self.nodes.values() if node.verdict is verdict)

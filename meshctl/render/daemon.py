@@ -56,6 +56,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         f"window = {transport.window}" if transport.window is not None else 'window = "adaptive"',
         f"fragment_bytes = {transport.fragment_bytes}",
         *_rates(transport),
+        *_position(fleet, robot),
         *_links(fleet, robot, computer),
         *_legacy_peers(fleet, robot),
         *(line for topic in fleet.topics for line in _topic(topic, robot)),
@@ -166,6 +167,17 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
                 yield from _neighbor(peer.name, str(peer.computer.address.ip))
+
+
+def _position(fleet: Fleet, robot: str) -> Iterator[str]:
+    """Where the robot or its first radio with a position stands."""
+    own = fleet.robots[robot]
+    nodes = (fleet.nodes[name].position for name in own.nodes if name in fleet.nodes)
+    place = own.position or next((one for one in nodes if one is not None), None)
+    if place is not None:
+        yield from ("", "[position]", f"x_m = {_number(place.x_m)}", f"y_m = {_number(place.y_m)}")
+        if place.z_m is not None:
+            yield f"z_m = {_number(place.z_m)}"
 
 
 def _neighbor(name: str, address: str) -> tuple[str, ...]:

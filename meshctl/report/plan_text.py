@@ -11,7 +11,9 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
+from meshctl.plan.ways import IN_ORDER, TOGETHER
 from meshctl.report.changed_options import changed_lines, summary
+from meshctl.report.duration import duration
 from meshctl.report.terminal_escapes import clean
 
 # below this width, words are broken
@@ -52,6 +54,9 @@ def _plan_lines(plan: Plan, *, with_diffs: bool, order: Iterable[str]) -> Iterat
         yield Line("")
         yield Line("order", "bold")
         yield from _stages(plan)
+    if plan.ways:
+        yield Line("")
+        yield from _ways(plan)
     for note in plan.notes:
         yield Line(f"note: {note}", "yellow")
     places = {name: place for place, name in enumerate(order)}
@@ -105,6 +110,22 @@ def _stages(plan: Plan) -> Iterator[Line]:
                 reasons.setdefault(why or "changes with its mesh", []).append(name)
             for why, members in reasons.items():
                 yield Line(f"  {'':>{width}}          {', '.join(members)}: {why}", "dim")
+
+
+def _ways(plan: Plan) -> Iterator[Line]:
+    """Both ways to execute the plan, and the recommended one."""
+    chosen = TOGETHER if any(stage.kind is StageKind.TOGETHER for stage in plan.stages) else IN_ORDER
+    yield Line(f"two ways ({plan.pace})", "bold")
+    for way in plan.ways:
+        mark = "this plan" if way.name == chosen else "--together" if way.name == TOGETHER else "without --together"
+        stages = f"{way.stages} stage{'s' if way.stages != 1 else ''}"
+        yield Line(
+            f"  {way.name:<9} {mark}: {stages}, about {duration(way.estimated_s)}: {way.risk}",
+            "" if way.name == chosen else "dim",
+        )
+    for way in plan.ways:
+        if way.is_recommended:
+            yield Line(f"  recommended: {way.name}, because {way.reason}", "" if way.name == chosen else "yellow")
 
 
 def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
@@ -174,7 +195,12 @@ def question(plan: Plan) -> str:
     """The confirmation prompt for the plan."""
     todo = len(plan.of(Verdict.CHANGE))
     switched = sum(len(stage.nodes) for stage in plan.stages if stage.kind is StageKind.SWITCH)
+    at_once = sum(len(stage.nodes) for stage in plan.stages if stage.kind is StageKind.TOGETHER)
     flashed = sum(1 for node in plan.nodes.values() if node.firmware is not None)
-    extra = [f"{switched} change cell together" if switched else "", f"{flashed} get new firmware" if flashed else ""]
+    extra = [
+        f"{switched} change cell together" if switched else "",
+        f"{at_once} at one moment" if at_once else "",
+        f"{flashed} get new firmware" if flashed else "",
+    ]
     more = "; ".join(part for part in extra if part)
     return f"Change {todo} node{'s' if todo != 1 else ''}" + (f" ({more})" if more else "") + "?"

@@ -72,7 +72,12 @@ class RobotConnector:
                 stack.callback(via.close)
             try:
                 connection = connect(
-                    endpoint, credentials=credentials, trust=trust, deadlines=self.access.deadlines, via=via
+                    endpoint,
+                    credentials=credentials,
+                    trust=trust,
+                    deadlines=self.access.deadlines,
+                    via=via,
+                    meter=self.access.meter,
                 )
             except NodeError as error:
                 is_user_written = bool(computer_of(self.fleet, robot).ssh.user)

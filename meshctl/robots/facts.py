@@ -16,6 +16,7 @@ from typing import Any
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, configuration
 from meshctl.robots.host import Host
+from meshctl.robots.position_facts import PositionFacts, positions_in
 from meshctl.robots.wheels import own_wheel, stock_units
 
 # Two Python programs start and answer, possibly on a small, busy ARM board.
@@ -60,6 +61,10 @@ class PeerFacts:
     round_trip_s: float | None = None
     loss: float = 0.0
     outbox_messages: int = 0
+    outbox_bytes: int = 0
+    capacity_bits_per_s: float | None = None
+    """The link's estimated capacity for payload; None if too little was sent to measure it."""
+    delivered_bits_per_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +135,8 @@ class RobotFacts:
     keys: tuple[str, ...] = ()
     unkeyed: bool = False
     peers: tuple[PeerFacts, ...] = ()
+    positions: tuple[PositionFacts, ...] = ()
+    """Of this robot and of its peers, as its daemon knows them; empty for older daemons."""
     queues: tuple[QueueFacts, ...] = ()
     topics: tuple[TopicFacts, ...] = ()
     computer: ComputerFacts = ComputerFacts()
@@ -186,8 +193,7 @@ def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Se
 def collect_facts(
     host: Host, robot: str, expected: ExpectedRelease, *, now_s: float, others: Iterable[str] = ()
 ) -> RobotFacts:
-    """Query one robot, which pings the addresses `others`; `now_s` is our clock (Unix time). Raises what `Host.run`
-    raises."""
+    """Query one robot, which pings `others`; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
     return parse_robot_facts(robot, host.run("facts", *others, timeout_s=FACTS_TIMEOUT_S), expected, now_s=now_s)
 
 
@@ -195,7 +201,7 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
     """Parse the sections of `scripts/facts.sh`; a missing section or invalid JSON counts as no answer."""
     sections = _sections(text)
     services = _services(sections.get("services", ()))
-    release = _values(sections.get("release", ()))
+    release, others = (_values(sections.get(name, ())) for name in ("release", "others"))
     status = _object(sections.get("status", ()))
     peers = tuple(_objects(_within(status, "conditions").get("peers")))
 
@@ -218,16 +224,13 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
         keys=tuple(str(key) for key in status.get("keys", ()) or ()),
         unkeyed=bool(status.get("unkeyed")),
         peers=tuple(_peer(peer) for peer in peers),
+        positions=positions_in(status),
         queues=_queues(peers),
         topics=tuple(_topic(topic) for topic in _objects(_object(sections.get("topics", ())).get("topics"))),
         computer=_computer(_values(sections.get("computer", ())), now_s),
-        answering=_answering(_values(sections.get("others", ()))),
+        answering=None if "ping" in others else tuple(others.get("answers", ())),
         status=status,
     )
-
-
-def _answering(others: Mapping[str, list[str]]) -> tuple[str, ...] | None:
-    return None if "ping" in others else tuple(others.get("answers", ()))
 
 
 def drift(
@@ -343,6 +346,9 @@ def _peer(peer: Mapping[str, Any]) -> PeerFacts:
         _float(peer.get("round_trip_s")),
         _float(peer.get("loss")) or 0.0,
         int(_float(peer.get("outbox_messages")) or 0),
+        int(_float(peer.get("outbox_bytes")) or 0),
+        _float(peer.get("capacity_bits_per_s")),
+        _float(peer.get("delivered_bits_per_s")),
     )
 
 

@@ -15,10 +15,11 @@ from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
 from meshctl.status.dropped import dropped_beacons
 from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
+from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperature_of
 from meshctl.status.robots import RobotAnswers, robot_status
 from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NoAnswer, NodeStatus, health_of
-from meshctl.topology import Graph, Report, Sighting, neighbours_of, report_of, seen_by
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, NoAnswer, NodeStatus, health_of
+from meshctl.topology import Graph, Sighting, neighbours_of, report_of, seen_by
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,8 @@ class Snapshot:
     robots: Mapping[str, RobotFacts] = field(default_factory=dict)
     no_answer_robots: Mapping[str, NoAnswer] = field(default_factory=dict)
     robots_skipped: str = ""
+    previous: Mapping[str, Observation] = field(default_factory=dict)
+    """The observations of the snapshot before, for what happened since."""
     is_partial: bool = False
     took_s: float = 0.0
 
@@ -54,6 +57,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     sightings = seen_by(reports.values(), snapshot.macs)
     paths = {} if snapshot.is_partial else snapshot.graph.paths(snapshot.entry)
     cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by(snapshot.entry)
+    heard = {name: neighbours_of(report, snapshot.macs) for name, report in reports.items()}
+    snr = {name: snr_of(snapshot.observations[name], heard[name]) for name in reports}
     relays: dict[str, list[str]] = {}
     for name, path in paths.items():
         if path.hops and path.via != snapshot.entry:
@@ -70,7 +75,13 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             node=node,
             observation=seen,
             plan=snapshot.plans.get(node.name),
-            neighbors=_neighbors(reports[node.name], snapshot.macs),
+            neighbors=neighbors_of(
+                node,
+                seen,
+                heard[node.name],
+                {other: snr[other].get(node.name) for other in heard[node.name] if other in snr},
+            ),
+            radios=radios_of(node, seen, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
             is_path_known=snapshot.entry in paths,
             cuts_off=cuts.get(node.name, ()),
@@ -123,15 +134,6 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
 
 
-def _neighbors(report: Report, macs: Mapping[str, str]) -> tuple[Neighbor, ...]:
-    """The neighbors that a node heard recently, best first."""
-    found = [
-        Neighbor(name, heard.last_seen_ms, heard.quality, heard.signal_dbm)
-        for name, heard in neighbours_of(report, macs).items()
-    ]
-    return tuple(sorted(found, key=lambda one: (-(one.quality or 0.0), -(one.signal_dbm or -200), one.name)))
-
-
 def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:
     last = snapshot.known.get(node.name)
     why = snapshot.no_answer.get(node.name, NOT_ASKED)
@@ -174,12 +176,16 @@ def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
         drift=None if plan is None else tuple(change.path for change in plan.files),
         uptime_s=observed.uptime_s,
         load=None if observed.load is None else observed.load.minute / observed.load.processors,
+        processors=None if observed.load is None else observed.load.processors,
         memory_free=memory.available / memory.total if memory and memory.total else None,
         flash_free_bytes=observed.overlay.free if observed.overlay else None,
         clock_offset_s=observed.clock_offset_s,
         channels=tuple(dict.fromkeys(link.channel for link in mesh_links if link.channel is not None)),
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,
+        radios=seen.radios,
+        temperature_c=temperature_of(observed),
+        mesh_statistics=observed.mesh_statistics,
         neighbors=seen.neighbors,
         is_path_known=seen.is_path_known,
         hops=seen.path.hops if seen.path else None,

@@ -73,6 +73,7 @@ class Collector:
     _desired_states: dict[str, DesiredState | str] = field(default_factory=dict, repr=False)
     _expected_releases: dict[str, ExpectedRelease | str] = field(default_factory=dict, repr=False)
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
+    _observed: dict[str, Observation] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def collect(self, nodes: Iterable[Node], robots: Iterable[str] = (), progress: Progress = _no_progress) -> Snapshot:
@@ -105,6 +106,7 @@ class Collector:
             if isinstance(expected := self._expected_release(robot), str):
                 unrendered[f"{ROBOT_PREFIX}{robot}"] = expected
         base = self.fleet.base_node
+        previous, self._observed = self._observed, {**self._observed, **observations}
         return Snapshot(
             fleet=self.fleet,
             observations=observations,
@@ -119,6 +121,7 @@ class Collector:
             robots=facts,
             no_answer_robots=no_answer["robot"],
             robots_skipped=self.robots_skipped,
+            previous=previous,
             took_s=self.clock() - began,
         )
 

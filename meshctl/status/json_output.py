@@ -9,9 +9,10 @@ from collections.abc import Iterable
 from typing import Any
 
 from meshctl.robots.facts import RobotFacts
+from meshctl.robots.position_facts import PositionFacts
 from meshctl.status.last_known import typed
 from meshctl.status.preflight import Check, verdict
-from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
+from meshctl.status.values import Alarm, FleetStatus, Health, Level, Neighbor, NodeStatus, RadioStatus, RobotStatus
 from meshctl.topology import Sighting
 
 VERSION = 1
@@ -69,24 +70,72 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         "drift": None if node.drift is None else list(node.drift),
         "uptime_s": node.uptime_s,
         "load": _rounded(node.load),
+        "processors": node.processors,
         "memory_free": _rounded(node.memory_free),
         "flash_free_bytes": node.flash_free_bytes,
         "clock_offset_s": _rounded(node.clock_offset_s),
         "channels": list(node.channels) if answers else None,
         "tx_power_dbm": node.tx_power_dbm,
+        "temperature_c": node.temperature_c,
+        "radios": [_radio(radio) for radio in node.radios] if answers else None,
+        "mesh_statistics": None
+        if node.mesh_statistics is None
+        else {name: dict(counters) for name, counters in node.mesh_statistics.items()},
         "bridge_ports": None if node.lan_ports is None else list(node.lan_ports),
-        "neighbours": [
-            {"name": n.name, "age_s": n.age_ms / 1000, "quality": _rounded(n.quality), "signal_dbm": n.signal_dbm}
-            for n in node.neighbors
-        ]
-        if answers
-        else None,
+        "neighbours": [_neighbor(neighbor) for neighbor in node.neighbors] if answers else None,
         "hops": node.hops,
         "quality": _rounded(node.quality),
         "via": node.via or None,
         "is_cut_vertex": node.is_cut_vertex if answers else None,
         "heard_by": _sightings(node.heard_by),
         "last_known": None if node.last_known is None else typed(node.last_known),
+    }
+
+
+def _neighbor(neighbor: Neighbor) -> dict[str, Any]:
+    return {
+        "name": neighbor.name,
+        "mesh": neighbor.mesh or None,
+        "age_s": neighbor.age_ms / 1000,
+        "quality": _rounded(neighbor.quality),
+        "signal_dbm": neighbor.signal_dbm,
+        "chain_signals_dbm": list(neighbor.chain_signals_dbm) or None,
+        "noise_dbm": neighbor.noise_dbm,
+        "snr_db": neighbor.snr_db,
+        "snr_there_db": neighbor.snr_there_db,
+        "tx_mcs": neighbor.tx_mcs or None,
+        "rx_mcs": neighbor.rx_mcs or None,
+        "tx_bitrate_kbit_s": neighbor.tx_bitrate_kbit_s,
+        "rx_bitrate_kbit_s": neighbor.rx_bitrate_kbit_s,
+        "expected_kbit_s": neighbor.expected_kbit_s,
+        "tx_packets": neighbor.tx_packets,
+        "tx_retries": neighbor.tx_retries,
+        "tx_failed": neighbor.tx_failed,
+    }
+
+
+def _radio(radio: RadioStatus) -> dict[str, Any]:
+    return {
+        "ifname": radio.ifname,
+        "mesh": radio.mesh,
+        "channel": radio.channel,
+        "noise_dbm": radio.noise_dbm,
+        "busy_ratio": _rounded(radio.busy_ratio),
+        "busy_over_s": _rounded(radio.busy_over_s),
+        "queue_packets": radio.queue_packets,
+        "temperature_c": radio.temperature_c,
+    }
+
+
+def _position(place: PositionFacts) -> dict[str, Any]:
+    return {
+        "name": place.name,
+        "x_m": _rounded(place.x_m),
+        "y_m": _rounded(place.y_m),
+        "z_m": _rounded(place.z_m),
+        "frame": place.frame,
+        "age_s": _rounded(place.age_s),
+        "source": place.source,
     }
 
 
@@ -111,7 +160,8 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
     }
     facts = robot.facts
     if facts is None:
-        return {**base, "computer": None, "daemon": None, "bridge": None, "peers": None, "queues": None, "topics": None}
+        nothing = ("computer", "daemon", "bridge", "peers", "position", "positions", "queues", "topics")
+        return {**base, **dict.fromkeys(nothing)}
     computer = facts.computer
     return {
         **base,
@@ -140,6 +190,8 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
             "unkeyed": facts.unkeyed,
         },
         "bridge": None if facts.bridge is None else {"service": facts.bridge.active or None},
+        "position": next((_position(one) for one in facts.positions if one.name == robot.name), None),
+        "positions": [_position(one) for one in facts.positions],
         "peers": [
             {
                 "name": peer.name,
@@ -148,6 +200,9 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
                 "round_trip_s": _rounded(peer.round_trip_s, 6),
                 "loss": _rounded(peer.loss),
                 "outbox_messages": peer.outbox_messages,
+                "outbox_bytes": peer.outbox_bytes,
+                "capacity_bits_per_s": _rounded(peer.capacity_bits_per_s, 0),
+                "delivered_bits_per_s": _rounded(peer.delivered_bits_per_s, 0),
             }
             for peer in facts.peers
         ],

@@ -13,7 +13,7 @@ from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
 from meshctl.report.duration import duration
-from meshctl.status.values import Alarm, Level, Neighbor
+from meshctl.status.values import Alarm, Level, Neighbor, RadioStatus
 from meshctl.topology import Path
 
 # below this the path loses more than it delivers: move a beacon
@@ -24,6 +24,12 @@ LOW_MEMORY_SHARE = 0.1
 LOW_FLASH_BYTES = 256 * 1024
 # with this load per processor a forwarding radio answers late and drops frames
 BUSY_LOAD = 4.0
+# Operators' thresholds of Silvus StreamScape (SC44-520): a link below 10 dB SNR and a node with more than 100 packets
+# queued are red.
+LOW_SNR_DB = 10
+LONG_QUEUE_PACKETS = 100
+# Doodle Labs calls more activity than this not ideal.
+BUSY_CHANNEL_RATIO = 0.8
 # radios have no battery-backed clock and often no NTP: only an offset that breaks logs and certificates matters
 CLOCK_TOLERANCE_S = 3600.0
 
@@ -51,6 +57,7 @@ class NodeAlarmInput:
     seconds_since_last_known: float | None
     """Time between the previous snapshot, if any, and this one."""
     own_lock: str
+    radios: tuple[RadioStatus, ...] = ()
 
     @property
     def must_mesh(self) -> bool:
@@ -130,6 +137,24 @@ def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "cut-vertex", f"without it {join_limited(seen.cuts_off)} would be cut off")
 
 
+def _air(seen: NodeAlarmInput) -> Iterator[Alarm]:
+    """The signal to the next hop, the channel, and the radio's queue."""
+    via = seen.path.via if seen.path is not None and seen.path.hops else ""
+    for one in seen.neighbors:
+        snr_db = one.worse_snr_db
+        if one.name == via and snr_db is not None and snr_db < LOW_SNR_DB:
+            text = f"the signal between it and {via} is {snr_db} dB above the noise"
+            yield Alarm(Level.WARNING, "snr", text, f"move closer, or drop a beacon between {seen.node.name} and {via}")
+    for radio in seen.radios:
+        if radio.busy_ratio is not None and radio.busy_ratio > BUSY_CHANNEL_RATIO:
+            channel = "" if radio.channel is None else f" {radio.channel}"
+            text = f"channel{channel} is busy for {radio.busy_ratio:.0%} of the time at {radio.ifname}"
+            yield Alarm(Level.WARNING, "busy", text, "send less, or change the channel of the mesh")
+        if radio.queue_packets is not None and radio.queue_packets > LONG_QUEUE_PACKETS:
+            text = f"{radio.queue_packets} packets are queued at {radio.ifname}"
+            yield Alarm(Level.WARNING, "radio-queue", text, "send less through it, or improve its links")
+
+
 def _dropped(seen: NodeAlarmInput) -> Iterator[Alarm]:
     """A beacon marked as carried that other nodes depend on."""
     if seen.node.state is NodeState.CARRIED and seen.node.role is Role.BEACON and seen.relays:
@@ -199,6 +224,7 @@ _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _drift,
     _radios,
     _mesh,
+    _air,
     _dropped,
     _bridge,
     _resources,

@@ -53,6 +53,9 @@ COLUMNS = (
     Column("hears", "hears", 0),
     Column("path", "to base", 1),
     Column("via", "via", 10),
+    Column("snr", "snr", 13),
+    Column("mcs", "mcs", 15),
+    Column("busy", "busy", 14),
     Column("waits", "waits", 4),
     Column("topics", "topics", 4),
     Column("age", "seen", 0),
@@ -86,7 +89,34 @@ def _node_row(node: NodeStatus) -> dict[str, TableCell]:
         "hears": _hears(node),
         "path": _path(node.hops, node.quality) if node.is_path_known else TableCell(),
         "via": TableCell(node.via),
+        **_air(node),
     }
+
+
+def _air(node: NodeStatus) -> dict[str, TableCell]:
+    """SNR of the next hop as `here/there`, MCS as `to/from` it; the busiest channel, and the packets queued."""
+    next_hop = node.next_hop
+    busy = [radio.busy_ratio for radio in node.radios if radio.busy_ratio is not None]
+    queued = [radio.queue_packets for radio in node.radios if radio.queue_packets is not None]
+    cells = {
+        "busy": TableCell(f"{max(busy):.0%}" if busy else ""),
+        "waits": TableCell(str(sum(queued)) if queued else ""),
+    }
+    if next_hop is not None:
+        if next_hop.worse_snr_db is not None:
+            cells["snr"] = TableCell(f"{_or_unknown(next_hop.snr_db)}/{_or_unknown(next_hop.snr_there_db)} dB")
+        if next_hop.tx_mcs or next_hop.rx_mcs:
+            cells["mcs"] = TableCell(f"{_index(next_hop.tx_mcs)}/{_index(next_hop.rx_mcs)}")
+    return cells
+
+
+def _or_unknown(value: object) -> str:
+    return "?" if value is None else str(value)
+
+
+def _index(mcs: str) -> str:
+    """`15` of `MCS 15`, `VHT 9` of `VHT-MCS 9 NSS 2`."""
+    return mcs.split(" NSS", 1)[0].replace("-MCS", "").removeprefix("MCS ") or "?"
 
 
 def _hears(node: NodeStatus) -> TableCell:

@@ -64,12 +64,46 @@ class NoAnswer:
 
 @dataclass(frozen=True, slots=True)
 class Neighbor:
-    """A node heard directly. `quality` 0..1, None if not measured."""
+    """A node heard directly. `quality` 0..1, None if not measured; `snr_db` is that of its frames here, `snr_there_db`
+    that of ours at it. Rates and counters of frames to it (`tx`) and from it (`rx`); an MCS is empty if unused."""
 
     name: str
     age_ms: int
     quality: float | None
     signal_dbm: int | None
+    mesh: str = ""
+    noise_dbm: int | None = None
+    snr_db: int | None = None
+    snr_there_db: int | None = None
+    chain_signals_dbm: tuple[int, ...] = ()
+    tx_mcs: str = ""
+    rx_mcs: str = ""
+    tx_bitrate_kbit_s: int | None = None
+    rx_bitrate_kbit_s: int | None = None
+    expected_kbit_s: int | None = None
+    tx_packets: int | None = None
+    tx_retries: int | None = None
+    tx_failed: int | None = None
+
+    @property
+    def worse_snr_db(self) -> int | None:
+        """The lower of both directions, as far as they are known."""
+        return min((snr for snr in (self.snr_db, self.snr_there_db) if snr is not None), default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class RadioStatus:
+    """One interface of a mesh. `busy_ratio` (0..1) is the share of time in which its channel was busy, its own frames
+    included, over the last `busy_over_s`; `queue_packets` wait in the radio."""
+
+    ifname: str
+    mesh: str
+    channel: int | None = None
+    noise_dbm: int | None = None
+    busy_ratio: float | None = None
+    busy_over_s: float | None = None
+    queue_packets: int | None = None
+    temperature_c: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +122,7 @@ class NodeStatus:
     uptime_s: float | None = None
     load: float | None = None
     """Load average over one minute, per processor."""
+    processors: int | None = None
     memory_free: float | None = None
     """Share of available memory, 0..1."""
     flash_free_bytes: int | None = None
@@ -96,6 +131,11 @@ class NodeStatus:
     tx_power_dbm: float | None = None
     lan_ports: tuple[str, ...] | None = None
     """Ports of its LAN bridge."""
+    radios: tuple[RadioStatus, ...] = ()
+    temperature_c: float | None = None
+    """The highest that the board reports."""
+    mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
+    """batman-adv's counters by its interface."""
     neighbors: tuple[Neighbor, ...] = ()
     is_path_known: bool = True
     """Whether enough nodes were queried to know its path; then `hops` None means that there is none."""
@@ -116,6 +156,13 @@ class NodeStatus:
     @property
     def state(self) -> NodeState | None:
         return self.node.state
+
+    @property
+    def next_hop(self) -> Neighbor | None:
+        """The neighbor on its path to the base, else the best one."""
+        return next(
+            (one for one in self.neighbors if one.name == self.via), self.neighbors[0] if self.neighbors else None
+        )
 
 
 @dataclass(frozen=True, slots=True)

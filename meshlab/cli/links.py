@@ -12,13 +12,13 @@ import typer
 from meshctl.cli.context import AsJson, LabDirectory, lab_directory
 from meshctl.cli.output import echo, echo_json
 from meshctl.errors import ExitCode, InputError
+from meshctl.inventory.yaml_entries import share_of
 from meshlab import placement, propagation_file, scenario_file
 from meshlab.fleet import VirtualFleet
 from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.scenario import Event, EventKind
 from meshlab.scenario_run import FleetTarget, play
 from meshlab.spec import LinkSpec
-from meshlab.yaml_entries import share_of
 
 
 def register(app: typer.Typer) -> None:

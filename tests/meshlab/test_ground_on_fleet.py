@@ -15,9 +15,11 @@ from typer.testing import CliRunner
 
 from meshctl.cli.main import build
 from meshctl.errors import InputError
+from meshctl.placement.ground import NodePosition
+from meshctl.placement.path_loss import Wall
 from meshlab import placement
 from meshlab.fleet import VirtualFleet
-from meshlab.propagation import NodePosition, RadioEnvironment, Wall, links_of
+from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.quality import tq_of
 from meshlab.spec import LinkSpec
 from meshlab.state import Power

@@ -9,6 +9,8 @@ import json
 import paramiko
 import pytest
 
+from meshctl.device.parse.batctl import parse_statistics
+from meshctl.device.parse.iw import parse_stations, parse_survey
 from meshlab.fleet import VirtualFleet
 from tests.meshlab.conftest import MESH, answers, connect, factory_reset, in_mesh, run
 from tests.waiting import until
@@ -21,6 +23,8 @@ def test_a_node_in_the_mesh_is_reachable_at_its_address_and_lists_its_neighbors(
     neighbors = json.loads(run(transport, "batctl meshif bat0 neighbors_json"))
     originators = json.loads(run(transport, "batctl meshif bat0 originators_json"))
     stations = run(transport, "iw dev mesh0 station dump")
+    survey = parse_survey(run(transport, "iw dev mesh0 survey dump"))
+    counters = parse_statistics(run(transport, "batctl meshif bat0 statistics"))
     info = json.loads(run(transport, 'ubus call iwinfo info \'{"device":"mesh0"}\''))
     transport.close()
     assert len(neighbors) == 1
@@ -29,6 +33,14 @@ def test_a_node_in_the_mesh_is_reachable_at_its_address_and_lists_its_neighbors(
     assert {path["neigh_address"] for path in originators} == {neighbors[0]["neigh_address"]}
     assert sorted(path["tq"] for path in originators) == [165, 200]
     assert stations.startswith(f"Station {neighbors[0]['neigh_address']} (on mesh0)\n\tinactive time:\t")
+    # a link of -58 dBm above a noise of -95 dBm carries the highest rate
+    (station,) = parse_stations(stations) or ()
+    assert (station.signal_dbm, station.tx_mcs, station.chain_signals_dbm) == (-58, "MCS 15", (-60, -62))
+    assert survey is not None
+    assert (survey.noise_dbm, survey.frequency_mhz) == (-95, 2437)
+    assert survey.active_ms is not None
+    assert survey.busy_ms == pytest.approx(0.01 * survey.active_ms, abs=1)
+    assert counters["mgmt_rx_bytes"] > 0
     assert (info["mode"], info["channel"], info["ssid"]) == ("Ad-Hoc", 6, "a team")
 
 

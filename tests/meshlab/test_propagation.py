@@ -12,19 +12,12 @@ from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
+from meshctl.inventory.yaml_entries import share_of
+from meshctl.placement.ground import NodePosition
+from meshctl.placement.path_loss import DEAF_LOSS, PathLossModel, Wall, frame_loss, received_dbm
 from meshlab import propagation_file
-from meshlab.propagation import (
-    DEAF_LOSS,
-    NodePosition,
-    PathLossModel,
-    RadioEnvironment,
-    Wall,
-    frame_loss,
-    links_of,
-    received_dbm,
-)
+from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.spec import LinkSpec
-from meshlab.yaml_entries import share_of
 
 FILE = "ground.yaml"
 EXAMPLES = Path(__file__).parents[2] / "inventory" / "lab"

@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from meshctl.diagnostics import InvalidInput
+from meshctl.placement.ground import NodePosition
+from meshctl.placement.path_loss import PathLossModel
 from meshlab import scenario_file
-from meshlab.propagation import NodePosition, RadioEnvironment, links_of
+from meshlab.propagation import RadioEnvironment, links_of
 from meshlab.scenario import (
     Deployment,
     Event,
@@ -141,7 +143,7 @@ incidents: [{at_s: 80, what: "off", who: spare}]
     mission = scenario_file.parse(text, tmp_path / "away.yaml")
     assert (mission.name, mission.base, mission.step_s) == ("away", "base", 1.0)
     assert mission.environment.positions == {"base": NodePosition((0, 0)), "spare": NodePosition((0, 5))}
-    assert mission.environment.path_loss.exponent == 2
+    assert mission.environment.path_loss == PathLossModel(exponent=2)
     assert (mission.robots, mission.beacons) == (AWAY.robots, AWAY.beacons)
     assert mission.power_events == (PowerEvent(80.0, "spare", False),)
     assert mission.names == ("base", "beacon", "rover", "spare")

@@ -30,6 +30,14 @@ def set_rates(arguments: argparse.Namespace) -> int:
     return Exit.USAGE if values is None else _change(arguments, "set-rates", values=values)
 
 
+def set_position(arguments: argparse.Namespace) -> int:
+    with MeshClient(arguments.socket) as mesh:
+        mesh.request("set-position", x_m=arguments.x, y_m=arguments.y, z_m=arguments.z, frame=arguments.frame)
+    if arguments.json:
+        print_json({"changes": ["position"]})
+    return Exit.OK
+
+
 def set_neighbour(arguments: argparse.Namespace) -> int:
     return _change(
         arguments,

@@ -289,6 +289,12 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     neighbour.add_argument("--name", help="node name (required with --legacy)")
     neighbour.add_argument("--link", help="link over which the neighbor is reached")
     neighbour.add_argument("--legacy", action="store_true", help="the neighbor uses the legacy format")
+    position = _command(
+        setters, "position", change.set_position, "set this node's position", example="udp-mesh set position 12.5 -3"
+    )
+    for axis, count_of in (("x", None), ("y", None), ("z", "?")):
+        position.add_argument(axis, type=float, nargs=count_of, help="meters")
+    position.add_argument("--frame", default="map", help="coordinate frame (default: %(default)s)")
     keys = _command(
         setters,
         "keys",

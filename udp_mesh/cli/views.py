@@ -97,6 +97,17 @@ def status_view(status: Json) -> str:
         f"for {duration(stranger['heard_for_s'])}"
         for stranger in conditions["strangers"]
     ]
+    if status.get("positions"):
+        rows = [
+            [
+                place["name"],
+                *("-" if place[axis] is None else f"{place[axis]:.1f}" for axis in ("x_m", "y_m", "z_m")),
+                place["frame"],
+                duration(place["age_s"]),
+            ]
+            for place in status["positions"]
+        ]
+        lines += ["", table(["position", "x, m", "y, m", "z, m", "frame", "age"], rows)]
     lines.append("")
     lines.append(
         f"channel: {rate(conditions['sent_bits_per_s'])} sent here, {rate(conditions['heard_bits_per_s'])} in total"

@@ -69,6 +69,11 @@ class PeerConditions:
     unanswered_for_s: float | None
     """How long nothing sent to the peer was acknowledged, even if it is heard; None if nothing awaits an
     acknowledgment."""
+    sent_bytes: int = 0
+    """What `sent_bits_per_s` is the rate of, since the peer was first sent to; the next two likewise."""
+    delivered_bytes: int = 0
+    received_bytes: int = 0
+    """Since its current boot was heard, without what it sent before it knew ours."""
 
 
 @dataclass(slots=True)

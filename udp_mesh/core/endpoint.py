@@ -308,6 +308,9 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
         held_bytes,
         session is not None and session.one_way_since is not None and _recently_heard(session, now),
         now - sender.last_progress if sender.state is SendState.UNRESPONSIVE and sender.pending else None,
+        sender.sent_bytes,
+        sender.delivered_bytes,
+        session.received_bytes if session is not None else meters.received.total if meters is not None else 0,
     )
 
 

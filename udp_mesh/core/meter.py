@@ -21,6 +21,11 @@ class Meter:
             self._total = total
             self._at = now
 
+    @property
+    def total(self) -> int:
+        """The running total of the last complete period."""
+        return self._total
+
     def per_s(self, now: float) -> float:
         """Units per second; zero if nothing was fed for long."""
         return self._rate if now - self._at < 4 * self.PERIOD_S else 0.0

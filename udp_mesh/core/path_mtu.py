@@ -46,6 +46,26 @@ def _fragment_bytes(message: OutgoingMessage, position: int) -> int:
     return end - start
 
 
+def compare_sizes(state: State, peer: Peer, sender: Sender, session: Session, now: float) -> None:
+    """While large datagrams are suspected to vanish: judge the pings of all sizes so far, and send the next ones."""
+    sender.pmtu.comparisons.settle(now)
+    update_pmtu(state, peer, sender, session, now)
+    path, comparisons = session.path, sender.pmtu.comparisons
+    if not comparisons.due(now):
+        return
+    rooms = {mtu: datagram_room(path.address, mtu, state.settings.fragment_bytes) for mtu in NARROWER_MTUS}
+    sizes = {path.mtu: path.room_bytes} | {mtu: room for mtu, room in rooms.items() if room < path.room_bytes}
+    if len(sizes) == 1 or not path.confirmed:
+        sender.pmtu.reset()
+        return
+    tokens = {}
+    for mtu, room in sizes.items():
+        token = state.rng.getrandbits(64)
+        tokens[token] = mtu
+        state.outgoing.append(build_mtu_probe(sender, path, token, room))
+    comparisons.on_sent(tokens, now, sender.congestion.capacity_packets_per_s())
+
+
 def update_pmtu(state: State, peer: Peer, sender: Sender, session: Session, now: float) -> None:
     """Use smaller fragments if full ones do not get through, and larger ones again if a probe of that size does."""
     path, size = session.path, sender.pmtu
@@ -54,6 +74,9 @@ def update_pmtu(state: State, peer: Peer, sender: Sender, session: Session, now:
     rooms = {mtu: datagram_room(path.address, mtu, fragment_bytes) for mtu in NARROWER_MTUS}
     narrower = [mtu for mtu, room in rooms.items() if room < path.room_bytes]
     if size.is_black_hole(now) and narrower:
+        arriving = size.comparisons.largest_arriving()
+        while len(narrower) > 1 and arriving and narrower[0] > arriving:
+            narrower.pop(0)
         path.switch_to(path.link, path.address, narrower.pop(0), fragment_bytes)
         size.on_narrowed(now)
         state.event_queue.emit(PathNarrowed(peer.name, path.mtu, path.fragment_bytes))

@@ -9,6 +9,7 @@ from heapq import heappop
 
 from udp_mesh.core.frame_handlers import inflate_step
 from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.path_mtu import compare_sizes
 from udp_mesh.core.peer_lifecycle import maintain
 from udp_mesh.core.peers.heartbeat import heartbeat_datagrams
 from udp_mesh.core.peers.introduction import introduction
@@ -261,6 +262,8 @@ def handle_timer(state: State, now: float) -> None:
             if sender.consume_small_probe(now):
                 session.queue_control(Ping(state.rng.getrandbits(64)))
                 state.schedule_control(session)
+            if sender.pmtu.comparisons.next_at <= now:
+                compare_sizes(state, peer, sender, session, now)
         state.ready[peer] = None
         state.arm(peer)
     if state.heartbeats.next_at <= now:

@@ -33,6 +33,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.interface import POSITION_TOPIC
 from udp_mesh.daemon.outbox import DirectoryStore
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import BOOT_ID_BYTES
@@ -156,6 +157,9 @@ class Node:
 
     def _event(self, event: Event) -> None:
         if isinstance(event, MessageReceived):
+            if event.topic == POSITION_TOPIC:
+                # between daemons
+                return
             self._messages.append(event)
             self._arrived.set()
             return

@@ -17,7 +17,7 @@ from udp_mesh.client.mesh_client import Header
 from udp_mesh.core.settings import Settings, is_type_name
 from udp_mesh.daemon import metrics
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.configuration import load, read_keys, read_rates, topic_from_values
+from udp_mesh.daemon.configuration import load, read_keys, read_rates
 from udp_mesh.daemon.file_access import FILE_TIMEOUT_S, is_below, off_loop
 from udp_mesh.daemon.interface import CONDITIONS_TOPIC, MAX_PING_S, RESERVED_PREFIX
 from udp_mesh.daemon.neighbours import (
@@ -28,9 +28,11 @@ from udp_mesh.daemon.neighbours import (
     parse_address,
     read_neighbour,
 )
+from udp_mesh.daemon.position_requests import publish_meter, set_position
 from udp_mesh.daemon.service import Service
 from udp_mesh.daemon.status import conditions_json, log_json, plain, show_address, topic_json, topics_json
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
+from udp_mesh.daemon.topic_settings import topic_from_values
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
 from udp_mesh.wire.limits import MAX_TYPE_BYTES
 
@@ -135,7 +137,7 @@ def ping(service: Service, _client: Client, header: Header, _: bytes) -> Awaitab
         raise RequestError("bad-request", f"timeout_s: expected at most {MAX_PING_S:g}, found {timeout_s!r}")
 
     async def answer() -> Header:
-        return {"round_trip_s": round(await service.ping(peer, float(timeout_s)), 6)}
+        return {"round_trip_s": round(await service.pings.ping(peer, float(timeout_s)), 6)}
 
     return answer()
 
@@ -182,6 +184,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
         "conditions": conditions_json(driver.conditions()),
+        "positions": service.positions.json(),
     }
 
 
@@ -222,8 +225,15 @@ def render_metrics(service: Service) -> str:
         "wire_version": str(WIRE_VERSION),
         "boot": service.boot_id.hex(),
     }
-    uptime_s = driver.now() - service.started
-    return metrics.render(driver.conditions(), visible, extra, logs=driver.node.logs(), about=about, uptime_s=uptime_s)
+    return metrics.render(
+        driver.conditions(),
+        visible,
+        extra,
+        logs=driver.node.logs(),
+        about=about,
+        uptime_s=driver.now() - service.started,
+        latencies=service.latencies.by_priority,
+    )
 
 
 # Change
@@ -358,6 +368,8 @@ COMMANDS = {
     "drop-topic": drop_topic,
     "set-window": set_window,
     "set-rates": set_rates,
+    "set-position": set_position,
+    "publish-meter": publish_meter,
     "set-neighbour": set_neighbour,
     "drop-neighbour": drop_neighbour,
     "neighbours": neighbours,

@@ -19,28 +19,38 @@ from typing import Literal
 
 from udp_mesh.core.settings import (
     DEFAULT_PORT,
-    MAX_COPIES,
     Address,
     Limits,
-    Log,
-    Outbox,
     Rates,
     Settings,
     Topic,
 )
 from udp_mesh.crypto import Key
 from udp_mesh.daemon.file_access import is_exposed, read_regular
-from udp_mesh.daemon.interface import BENCH_TOPIC, DEFAULT_SOCKET, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
+from udp_mesh.daemon.interface import (
+    BENCH_TOPIC,
+    DEFAULT_SOCKET,
+    PING_TOPIC,
+    PONG_TOPIC,
+    POSITION_TOPIC,
+)
 from udp_mesh.daemon.neighbours import (
     NODE_NAME,
-    TOPIC_NAME,
     is_node_name,
-    is_topic_name,
     parse_address,
     read_link,
     read_neighbours,
 )
-from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Source, Table, parse
+from udp_mesh.daemon.positions import (
+    DEFAULT_FRAME,
+    MAX_COORDINATE_M,
+    MAX_FRAME_BYTES,
+    Position,
+    PositionSource,
+    is_frame,
+)
+from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, parse
+from udp_mesh.daemon.topic_settings import or_default, problem_from, read_topic
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
@@ -58,6 +68,8 @@ RESERVED_TOPICS = (
     Topic(PING_TOPIC, priority=0, deadline_s=10.0),
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
     Topic(BENCH_TOPIC, priority=15, reliable=True),
+    # The next one comes in seconds: a lost one is not sent again, an old one not at all.
+    Topic(POSITION_TOPIC, priority=13, reliable=False, keep_last=1, deadline_s=5.0),
 )
 
 
@@ -89,6 +101,8 @@ class Configuration:
     settings: Settings
     links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
+    position: Position | None = None
+    """The fixed position of a node that does not move."""
     file: Path | None = None
 
 
@@ -181,6 +195,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
     neighbours = read_neighbours(top, port)
     rates, limits = read_rates(top.table("rates")), _read_limits(top.table("limits"))
     daemon = _read_daemon(top.table("daemon"))
+    position = _read_position(top.table("position")) if top.has("position") else None
     top.finish()
     if source.problems:
         raise ConfigurationError(sorted(source.problems, key=lambda problem: problem.line))
@@ -201,81 +216,11 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
         )
     except ValueError as error:
         raise ConfigurationError([problem_from(source, error)]) from error
-    return Configuration(settings, links, daemon)
+    return Configuration(settings, links, daemon, position)
 
 
 def _window(packets: int | None) -> Literal["adaptive"] | int:
     return "adaptive" if packets is None else packets
-
-
-def problem_from(source: Source, error: ValueError) -> Problem:
-    """Converts a ValueError of the settings into a problem, at its key's line if the text names one."""
-    text = str(error)
-    parts = re.fullmatch(r"(?P<key>[^:]+): (?:expected )?(?P<expected>.*?)(?:, found (?P<found>.*))?", text)
-    if parts is None:
-        return Problem(source.file, 1, "", "a valid configuration", text)
-    path = tuple(parts["key"].split("."))
-    return Problem(source.file, source.line(path), parts["key"], parts["expected"], parts["found"] or "otherwise")
-
-
-def read_topic(name: str, table: Table) -> Topic:
-    """A topic from an entry of `[topics]` or from a request. Reports problems to the table's source."""
-    good_name = False
-    if name.startswith(RESERVED_PREFIX):
-        table.source.report(table.path, f"a topic outside {RESERVED_PREFIX}", name)
-    elif not is_topic_name(name):
-        table.source.report(table.path, TOPIC_NAME, name)
-    else:
-        good_name = True
-    default = Topic("default")
-    topic = Topic(
-        name="default",
-        priority=_or(table.integer("priority", default.priority, 0, 15), default.priority),
-        reliable=table.boolean("reliable", default.reliable),
-        keep_last=table.integer("keep_last", None, 1, 1 << 20),
-        deadline_s=table.number("deadline_s", None, 0.001, 1e7),
-        rate_limit_bytes_per_s=table.integer("rate_limit_bytes_per_s", None, 1, 1 << 40),
-        compression=table.boolean("compression", default.compression),
-        destinations=table.texts("destinations"),
-        outbox=Outbox(table.choice("outbox", default.outbox.value, [member.value for member in Outbox])),
-        outbox_bytes=_or(table.integer("outbox_bytes", default.outbox_bytes, 0, 1 << 40), default.outbox_bytes),
-        outbox_on_disk=table.boolean("outbox_on_disk", default.outbox_on_disk),
-        repair=table.boolean("repair", default.repair),
-    )
-    log = _read_log(table.table("log")) if table.has("log") else None
-    table.finish()
-    for destination in topic.destinations:
-        if not is_node_name(destination):
-            table.report("destinations", f"node names, each {NODE_NAME}", destination)
-    if topic.outbox_on_disk and topic.outbox is Outbox.NONE:
-        table.report("outbox_on_disk", 'outbox = "last" or "all" as well', topic.outbox_on_disk)
-    try:
-        return dataclasses.replace(topic, name=name if good_name else topic.name, log=log)
-    except ValueError as error:
-        _, _, text = str(error).partition(": expected ")
-        expected, _, found = text.rpartition(", found ")
-        table.source.report(table.path, expected, found)
-        return topic
-
-
-def _read_log(table: Table) -> Log:
-    default = Log()
-    log = Log(
-        readers=table.texts("readers"),
-        max_items=_or(table.integer("max_items", None, 1, 1 << 24), default.max_items),
-        max_bytes=_or(table.integer("max_bytes", None, 1, 1 << 40), default.max_bytes),
-        max_age_s=table.number("max_age_s", None, 1.0, 1e9),
-        copies=_or(table.integer("copies", None, 0, MAX_COPIES), default.copies),
-    )
-    table.finish()
-    for reader in log.readers:
-        if not is_node_name(reader):
-            table.report("readers", f"node names, each {NODE_NAME}", reader)
-    return log
-
-
-def _or(value: int | None, default: int) -> int:
-    return default if value is None else value
 
 
 def read_rates(table: Table, current: Rates | None = None) -> Rates:
@@ -301,7 +246,7 @@ def read_rates(table: Table, current: Rates | None = None) -> Rates:
 
 def _read_limits(table: Table) -> Limits:
     values = {
-        entry.name: _or(
+        entry.name: or_default(
             table.integer(entry.name, None, 1, MAX_MESSAGE_BYTES if entry.name == "message_bytes" else 1 << 40),
             getattr(Limits(), entry.name),
         )
@@ -335,12 +280,26 @@ def _read_daemon(table: Table) -> DaemonSettings:
         state_directory=_read_path(table, "state_directory", default.state_directory),
         metrics_address=metrics,
         conditions_period_s=table.number("conditions_period_s", default.conditions_period_s, 0.05, 3600) or 1.0,
-        outbox_disk_bytes=_or(table.integer("outbox_disk_bytes", None, 0, 1 << 40), default.outbox_disk_bytes),
-        record_bytes=_or(table.integer("record_bytes", None, 1 << 16, 1 << 40), default.record_bytes),
-        urgent_dscp=_or(table.integer("urgent_dscp", None, 0, 63), default.urgent_dscp),
+        outbox_disk_bytes=or_default(table.integer("outbox_disk_bytes", None, 0, 1 << 40), default.outbox_disk_bytes),
+        record_bytes=or_default(table.integer("record_bytes", None, 1 << 16, 1 << 40), default.record_bytes),
+        urgent_dscp=or_default(table.integer("urgent_dscp", None, 0, 63), default.urgent_dscp),
     )
     table.finish()
     return settings
+
+
+def _read_position(table: Table) -> Position:
+    """`x_m`, `y_m` and optional `z_m` and `frame`."""
+    high = MAX_COORDINATE_M
+    for key in ("x_m", "y_m"):
+        if not table.has(key):
+            table.source.report((*table.path, key), "a number of meters", "none")
+    frame = table.text("frame", DEFAULT_FRAME) or ""
+    if not is_frame(frame):
+        table.report("frame", f"a name of 1 to {MAX_FRAME_BYTES} bytes without spaces", frame)
+    x_m, y_m, z_m = (table.number(key, None, -high, high) for key in ("x_m", "y_m", "z_m"))
+    table.finish()
+    return Position(x_m or 0.0, y_m or 0.0, z_m, frame, 0.0, PositionSource.CONFIGURATION)
 
 
 def _read_path(table: Table, key: str, default: Path) -> Path:
@@ -348,32 +307,3 @@ def _read_path(table: Table, key: str, default: Path) -> Path:
     if text == "":
         table.report(key, "a path", text)
     return Path(text) if text else default
-
-
-def _unparsed(value: object) -> object:
-    """A topic's field as it is written in a configuration."""
-    match value:
-        case Outbox():
-            return value.value
-        case Log():
-            fields = ((entry.name, getattr(value, entry.name)) for entry in dataclasses.fields(value))
-            return {name: list(item) if isinstance(item, tuple) else item for name, item in fields if item is not None}
-        case _:
-            return value
-
-
-def topic_from_values(name: str, values: dict[str, object], current: Topic | None) -> Topic:
-    """A topic from a request's fields; missing fields keep the value in `current`. Raises ConfigurationError."""
-    merged: dict[str, object] = {}
-    if current is not None:
-        for entry in dataclasses.fields(Topic):
-            value = getattr(current, entry.name)
-            if entry.name != "name" and value is not None:
-                merged[entry.name] = _unparsed(value)
-        merged["destinations"] = list(current.destinations)
-    merged.update(values)
-    source = Source("command", {})
-    topic = read_topic(name, Table({key: value for key, value in merged.items() if value is not None}, source, (name,)))
-    if source.problems:
-        raise ConfigurationError(source.problems)
-    return topic

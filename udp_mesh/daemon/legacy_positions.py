@@ -23,6 +23,24 @@ log = logging.getLogger(__name__)
 MAX_FILE_BYTES = 1 << 20
 
 
+class LegacyPositions:
+    """The file, and what it holds."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.saved = load_positions(path)
+
+    async def save(self, positions: Mapping[str, ReceivePosition]) -> None:
+        """Saves what was received from legacy peers, if it changed."""
+        if positions == self.saved:
+            return
+        self.saved = dict(positions)
+        try:
+            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
+        except OSError as error:
+            log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)
+
+
 def load_positions(path: Path) -> dict[str, ReceivePosition]:
     """The positions by peer; none if there is no file, or if it was being written when the computer stopped."""
     try:
@@ -53,21 +71,3 @@ def save_positions(path: Path, positions: Mapping[str, ReceivePosition]) -> None
         os.pwrite(descriptor, data.ljust(os.fstat(descriptor).st_size), 0)
     finally:
         os.close(descriptor)
-
-
-class PositionsFile:
-    """The positions of this run, saved whenever they have changed."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.saved: Mapping[str, ReceivePosition] = load_positions(path)
-
-    async def save(self, positions: Mapping[str, ReceivePosition]) -> None:
-        """Save the positions, if they changed. A disk that refuses them is logged."""
-        if positions == self.saved:
-            return
-        self.saved = positions
-        try:
-            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
-        except OSError as error:
-            log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)

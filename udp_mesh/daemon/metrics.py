@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.daemon.latencies import BOUNDS_S, Histogram
 from udp_mesh.daemon.status import TopicCount
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -34,6 +35,13 @@ _PEER_GAUGES = (
     ("peer_outbox_messages", "Messages stored for the offline peer.", lambda peer: float(peer.outbox_messages)),
     ("peer_outbox_bytes", "Bytes stored for the offline peer.", lambda peer: float(peer.outbox_bytes)),
 )
+# Base units and counters; the rates in bits per second above are kept for one release.
+_PEER_COUNTERS = {
+    "sent_bytes": "Wire bytes of messages sent to the peer.",
+    "received_bytes": "Wire bytes received from the peer.",
+    "delivered_bytes": "Payload bytes the peer acknowledged.",
+}
+_BUILD_LABELS = ("version", "wire_version")
 _QUEUE_GAUGES = (
     ("queue_messages", "Messages waiting.", lambda queue: float(queue.messages)),
     ("queue_bytes", "Bytes waiting.", lambda queue: float(queue.bytes)),
@@ -51,10 +59,14 @@ def render(
     logs: Iterable[LogConditions] = (),
     about: Mapping[str, str],
     uptime_s: float,
+    latencies: Mapping[int, Histogram] | None = None,
 ) -> str:
-    """The Prometheus page; `extra` are counters of the daemon itself, `about` the labels of the info metric."""
+    """The Prometheus page; `extra` are counters of the daemon itself, `about` the labels of the info metric,
+    `latencies` those of deliveries by priority."""
     lines: list[str] = []
     _family(lines, "info", "gauge", "Always 1; the labels describe the node.", [(about, 1)])
+    build = {name: about[name] for name in _BUILD_LABELS if name in about}
+    _family(lines, "build_info", "gauge", "Always 1; the labels describe the program.", [(build, 1)])
     _family(lines, "uptime_seconds", "gauge", "Time since the daemon started.", [({}, round(uptime_s, 3))])
     for item in dataclasses.fields(conditions.counters):
         value = getattr(conditions.counters, item.name)
@@ -70,6 +82,9 @@ def render(
     for name, help_text, read in _PEER_GAUGES:
         samples = [({"peer": peer.name}, value) for peer in conditions.peers if (value := read(peer)) is not None]
         _family(lines, name, "gauge", help_text, samples)
+    for field_name, help_text in _PEER_COUNTERS.items():
+        samples = [({"peer": peer.name}, float(getattr(peer, field_name))) for peer in conditions.peers]
+        _family(lines, f"peer_{field_name}_total", "counter", help_text, samples)
     retransmitted = [({"peer": peer.name}, float(peer.retransmitted_packets)) for peer in conditions.peers]
     _family(lines, "peer_retransmitted_packets_total", "counter", "Retransmitted packets.", retransmitted)
     for name, help_text, read_queue in _QUEUE_GAUGES:
@@ -79,6 +94,7 @@ def render(
             for queue in peer.queues
         ]
         _family(lines, name, "gauge", help_text, samples)
+    _histogram(lines, "delivery_latency_seconds", "Time from sending a message to its acknowledgment.", latencies or {})
     for field_name in ("sent_messages", "sent_bytes", "received_messages", "received_bytes"):
         samples = [({"topic": topic}, float(getattr(count, field_name))) for topic, count in sorted(topics.items())]
         help_text = f"{field_name.replace('_', ' ').capitalize()} of the topic."
@@ -110,6 +126,20 @@ def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
     ]
     _family(lines, "log_missing_items", "gauge", "Items that a reader is not known to have.", missing)
     return lines
+
+
+def _histogram(lines: list[str], name: str, help_text: str, by_priority: Mapping[int, Histogram]) -> None:
+    """A histogram with the label `priority`: cumulative buckets, sum and count of each."""
+    if not by_priority:
+        return
+    lines += [f"# HELP udp_mesh_{name} {help_text}", f"# TYPE udp_mesh_{name} histogram"]
+    for priority, histogram in sorted(by_priority.items()):
+        total = 0
+        for bound, count in zip((*map(str, BOUNDS_S), "+Inf"), histogram.counts, strict=True):
+            total += count
+            lines.append(f'udp_mesh_{name}_bucket{{priority="{priority}",le="{bound}"}} {total}')
+        lines.append(f'udp_mesh_{name}_sum{{priority="{priority}"}} {_number(histogram.sum_s)}')
+        lines.append(f'udp_mesh_{name}_count{{priority="{priority}"}} {total}')
 
 
 def _family(lines: list[str], name: str, kind: str, help_text: str, samples: Iterable[Sample]) -> None:

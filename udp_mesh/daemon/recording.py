@@ -19,6 +19,7 @@ from pathlib import Path
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived
 from udp_mesh.daemon.interface import RESERVED_PREFIX
+from udp_mesh.daemon.positions import Position, position_json
 from udp_mesh.daemon.status import Json, conditions_json, event_json
 
 log = logging.getLogger(__name__)
@@ -97,6 +98,12 @@ class Recorder:
             if self._payloads:
                 fields["payload"] = base64.b64encode(event.payload).decode()
         self._write({"t": self._at(now), "kind": kind, **fields})
+
+    def position(self, now: float, name: str, position: Position) -> None:
+        """Records where a node is; the report draws it."""
+        fields = position_json(name, position, now)
+        line = {"at": fields["name"], "x": fields["x_m"], "y": fields["y_m"], "z": fields["z_m"]}
+        self._write({"t": self._at(now), "kind": "place", **line, "frame": fields["frame"], "age_s": fields["age_s"]})
 
     def conditions(self, conditions: Conditions) -> None:
         self._write({"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)})

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
@@ -32,10 +31,13 @@ from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.daemon.inbox import Inbox
-from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, PING_TOPIC, PONG_TOPIC, RESERVED_PREFIX
-from udp_mesh.daemon.legacy_positions import PositionsFile
+from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, RESERVED_PREFIX
+from udp_mesh.daemon.latencies import Latencies
+from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.log_store import SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
+from udp_mesh.daemon.pings import Pings
+from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
 from udp_mesh.daemon.subscriptions import Subscriptions
@@ -46,7 +48,6 @@ MAX_OUTCOMES = 65_536
 """Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
-TOKEN_BYTES = 8
 
 
 class Service:
@@ -63,16 +64,17 @@ class Service:
         )
         self._flusher = Flusher(self.store)
         self.log_store = SqliteLogStore(configuration.daemon.state_directory / "logs" / "items.db", wall_clock)
-        self._legacy_positions = PositionsFile(configuration.daemon.state_directory / "legacy-positions.json")
+        self._legacy = LegacyPositions(configuration.daemon.state_directory / "legacy-positions.json")
+        self.latencies = Latencies(self._priority)
         self.driver = Driver(
             configuration.settings,
             configuration.links,
             boot_id=boot_id,
             rng=rng,
-            on_event=self._event,
+            on_event=self.latencies.watching(self._event),
             store=self.store,
             log_store=self.log_store,
-            legacy_positions=self._legacy_positions.saved,
+            legacy_positions=self._legacy.saved,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
         self.log_store.on_done = self.driver.send_soon
@@ -83,13 +85,16 @@ class Service:
         )
         self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
+        self.positions = PositionExchange(
+            self.driver, configuration.settings.name, configuration.position, lambda: self.recorder
+        )
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
         self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority)
         self._watchers: set[Client] = set()
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
-        self._pings: dict[bytes, asyncio.Future[float]] = {}
+        self.pings = Pings(self.driver)
         self._tasks: set[asyncio.Task[None]] = set()
         self._conditions_timer: asyncio.TimerHandle | None = None
 
@@ -100,24 +105,24 @@ class Service:
     def start(self) -> None:
         """Starts sending and receiving."""
         self.driver.start()
-        topics = (*self.settings.topics, self.settings.undeclared)
-        if any(topic is not None and topic.outbox_on_disk for topic in topics):
+        if any(one is not None and one.outbox_on_disk for one in (*self.settings.topics, self.settings.undeclared)):
             self.store.check_writable()
         self._publish_conditions()
+        self.positions.start()
 
     async def close(self) -> None:
         """Stops the driver, cancels waiting requests and ends the recording."""
         if self._conditions_timer is not None:
             self._conditions_timer.cancel()
+        self.positions.close()
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
-        await self._legacy_positions.save(self.driver.node.legacy_positions())
+        await self._legacy.save(self.driver.node.legacy_positions())
         await self.stop_recording()
-        await asyncio.get_running_loop().run_in_executor(None, self.store.close)
-        await asyncio.get_running_loop().run_in_executor(None, self.inbox.close)
-        await asyncio.get_running_loop().run_in_executor(None, self.log_store.close)
+        for close in (self.store.close, self.inbox.close, self.log_store.close):
+            await asyncio.get_running_loop().run_in_executor(None, close)
 
     # Requests (called by the local API)
 
@@ -207,23 +212,6 @@ class Service:
                 return topic
         return self.settings.undeclared
 
-    async def ping(self, peer: str, timeout_s: float) -> float:
-        """Measures the round trip to the peer's daemon, through both cores, in seconds. Raises RequestError."""
-        token = os.urandom(TOKEN_BYTES)
-        answer: asyncio.Future[float] = asyncio.get_running_loop().create_future()
-        self._pings[token] = answer
-        begun = self.driver.now()
-        try:
-            outcome = self.driver.send(PING_TOPIC, token, destination=peer)
-            if isinstance(outcome, Rejected):
-                raise RequestError(outcome.reason.value.replace(" ", "-"), outcome.detail)
-            async with asyncio.timeout(timeout_s):
-                return await answer - begun
-        except TimeoutError as error:
-            raise RequestError("no-answer", f"{peer} did not answer within {timeout_s:g} s") from error
-        finally:
-            del self._pings[token]
-
     # Runtime changes
 
     def apply(self, settings: Settings) -> list[str]:
@@ -265,6 +253,9 @@ class Service:
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)
             changes.append("links")
+        if fresh.position != running.position:
+            self.positions.set_fixed(fresh.position)
+            changes.append("position")
         self.configuration = replace(fresh, settings=settings, daemon=running.daemon)
         return changes + notes
 
@@ -323,21 +314,14 @@ class Service:
     def _on_message(self, event: MessageReceived) -> None:
         topic = event.topic
         if topic.startswith(RESERVED_PREFIX):
-            self._on_reserved_message(event)
+            if not self.pings.on_message(event):
+                self.positions.on_reserved_message(event)
             return
         count = self._count(topic)
         count.received_messages += 1
         count.received_bytes += len(event.payload)
         count.last_received = self.driver.now()
         self.subscriptions.distribute(event)
-
-    def _on_reserved_message(self, event: MessageReceived) -> None:
-        if event.topic == PING_TOPIC and len(event.payload) == TOKEN_BYTES:
-            self.driver.send(PONG_TOPIC, event.payload, destination=event.source)
-        elif event.topic == PONG_TOPIC:
-            waiting = self._pings.get(event.payload)
-            if waiting is not None and not waiting.done():
-                waiting.set_result(self.driver.now())
 
     # Messages held until a program takes them
 
@@ -364,7 +348,7 @@ class Service:
         if self.store.needs_flush:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
-        self._spawn(self._legacy_positions.save(self.driver.node.legacy_positions()))
+        self._spawn(self._legacy.save(self.driver.node.legacy_positions()))
         self.inbox.take_read()
         self.subscriptions.pass_on_held()
         clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))

@@ -21,6 +21,12 @@ _NEIGHBOUR_V = re.compile(rf"^ *{_MAC} +{_SEEN} +\([^)]*\) +\[ *(\S+)\]", re.IGN
 _HEADER = re.compile(r"\[B\.A\.T\.M\.A\.N\. adv ([^,]+),.*?(BATMAN_I?V)\)?")
 
 
+def parse_statistics(text: str) -> Mapping[str, int]:
+    """`statistics`: `<tab>tx_bytes: 5930`, one counter per line; other lines are left out."""
+    found = (re.fullmatch(r"\s*([a-z][a-z0-9_]{0,40}): (\d{1,20})\s*", line) for line in text.splitlines())
+    return MappingProxyType({match[1]: int(match[2]) for match in found if match})
+
+
 def parse_mesh_json(text: str) -> MeshInfo | None:
     """`mesh_json`: version, algorithm and every setting as text."""
     data = mapping(parse_json(text))

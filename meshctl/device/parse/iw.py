@@ -1,4 +1,4 @@
-"""`iw`: `dev`, `dev IF link`, `dev IF station dump` (iw's interface.c, link.c, station.c)."""
+"""`iw`: `dev`, `dev IF link`, `station dump`, `survey dump` (iw's interface.c, link.c, station.c, survey.c)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,18 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
-from meshctl.device.observation import Station, WirelessLink
+from meshctl.device.observation import ChannelSurvey, Station, WirelessLink
 
 _INTERFACE = re.compile(r"^\s*Interface (\S+)$")
 _CHANNEL = re.compile(r"channel (\d{1,3}) \((\d{3,6})(?:\.\d+)? MHz\)(?:, width: ([^,]+))?")
 _STATION = re.compile(r"^Station ((?:[0-9a-f]{2}:){5}[0-9a-f]{2}) \(on (\S+)\)$", re.IGNORECASE)
 _JOINED = re.compile(r"^(?:Joined IBSS|Connected to) ((?:[0-9a-f]{2}:){5}[0-9a-f]{2})", re.IGNORECASE)
+_PHY = re.compile(r"^phy#(\d{1,3})$")
+_SURVEY = re.compile(r"^Survey data from (\S+)$")
+# `-58 [-60, -62] dBm`: all chains together, then each
+_CHAINS = re.compile(r"\[(-?\d{1,3}(?:, -?\d{1,3})*)\]")
+# `144.4 MBit/s MCS 15 short GI`, `866.7 MBit/s VHT-MCS 9 80MHz short GI VHT-NSS 2`, `HE-MCS 11 HE-NSS 2`, EHT likewise
+_MCS = re.compile(r"((?:VHT-|HE-|EHT-)?MCS \d{1,2})\b(?:.*?\b(?:VHT|HE|EHT)-NSS (\d{1,2}))?")
 _ESCAPED = re.compile(rb"\\x([0-9a-fA-F]{2})")
 
 
@@ -19,10 +25,17 @@ def parse_iw_dev(text: str) -> tuple[WirelessLink, ...] | None:
     """`iw dev`: every wireless interface. None for text that is not iw's."""
     if text.strip() and not re.search(r"^phy#\d+", text, re.MULTILINE):
         return None
-    return tuple(_interface(name, lines) for name, lines in _blocks(text, _INTERFACE))
+    phys: dict[str, str] = {}
+    phy = ""
+    for line in text.splitlines():
+        if found := _PHY.match(line):
+            phy = f"phy{found[1]}"
+        elif found := _INTERFACE.match(line):
+            phys[found[1]] = phy
+    return tuple(_interface(name, lines, phys.get(name, "")) for name, lines in _blocks(text, _INTERFACE))
 
 
-def _interface(name: str, lines: list[str]) -> WirelessLink:
+def _interface(name: str, lines: list[str], phy: str) -> WirelessLink:
     fields = {words[0]: words[1] for line in lines if len(words := line.strip().split(" ", 1)) == 2}
     channel = next((found for line in lines if (found := _CHANNEL.search(line))), None)
     power = re.match(r"-?\d{1,3}(?:\.\d+)?", fields.get("txpower", ""))
@@ -35,6 +48,7 @@ def _interface(name: str, lines: list[str]) -> WirelessLink:
         frequency_mhz=int(channel[2]) if channel else None,
         width=(channel[3] or "").strip() if channel else "",
         tx_power_dbm=float(power[0]) if power else None,
+        phy=phy,
     )
 
 
@@ -78,7 +92,43 @@ def _station(heading: str, lines: list[str]) -> Station:
         rx_mbit_s=_number(fields.get("rx bitrate")),
         expected_mbit_s=_number(fields.get("expected throughput")),
         connected_s=_integer(fields.get("connected time")),
+        signal_avg_dbm=_integer(fields.get("signal avg")),
+        chain_signals_dbm=_chains(fields.get("signal", "")),
+        rx_packets=_integer(fields.get("rx packets")),
+        tx_mcs=_mcs(fields.get("tx bitrate", "")),
+        rx_mcs=_mcs(fields.get("rx bitrate", "")),
     )
+
+
+def _chains(text: str) -> tuple[int, ...]:
+    found = _CHAINS.search(text)
+    return tuple(int(value) for value in found[1].split(", ")) if found else ()
+
+
+def _mcs(text: str) -> str:
+    found = _MCS.search(text)
+    if found is None:
+        return ""
+    return f"{found[1]} NSS {found[2]}" if found[2] else found[1]
+
+
+def parse_survey(text: str) -> ChannelSurvey | None:
+    """`iw dev IF survey dump`: the channel in use. None if none is (radio down), or for text that is not iw's."""
+    for name, lines in _blocks(text, _SURVEY):
+        fields = {words[0].strip(): words[1] for line in lines if len(words := line.split(":", 1)) == 2}
+        frequency = fields.get("frequency", "")
+        if "[in use]" not in frequency or (mhz := _integer(frequency)) is None:
+            continue
+        return ChannelSurvey(
+            ifname=name,
+            frequency_mhz=mhz,
+            noise_dbm=_integer(fields.get("noise")),
+            active_ms=_integer(fields.get("channel active time")),
+            busy_ms=_integer(fields.get("channel busy time")),
+            receive_ms=_integer(fields.get("channel receive time")),
+            transmit_ms=_integer(fields.get("channel transmit time")),
+        )
+    return None
 
 
 def unescape_ssid(text: str) -> str:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from types import MappingProxyType
 
-from meshctl.device.observation import Bridge, Load, Memory, ReleaseInfo, Space
+from meshctl.device.observation import Bridge, Load, Memory, ReleaseInfo, Sensors, Space
 
 _ASSIGNMENT = re.compile(r"""^DISTRIB_([A-Z]+)=(['"]?)(.*)\2\s*$""", re.MULTILINE)
 _MEMINFO = re.compile(r"^(\w+):\s+(\d{1,15}) kB$", re.MULTILINE)
 _MAC = re.compile(r"[0-9a-fA-F]{2}(?::[0-9a-fA-F]{2}){5}")
 _BOOT_ID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+_BACKLOG = re.compile(r"/sys/kernel/debug/ieee80211/(phy\d{1,3})/aqm:R fq_backlog (\d{1,9})")
+_TEMPERATURE = re.compile(r"/sys/class/(?:ieee80211|thermal)/(phy\d{1,3}|thermal_zone\d{1,3})/\S+?:(-?\d{1,7})")
 _NUMBER = re.compile(r"\d{1,12}(?:\.\d{1,9})?")
 
 
@@ -56,6 +59,19 @@ def parse_load(text: str) -> Load | None:
     return Load(minute, max(1, int(lines[1])))
 
 
+def parse_sensors(text: str) -> Sensors:
+    """`PATH:LINE` of debugfs' aqm (`R fq_backlog 12`) and of temperature files; other lines are left out."""
+    queued: dict[str, int] = {}
+    temperatures: dict[str, float] = {}
+    for line in text.splitlines():
+        if found := _BACKLOG.fullmatch(line):
+            queued[found[1]] = int(found[2])
+        elif found := _TEMPERATURE.fullmatch(line):
+            # a radio has one sensor, which it may show in two places
+            temperatures[found[1]] = int(found[2]) / 1000
+    return Sensors(MappingProxyType(queued), MappingProxyType(temperatures))
+
+
 def parse_meminfo(text: str) -> Memory | None:
     """/proc/meminfo, in bytes; a kernel without MemAvailable counts free, buffers and cache."""
     kib = {match[1]: int(match[2]) for match in _MEMINFO.finditer(text)}
@@ -83,6 +99,13 @@ def parse_root(text: str) -> bool:
     """The lines of /proc/mounts about /: whether it is the memory that stands in for flash at a first boot (fstools,
     overlay.c)."""
     return any(line.startswith("overlayfs:/tmp/root / ") for line in text.splitlines())
+
+
+def parse_read_only_root(text: str) -> bool:
+    """The lines of /proc/mounts about /: whether nothing can be written below it, as in failsafe mode (the ROM image
+    alone) or after errors of the flash. The last mount is the one in use."""
+    rows = [line.split() for line in text.splitlines() if line.split()[1:2] == ["/"]]
+    return bool(rows) and len(rows[-1]) > 3 and "ro" in rows[-1][3].split(",")
 
 
 def parse_macs(text: str) -> dict[str, str] | None:

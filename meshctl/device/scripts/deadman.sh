@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=6
+VERSION=7
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -17,9 +17,12 @@ SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2'
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
 EXPIRE_GRACE_CS=1500       # an armed change that was not started ends so long after its owner's lock has
 START_LIMIT_CS=1500        # a loaded radio starts a process within 15 s, or something is wrong with it
+NEWLINE='
+'
 PROOF_S=3                  # what remains of the window when a reload stops waiting
 RELOAD_TURN_CS=1000        # a restore waits so long for a reload under way, then stops it
 EXTRA_LIMIT_CS=36000       # what else a change does (packages, into a slow jffs2) takes a minute or two
+RESTORED_WAIT_CS=2000      # a new change waits so long for the reload of a rollback, then it is refused
 RELOAD_LIMIT_CS=30000      # a reload of the restored state that takes over 300 s is stuck; then reboot
 
 # by its path: a busybox that prefers its own applets would leave no way to stand in for it
@@ -83,14 +86,16 @@ write_lock() { # OWNER TTL_CS
 	}
 	ln "$RUN/new.$$" "$RUN/lock.$next" 2>/dev/null
 	made=$?
-	rm -f "$RUN/new.$$"
-	[ $made -eq 0 ] || refuse locked "another process was faster"
+	[ $made -eq 0 ] || { rm -f "$RUN/new.$$" && refuse locked "another process was faster"; }
 	read_lock
 	# a slow process may have read the directory before a winner tidied it, and so made a number that is too low
-	[ "$LOCK_N" = $next ] || { rm -f "$RUN/lock.$next" && refuse locked "another process was faster"; }
+	[ "$LOCK_N" = $next ] || { rm -f "$RUN/new.$$" "$RUN/lock.$next" && refuse locked "another process was faster"; }
+	old=$RUN/new.$$
 	for f in "$RUN"/lock.*; do
-		[ "${f##*.}" -ge $next ] || rm -f "$f"
+		[ "${f##*.}" -ge $next ] || old="$old $f"
 	done
+	# shellcheck disable=SC2086 # names without blanks
+	rm -f $old
 }
 
 need_lock() { # OWNER
@@ -138,6 +143,7 @@ is_armed() { [ -f "$CHANGE/armed.$ID" ]; }
 
 alive() { # PIDFILE: a process of ours still runs under that number
 	read -r pid 2>/dev/null <"$1" || return 1
+	# not by `read`, which reads byte by byte: halves of two command lines while the process is being started
 	case $(cat "/proc/$pid/cmdline" 2>/dev/null) in
 	*meshctl-deadman*) ;;
 	# a process that is being started has no command line yet; a zombie has none any more
@@ -191,26 +197,26 @@ no_foreign_changes() {
 # kib_free DIRECTORY: FREE, of the last line of df, because a long device name breaks its row in two
 kib_free() {
 	FREE=''
-	df -k "$1" 2>/dev/null >"$RUN/df.$$"
 	while read -r a b c d e f; do
 		if [ -n "$f" ]; then FREE=$d; elif [ -n "$e" ]; then FREE=$c; fi
-	done <"$RUN/df.$$"
-	rm -f "$RUN/df.$$"
+	done <<-END
+		$(df -k "$1" 2>/dev/null)
+	END
 }
 
 check_space() { # BUNDLE: its manifest, and that there is room for it and for what it will replace
 	kib_free "${CHANGE%/*}"
 	need=$((SPARE_KIB + $(gzip -dc "$1" | wc -c) / 1024 + 1))
-	tar -xzOf "$1" manifest 2>/dev/null >"$RUN/manifest.$$"
 	old=''
 	while read -r _ _ _ _ path; do
-		check_path "$path" || { rm -f "$RUN/manifest.$$" && refuse bad-path "$BAD_PATH"; }
+		[ -z "$path" ] || check_path "$path" || refuse bad-path "$BAD_PATH"
 		[ ! -f "$path" ] || old="$old $path"
-	done <"$RUN/manifest.$$"
-	rm -f "$RUN/manifest.$$"
+	done <<-END
+		$(tar -xzOf "$1" manifest 2>/dev/null)
+	END
 	# shellcheck disable=SC2086 # paths have no blanks, see check_path
-	[ -z "$old" ] || while read -r size _; do need=$((need + size / 1024 + 1)); done <<-END
-		$(wc -c $old | sed '/ total$/d')
+	[ -z "$old" ] || while read -r size of; do [ "$of" = total ] || need=$((need + size / 1024 + 1)); done <<-END
+		$(wc -c $old)
 	END
 	case $FREE in '' | *[!0-9]*) return 0 ;; esac
 	[ "$FREE" -ge "$need" ] || refuse flash-full "needs $need KiB of flash, $FREE KiB are free"
@@ -226,23 +232,23 @@ check_path() { # PATH: 1, and why in BAD_PATH, where it cannot be covered
 	esac
 }
 
-# sums_hold: what is in RUN/sums.PID has these sums; one process for all files
+# sums_hold SUMS: lines of `SHA256  PATH`, all of which are right; one process for all files
 sums_hold() {
-	[ ! -s "$RUN/sums.$$" ] || sha256sum -c "$RUN/sums.$$" >/dev/null 2>&1
-	held=$?
-	rm -f "$RUN/sums.$$"
-	return $held
+	[ -z "$1" ] || sha256sum -c >/dev/null 2>&1 <<-END
+		$1
+	END
 }
 
 was_as_expected() { # DIRECTORY: every live file is what the plan saw; if not, MOVED_ON is one that differs
+	sums=''
 	while read -r _ _ _ expected MOVED_ON; do
 		case $expected in
 		-) ;;
 		absent) ! exists "$MOVED_ON" || return 1 ;;
-		*) [ -f "$MOVED_ON" ] && echo "$expected  $MOVED_ON" >&3 || return 1 ;;
+		*) [ -f "$MOVED_ON" ] && sums="$sums${sums:+$NEWLINE}$expected  $MOVED_ON" || return 1 ;;
 		esac
-	done 3>"$RUN/sums.$$" <"$1/manifest"
-	sums_hold && return 0
+	done <"$1/manifest"
+	sums_hold "$sums" && return 0
 	while read -r _ _ _ expected MOVED_ON; do
 		case $expected in
 		- | absent) ;;
@@ -251,45 +257,58 @@ was_as_expected() { # DIRECTORY: every live file is what the plan saw; if not, M
 	done <"$1/manifest"
 }
 
-keep_previous() { # DIRECTORY PATH
-	if exists "$2"; then
-		[ -d "$1/prev${2%/*}" ] || mkdir -p "$1/prev${2%/*}" || return 1
-		cp -a "$2" "$1/prev$2" && echo "had $2"
-		return
-	fi
-	echo "not $2"
-	dir=${2%/*}
-	while [ -n "$dir" ] && [ ! -d "$dir" ]; do
-		echo "dir $dir"
-		dir=${dir%/*}
-	done
+# copy_kept DIRECTORY: copies the files FROM of the directory AT to prev/
+copy_kept() {
+	[ -n "$FROM" ] || return 0
+	[ -d "$1/prev$AT" ] || mkdir -p "$1/prev$AT" || return 1
+	# shellcheck disable=SC2086 # paths have no blanks, see check_path
+	cp -a $FROM "$1/prev$AT/"
+}
+
+# keep_previous DIRECTORY: copies what the manifest names to prev/, with one process for each directory; what to do with
+# each file goes to `previous`, the sums of the copies, by the live paths, to `kept`
+keep_previous() {
+	FROM='' AT='' files=''
+	while read -r _ _ _ _ path; do
+		dir=${path%/*}
+		if exists "$path"; then
+			[ "$dir" = "$AT" ] || { copy_kept "$1" && AT=$dir FROM=''; } || return 1
+			FROM="$FROM $path"
+			[ -L "$path" ] || files="$files .$path"
+			echo "had $path" || return 1
+			continue
+		fi
+		echo "not $path" || return 1
+		while [ -n "$dir" ] && [ ! -d "$dir" ]; do
+			echo "dir $dir" || return 1
+			dir=${dir%/*}
+		done
+	done <"$1/manifest" >"$1/previous" || return 1
+	copy_kept "$1" && : >"$1/kept" || return 1
+	# shellcheck disable=SC2086
+	[ -z "$files" ] || (cd "$1/prev" && sha256sum $files) >"$1/kept"
 }
 
 check_new() { # DIRECTORY: every new file is there, whole
+	sums=''
 	while read -r kind _ is _ path; do
 		case $kind in
-		file) echo "$is  $1/new$path" >&3 ;;
+		file) sums="$sums${sums:+$NEWLINE}$is  $1/new$path" ;;
 		link) [ "$(readlink "$1/new$path")" = "$is" ] ;;
 		esac || return 1
-	done 3>"$RUN/sums.$$" <"$1/manifest"
-	sums_hold
-}
-
-same() { # PATH PATH: both the same file's content, or the same link
-	if [ -L "$1" ] || [ -L "$2" ]; then
-		[ "$(readlink "$1")" = "$(readlink "$2")" ]
-	else
-		cmp -s "$1" "$2"
-	fi
+	done <"$1/manifest"
+	sums_hold "$sums"
 }
 
 unchanged_since_kept() { # DIRECTORY: what is live is what was kept
 	while read -r kind path; do
 		case $kind in
-		had) same "$path" "$1/prev$path" ;;
+		had) [ ! -L "$path" ] && [ ! -L "$1/prev$path" ] || [ "$(readlink "$path")" = "$(readlink "$1/prev$path")" ] ;;
 		not) ! exists "$path" ;;
 		esac || return 1
 	done <"$1/previous"
+	[ -f "$1/kept" ] || return 1
+	[ ! -s "$1/kept" ] || (cd / && sha256sum -c) <"$1/kept" >/dev/null 2>&1
 }
 
 drop() { # DIRECTORY CODE TEXT
@@ -298,9 +317,16 @@ drop() { # DIRECTORY CODE TEXT
 }
 
 # At the first boot / is RAM until jffs2 is ready, and what is copied into it then may lack what was written meanwhile
-# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all.
+# (fstools, overlay.c and mount.c name that mount so). An initramfs image has no flash below / at all: procd says so in
+# `rootfs_type` (22.03 on) or as `"initramfs": true` (21.02); up to 19.07 / is the kernel's rootfs. The last mount on /
+# is the one in use.
 in_flash() {
-	! grep -q '^overlayfs:/tmp/root / ' /proc/mounts && ! ubus call system board 2>/dev/null | grep -q '"rootfs_type": "initramfs"'
+	root=
+	while read -r device at _; do
+		[ "$at" != / ] || root=$device
+	done </proc/mounts
+	case $root in overlayfs:/tmp/root | rootfs) return 1 ;; esac
+	case $(ubus call system board 2>/dev/null) in *'"initramfs"'*) return 1 ;; esac
 }
 
 # An armed change that was not started has changed nothing. It ends once its owner has lost the lock.
@@ -317,23 +343,23 @@ stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_sta
 	tidy
 	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac
-	{ [ -f "$3" ] && gzip -t "$3" 2>/dev/null; } || refuse bad-bundle "$3 is missing or damaged"
+	await_restored
+	# `change` has just compared its sum
+	{ [ -f "$3" ] && { [ -n "$part" ] || gzip -t "$3" 2>/dev/null; }; } || refuse bad-bundle "$3 is missing or damaged"
 	no_foreign_changes
 	[ ! -e "$CHANGE" ] || rm -rf "$CHANGE"
 	check_space "$3"
 	w=$CHANGE.$$
 	mkdir -p "$w/new" "$w/prev" || drop "$w" flash-full "cannot make $w"
 	tar -xzf "$3" -C "$w" 2>/dev/null || drop "$w" flash-full "the bundle did not unpack"
-	: >"$w/previous"
 	{ [ -f "$w/manifest" ] && [ -f "$w/reload" ]; } || drop "$w" bad-bundle "no manifest or reload in it"
 	check_new "$w" || drop "$w" flash-full "what was unpacked is not what was sent"
 	was_as_expected "$w" || drop "$w" moved-on "$MOVED_ON is not what the plan saw"
-	while read -r kind mode _ _ path; do
+	while read -r kind _ _ _ path; do
 		# a link that led to a directory would let a later mv put its file in there
 		case $kind$path in link/etc/rc.d/* | file/* | remove/* | cover/*) ;; *) drop "$w" bad-path "$kind $path" ;; esac
-		[ "$kind" != file ] || chmod "$mode" "$w/new$path" || drop "$w" bad-bundle "mode $mode of $path"
-		keep_previous "$w" "$path" >>"$w/previous" || drop "$w" flash-full "could not keep $path"
 	done <"$w/manifest"
+	keep_previous "$w" || drop "$w" flash-full "could not keep the previous files"
 	extra keep "$w" || drop "$w" flash-full "could not read the new packages, or not keep those that they replace"
 	unchanged_since_kept "$w" || drop "$w" flash-full "what was kept is not what is there"
 	for conf in "$w"/new/etc/config/*; do
@@ -421,11 +447,12 @@ change() { # OWNER TTL_S ID NONCE_SHA256 WINDOW_S LIMIT_S BUNDLE_SHA256: the bun
 	[ "$(hash_of "$bundle")" = "$7" ] || refuse bad-bundle "the bundle was damaged on the way"
 	stage "$1" "$3" "$bundle" "$4" "$5"
 	rm -f "$bundle"
+	trap - EXIT
 	arm "$1" "$3" "$4" "$5"
 	apply "$1" "$3" now
 	now
 	limit=$((NOW + $6 * 100))
-	until { [ -e "$TIMER/applied" ] && [ -e "$RUN/reloaded" ]; } || ! is_armed || { now && [ $NOW -ge $limit ]; }; do sleep 1; done
+	until { [ -e "$TIMER/applied" ] && [ -e "$RUN/reloaded" ]; } || ! is_armed || { now && [ $NOW -ge $limit ]; }; do pause 1; done
 	reloaded=''
 	[ ! -e "$TIMER/applied" ] || read -r reloaded 2>/dev/null <"$RUN/reloaded"
 	part=''
@@ -440,18 +467,37 @@ nap() {
 
 doze() { sleep 0.2 2>/dev/null || sleep 1; }
 
+# pause SECONDS: a sleep without a process of its own, which a slow processor would have to start every second: nothing is
+# ever written into the FIFO
+pause() {
+	[ -p "$RUN/pause" ] || mkfifo "$RUN/pause" 2>/dev/null
+	if [ -p "$RUN/pause" ]; then read -r -t "$1" _ <>"$RUN/pause" || :; else sleep "$1"; fi
+}
+
 # extra VERB DIRECTORY: what else a change does and undoes besides files; says nothing, since sessions read our answers
 extra() { [ ! -f "$2/extra" ] || sh "$2/extra" "$1" "$2" >"$RUN/extra.log" 2>&1; }
 
+# move_new: moves the files FROM into the directory AT
+move_new() {
+	[ -n "$FROM" ] || return 0
+	[ -d "$AT" ] || mkdir -p "$AT" || return 1
+	# shellcheck disable=SC2086 # paths have no blanks, see check_path
+	mv -f $FROM "$AT/"
+}
+
 put_new() {
 	extra do "$CHANGE" || return 1
+	FROM='' AT=''
 	while read -r kind _ _ _ path; do
 		case $kind in
-		file | link) { [ -d "${path%/*}" ] || mkdir -p "${path%/*}"; } && mv -f "$CHANGE/new$path" "$path" ;;
+		file | link)
+			[ "${path%/*}" = "$AT" ] || { move_new && AT=${path%/*} FROM=''; } || return 1
+			FROM="$FROM $CHANGE/new$path"
+			;;
 		remove) rm -f "$path" ;;
 		esac || return 1
 	done <"$CHANGE/manifest"
-	sync
+	move_new && sync
 }
 
 # moved back, not copied: atomic for each file, and a full flash cannot stop it; what frees flash comes first
@@ -482,15 +528,16 @@ wait_until() {
 		is_armed || return 1
 		[ ! -e "$TIMER/abort" ] || return 0
 		left=$(($1 - NOW))
-		if [ $left -gt 150 ]; then sleep 1; elif [ $left -gt 50 ]; then nap $((left - 40)); else nap $left; fi
+		if [ $left -gt 150 ]; then pause 1; elif [ $left -gt 50 ]; then nap $((left - 40)); else nap $left; fi
 	done
 	is_armed
 }
 
-reload() { # SCRIPT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
+# Held in the shell: the change may be forgotten before it runs, and of a copy in a full /tmp only a part might, or nothing.
+reload() { # SCRIPT_TEXT [UPTIME_S]: in the background, so that no hanging reload holds up the timer; its waits end then
 	rm -f "$RUN/reloaded"
 	(
-		UNTIL_S=$2 sh "$1" >"$RUN/reload.log" 2>&1 &
+		UNTIL_S=$2 sh -c "${1:-exit 1}" >"$RUN/reload.log" 2>&1 &
 		echo $! >"$RUN/reload.pid"
 		wait $!
 		echo $? >"$RUN/reloaded"
@@ -510,22 +557,35 @@ end_reload() {
 	kill "$reload_pid" "$script_pid" 2>/dev/null
 }
 
+# A restore ends the change before its reload has ended: another change would share the status of that reload.
+is_reloading() { read -r restoring_pid 2>/dev/null <"$RUN/restoring" && kill -0 "$restoring_pid" 2>/dev/null; }
+
+await_restored() {
+	now
+	limit=$((NOW + RESTORED_WAIT_CS))
+	while is_reloading; do
+		now && [ $NOW -lt $limit ] || refuse busy "services are still reloading after a rollback; try again in a minute"
+		doze
+	done
+}
+
 # restore REASON: the marker's rename decides who does it; nothing happens when the change was confirmed meanwhile
 restore() {
 	mv "$CHANGE/armed.$ID" "$CHANGE/restoring.$ID" 2>/dev/null || [ -f "$CHANGE/restoring.$ID" ] || return 0
 	sync
-	cp "$CHANGE/reload" "$RUN/restored"
-	reload_it=no stays=''
+	reload_script=$(cat "$CHANGE/reload") reload_it=no stays=''
 	[ ! -e "$TIMER/applied" ] || reload_it=yes
 	put_previous || return 0 # the marker stays: abort, the second timer and the next boot try again
+	[ $reload_it = no ] || echo $$ 2>/dev/null >"$RUN/restoring"
 	finish restored "$1$stays"
 	[ $reload_it = yes ] || return 0
 	end_reload
-	reload "$RUN/restored"
+	reload "$reload_script"
 	now
 	limit=$((NOW + RELOAD_LIMIT_CS))
 	until [ -e "$RUN/reloaded" ] || { now && [ $NOW -ge $limit ]; }; do doze; done
 	read -r status 2>/dev/null <"$RUN/reloaded"
+	rm -f "$RUN/restoring"
 	# the boot path is the one that is known to bring the restored state up
 	[ "$status" = 0 ] || /sbin/reboot
 }
@@ -550,10 +610,9 @@ watch() { # ID DUE_CS: detached
 		applied_at_now
 		restore failed
 	else
-		cp "$CHANGE/reload" "$RUN/reload"
 		# a reload that is not done by then would run at once with the one of the restore
 		now
-		reload "$RUN/reload" $((NOW / 100 + WINDOW - PROOF_S))
+		reload "$(cat "$CHANGE/reload")" $((NOW / 100 + WINDOW - PROOF_S))
 		applied_at_now
 		wait_until $((NOW + WINDOW * 100)) || exit 0
 		reason=timeout
@@ -569,9 +628,9 @@ guard() { # ID DUE_CS: detached; ends the change if `watch` was killed
 	limit=$(($2 + WINDOW * 100 + GUARD_GRACE_CS))
 	[ ! -f "$CHANGE/extra" ] || limit=$((limit + EXTRA_LIMIT_CS))
 	while now && [ $NOW -lt $limit ] && is_armed; do
-		if [ $((limit - NOW)) -gt 500 ]; then sleep 4; else sleep 1; fi
+		if [ $((limit - NOW)) -gt 500 ]; then pause 4; else pause 1; fi
 	done
-	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do sleep 1; done
+	while [ -f "$CHANGE/restoring.$ID" ] && alive "$TIMER/watch.pid"; do pause 1; done
 	{ is_armed || [ -f "$CHANGE/restoring.$ID" ]; } || exit 0
 	applied_at_now
 	restore guard
@@ -584,7 +643,7 @@ expire() { # ID DUE_CS: detached; ends a change that its owner armed and never s
 		is_armed || exit 0
 		now
 		[ $NOW -lt "$2" ] || break
-		if [ $(($2 - NOW)) -gt 500 ]; then sleep 3; else sleep 1; fi
+		if [ $(($2 - NOW)) -gt 500 ]; then pause 3; else pause 1; fi
 	done
 	read_lock
 	# started, or its owner has renewed the lock and decides

@@ -6,12 +6,20 @@ section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
 	shift
 	"$@" 2>/dev/null
-	printf '\n%s end %s\n' "$N" $?
+	STATUS=$?
+	printf '\n%s end %s\n' "$N" $STATUS
+}
+
+# first_line FILE: without a process, for the short files of the kernel
+first_line() {
+	line=''
+	read -r line <"$1" || [ -n "$line" ] || return
+	echo "$line"
 }
 
 macs() {
 	for d in /sys/class/net/*; do
-		[ ! -f "$d/address" ] || echo "${d##*/} $(cat "$d/address") $(cat "$d/ifindex")"
+		[ ! -f "$d/address" ] || { read -r mac <"$d/address" && read -r index <"$d/ifindex" && echo "${d##*/} $mac $index"; }
 	done
 }
 
@@ -25,7 +33,12 @@ bridges() {
 	done
 }
 
-load() { cat /proc/loadavg && grep -c ^processor /proc/cpuinfo; }
+load() {
+	first_line /proc/loadavg || return
+	count=0
+	for cpu in /sys/devices/system/cpu/cpu[0-9]*; do [ ! -e "$cpu" ] || count=$((count + 1)); done
+	echo $count
+}
 
 # opkg and apk are slow on a small processor, so read their databases
 packages() {
@@ -49,7 +62,23 @@ supplicants() {
 	for socket in /var/run/wpa_supplicant/*; do [ ! -e "$socket" ] || echo "${socket##*/}"; done
 }
 
+listed_radios() {
+	[ -z "$radios" ] || echo "$radios"
+	return $known
+}
+
 package_tool() { command -v apk || command -v opkg; }
+
+# the channel in use alone: some drivers list every channel of the band
+survey() { # INTERFACE
+	iw dev "$1" survey dump | awk '/^Survey/ { head = $0 } /frequency:/ { used = /\[in use\]/; if (used) print head } used && !/^Survey/'
+}
+
+# packets queued per radio (debugfs), temperatures in thousandths of a degree; a file that is missing is left out
+sensors() {
+	grep -sHE '^-?[0-9]+$|fq_backlog' /sys/kernel/debug/ieee80211/phy*/aqm /sys/class/thermal/thermal_zone*/temp \
+		/sys/class/ieee80211/phy*/hwmon*/temp1_input /sys/class/ieee80211/phy*/device/hwmon/hwmon*/temp1_input
+}
 
 authorized_keys() { [ ! -f /etc/dropbear/authorized_keys ] || cat /etc/dropbear/authorized_keys; }
 
@@ -61,19 +90,23 @@ mesh() { # INTERFACE
 	section "batctl.hardifs_json $1" batctl meshif "$1" hardifs_json
 	section "batctl.neighbors_json $1" batctl meshif "$1" neighbors_json
 	section "batctl.originators_json $1" batctl meshif "$1" originators_json
-	batctl meshif "$1" originators_json >/dev/null 2>&1 && return
+	if [ $STATUS -eq 0 ]; then
+		section "batctl.statistics $1" batctl meshif "$1" statistics
+		return
+	fi
+	section "batctl.statistics $1" batctl -m "$1" statistics
 	section "batctl.interface $1" batctl -m "$1" if
 	section "batctl.neighbors $1" batctl -m "$1" n
 	section "batctl.originators $1" batctl -m "$1" o
 }
 
-section uptime cat /proc/uptime
+section uptime first_line /proc/uptime
 section clock date +%s
-section boot_id cat /proc/sys/kernel/random/boot_id
+section boot_id first_line /proc/sys/kernel/random/boot_id
 section ubus.board ubus call system board
 section openwrt_release cat /etc/openwrt_release
-section board_name cat /tmp/sysinfo/board_name
-section model cat /tmp/sysinfo/model
+section board_name first_line /tmp/sysinfo/board_name
+section model first_line /tmp/sysinfo/model
 section board.json cat /etc/board.json
 section load load
 section meminfo cat /proc/meminfo
@@ -82,14 +115,22 @@ section root grep ' / ' /proc/mounts
 section macs macs
 section ubus.wireless ubus call network.wireless status
 section ubus.interfaces ubus call network.interface dump
-section iw.dev iw dev
-for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { print $2 }'); do
-	section "iw.link $dev" iw dev "$dev" link
-	section "iw.stations $dev" iw dev "$dev" station dump
-done
+# all interfaces are listed before the first is asked: the list is in memory
+radios=$(iw dev 2>/dev/null)
+known=$?
+section iw.dev listed_radios
+while read -r word dev _; do
+	[ "$word" = Interface ] || continue
+	section "iw.link $dev" iw dev "$dev" link </dev/null
+	section "iw.stations $dev" iw dev "$dev" station dump </dev/null
+	section "iw.survey $dev" survey "$dev" </dev/null
+done <<-END
+	$radios
+END
 for dev in /sys/class/net/bat*; do
 	[ ! -e "$dev" ] || mesh "${dev##*/}"
 done
+section sensors sensors
 section supplicants supplicants
 section batctl.version batctl -v
 section bridges bridges

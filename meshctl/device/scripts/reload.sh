@@ -18,6 +18,8 @@ NETIFD_LIMIT_S=20    # a radio with SAE or DFS, or a WAN without a server, takes
 RADIO_LIMIT_S=8      # netifd may not have started, or the radio is between down and up
 DROPBEAR_LIMIT_S=15  # procd waits 5 s for the old process before it kills it
 STATUS=0
+NEWLINE='
+'
 
 changed() { # PACKAGE...: whether one of them is in PACKAGES
 	for package; do
@@ -34,6 +36,12 @@ fail() {
 # is_late: whether the uptime UNTIL_S has come, shortly before the change is rolled back; a rollback's own reload has none
 is_late() { [ -n "$UNTIL_S" ] && read -r uptime _ </proc/uptime && [ "${uptime%.*}" -ge "$UNTIL_S" ]; }
 
+# pause SECONDS: a sleep without a process of its own; nothing is ever written into the FIFO
+pause() {
+	[ -p /tmp/meshctl/pause ] || mkfifo /tmp/meshctl/pause 2>/dev/null
+	if [ -p /tmp/meshctl/pause ]; then read -r -t "$1" _ <>/tmp/meshctl/pause || :; else sleep "$1"; fi
+}
+
 # until_s SECONDS COMMAND...: runs COMMAND once a second until it succeeds; 1 on timeout, or when it is late
 until_s() {
 	seconds=$1
@@ -41,7 +49,7 @@ until_s() {
 	until "$@"; do
 		[ "$seconds" -gt 0 ] && ! is_late || return 1
 		seconds=$((seconds - 1))
-		sleep 1
+		pause 1
 	done
 }
 
@@ -51,7 +59,7 @@ barrier() {
 	rm -f "$PASSED"
 	if ! ubus call service set "{\"name\":\"$BARRIER\",\"triggers\":[[\"config.change\",[\"if\",[\"eq\",\"package\",\"$BARRIER\"],[\"run_script\",\"touch\",\"$PASSED\"]],1000]]}" ||
 		! ubus call service event "{\"type\":\"config.change\",\"data\":{\"package\":\"$BARRIER\"}}"; then
-		sleep $BLIND_S
+		pause $BLIND_S
 		return 0
 	fi
 	until_s $BARRIER_LIMIT_S [ -e "$PASSED" ]
@@ -79,7 +87,8 @@ take_up() {
 }
 
 netifd_is_idle() {
-	! { ubus call network.wireless status && ubus call network.interface dump; } 2>/dev/null | grep -q '"pending": true'
+	case $(ubus call network.wireless status 2>/dev/null) in *'"pending": true'*) return 1 ;; esac
+	case $(ubus call network.interface dump 2>/dev/null) in *'"pending": true'*) return 1 ;; esac
 }
 
 # radio_interfaces: prints `+NAME` for each enabled radio interface and `-NAME` for each disabled one; sections without
@@ -102,7 +111,7 @@ radio_interfaces() {
 # no_radio_is_lost: no enabled interface has disappeared since the reload started, and no disabled one exists. One that
 # was missing before does not count: a USB radio that is not plugged in, or a slow first setup.
 no_radio_is_lost() {
-	for interface in $(radio_interfaces); do
+	for interface in $configured_interfaces; do
 		name=${interface#?}
 		case $interface in
 		+*) case $before_interfaces in *" $name "*) [ -e "/sys/class/net/$name" ] || return 1 ;; esac ;;
@@ -116,6 +125,7 @@ no_radio_is_lost() {
 # the radios down first clears that state.
 settle_radios() {
 	until_s $NETIFD_LIMIT_S netifd_is_idle
+	configured_interfaces=$(radio_interfaces)
 	until_s $RADIO_LIMIT_S no_radio_is_lost && return
 	[ -x /sbin/wifi ] || return 0
 	/sbin/wifi down
@@ -126,7 +136,7 @@ settle_radios() {
 is_firewall_running() { [ -e /var/run/fw4.state ] || [ -e /var/run/fw3.state ]; }
 
 # Every ruleset that nft accepts has new rules with new handles.
-rules_of_fw4() { nft -a list chain inet fw4 input 2>/dev/null | md5sum; }
+rules_of_fw4() { nft -a list chain inet fw4 input 2>/dev/null; }
 
 # load_firewall: loads the ruleset and verifies it. fw4 exits with 0 and writes its state file even if nft rejected the
 # ruleset (firewall4: root/sbin/fw4), so the loaded rules are compared; fw3 reports by its exit status. Without its state
@@ -147,16 +157,29 @@ load_firewall() {
 
 dropbear_service() { ubus call service list '{"name":"dropbear"}' 2>/dev/null; }
 
-without_pids() { echo "$1" | sed '/"pid":/d'; }
-
-pids_in() { echo "$1" | sed -n 's/.*"pid": *\([0-9]*\).*/\1/p'; }
+# split_service JSON: WITHOUT_PIDS are its lines but those with a pid, PIDS these
+split_service() {
+	WITHOUT_PIDS='' PIDS=''
+	while read -r line; do
+		case $line in
+		*'"pid":'*)
+			line=${line##*'"pid":'}
+			line=${line# }
+			PIDS="$PIDS ${line%%[!0-9]*}"
+			;;
+		*) WITHOUT_PIDS=$WITHOUT_PIDS$NEWLINE$line ;;
+		esac
+	done <<-END
+		$1
+	END
+}
 
 # dropbear_is_new: no old process runs with old options. procd lists the new command at once and starts it when the old
 # process has ended.
 dropbear_is_new() {
-	now_dropbear=$(dropbear_service)
-	[ "$(without_pids "$now_dropbear")" != "$(without_pids "$before_dropbear")" ] || return 0
-	for pid in $(pids_in "$before_dropbear"); do
+	split_service "$(dropbear_service)"
+	[ "$WITHOUT_PIDS" != "$before_options" ] || return 0
+	for pid in $before_pids; do
 		! kill -0 "$pid" 2>/dev/null || return 1
 	done
 }
@@ -172,7 +195,8 @@ resolve_without_dnsmasq() {
 }
 
 mkdir -p /tmp/meshctl
-before_dropbear=$(dropbear_service)
+split_service "$(dropbear_service)"
+before_options=$WITHOUT_PIDS before_pids=$PIDS
 before_interfaces=" $(cd /sys/class/net && echo *) "
 [ -z "$PACKAGES" ] || take_up
 ! changed dhcp || resolve_without_dnsmasq

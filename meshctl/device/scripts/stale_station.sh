@@ -10,20 +10,32 @@ ECHOES=3       # each is sent up to seven times on the air: a link that loses al
 WATCH_PAUSE_S=2
 FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
 
-# station DEV MAC FIELD: the number that iw prints after FIELD (`inactive time`, ms; `connected time`, s)
-station() { iw dev "$1" station get "$2" 2>/dev/null | sed -n "s/.*$3:[^0-9]*\([0-9]*\).*/\1/p"; }
-
-is_heard() {
-	inactive=$(station "$1" "$2" 'inactive time')
-	[ "${inactive:-$HEARD_MS}" -lt $HEARD_MS ]
+# number_after WORDS TEXT: NUMBER, the one that follows WORDS and a colon; empty if there is none
+number_after() {
+	NUMBER=${2#*"$1":}
+	[ "$NUMBER" != "$2" ] || NUMBER=''
+	NUMBER=${NUMBER#"${NUMBER%%[0-9]*}"}
+	NUMBER=${NUMBER%%[!0-9]*}
 }
 
-is_old() { # DEV MAC SECONDS: the entry is at least that old
-	connected=$(station "$1" "$2" 'connected time')
-	[ "${connected:--1}" -ge "$3" ]
+# look DEV MAC: STATION, what iw prints of the entry
+look() { STATION=$(iw dev "$1" station get "$2" 2>/dev/null); }
+
+# is_heard, is_old SECONDS: of the latest look
+is_heard() {
+	number_after 'inactive time' "$STATION"
+	[ "${NUMBER:-$HEARD_MS}" -lt $HEARD_MS ]
+}
+
+is_old() {
+	number_after 'connected time' "$STATION"
+	[ "${NUMBER:--1}" -ge "$1" ]
 }
 
 mesh_of() { # DEV: the batman-adv interface that it is a hard interface of
+	# asked once: a watch would start a process for it every time
+	[ "$1" != "$mesh_dev" ] || [ ! -e "/sys/class/net/$mesh" ] || return 0
+	mesh_dev=$1
 	mesh=$(readlink "/sys/class/net/$1/master")
 	mesh=${mesh##*/}
 	[ -n "$mesh" ] || for mesh in /sys/class/net/bat*; do mesh=${mesh##*/} && break; done
@@ -54,13 +66,14 @@ remove() { # DEV MAC
 # removed), `answers`, or `unknown` MAC
 flush_stale() {
 	for dev in $1; do
-		is_old "$dev" "$2" "$3" && is_heard "$dev" "$2" || continue
+		look "$dev" "$2"
+		is_old "$3" && is_heard || continue
 		echo_state "$dev" "$2"
 		case $ECHO in
 		answered) echo "answers $2" ;;
 		unknown) echo "unknown $2" ;;
 		# check again that it has not just gone out of range
-		*) ! is_old "$dev" "$2" "$3" || ! is_heard "$dev" "$2" || remove "$dev" "$2" ;;
+		*) look "$dev" "$2" && is_old "$3" && is_heard && remove "$dev" "$2" ;;
 		esac
 	done
 }
@@ -68,8 +81,15 @@ flush_stale() {
 # flush_restarted DEVICES MAC SECONDS: removes an entry that is that old; for a radio that was observed to restart
 flush_restarted() {
 	for dev in $1; do
-		! is_old "$dev" "$2" "$3" || remove "$dev" "$2"
+		look "$dev" "$2"
+		! is_old "$3" || remove "$dev" "$2"
 	done
+}
+
+# pause SECONDS: a sleep without a process of its own; nothing is ever written into the FIFO
+pause() {
+	[ -p /tmp/meshctl/pause ] || mkfifo /tmp/meshctl/pause 2>/dev/null
+	if [ -p /tmp/meshctl/pause ]; then read -r -t "$1" _ <>/tmp/meshctl/pause || :; else sleep "$1"; fi
 }
 
 # watch_stale SECONDS DEV/MAC...: for SECONDS, removes entries that are older than the watch and become stale
@@ -78,10 +98,11 @@ watch_stale() {
 	began=${up%.*} until=$((${up%.*} + $1))
 	shift
 	left=$((FLUSHES * $#))
-	while sleep $WATCH_PAUSE_S && read -r up _ </proc/uptime && [ "${up%.*}" -lt $until ] && [ $left -gt 0 ]; do
+	while pause $WATCH_PAUSE_S && read -r up _ </proc/uptime && [ "${up%.*}" -lt $until ] && [ $left -gt 0 ]; do
 		for entry; do
 			watched=${entry%%/*} age=$((${up%.*} - began))
-			is_old "$watched" "${entry#*/}" $age && is_heard "$watched" "${entry#*/}" || continue
+			look "$watched" "${entry#*/}"
+			is_old $age && is_heard || continue
 			# one echo request suffices if the neighbor answers; otherwise flush_stale repeats it
 			echo_state "$watched" "${entry#*/}" 1
 			[ "$ECHO" = lost ] || continue

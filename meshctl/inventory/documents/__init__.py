@@ -4,7 +4,14 @@ The models hold one mapping as written; ranges, groups and references are resolv
 """
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.documents.node import GroupDocument, NodeDocument, NodeLayer, RadioLayer, SshLayer
+from meshctl.inventory.documents.node import (
+    GroupDocument,
+    NodeDocument,
+    NodeLayer,
+    PositionDocument,
+    RadioLayer,
+    SshLayer,
+)
 from meshctl.inventory.documents.radio import (
     BatmanDocument,
     FirmwareDocument,
@@ -44,6 +51,7 @@ __all__ = [
     "OperatorPartsDocument",
     "OperatorsDocument",
     "OtherComputerDocument",
+    "PositionDocument",
     "RadioHardwareDocument",
     "RadioLayer",
     "RobotDocument",

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from meshctl.inventory.addresses import AddressField
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document
-from meshctl.inventory.fields import Address, Mac, Name, ReleaseName, Text, Whole
+from meshctl.inventory.fields import Address, Mac, Name, Real, ReleaseName, Text, Whole
 from meshctl.model import NodeState, Role
 
 
@@ -34,6 +34,18 @@ class SshLayer(Document):
     """Private key files to try. Default: the SSH agent and the usual files."""
     jump: Text = ""
     """Node to use as a jump host."""
+
+
+class PositionDocument(Document):
+    """Where a device stands for the whole mission, in meters in the frame of the fleet's map."""
+
+    # beyond 1000 km it is another unit, or degrees of another map
+    x_m: Real = Field(ge=-1e6, le=1e6)
+    """x in meters."""
+    y_m: Real = Field(ge=-1e6, le=1e6)
+    """y in meters."""
+    z_m: Real = Field(default=NOT_WRITTEN, ge=-12_000, le=50_000)
+    """Height in meters. Default: unknown."""
 
 
 class NodeLayer(Document):
@@ -76,6 +88,8 @@ class NodeLayer(Document):
     """Additional UCI options by their full names: `wireless.radio0.rts: "500"`."""
     gateway: Address = NOT_WRITTEN
     """Default gateway."""
+    position: PositionDocument = NOT_WRITTEN
+    """Where it stands, if it does not move."""
 
 
 class NodeDocument(NodeLayer):

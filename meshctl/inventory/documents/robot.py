@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.documents.node import SshLayer
+from meshctl.inventory.documents.node import PositionDocument, SshLayer
 from meshctl.inventory.fields import Address, Flag, Interface, Name, Network, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
@@ -64,6 +64,8 @@ class RobotDocument(Document):
     lan: LanDocument = NOT_WRITTEN
     """Subnet of the robot's own LAN; its first radio in service routes it. Default: its radios bridge the mesh to its
     switch."""
+    position: PositionDocument = NOT_WRITTEN
+    """Where it stands, if it does not move, as a base station."""
 
 
 class OperatorsDocument(Document):

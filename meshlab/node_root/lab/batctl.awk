@@ -42,6 +42,12 @@ END {
 		header()
 		print "IF             Neighbor              last-seen"
 		for (i = 1; i <= n; i++) printf " %10s\t  %s %4d.%03ds\n", n_face[i], neighbour[i], n_age[i] / 1000, n_age[i] % 1000
+	} else if (verb == "statistics" || verb == "s") {
+		# one OGM a second of its own, and one of every originator
+		ogms = int(uptime)
+		printf "\ttx: %d\n\ttx_bytes: %d\n\ttx_dropped: 0\n\trx: %d\n\trx_bytes: %d\n", ogms * 2, ogms * 400, ogms * 2, ogms * 400
+		printf "\tforward: 0\n\tforward_bytes: 0\n\tmgmt_tx: %d\n\tmgmt_tx_bytes: %d\n", ogms * (o + 1), ogms * (o + 1) * 72
+		printf "\tmgmt_rx: %d\n\tmgmt_rx_bytes: %d\n", ogms * n * (o + 1), ogms * n * (o + 1) * 72
 	} else if (verb == "if" || verb == "interface") for (i = 1; i <= nfaces; i++) print faces[i] ": active"
 	else if (verb == "ra" || verb == "routing_algo") print algorithm
 	else if (verb == "it" || verb == "orig_interval") print configured("orig_interval", 1000)

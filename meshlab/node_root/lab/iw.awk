@@ -30,24 +30,55 @@ FILENAME ~ /iw$/ {
 	if (face[1] != device) next
 	found = 1
 	type = face[2]
+	joined = face[11]
+	frequency = face[5]
 	if (verb == "info") { printf "Interface %s\n", device; describe("\t", face) }
 	if (verb == "link") {
 		if (face[11] && face[2] == "adhoc") printf "Joined IBSS %s (on %s)\n\tSSID: %s\n\tfreq: %d\n", face[9], device, face[8], face[5]
 		else print "Not connected."
 	}
 }
+# thermal noise of 20 MHz and a noise figure of 6 dB: what ath9k reports in a quiet place
+function noise() { return -95 }
+# the highest rate of two streams in 20 MHz for this signal: about the SNR that MCS 0 to 7 need, and 3 dB for the second stream
+function mcs_of(signal,    snr, i, need) {
+	snr = signal - noise()
+	split("5 8 11 14 18 22 25 27", need, " ")
+	for (i = 8; i > 1 && snr < need[i] + 3; i--);
+	return snr < need[1] + 3 ? 0 : 8 + i - 1
+}
+function rate_of(mcs,    rates) {
+	split("7.2 14.4 21.7 28.9 43.3 57.8 65 72.2 14.4 28.9 43.3 57.8 86.7 115.6 130 144.4", rates, " ")
+	return rates[mcs + 1]
+}
+# beacons and OGMs of every station that is heard, and its own: half a per cent of the time each
+FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "survey" { if (!$8) beacons++ }
 # deleted and not heard since
 FILENAME ~ /heard$/ && $1 == "S" && $8 && since[$2 " " $3] >= $8 { next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && act == "del" { if ($3 == mac) known = 1; next }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device && verb == "station" && (act == "dump" || $3 == mac) {
 	known = 1
+	signal = $4
+	mcs = mcs_of(signal)
+	age = ($7 ? now - $7 : uptime)
+	sent = int(10 * age)
+	# the share of frames that are lost on their way there, from the TQ
+	lost = 1 - $6 / 144.4
 	made = $7 > since[device " " $3] ? $7 : since[device " " $3]
-	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t96000\n\trx packets:\t1200\n\ttx bytes:\t88000\n\ttx packets:\t1100\n\ttx retries:\t12\n\ttx failed:\t0\n\trx drop misc:\t0\n", $3, device, $5 + ($8 ? (now - $8) * 1000 : 0)
+	printf "Station %s (on %s)\n\tinactive time:\t%d ms\n\trx bytes:\t%d\n\trx packets:\t%d\n\ttx bytes:\t%d\n\ttx packets:\t%d\n\ttx retries:\t%d\n\ttx failed:\t%d\n\trx drop misc:\t0\n", $3, device, $5 + ($8 ? (now - $8) * 1000 : 0), \
+		sent * 80, sent, sent * 80, sent, sent * lost / (1.01 - lost), sent * lost * lost * lost * lost * lost * lost * lost
 	printf "\tsignal:  \t%d [%d, %d] dBm\n\tsignal avg:\t%d [%d, %d] dBm\n", $4, $4 - 2, $4 - 4, $4, $4 - 2, $4 - 4
-	printf "\ttx bitrate:\t%.1f MBit/s MCS 15 short GI\n\trx bitrate:\t%.1f MBit/s MCS 15 short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", $6, $6, $6 * 0.4, made ? now - made : uptime
+	printf "\ttx bitrate:\t%.1f MBit/s MCS %d short GI\n\trx bitrate:\t%.1f MBit/s MCS %d short GI\n\texpected throughput:\t%.2fMbps\n\tauthorized:\tyes\n\tauthenticated:\tyes\n\tassociated:\tyes\n\tconnected time:\t%d seconds\n", rate_of(mcs), mcs, rate_of(mcs), mcs, $6 * 0.4, made ? now - made : uptime
 }
 function fail(text, number) { printf "command failed: %s (-%d)\n", text, number > "/dev/stderr"; exit 256 - number }
 END {
+	if (verb == "survey" && found && joined) {
+		share = 0.005 * (beacons + 1)
+		if (share > 0.7) share = 0.7
+		printf "Survey data from %s\n\tfrequency:\t\t\t%d MHz [in use]\n\tnoise:\t\t\t\t%d dBm\n", device, frequency, noise()
+		printf "\tchannel active time:\t\t%d ms\n\tchannel busy time:\t\t%d ms\n", uptime * 1000, uptime * 1000 * share
+		printf "\tchannel receive time:\t\t%d ms\n\tchannel transmit time:\t\t%d ms\n", uptime * 1000 * (share - 0.005), uptime * 5
+	}
 	if (device != "" && !found) fail("No such device", 19)
 	# ad-hoc cells: Linux 5.7 and later; 19.07 has the wireless stack of 4.19
 	if (verb == "station" && act == "del" && type == "adhoc" && series == "19.07") fail("Operation not supported", 95)

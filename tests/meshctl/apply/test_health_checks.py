@@ -15,6 +15,7 @@ from meshctl.device.observation import (
     NetInterface,
     Observation,
     Originator,
+    RadioState,
     WirelessLink,
 )
 from meshctl.uci import dump, parse
@@ -63,6 +64,11 @@ def test_a_node_that_regained_everything_passes_the_health_check() -> None:
         ),
         (replace(good(), bridges=(Bridge("br-lan", ("bat0",)),)), "eth0 not in its bridge br-lan"),
         (replace(good(), links=()), "mesh0 does not exist"),
+        # 24.10.7, a radio whose setup ended with an error: retry_setup_failed, and not pending
+        (
+            replace(good(), links=(), radios=(RadioState("radio0", False, False, False, True, {}, (("mesh0", ""),)),)),
+            "mesh0 does not exist: netifd gave up setting up radio0",
+        ),
         (
             replace(good(), links=(WirelessLink("mesh0", "IBSS", channel=6, joined=False),)),
             "mesh0 has not joined its cell",

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import cast
 
 from meshctl.apply.context import NodeContext
-from meshctl.apply.mesh_commit import Participant, canceled_because, quorum_of, short_of_quorum
+from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
 from meshctl.fleet import Outcome, Result
 
 

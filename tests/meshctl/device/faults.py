@@ -29,6 +29,10 @@ tick() {
 	echo "$tick_n $*" >>/harness/commands
 	[ "$tick_n" != "$KILL_AT" ] || kill -9 0
 }
+read() {
+	[ -z "$STOP_AT_SLEEP" ] || [ "$2" != -t ] || kill -9 0
+	command read "$@"
+}
 sleep() {
 	[ -z "$STOP_AT_SLEEP" ] || kill -9 0
 	command sleep "$@"

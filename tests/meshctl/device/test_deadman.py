@@ -309,13 +309,54 @@ def test_a_rollback_waits_for_a_running_reload_to_finish(node: Sandbox) -> None:
     assert node.text("/harness/log") == "begin\nend\nbegin\nend\n"
 
 
-def test_staging_is_rejected_while_the_root_is_in_ram(node: Sandbox) -> None:
+def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
+    # the status of that reload would count for the new change, before its own services have reloaded
+    second = "[ ! -e /harness/first ] || until [ -e /harness/go ]; do sleep 0.1; done"
+    log = f"echo begin >>/harness/log; {second}; : >/harness/first"
+    applied(node, wanted=change(reload=log))
+    eventually(lambda: (node.text("/harness/log") or "") == "begin\n" and node.path("/harness/first").exists())
+    node.deadman("abort", OWNER, "c1")
+    eventually(lambda: (node.text("/harness/log") or "") == "begin\nbegin\n")
+    prepare(node)
+    switch = "/usr/sbin/meshctl-deadman"
+    node.put("/harness/hasty", (node.text(switch) or "").replace("RESTORED_WAIT_CS=2000", "RESTORED_WAIT_CS=20"), 0o755)
+    refused = node.run("/harness/hasty", "stage", OWNER, "c1", BUNDLE).stdout
+    assert refused.startswith("refused busy services are still reloading"), refused
+    with ThreadPoolExecutor(1) as hand:
+        waiting = hand.submit(node.deadman, "stage", OWNER, "c1", BUNDLE)
+        node.put("/harness/go", "")
+        assert waiting.result() == "ok state=staged id=c1"
+
+
+OVERLAY_IN_RAM = "overlayfs:/tmp/root"
+INITRAMFS_19_07 = "rootfs"
+
+
+@pytest.mark.parametrize("device", [OVERLAY_IN_RAM, INITRAMFS_19_07])
+def test_staging_is_rejected_while_the_root_is_in_ram(node: Sandbox, device: str) -> None:
     prepare(node)
     node.deadman("lock", OWNER, LONG)
     stage = f"exec /usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}"
-    done = node.run("/bin/sh", "-c", f"/bin/busybox mount -t tmpfs overlayfs:/tmp/root / && {stage}")
+    done = node.run("/bin/sh", "-c", f"/bin/busybox mount -t tmpfs {device} / && {stage}")
     assert done.stdout.startswith("refused no-flash "), done
     assert not node.path("/etc/meshctl/change").exists()
+
+
+def test_the_kernels_own_rootfs_below_an_overlay_does_not_count(node: Sandbox) -> None:
+    prepare(node)
+    node.deadman("lock", OWNER, LONG)
+    stage = f"exec /usr/sbin/meshctl-deadman stage {OWNER} c1 {BUNDLE}"
+    mounts = "".join(f"/bin/busybox mount -t tmpfs {device} / && " for device in ("rootfs", "overlayfs:/overlay"))
+    done = node.run("/bin/sh", "-c", f"{mounts}{stage}")
+    assert done.stdout.startswith("ok state=staged "), done
+
+
+@pytest.mark.parametrize("reported", ['"rootfs_type": "initramfs",', '"initramfs": true,'], ids=["22.03 on", "21.02"])
+def test_staging_is_rejected_on_an_initramfs_image(node: Sandbox, reported: str) -> None:
+    prepare(node)
+    node.put("/bin/ubus", f"""#!/bin/sh\n[ "$*" != "call system board" ] || echo '\t{reported}'\n""", 0o755)
+    node.deadman("lock", OWNER, LONG)
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("refused no-flash ")
 
 
 def test_the_node_reboots_if_reloading_the_restored_state_fails(node: Sandbox) -> None:

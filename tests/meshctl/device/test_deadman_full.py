@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import shutil
 
 from tests.meshctl.device.changes import (
     BUNDLE,
     NONCE_HASH,
     OWNER,
+    change,
     is_before,
     prepare,
     refusal,
@@ -97,3 +99,24 @@ def test_a_lock_can_be_released_with_full_memory(node: Sandbox) -> None:
     )
     assert given_back == "ok"
     assert taken == "ok lock_owner=somebody@else"
+
+
+def test_with_full_memory_a_change_and_its_rollback_reload_completely(node: Sandbox) -> None:
+    # of a script that was copied into a full /tmp nothing was run, and nothing is a success
+    prepare(node, change(reload="echo reloaded >>/harness/log\n" + f"# {'x' * 70}\n" * 80))
+    shutil.copy(node.path(BUNDLE), node.path("/harness/bundle"))
+    answers = on_small_memory(
+        node,
+        f"""
+        d=/usr/sbin/meshctl-deadman
+        $d lock {OWNER} 6000 && $d stage {OWNER} c1 /harness/bundle && $d arm {OWNER} c1 {NONCE_HASH} 1
+        mkdir -p /tmp/meshctl/change-c1
+        fill
+        $d watch c1 0
+        """,
+    )
+    assert answers[-1] == "ok state=armed id=c1"
+    assert is_before(node.path("/etc"))
+    assert node.text("/harness/log") == "reloaded\n" * 2
+    # there was no room for its exit status; booting also empties /tmp
+    assert node.text("/harness/reboots") == "reboot\n"

@@ -116,6 +116,9 @@ PARSERS = [
     system.parse_mode,
     iw.parse_iw_dev,
     iw.parse_stations,
+    iw.parse_survey,
+    batctl.parse_statistics,
+    system.parse_sensors,
     batctl.parse_mesh_json,
     batctl.parse_mesh_header,
     batctl.parse_interfaces_text,
@@ -205,7 +208,7 @@ def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshCo
     assert len(seen.authorized_keys) == 1
     assert seen.mesh is None
     assert seen.change is not None
-    assert (seen.change.state, seen.change.version) == ("idle", "6")
+    assert (seen.change.state, seen.change.version) == ("idle", "7")
     assert seen.root_in_ram is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None
@@ -300,10 +303,45 @@ def test_batman_v_tables_give_throughput() -> None:
     assert (neighbour.mac, neighbour.ifname, neighbour.last_seen_ms) == ("02:00:00:00:00:02", "mesh0", 460)
 
 
+@pytest.mark.parametrize(
+    ("bitrate", "mcs"),
+    [
+        ("144.4 MBit/s MCS 15 short GI", "MCS 15"),
+        ("866.7 MBit/s VHT-MCS 9 80MHz short GI VHT-NSS 2", "VHT-MCS 9 NSS 2"),
+        ("1200.9 MBit/s 80MHz HE-MCS 11 HE-NSS 2 HE-GI 0 HE-DCM 0", "HE-MCS 11 NSS 2"),
+        ("2882.3 MBit/s 160MHz EHT-MCS 13 EHT-NSS 2 EHT-GI 0", "EHT-MCS 13 NSS 2"),
+        ("1.0 MBit/s", ""),
+        ("(unknown)", ""),
+    ],
+)
+def test_the_mcs_of_every_generation_is_read(bitrate: str, mcs: str) -> None:
+    text = f"Station 02:00:00:00:00:01 (on mesh0)\n\tsignal:  \t-60 dBm\n\ttx bitrate:\t{bitrate}\n"
+    (station,) = iw.parse_stations(text) or ()
+    assert (station.tx_mcs, station.rx_mcs, station.chain_signals_dbm) == (mcs, "", ())
+
+
+def test_the_survey_is_that_of_the_channel_in_use() -> None:
+    other = "Survey data from mesh0\n\tfrequency:\t\t\t2412 MHz\n\tnoise:\t\t\t\t-90 dBm\n"
+    used = other.replace("2412 MHz", "2437 MHz [in use]") + "\tchannel active time:\t\t70 ms\n"
+    survey = iw.parse_survey(other + used + other)
+    assert survey is not None
+    assert (survey.frequency_mhz, survey.noise_dbm, survey.active_ms, survey.busy_ms) == (2437, -90, 70, None)
+    assert iw.parse_survey(other) is None
+
+
 def test_a_root_in_memory_is_distinguished_from_one_in_flash() -> None:
     ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
     assert system.parse_root(ram)
     assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
+
+
+def test_a_root_that_cannot_be_written_is_recognized() -> None:
+    rom = "/dev/root / squashfs ro,relatime 0 0\n"
+    assert system.parse_read_only_root(rom)
+    # the last mount on / is the one in use, as after `mount_root` in failsafe mode
+    assert not system.parse_read_only_root(rom + "overlayfs:/overlay / overlay rw,lowerdir=/,upperdir=/ro 0 0\n")
+    assert system.parse_read_only_root("/dev/sda2 / ext4 ro,noatime 0 0\n")
+    assert not system.parse_read_only_root("")
 
 
 def test_a_node_without_a_package_manager_has_one_note_that_says_so() -> None:

@@ -141,3 +141,33 @@ def test_a_bridge_that_becomes_a_router_cuts_its_lan_and_keeps_its_management_ad
     routed = BRIDGED.replace("\tlist ports 'bat0'\n", "").replace("10.42.0.11", "10.43.1.1") + BACKBONE
     assert network_effects(BRIDGED, routed) == [(Cut.LAN, "it routes its LAN, which leaves the mesh's network")]
     assert network_effects(routed, BRIDGED) == [(Cut.LAN, "it bridges its LAN into the mesh's network")]
+
+
+IN_DEVICE = ("option htmode 'HT20'\n\toption country 'US'", "option country 'US'\n\toption htmode 'HT20'")
+IN_INTERFACE = ("option ifname 'mesh0'\n\toption mode 'adhoc'", "option mode 'adhoc'\n\toption ifname 'mesh0'")
+NO_CHANGE = Effect("wifi", Cut.NOTHING, "no radio changes")
+RESTART = Effect("wifi", Cut.MESH, "radio0 restarts: order of options")
+REJOIN = Effect("wifi", Cut.MESH, "the interfaces of radio0 leave their networks and return: order of options")
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        (IN_DEVICE, [RESTART, RESTART, RESTART, NO_CHANGE, NO_CHANGE, NO_CHANGE]),
+        (IN_INTERFACE, [RESTART, RESTART, RESTART, REJOIN, REJOIN, NO_CHANGE]),
+    ],
+    ids=["radio", "interface"],
+)
+def test_options_in_another_order_cut_what_netifd_takes_down_for_them(
+    place: tuple[str, str], expected: list[Effect]
+) -> None:
+    # an edit by hand has moved an option; meshctl writes the file for another reason, such as another radio
+    assert [cut_by(*place, release) for release in RELEASES] == expected
+
+
+def test_a_change_in_place_names_the_order_of_options_where_that_reconnects_the_interface() -> None:
+    moved = wireless(*IN_INTERFACE)
+    louder = parse(WIRELESS.replace("'27'", "'28'"), "wireless")
+    (effect,) = effects(["etc/config/wireless"], {"wireless": moved}, {"wireless": louder}, Release.V24_10)
+    assert effect.cut is Cut.MESH
+    assert effect.why == "the interfaces of radio0 leave their networks and return: txpower, order of options"

@@ -89,6 +89,7 @@ def test_an_unreachable_node_is_away_with_the_reason() -> None:
     [
         ({"board": BoardInfo("ubnt,rocket-m")}, "wrong board: expected compex,wpj344-16m (box), found ubnt,rocket-m"),
         ({"board": None}, "cannot read its board"),
+        ({"board": None, "root_read_only": True}, "its root file system is read-only: it is in failsafe mode"),
         ({"uci": None}, "cannot read its configuration"),
         (
             {"release": ReleaseInfo("OpenWrt", "21.02.7", "r1", "ath79/generic")},

@@ -106,6 +106,8 @@ class Rig:
     # whether meshctl knows that the fleet is virtual; otherwise it uses addresses and cables as in the field
     knows_lab: bool = True
     release: Release = Release.V23_05
+    # each node hears the one before and the one after it, instead of the base
+    is_chain: bool = False
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
@@ -145,7 +147,8 @@ class Rig:
             )
             for name in names
         )
-        links = tuple(LinkSpec("base", name) for name in self.names)
+        nearer = names[:-1] if self.is_chain else ["base"] * self.count
+        links = tuple(LinkSpec(near, name) for near, name in zip(nearer, self.names, strict=True))
         # nodes boot within a second: those around them still know their radios
         spec = FleetSpec("proof", nodes, links, quick_boot=True)
         self.fleet = VirtualFleet(spec, self.directory / "lab").up(wait_s=60.0 + 5.0 * self.count)

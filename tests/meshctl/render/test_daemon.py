@@ -16,6 +16,7 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import (
     Computer,
+    FixedPosition,
     Fleet,
     Outbox,
     Robot,
@@ -108,6 +109,16 @@ def test_the_destinations_of_a_log_are_its_readers(tmp_path: Path) -> None:
         )
     everybody = loaded(fleet(Topic("artifacts", 4, log=TopicLog())), "spot", tmp_path).settings.topics
     assert core.Topic("artifacts", 4, log=core.Log()) in everybody
+
+
+def test_a_fixed_position_is_the_daemons_and_a_robot_without_one_has_none(tmp_path: Path) -> None:
+    source = fleet(ESTOP)
+    placed = replace(source.robots["base"], position=FixedPosition(12.5, -3.0))
+    source = replace(source, robots={**source.robots, "base": placed})
+    position = loaded(source, "base", tmp_path).position
+    assert position is not None
+    assert (position.x_m, position.y_m, position.z_m, position.frame) == (12.5, -3.0, None, "map")
+    assert loaded(source, "uav", tmp_path).position is None
 
 
 def test_without_broadcast_all_other_robots_are_neighbors(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_ranked_columns_are_dropped_to_fit_and_unranked_ones_are_kept(cells: lis
 
 def test_an_empty_column_is_left_out_silently(fleet: Fleet) -> None:
     status = assess(look_of(fleet), fleet.managed(), NOW)
-    assert "waits" not in text(status)
+    assert "topics" not in text(status)
     assert "no room" not in text(status)
 
 

@@ -126,6 +126,18 @@ def test_status_lists_the_stations_heard_by_each_radio(lab: Lab) -> None:
     until(agrees, "the reported neighbors to be the stations of the kernels")
 
 
+def test_status_shows_what_the_kernels_radios_measure(lab: Lab) -> None:
+    nodes = lab.meshctl("status", "--json", "--timeout", "30", expect=None).json["nodes"]
+    for node in nodes:
+        assert node["mesh_statistics"]["bat0"]["mgmt_tx"] > 0
+        for radio in node["radios"]:
+            # mac80211_hwsim reports a constant noise, and counts the time
+            assert (radio["noise_dbm"], radio["busy_ratio"] is not None) == (-92, True)
+        for neighbor in node["neighbours"]:
+            assert neighbor["snr_db"] == neighbor["signal_dbm"] + 92
+            assert neighbor["tx_bitrate_kbit_s"] > 0
+
+
 def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
     def quality() -> int:
         known = json.loads(lab.on("b01", "batctl meshif bat0 originators_json"))

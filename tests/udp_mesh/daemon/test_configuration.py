@@ -15,10 +15,10 @@ from udp_mesh.daemon.configuration import (
     DaemonSettings,
     load,
     read_keys,
-    topic_from_values,
 )
 from udp_mesh.daemon.neighbours import parse_address
 from udp_mesh.daemon.toml_source import ConfigurationError, locate
+from udp_mesh.daemon.topic_settings import topic_from_values
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 
 FULL = """\

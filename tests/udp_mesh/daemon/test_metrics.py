@@ -6,13 +6,18 @@ end in `_total` and are never negative.
 """
 
 import asyncio
+import random
 import re
 
 import pytest
 
 from tests.udp_mesh.core.pair import pair
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh.core.conditions import PeerConditions
+from udp_mesh.core.events import Event, MessageDelivered, MessageId, PeerOffline
 from udp_mesh.core.settings import Topic
+from udp_mesh.daemon.interface import PING_TOPIC
+from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.metrics import render
 from udp_mesh.daemon.metrics_server import MetricsServer
 from udp_mesh.daemon.status import TopicCount
@@ -63,12 +68,54 @@ def test_the_metrics_page_follows_the_prometheus_text_format() -> None:
     assert found["udp_mesh_info"] == [('name="a",version="1.0"', 1)]
     assert found["udp_mesh_uptime_seconds"] == [("", 61.5)]
     assert found["udp_mesh_peer_online"] == [('peer="b"', 1)]
+    assert found["udp_mesh_build_info"] == [('version="1.0"', 1)]
+    assert found["udp_mesh_peer_sent_bytes_total"] == [('peer="b"', both.a.conditions(both.now).peers[0].sent_bytes)]
     assert ('peer="b",priority="5"', 1) in found["udp_mesh_queue_messages"]
     assert [labels for labels, _ in found["udp_mesh_topic_sent_bytes_total"]] == [
         'topic="a\\"b\\\\c"',
         'topic="line\\nfeed"',
         'topic="map"',
     ]
+
+
+def test_bytes_to_and_from_a_peer_grow_with_each_message() -> None:
+    both = pair(Topic("map", priority=5))
+    rng = random.Random(1)
+
+    def after_message() -> tuple[PeerConditions, PeerConditions]:
+        both.a.send("map", rng.randbytes(50_000), destination="b", now=both.now)
+        both.roundtrip(200)
+        return both.a.conditions(both.now).peers[0], both.b.conditions(both.now).peers[0]
+
+    sent_before, received_before = after_message()
+    sent, received = after_message()
+    assert 50_000 <= sent.delivered_bytes - sent_before.delivered_bytes < sent.sent_bytes - sent_before.sent_bytes
+    assert 50_000 < received.received_bytes - received_before.received_bytes < 60_000
+    assert sent.sent_bytes - sent_before.sent_bytes < 60_000
+
+
+def test_latencies_are_a_cumulative_histogram_by_priority() -> None:
+    seen: list[Event] = []
+    latencies = Latencies({"estop": 0, "map": 5}.__getitem__)
+    observe = latencies.watching(seen.append)
+    for topic, seconds in (("estop", 0.004), ("estop", 0.005), ("estop", 0.03), ("map", 1000.0), (PING_TOPIC, 0.1)):
+        observe(MessageDelivered(MessageId(1), "b", topic, seconds))
+    observe(PeerOffline("b", left=False))
+    assert len(seen) == 6
+    both = pair(Topic("map", priority=5))
+    page = render(both.a.conditions(both.now), {}, {}, about={}, uptime_s=1.0, latencies=latencies.by_priority)
+    lines = [line for line in page.splitlines() if line.startswith("udp_mesh_delivery_latency_seconds")]
+    name = "udp_mesh_delivery_latency_seconds"
+    assert [line for line in lines if 'le="0.005"' in line or 'le="0.05"' in line or 'le="+Inf"' in line] == [
+        f'{name}_bucket{{priority="0",le="0.005"}} 2',
+        f'{name}_bucket{{priority="0",le="0.05"}} 3',
+        f'{name}_bucket{{priority="0",le="+Inf"}} 3',
+        f'{name}_bucket{{priority="5",le="0.005"}} 0',
+        f'{name}_bucket{{priority="5",le="0.05"}} 0',
+        f'{name}_bucket{{priority="5",le="+Inf"}} 1',
+    ]
+    assert f'{name}_count{{priority="0"}} 3' in lines
+    assert f'{name}_sum{{priority="5"}} 1000' in lines
 
 
 @pytest.mark.parametrize(

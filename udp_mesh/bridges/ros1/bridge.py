@@ -26,6 +26,7 @@ from udp_mesh.bridges.names import (
     routes,
     undeclared_route,
 )
+from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
 from udp_mesh.bridges.runtime import BridgeRuntime
@@ -57,11 +58,14 @@ class Ros1Bridge:
         relay = Relay(own, PROTOCOL_TOPIC, ros_version=1, nonce=os.urandom(16))
         self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
         self._master_gone = False
+        self._positions = PositionInput(daemon, 1, given.odometry, [str(frame) for frame in given.tf_frames])
         self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
 
     def start(self, stop: threading.Event) -> None:
         """Starts publishing, until `stop` is set."""
         self._graph.start(stop)
+        for name in self._positions.topics:
+            self._graph.watch(name, self._positions.arrived)
 
     def _to_ros(self, message: ToRos) -> None:
         self._graph.publish(message)

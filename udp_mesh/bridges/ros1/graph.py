@@ -86,6 +86,8 @@ class Parameters(NamedTuple):
     hostname: str
     topic_list: list[object]
     host_list: list[object]
+    odometry: str = ""
+    tf_frames: list[object] = []  # noqa: RUF012 - a tuple's default, never changed
 
 
 class Graph:
@@ -95,6 +97,7 @@ class Graph:
         self._on_message = on_message
         self._pid = _master().getPid()
         self._subscribers: dict[str, tuple[Route, Any]] = {}
+        self._watched: list[Any] = []
         self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
         self._conditions: Mapping[str, Any] | None = None
@@ -131,6 +134,15 @@ class Graph:
             header.get("latching") == "1",
             bytes(message._buff),
         )
+
+    def watch(self, name: str, on_bytes: Callable[[str, bytes], None]) -> None:
+        """Subscribes to a name for this bridge itself, not for the mesh. Waits for the master."""
+
+        def arrived(message: Any) -> None:
+            on_bytes(name, bytes(message._buff))
+
+        # only the newest matters; the name may be relative to the node's namespace
+        self._watched.append(rospy.Subscriber(name, rospy.AnyMsg, arrived, queue_size=1, buff_size=BUFFER_BYTES))
 
     def _settings_arrived(self, message: Any, on_window: Callable[[int], None]) -> None:
         """The legacy `MeshSettings`, one byte: the window in packets, 0 for adaptive."""
@@ -183,7 +195,8 @@ class Graph:
         fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts, self._text)]
         for name, message_type in [*fixed, *self._publications.advertised()]:
             master.registerPublisher(name, message_type, uri)
-        for name in [*self._subscribers, self._settings.resolved_name]:
+        watched = [subscriber.resolved_name for subscriber in self._watched]
+        for name in [*self._subscribers, *watched, self._settings.resolved_name]:
             publishers = master.registerSubscriber(name, rospy.AnyMsg._type, uri)
             # Pass the new master's answer to rospy as if the master had called.
             ourselves.publisherUpdate("/master", name, publishers)
@@ -229,6 +242,8 @@ def parameters(default_socket: str) -> Parameters:
         str(rospy.get_param("~hostname", "")),
         _list_parameter("topic_list"),
         _list_parameter("host_list"),
+        str(rospy.get_param("~odometry", "")),
+        _list_parameter("tf_frames"),
     )
 
 

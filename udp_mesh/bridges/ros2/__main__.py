@@ -21,6 +21,7 @@ from typing import Any, Deque, Sequence
 
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route, ros_word, routes
+from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.relay import Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
 from udp_mesh.bridges.runtime import BridgeRuntime
@@ -84,7 +85,9 @@ def message_class(name: str) -> Any:
 class Ros2Bridge:
     """The running bridge."""
 
-    def __init__(self, node: Any, daemon: DaemonClient, own: str) -> None:
+    def __init__(
+        self, node: Any, daemon: DaemonClient, own: str, odometry: str = "", tf_frames: Sequence[str] = ()
+    ) -> None:
         self._node, self._daemon, self._own = node, daemon, own
         relay = Relay(own, PROTOCOL_TOPIC, ros_version=2, nonce=os.urandom(16))
         self._runtime = BridgeRuntime(daemon, relay, self._to_ros)
@@ -94,6 +97,23 @@ class Ros2Bridge:
         self._warned: set[str] = set()
         self._wake = node.create_guard_condition(self.publish_arrived)
         node.create_timer(REFRESH_S, self.refresh)
+        positions = PositionInput(daemon, 2, odometry, tf_frames)
+        for name, type_name in positions.topics.items():
+            self._watch(name, type_name.replace("/", "/msg/"), positions)
+
+    def _watch(self, name: str, type_name: str, positions: PositionInput) -> None:
+        """Subscribes to a name for the robot's own position. Best effort matches every publisher; static transforms are
+        latched."""
+        message_class = self._class(type_name)
+        if message_class is None:
+            return
+
+        def arrived(data: bytes) -> None:
+            positions.arrived(name, bytes(data))
+
+        static = name.endswith("_static")
+        wanted = Quality("reliable" if static else "best_effort", "transient_local" if static else "volatile", 100)
+        self._node.create_subscription(message_class, name, arrived, profile(wanted), raw=True)
 
     def _to_ros(self, message: ToRos) -> None:
         self._arrived.append(message)
@@ -200,6 +220,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs until ROS or a signal stops it. Waits for the daemon."""
     parser = argparse.ArgumentParser(prog="udp_mesh.bridges.ros2", description="Carry ROS 2 topics over the mesh.")
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
+    parser.add_argument("--odometry", default="", metavar="TOPIC", help="take the robot's position from this topic")
+    parser.add_argument(
+        "--tf-frames",
+        nargs=2,
+        default=(),
+        metavar=("MAP", "ROBOT"),
+        help="take the robot's position from /tf: the map's frame and the robot's",
+    )
     options, ros_arguments = parser.parse_known_args(argv)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     daemon = DaemonClient(options.socket, ["*"])
@@ -210,7 +238,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Ros2Bridge(node, daemon, own)
+        bridge = Ros2Bridge(node, daemon, own, options.odometry, options.tf_frames)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)

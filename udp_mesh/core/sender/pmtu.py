@@ -4,14 +4,18 @@ A tunnel or mesh on the path may carry less than our own interface without repor
 smaller MTU would not carry it.
 
 1. A round ends when a small datagram arrives after large ones were lost, some time after the previous round.
-2. After several rounds without an arrival as large as the smallest loss, the loss rate of small datagrams, measured
-   meanwhile, gives the probability that the large ones were lost by chance. If it is negligible, the MTU is reduced.
-3. From then on pings of the larger size probe, ever less often, whether the path carries it after all.
+2. From the first round on, pings of all sizes are compared (`size_comparison`).
+3. The loss rate of small datagrams, measured meanwhile, gives the probability that the large ones were lost by chance.
+   If it is negligible after some comparisons, or after several rounds without an arrival as large as the smallest loss,
+   the MTU is reduced.
+4. From then on pings of the larger size probe, ever less often, whether the path carries it after all.
 """
 
 from collections.abc import Iterable, Sequence
 
 from udp_mesh.core.sender.sent_packets import Packet
+from udp_mesh.core.sender.size_comparison import MAX_CHANCE as MAX_COMPARISON_CHANCE
+from udp_mesh.core.sender.size_comparison import SizeComparisons
 from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
 
 ETHERNET_MTU = 1500
@@ -85,6 +89,7 @@ class PathMtu:
         "_small_lost_between",
         "_smallest_lost",
         "_suspect_since",
+        "comparisons",
         "large_bytes",
         "narrowed_at",
         "probe",
@@ -113,6 +118,7 @@ class PathMtu:
         self._probes = 0
         self.narrowed_at: float | None = None
         self.probe = PmtuProbe()
+        self.comparisons = SizeComparisons()
 
     @property
     def suspect(self) -> bool:
@@ -156,7 +162,11 @@ class PathMtu:
 
     def on_pong(self, token: int, now: float) -> None:
         """Record the answer to a ping."""
-        if not self.probe.on_pong(token) and self.suspect:
+        mtu = self.comparisons.on_pong(token, now)
+        if mtu is not None:
+            if mtu == self.comparisons.largest_mtu:
+                self.reset()
+        elif not self.probe.on_pong(token) and self.suspect:
             self._on_small_acked(1, 1, now)
 
     def _on_small_lost(self) -> None:
@@ -176,16 +186,21 @@ class PathMtu:
             self._rounds += 1
             self._large_lost = 0
             self._round_at = now
+            self.comparisons.start(now)
 
     def is_black_hole(self, now: float) -> bool:
         """Whether large datagrams do not get through."""
-        if self._rounds < ROUNDS or now - self._suspect_since < SUSPECT_S:
+        if not self._rounds:
             return False
         small_loss = max(
             (self._small_lost + 1) / (self._small + 2),
             (self._past_small_lost + self._small_lost + 1) / (self._past_small + self._small + 2),
         )
-        return bool(small_loss**self._large_lost_in_a_row < MAX_CHANCE)
+        chance = small_loss**self._large_lost_in_a_row
+        compared = self.comparisons.chance(small_loss)
+        if compared < MAX_COMPARISON_CHANCE and chance * compared < MAX_CHANCE:
+            return True
+        return bool(chance < MAX_CHANCE and self._rounds >= ROUNDS and now - self._suspect_since >= SUSPECT_S)
 
     def reset(self) -> None:
         """Start over: a large datagram arrived, or the sizes changed."""
@@ -197,6 +212,8 @@ class PathMtu:
         self._large_lost = self._rounds = self._large_lost_in_a_row = self._small = self._small_lost = 0
         self._large_lost_between = self._small_lost_between = 0
         self._smallest_lost = _INFINITY
+        if self.comparisons.running or self.comparisons.sent:
+            self.comparisons = SizeComparisons()
 
     # Reduction
 

@@ -57,7 +57,6 @@ STALE_AFTER_S = 1.0
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
 
-
 NON_URGENT_RTT_VALID_S = 1.0
 """While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
 
@@ -283,8 +282,9 @@ class Sender(PendingMessages):
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
             at = deadline
-        if self.wake_at != float("inf") and (at is None or self.wake_at < at):
-            at = self.wake_at
+        wake_at = min(self.wake_at, self.pmtu.comparisons.next_at)
+        if wake_at != float("inf") and (at is None or wake_at < at):
+            at = wake_at
         if self.copies and (at is None or self.copies.next_at() < at):
             at = self.copies.next_at()
         return at
@@ -364,15 +364,15 @@ class Sender(PendingMessages):
         self._demote_in_flight()
 
     def consume_small_probe(self, now: float) -> bool:
-        """Whether the probe just allowed is to be a ping: nothing waits, or full fragments may be too large for the
-        path (then one probe in a few, once the peer has been unresponsive for longer)."""
+        """Whether a ping is sent as the probe just allowed: nothing waits, or full fragments may be too large for the
+        path (then with one probe in a few, and later in its place)."""
         if self.state is not SendState.UNRESPONSIVE or not self.probe_credit:
             return False
         if self.scheduler.waiting:
-            long_since = now - self.unresponsive_since > FAST_PROBE_FOR_S
-            if not (long_since and self.pmtu.next_probe_is_small()):
+            if not self.pmtu.next_probe_is_small():
                 return False
-            self.probe_credit = 0
+            if now - self.unresponsive_since > FAST_PROBE_FOR_S:
+                self.probe_credit = 0
         self.pmtu.on_small_probe_sent()
         return True
 

@@ -29,6 +29,8 @@ UNDER_WAY = 40
 MEET_S = 2.0
 """Time to discover each other before the load starts."""
 
+TIMELINE_STEP_S = 0.5
+
 RECEIVER = "base"
 _KEY = Key(bytes(range(32)))
 
@@ -58,6 +60,17 @@ class Cell:
     warm_up_s: float = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The mean of the step that ends `at_s` after the start of the load."""
+
+    at_s: float
+    link_bits_per_s: float | None
+    """What the link can carry; None for a chain of hops."""
+    goodput_bits_per_s: float
+    foreign_bits_per_s: float
+
+
 @dataclass(slots=True)
 class Result:
     share: float = 0.0
@@ -68,6 +81,9 @@ class Result:
     urgent_sent: int = 0
     wire_ratio: float = 0.0
     """IP bytes of both directions per byte of payload."""
+    timeline: list[Moment] = field(default_factory=list)
+    urgent_at: list[tuple[float, float]] = field(default_factory=list)
+    """(when it was sent after the start of the load, latency) of every urgent message that arrived, in seconds."""
 
     def urgent_p99_s(self) -> float:
         return percentile(self.urgent_s, 0.99)
@@ -104,6 +120,8 @@ class Trial:
         self._measured_from = MEET_S + cell.warm_up_s
         self._sent_at: dict[tuple[str, bytes], float] = {}
         self._received_bytes = 0
+        self._step_bytes = 0
+        """Received in the current step of the timeline."""
         self.result = Result()
         self.foreign: TcpFlow | None = None
         if cell.foreign is not None:
@@ -127,15 +145,14 @@ class Trial:
         self.network.start()
         queue.at(self._starts_at, self._begin)
         queue.run_until(self._measured_from)
-        foreign_before = self.foreign.received_bytes if self.foreign is not None else 0
+        foreign_before = self._foreign_bytes()
         wire_before = sum(self.network.bytes_sent.values())
         queue.run_until(self._ends_at)
         carried = self._capacity_bytes()
         result = self.result
         result.share = self._received_bytes / carried
         result.wire_ratio = (sum(self.network.bytes_sent.values()) - wire_before) / max(1, self._received_bytes)
-        if self.foreign is not None:
-            result.foreign_share = (self.foreign.received_bytes - foreign_before) / carried
+        result.foreign_share = (self._foreign_bytes() - foreign_before) / carried
         result.urgent_s.sort()
         result.map_s.sort()
         return result
@@ -159,6 +176,29 @@ class Trial:
             self._send_every(name, "map", MAP_BYTES, MAP_PERIOD_S, index * 0.013)
             self._send_every(name, "urgent", URGENT_BYTES, URGENT_PERIOD_S, index * 0.007)
             self.network.pump(name)
+        self._note_step(self._foreign_bytes())
+
+    def _foreign_bytes(self) -> int:
+        return self.foreign.received_bytes if self.foreign is not None else 0
+
+    def _note_step(self, foreign_before: int) -> None:
+        """At the start of a step of the timeline: note it at its end."""
+
+        def note() -> None:
+            now, foreign = self.event_queue.now, self._foreign_bytes()
+            carried = self.link.rate.integral(now - TIMELINE_STEP_S, now) if self.link is not None else None
+            self.result.timeline.append(
+                Moment(
+                    now - self._starts_at,
+                    None if carried is None else carried / TIMELINE_STEP_S,
+                    self._step_bytes * 8 / TIMELINE_STEP_S,
+                    (foreign - foreign_before) * 8 / TIMELINE_STEP_S,
+                )
+            )
+            self._note_step(foreign)
+
+        self._step_bytes = 0
+        self.event_queue.after(TIMELINE_STEP_S, note)
 
     def _send_every(self, name: str, topic: str, size_bytes: int, period_s: float, offset_s: float) -> None:
         def send() -> None:
@@ -184,12 +224,15 @@ class Trial:
     def _on_event(self, now: float, name: str, event: Event) -> None:
         if not isinstance(event, MessageReceived) or name != RECEIVER:
             return
+        self._step_bytes += len(event.payload)
         if now >= self._measured_from:
             self._received_bytes += len(event.payload)
         if event.topic == "bulk":
             self.event_queue.at(now, partial(self._next_bulk, event.source))
             return
         sent_at = self._sent_at.pop((event.topic, bytes(event.payload)), None)
+        if sent_at is not None and event.topic == "urgent":
+            self.result.urgent_at.append((sent_at - self._starts_at, now - sent_at))
         if sent_at is not None and self._counts(sent_at):
             (self.result.urgent_s if event.topic == "urgent" else self.result.map_s).append(now - sent_at)
 

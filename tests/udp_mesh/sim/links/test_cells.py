@@ -19,7 +19,7 @@ BOUNDS = {
     "half duplex": (1, 0.87, 15),
     "600 ms, 2 %": (2, 0.92, 380),
     "wifi rate walk": (1, 0.84, 52),
-    "route 10 and 150 ms, MTU hole": (1, 0.73, 125),
+    "route 10 and 150 ms, MTU hole": (1, 0.81, 125),
     "four senders": (1, 0.90, 21),
     "three half-duplex hops": (1, 0.67, 40),
 }

@@ -1,6 +1,7 @@
-"""The journal's SQLite file: how it is opened, locked, read and written, and what its errors mean.
+"""A SQLite file of meshctl: how it is opened, locked, read and written, and what its errors mean.
 
-WAL, so that two meshctl processes can write and a killed one leaves it readable.
+WAL, so that two meshctl processes can write and a killed one leaves it readable. The journal and the monitor's history
+are such files.
 """
 
 from __future__ import annotations
@@ -10,49 +11,53 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
 
-SCHEMA_VERSION = 1
 # Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
 BUSY_TIMEOUT_S = 20.0
-_SCHEMA = """
-CREATE TABLE runs (
-    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
-    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE TABLE outcomes (
-    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
-    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
-) STRICT;
-CREATE TABLE steps (
-    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
-    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE INDEX steps_of_run ON steps(run, node);
-CREATE TABLE nodes (
-    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
-) STRICT;
-"""
 
 
-class JournalFile:
-    """The open file. Safe for several threads and processes."""
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The tables of a file. `name` is what messages call it (`journal`); `space_hint` says what to do if it cannot be
+    written; `pragmas` are set on every connection."""
 
-    def __init__(self, path: Path) -> None:
+    name: str
+    version: int
+    statements: str
+    space_hint: str
+    pragmas: tuple[str, ...] = ()
+
+
+class SqliteFile:
+    """The open file. Safe for several threads and processes; `read_only` neither creates nor changes it."""
+
+    def __init__(self, path: Path, schema: Schema, *, read_only: bool = False) -> None:
         """Open the file, or create it. Raises MeshctlError."""
         self.path = path
+        self._schema = schema
         self._lock = threading.Lock()
+        if read_only:
+            self._open_read_only()
+        else:
+            self._open()
+
+    def _open(self) -> None:
+        path, schema = self.path, self._schema
         try:
             path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self._database = sqlite3.connect(
                 path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
             )
         except (OSError, sqlite3.Error) as error:
-            raise MeshctlError(f"{path}: cannot open the journal: {error}", hint=_hint(error)) from error
+            raise MeshctlError(f"{path}: cannot open the {schema.name}: {error}", hint=self._hint(error)) from error
         try:
+            for pragma in schema.pragmas:
+                self._database.execute(f"PRAGMA {pragma}")
             self._enter_wal()
             self._database.execute("PRAGMA synchronous = NORMAL")
             self._database.execute("PRAGMA foreign_keys = ON")
@@ -61,9 +66,33 @@ class JournalFile:
             self._database.close()
             if isinstance(error, MeshctlError):
                 raise
-            what = "cannot open the journal" if _hint(error) else "not a journal of meshctl"
-            hint = _hint(error) or "move the file away and run again"
+            what = f"cannot open the {schema.name}" if self._hint(error) else f"not a {schema.name} of meshctl"
+            hint = self._hint(error) or "move the file away and run again"
             raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
+
+    def _open_read_only(self) -> None:
+        """Open it without changing anything. Where nothing can be written, no other process writes either."""
+        error: Exception = MeshctlError("not opened")
+        for mode in ("mode=ro", "immutable=1"):
+            try:
+                uri = f"{self.path.resolve().as_uri()}?{mode}"
+                self._database = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+            except sqlite3.Error as failed:
+                error = failed
+                continue
+            try:
+                version = self._version()
+                self._database.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+            except sqlite3.Error as failed:
+                error = failed
+                self._database.close()
+                continue
+            if version == self._schema.version:
+                return
+            self._database.close()
+            error = MeshctlError(f"found version {version}, expected {self._schema.version}")
+            break
+        raise MeshctlError(f"{self.path}: cannot read as a {self._schema.name}: {error}") from error
 
     def _enter_wal(self) -> None:
         # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
@@ -80,17 +109,18 @@ class JournalFile:
 
     def _create(self) -> None:
         # a reader does not wait for a writer
-        if self._version() == SCHEMA_VERSION:
+        expected = self._schema.version
+        if self._version() == expected:
             return
         with self.write() as database:
             version = self._version()
             if version == 0:
-                for statement in _SCHEMA.split(";\n"):
+                for statement in self._schema.statements.split(";\n"):
                     if statement.strip():
                         database.execute(statement)
-                database.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            elif version != SCHEMA_VERSION:
-                raise MeshctlError(f"{self.path}: journal of version {version}, expected {SCHEMA_VERSION}")
+                database.execute(f"PRAGMA user_version = {expected}")
+            elif version != expected:
+                raise MeshctlError(f"{self.path}: {self._schema.name} of version {version}, expected {expected}")
 
     def _version(self) -> int:
         return int(self._database.execute("PRAGMA user_version").fetchone()[0])
@@ -114,7 +144,8 @@ class JournalFile:
                 if self._database.in_transaction:
                     with suppress(sqlite3.Error):
                         self._database.execute("ROLLBACK")
-                raise MeshctlError(f"{self.path}: cannot write the journal: {error}", hint=_hint(error)) from error
+                what = f"cannot write the {self._schema.name}"
+                raise MeshctlError(f"{self.path}: {what}: {error}", hint=self._hint(error)) from error
 
     def read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
         """The rows of a query. Raises MeshctlError."""
@@ -122,11 +153,19 @@ class JournalFile:
             try:
                 return self._database.execute(query, values).fetchall()
             except sqlite3.Error as error:
-                raise MeshctlError(f"{self.path}: cannot read the journal: {error}") from error
+                raise MeshctlError(f"{self.path}: cannot read the {self._schema.name}: {error}") from error
 
     def close(self) -> None:
         with self._lock:
             self._database.close()
+
+    def _hint(self, error: Exception) -> str:
+        """What to do if the file cannot be used; empty if its content is at fault."""
+        if _is_locked(error):
+            return "another process has locked it: run `fuser` with its path to find that process"
+        if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
+            return self._schema.space_hint
+        return ""
 
 
 # SQLite's primary result codes (sqlite.org/rescode.html) are the low eight bits of the extended ones.
@@ -144,12 +183,3 @@ def _primary(error: Exception) -> int:
 
 def _is_locked(error: Exception) -> bool:
     return _primary(error) in _LOCKED
-
-
-def _hint(error: Exception) -> str:
-    """What to do if the file cannot be used; empty if its content is at fault."""
-    if _is_locked(error):
-        return "another process has locked it: run `fuser` with its path to find that process"
-    if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:
-        return "set XDG_STATE_HOME to a directory on a writable disk with free space"
-    return ""

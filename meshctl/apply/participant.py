@@ -1,0 +1,86 @@
+"""A node of a simultaneous change: how far it got, which quorum it counts for, and why it failed. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from meshctl.apply.change_in_progress import ChangeInProgress
+from meshctl.apply.context import NodeContext
+from meshctl.device.openwrt import UptimeSample
+from meshctl.fleet import Outcome
+
+# Each of the others has its own reason in its own outcome.
+MAX_NAMED = 3
+
+
+@dataclass(slots=True)
+class Participant:
+    """One node of the mesh change. `failure` is why it cannot take part."""
+
+    ctx: NodeContext
+    # not because the cell changes: the operator wants all nodes to change simultaneously
+    is_together: bool = False
+    change: ChangeInProgress | None = None
+    clock: UptimeSample | None = None
+    failure: Outcome | None = None
+    is_scheduled: bool = False
+    is_unreachable: bool = False
+    is_proven: bool = False
+    # it has rolled back, or its reload has failed
+    has_failed: bool = False
+    is_confirmed: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.ctx.name
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """The meshes whose quorum this node counts for: those whose cell it changes, or all of its own."""
+        return self.ctx.plan.meshes if self.is_together else self.ctx.plan.parted_from
+
+    @property
+    def is_decided(self) -> bool:
+        return self.is_proven or self.has_failed
+
+    @property
+    def leaves_cell(self) -> bool:
+        return bool(self.ctx.plan.splits)
+
+
+def canceled_because(participants: Iterable[Participant], step: str, what: str = "the mesh change") -> str:
+    """Why no node changes: the participants that could not be armed or scheduled, each with its reason."""
+    failed = [
+        f"{participant.name} could not be {step}: {participant.failure.reason}"
+        for participant in participants
+        if participant.failure is not None
+    ]
+    if not failed:
+        return f"{what} was canceled: interrupted"
+    more = f"; and {len(failed) - MAX_NAMED} more" if len(failed) > MAX_NAMED else ""
+    return f"{what} was canceled: {'; '.join(failed[:MAX_NAMED])}{more}"
+
+
+def quorum_of(participants: Iterable[Participant], quorum: float) -> dict[str, int]:
+    """How many nodes of each changing mesh must prove themselves."""
+    counts = Counter(mesh for participant in participants for mesh in participant.meshes)
+    return {mesh: max(1, math.ceil(quorum * count)) for mesh, count in counts.items()}
+
+
+def short_of_quorum(proven: Iterable[Participant], needed: Mapping[str, int], success: str = "rejoined") -> str:
+    """Which meshes are below their quorum; empty when none is."""
+    there = Counter(mesh for participant in proven for mesh in participant.meshes)
+    short = {mesh: count for mesh, count in needed.items() if there[mesh] < count}
+    return "; ".join(f"{there[mesh]} of mesh {mesh} {success}, {count} required" for mesh, count in short.items())
+
+
+def unmet_of(participant: Participant) -> str:
+    """`b01: it has no route to the base`: why a participant had not proven itself in its latest observation."""
+    change = participant.change
+    if change is None or participant.is_unreachable or not change.unmet:
+        last_error = "" if change is None else change.last_error
+        return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
+    return f"{participant.name}: {', '.join(change.unmet)}"

@@ -1,0 +1,79 @@
+"""The udp_mesh daemon of this machine, over its local socket: one request, one reply (docs/local-api.md).
+
+`LocalDaemon` connects when it is first used and again after an error, so that a daemon may be restarted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+DEFAULT_SOCKET = Path("/run/udp-mesh/udp-mesh.sock")
+MAX_REPLY_BYTES = 64 << 20
+TIMEOUT_S = 2.0
+_LENGTHS = struct.Struct(">II")
+
+
+class DaemonError(Exception):
+    """The daemon cannot be reached, or refused the request."""
+
+
+def socket_path(given: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
+    """The option's path, or UDP_MESH_SOCKET, or the default."""
+    return given or Path(environ.get("UDP_MESH_SOCKET") or DEFAULT_SOCKET)
+
+
+@dataclass(slots=True)
+class LocalDaemon:
+    """The daemon behind `path`. Not thread-safe."""
+
+    path: Path
+    _connection: socket.socket | None = field(default=None, repr=False)
+
+    def request(self, op: str, payload: bytes = b"", **fields: object) -> dict[str, Any]:
+        """The reply's header. Raises DaemonError."""
+        try:
+            return self._request(op, payload, fields)
+        except (OSError, ValueError) as error:
+            self.close()
+            raise DaemonError(f"{self.path}: {error}") from error
+
+    def _request(self, op: str, payload: bytes, fields: Mapping[str, object]) -> dict[str, Any]:
+        if self._connection is None:
+            self._connection = socket.socket(socket.AF_UNIX)
+            self._connection.settimeout(TIMEOUT_S)
+            self._connection.connect(str(self.path))
+        header = json.dumps({"op": op, "id": 1, **fields}).encode()
+        self._connection.sendall(_LENGTHS.pack(len(header), len(payload)) + header + payload)
+        # without a subscription, the reply is the next frame
+        header_bytes, payload_bytes = _LENGTHS.unpack(self._read(_LENGTHS.size))
+        if header_bytes + payload_bytes > MAX_REPLY_BYTES:
+            raise ValueError(f"a reply of {header_bytes + payload_bytes} bytes")
+        reply = json.loads(self._read(header_bytes))
+        self._read(payload_bytes)
+        if not isinstance(reply, dict):
+            raise ValueError("a reply that is no object")
+        if not reply.get("ok"):
+            raise DaemonError(f"{self.path}: {reply.get('error', 'refused')}")
+        return reply
+
+    def _read(self, count: int) -> bytes:
+        assert self._connection is not None
+        read = bytearray()
+        while len(read) < count:
+            part = self._connection.recv(count - len(read))
+            if not part:
+                raise ConnectionError("the daemon closed the connection")
+            read += part
+        return bytes(read)
+
+    def close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
