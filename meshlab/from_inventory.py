@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from meshctl.model import Fleet, Node, Robot, Role
+from meshctl.resolve import computer_gateway
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 # the default topology is a chain up to this size, a tree above
@@ -30,7 +31,7 @@ def spec_of(
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
         links=tuple(used),
         port=port,
-        lans=tuple(_lan_spec(robot, names) for robot in fleet.robots.values() if set(robot.nodes) & set(names)),
+        lans=tuple(_lan_spec(fleet, robot, names) for robot in fleet.robots.values() if set(robot.nodes) & set(names)),
     )
 
 
@@ -44,10 +45,11 @@ def default_links(names: Sequence[str]) -> list[LinkSpec]:
     return chain + past
 
 
-def _lan_spec(robot: Robot, names: Sequence[str]) -> LanSpec:
+def _lan_spec(fleet: Fleet, robot: Robot, names: Sequence[str]) -> LanSpec:
     computer = robot.computer
     nodes = tuple(name for name in robot.nodes if name in names)
-    return LanSpec(robot.name, nodes, str(computer.address) if computer else "")
+    gateway = computer_gateway(fleet, robot)
+    return LanSpec(robot.name, nodes, str(computer.address) if computer else "", str(gateway) if gateway else "")
 
 
 def _node_spec(node: Node, number: int) -> NodeSpec:

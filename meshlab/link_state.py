@@ -14,6 +14,7 @@ from meshlab import mesh_model
 from meshlab.fleet_state import FleetState
 from meshlab.shaped_tunnel import Shape
 from meshlab.spec import LinkSpec, Medium, changed_link
+from meshlab.state import NodeState
 from meshlab.station_tables import StationTables
 
 # recomputing all tables of a big fleet is slow; at most this share of the time is spent on it
@@ -110,6 +111,8 @@ class LinkState:
             return None
         if state.plugged and state.effective.holds(address, over="wire"):
             return Shape()
+        if self._is_own_router(state) and state.effective.holds(address, over="mesh"):
+            return Shape()
         path = self._base_routes.get(name)
         if path is None or not state.effective.holds(address, over="mesh"):
             return None
@@ -123,6 +126,10 @@ class LinkState:
         return Shape(
             sum(link.delay_ms for link in path.links) / 1000, 1 - arrives, min(rates) * 125.0 if rates else None
         )
+
+    def _is_own_router(self, state: NodeState) -> bool:
+        """Whether the operator's machine is on this node's LAN, which it routes: all its addresses answer there."""
+        return state.spec.medium is Medium.BASE and state.plugged and state.effective.routes_lan_and_mesh
 
     def bench_shape(self, name: str, address: str) -> Shape | None:
         """The shape of the path over the node's bench port; None when there is none."""
@@ -184,10 +191,16 @@ class LinkState:
     def _routes_from_base(self, graph: dict[str, list[mesh_model.Edge]]) -> dict[str, mesh_model.Route]:
         found: dict[str, mesh_model.Route] = {}
         for name, state in self._fleet.nodes.items():
-            if state.spec.medium is Medium.BASE and state.plugged and state.effective.bridges_lan_and_mesh:
-                for target, path in mesh_model.best_routes(graph, name).items():
-                    if target not in found or path.tq > found[target].tq:
-                        found[target] = path
+            if state.spec.medium is not Medium.BASE or not state.plugged:
+                continue
+            bridges = state.effective.bridges_lan_and_mesh
+            if not bridges and not state.effective.routes_lan_and_mesh:
+                continue
+            for target, path in mesh_model.best_routes(graph, name).items():
+                if not bridges and not self._fleet.nodes[target].effective.answers_through(state.effective):
+                    continue
+                if target not in found or path.tq > found[target].tq:
+                    found[target] = path
         return found
 
     def _remove_lost_routes(self) -> None:

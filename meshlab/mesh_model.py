@@ -11,8 +11,9 @@ from __future__ import annotations
 import heapq
 import itertools
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from ipaddress import IPv4Interface, IPv4Network
 
 from meshlab.quality import TQ_MAX
 from meshlab.spec import LinkSpec
@@ -65,19 +66,36 @@ class Address:
     """
 
     interface: str
+    device: str
     address: str
     prefix: int
     over_mesh: bool
     over_wire: bool
     admitted: bool = True
 
+    @property
+    def network(self) -> IPv4Network:
+        return IPv4Interface(f"{self.address}/{self.prefix}").network
+
+
+@dataclass(frozen=True, slots=True)
+class StaticRoute:
+    """A route of a node to `target` through `gateway`, which is reached over the device `interface`."""
+
+    interface: str
+    target: IPv4Network
+    gateway: str
+
 
 @dataclass(frozen=True, slots=True)
 class EffectiveState:
-    """A node's current interfaces and addresses, as its netifd stand-in wrote them."""
+    """A node's current interfaces, addresses and routes, as its netifd stand-in wrote them, and the devices between
+    which the loaded firewall forwards."""
 
     interfaces: tuple[WirelessInterface, ...] = ()
     addresses: tuple[Address, ...] = ()
+    routes: tuple[StaticRoute, ...] = ()
+    forwards: frozenset[tuple[str, str]] = frozenset({("*", "*")})
 
     def holds(self, address: str, *, over: str) -> bool:
         """Whether the node answers at `address` to packets that arrive over the `mesh` or a `wire`."""
@@ -92,6 +110,25 @@ class EffectiveState:
     @property
     def bridges_lan_and_mesh(self) -> bool:
         return any(one.over_mesh and one.over_wire for one in self.addresses)
+
+    @property
+    def routes_lan_and_mesh(self) -> bool:
+        """Whether a computer on its wire reaches the mesh through it, at another address and through its firewall."""
+        return any(self.forwards & {(lan.device, mesh.device), ("*", "*")} for lan, mesh in self._routed())
+
+    def answers_through(self, base: EffectiveState) -> bool:
+        """Whether replies to a computer on the wire of the router `base` find back to it."""
+        return any(
+            lan.network == route.target and mesh.address == route.gateway
+            for lan, mesh in base._routed()
+            for route in self.routes
+        )
+
+    def _routed(self) -> Iterator[tuple[Address, Address]]:
+        """The pairs of an address on a wire only and one on the mesh only."""
+        wired = [one for one in self.addresses if one.over_wire and not one.over_mesh]
+        meshed = [one for one in self.addresses if one.over_mesh and not one.over_wire]
+        return itertools.product(wired, meshed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +153,9 @@ class Route:
 
 
 def parse_effective(text: str) -> EffectiveState:
-    """Parse air/effective: `cell` and `addr` lines, tab-separated (node_root/lab/netifd.awk, admitted.awk)."""
-    interfaces, addresses = [], []
+    """Parse air/effective: lines of `cell`, `addr`, `route` and `forward`, tab-separated (node_root/lab/netifd.awk,
+    admitted.awk)."""
+    interfaces, addresses, routes, forwards = [], [], [], set()
     for line in text.splitlines():
         match line.split("\t"):
             case ["cell", _, interface, mode, frequency, ssid, bssid, algorithm, key, mac, soft, routing, *index]:
@@ -127,10 +165,14 @@ def parse_effective(text: str) -> EffectiveState:
                         interface, mode, int(frequency), ssid, bssid, algorithm, key, mac, soft, routing, number
                     )
                 )
-            case ["addr", interface, _, address, prefix, over_mesh, over_wire, *admitted]:
+            case ["addr", interface, device, address, prefix, over_mesh, over_wire, *admitted]:
                 flags = over_mesh == "1", over_wire == "1", admitted != ["0"]
-                addresses.append(Address(interface, address, int(prefix), *flags))
-    return EffectiveState(tuple(interfaces), tuple(addresses))
+                addresses.append(Address(interface, device, address, int(prefix), *flags))
+            case ["route", device, target, prefix, gateway]:
+                routes.append(StaticRoute(device, IPv4Network(f"{target}/{prefix}", strict=False), gateway))
+            case ["forward", incoming, outgoing]:
+                forwards.add((incoming, outgoing))
+    return EffectiveState(tuple(interfaces), tuple(addresses), tuple(routes), frozenset(forwards))
 
 
 def edges(nodes: Mapping[str, EffectiveState], links: Iterable[LinkSpec]) -> dict[str, list[Edge]]:

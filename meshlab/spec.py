@@ -137,11 +137,12 @@ def changed_link(link: LinkSpec, changes: Mapping[str, Any]) -> LinkSpec:
 @dataclass(frozen=True, slots=True)
 class LanSpec:
     """A robot's wired network: one switch, the LAN ports of `nodes`, and its computer with an address such as
-    `10.42.0.21/24`. Only QEMU fleets have LANs."""
+    `10.42.0.21/24` and a default gateway, if set. Only QEMU fleets have LANs."""
 
     name: str
     nodes: tuple[str, ...]
     computer: str = ""
+    gateway: str = ""
 
 
 @dataclass(frozen=True, slots=True)

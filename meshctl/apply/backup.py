@@ -34,7 +34,7 @@ from meshctl.model import Node
 from meshctl.plan.lockout import lockout
 from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
-from meshctl.plan.seen import WIRELESS, lan_address, packages_seen, parsed
+from meshctl.plan.seen import WIRELESS, management_address, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
@@ -211,7 +211,7 @@ def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
 def _address(backup: Backup) -> IPv4Address | None:
     """The management address in the backup."""
     network = backup.files.get("/etc/config/network")
-    return None if network is None else lan_address(network.content.decode("utf-8", "replace"))
+    return None if network is None else management_address(network.content.decode("utf-8", "replace"))
 
 
 def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> FailedPrecondition | None:

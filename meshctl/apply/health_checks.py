@@ -86,16 +86,21 @@ def _packages(expected: Expectation, after: Observation) -> tuple[str, ...]:
 
 
 def _lan(expected: Expectation, after: Observation) -> tuple[str, ...]:
-    lan = None if expected.network is None else expected.network.section("lan")
-    if lan is None or after.interfaces is None:
+    if expected.network is None or after.interfaces is None:
         return ()
-    interface = next((found for found in after.interfaces if found.name == "lan"), None)
-    if interface is None or not interface.up:
-        return ("its LAN is down",)
-    address = lan.get("ipaddr").partition("/")[0]
-    if address and not any(found.partition("/")[0] == address for found in interface.addresses):
-        return (f"its LAN has {', '.join(interface.addresses) or 'no address'}, not {address}",)
-    return _bridge(expected.network, lan.get("device"), after)
+    # a router's interface on the mesh, with the management address
+    for name, what in (("lan", "its LAN"), ("backbone", "its mesh interface")):
+        section = expected.network.section(name)
+        if section is None:
+            continue
+        interface = next((found for found in after.interfaces if found.name == name), None)
+        if interface is None or not interface.up:
+            return (f"{what} is down",)
+        address = section.get("ipaddr").partition("/")[0]
+        if address and not any(found.partition("/")[0] == address for found in interface.addresses):
+            return (f"{what} has {', '.join(interface.addresses) or 'no address'}, not {address}",)
+    lan = expected.network.section("lan")
+    return () if lan is None else _bridge(expected.network, lan.get("device"), after)
 
 
 def _bridge(network: Package | None, device: str, after: Observation) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from meshctl.model import Node, Secret
 from meshctl.nodes.desired import Renderer
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.masking import masked_text, secrets_of
-from meshctl.plan.seen import file_info, lan_address, package_of, parsed, text_of
+from meshctl.plan.seen import file_info, management_address, package_of, parsed, text_of
 from meshctl.render import RenderedFile
 
 # The replacement character stands for bytes that are not UTF-8, whose value the observation does not have.
@@ -45,7 +45,7 @@ class EarlierState:
     @property
     def address(self) -> IPv4Address | None:
         """Its management address at that time."""
-        return lan_address(next((file.text for file in self.files if file.path == _NETWORK), None))
+        return management_address(next((file.text for file in self.files if file.path == _NETWORK), None))
 
     def to_json(self) -> dict[str, Any]:
         files = [[file.path, file.mode, file.text] for file in self.files]

@@ -6,10 +6,10 @@ The edit is that of `meshctl inventory state`: one value per beacon; comments an
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -36,6 +36,15 @@ def deployed(
             "--from-mesh", help="Query the mesh, and mark the carried beacons that are away from their robot."
         ),
     ] = False,
+    watch: Annotated[
+        float | None,
+        typer.Option(
+            "--watch",
+            min=1.0,
+            metavar="S",
+            help="As --from-mesh every S seconds until Ctrl-C; marks what two queries in a row show.",
+        ),
+    ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
     key: KeyFiles = None,
     lab: Lab = None,
@@ -45,16 +54,20 @@ def deployed(
     Example: meshctl deployed husky1-b03 B4
 
     Example: meshctl deployed --from-mesh
+    Example: meshctl deployed --watch 30
     """
-    if back and from_mesh:
-        raise InputError("expected --back or --from-mesh, found both")
+    for other, is_set in (("--from-mesh", from_mesh), ("--watch", watch is not None)):
+        if back and is_set:
+            raise InputError(f"expected --back or {other}, found both")
+    if watch is not None:
+        _watch(inventory, key, lab, watch, beacons, limit, dry_run=dry_run)
     if not beacons and not from_mesh:
         raise InputError("expected beacons, or --from-mesh", hint="for example: meshctl deployed husky1-b03")
     fleet = load_fleet(inventory, environ=os.environ)
     before, after = (NodeState.DEPLOYED, NodeState.CARRIED) if back else (NodeState.CARRIED, NodeState.DEPLOYED)
     chosen = chosen_beacons(fleet, beacons or ["role:beacon"], limit or ())
     if from_mesh:
-        found = _found_in_mesh(inventory, key, lab)
+        found = _found_in_mesh(inventory, key, lab, chosen)
         chosen = [node for node in chosen if node.name in found]
         for node in chosen:
             echo(f"{node.name}: {found[node.name]}", err=True)
@@ -68,6 +81,11 @@ def deployed(
             f"expected {before.value} beacons, found: {states}",
             hint=f"to set any state, run `meshctl inventory state {wrong[0].name} {after.value}`",
         )
+    _mark(inventory, chosen, before, after, dry_run=dry_run)
+
+
+def _mark(inventory: Path, chosen: Iterable[Node], before: NodeState, after: NodeState, *, dry_run: bool) -> None:
+    """Edit the inventory and show the change; those with the state `after` already are reported."""
     editor = Editor.open(inventory, environ=os.environ)
     for node in chosen:
         if node.state is before:
@@ -82,16 +100,37 @@ def deployed(
         save(changes)
 
 
-def _found_in_mesh(inventory: Path, key: list[Path] | None, lab: Path | None) -> dict[str, str]:
+def _found_in_mesh(inventory: Path, key: list[Path] | None, lab: Path | None, chosen: Iterable[Node]) -> dict[str, str]:
     """The dropped beacons that one snapshot of the mesh shows, each with the reason."""
-    from meshctl.cli.fleet_view import collect, open_fleet_view
-    from meshctl.status import assess
-    from meshctl.status.dropped import dropped_beacons
+    from meshctl.cli.deployed_watch import dropped_in
+    from meshctl.cli.fleet_view import open_fleet_view
 
     with open_fleet_view(inventory, key=key, lab=lab, no_robots=True) as fleet_view:
-        snapshot = collect(fleet_view)
-        status = assess(snapshot, fleet_view.nodes, time.time())
-    return dropped_beacons(fleet_view.fleet, status.nodes)
+        return dropped_in(fleet_view, chosen)
+
+
+def _watch(
+    inventory: Path,
+    key: list[Path] | None,
+    lab: Path | None,
+    period_s: float,
+    beacons: list[str] | None,
+    limit: list[str] | None,
+    *,
+    dry_run: bool,
+) -> NoReturn:
+    """Mark dropped beacons by themselves, until Ctrl-C."""
+    from meshctl.cli.deployed_watch import watch_for_drops
+    from meshctl.cli.fleet_view import open_fleet_view
+
+    def choose(fleet: Fleet) -> list[Node]:
+        return chosen_beacons(fleet, beacons or ["role:beacon"], limit or ())
+
+    def mark(nodes: list[Node]) -> None:
+        _mark(inventory, nodes, NodeState.CARRIED, NodeState.DEPLOYED, dry_run=dry_run)
+
+    echo(f"watching the mesh every {period_s:g} s; Ctrl-C to end", err=True)
+    watch_for_drops(partial(open_fleet_view, inventory, key=key, lab=lab, no_robots=True), choose, mark, period_s)
 
 
 def chosen_beacons(fleet: Fleet, words: Iterable[str], limits: Iterable[str] = ()) -> list[Node]:

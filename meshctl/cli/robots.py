@@ -72,7 +72,8 @@ def status_command(context: RobotsContext) -> None:
     expected = {name: expected_release(context.fleet, name, context.options.secrets) for name in context.robots}
 
     def work(host: Host, robot: str) -> Outcome:
-        found[robot] = collect_facts(host, robot, expected[robot], now_s=time.time())
+        others = context.fleet.robots[robot].other_addresses
+        found[robot] = collect_facts(host, robot, expected[robot], now_s=time.time(), others=others)
         return Outcome(robot, Result.DONE if found[robot].is_healthy else Result.FAILED)
 
     outcomes = context.run_on_each(work)

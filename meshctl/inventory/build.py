@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,9 +18,12 @@ from meshctl.inventory.documents import (
     ComputerDocument,
     HardwareDocument,
     InventoryDocument,
+    LanDocument,
     MeshDocument,
+    OtherComputerDocument,
     RobotDocument,
     SecretDocument,
+    SshLayer,
     TopicDocument,
     TopicLogDocument,
 )
@@ -27,6 +31,7 @@ from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, descend, position_of
 from meshctl.model import (
     ApplyPolicy,
@@ -42,6 +47,7 @@ from meshctl.model import (
     Robot,
     SecretKind,
     SecretRef,
+    SshSettings,
     SystemSettings,
     Topic,
     TopicLog,
@@ -70,7 +76,8 @@ def build(
         for robot in robots.values():
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
-    built = build_nodes(specs, hardware, meshes, robot_of)
+    lan_addresses = _lan_addresses(document, robots, root, diagnostics)
+    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses)
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -235,8 +242,41 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         is_base=document.is_base,
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
         fielded=document.fielded,
+        lan=document.lan.network if document.lan is not None else None,
+        computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
         position=fixed_position(document.position),
     )
+
+
+def _lan_addresses(
+    document: InventoryDocument, robots: Mapping[str, Robot], root: MappingNode, diagnostics: list[Diagnostic]
+) -> dict[str, IPv4Interface]:
+    """The address of each radio in its robot's own LAN: as set, else the first ones in the order of `nodes`."""
+    found: dict[str, IPv4Interface] = {}
+    for name, robot in robots.items():
+        if robot.lan is None:
+            continue
+        lan = document.robots[name].lan
+        for node in lan.addresses.keys() - set(robot.nodes):
+            path = ("robots", name, "lan", "addresses", node)
+            place = position_of(root, path) or Position(root.file)
+            message = f"the robot has no radio '{node}'"
+            hint = did_you_mean(node, robot.nodes)
+            diagnostics.append(codes.error(codes.BAD_ADDRESS, place, message, path=".".join(path), hint=hint))
+        for index, node in enumerate(dict.fromkeys(robot.nodes)):
+            address = lan.addresses.get(node) or _host(lan, index)
+            if address is None:
+                place = position_of(root, ("robots", name, "lan")) or Position(root.file)
+                message = f"{lan.network} has no address for the radio '{node}'"
+                diagnostics.append(codes.error(codes.BAD_ADDRESS, place, message, path=f"robots.{name}.lan"))
+                break
+            found.setdefault(node, IPv4Interface((address, lan.network.prefixlen)))
+    return found
+
+
+def _host(lan: LanDocument, index: int) -> IPv4Address | None:
+    """The LAN's host address with `index` (from 0); None beyond its last."""
+    return lan.network[index + 1] if index + 2 < lan.network.num_addresses else None
 
 
 def _names(
@@ -263,14 +303,22 @@ def _names(
     return tuple(made)
 
 
+def _other_computer(document: OtherComputerDocument) -> Computer:
+    return Computer(document.address, _computer_ssh(document.ssh))
+
+
+def _computer_ssh(document: SshLayer) -> SshSettings:
+    return ssh_settings({key: getattr(document, key) for key in document.model_fields_set}, user="")
+
+
 def _computer(document: ComputerDocument) -> Computer:
-    written = {key: getattr(document.ssh, key) for key in document.ssh.model_fields_set}
     return Computer(
         address=document.address,
-        ssh=ssh_settings(written, user=""),
+        ssh=_computer_ssh(document.ssh),
         python=document.python,
         arch=document.arch,
         ros=document.ros,
+        gateway=document.gateway,
     )
 
 

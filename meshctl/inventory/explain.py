@@ -31,6 +31,8 @@ def _values(node: Node) -> Iterator[tuple[str, str]]:
     yield "release", str(node.release)
     yield "hostname", node.hostname
     yield "address", str(node.address)
+    if node.lan_address is not None:
+        yield "lan_address", str(node.lan_address)
     for radio in node.radios:
         for key, value in _radio_values(radio):
             yield f"radios.{radio.name}.{key}", value
@@ -78,6 +80,8 @@ def _origin(fleet: Fleet, node: Node, key: str) -> Origin:
         written = fleet.provenance.get(path)
         if written is not None:
             return written
+    if key == "lan_address":
+        return _lan_origin(fleet, node)
     if parts[0] == "radios":
         place = fleet.where("hardware", node.hardware.name, *parts[:2])
         # The drive level defaults to the driver's maximum, the mesh to the only one of the band.
@@ -86,6 +90,13 @@ def _origin(fleet: Fleet, node: Node, key: str) -> Origin:
             place = fleet.where("hardware", node.hardware.name, *parts[:2], source)
         return Origin(place.position, "built-in")
     return Origin(fleet.where("nodes", node.name).position, "built-in")
+
+
+def _lan_origin(fleet: Fleet, node: Node) -> Origin:
+    robot = next(robot.name for robot in fleet.robots.values() if robot.lan is not None and node.name in robot.nodes)
+    path = ("robots", robot, "lan", "addresses", node.name)
+    is_written = path in fleet.provenance
+    return fleet.where(*path) if is_written else Origin(fleet.where(*path[:3], "network").position, "rule")
 
 
 def _listed(items: tuple[str, ...]) -> str:

@@ -46,17 +46,20 @@ def build_nodes(
     hardware: Mapping[str, HardwareProfile],
     meshes: Mapping[str, Mesh],
     robot_of: Mapping[str, str],
+    lan_addresses: Mapping[str, IPv4Interface],
 ) -> BuiltNodes:
     """Build all nodes; errors of a range are reported once.
 
-    `robot_of` maps nodes to the robots that list them, for nodes without `robot`.
+    `robot_of` maps nodes to the robots that list them, for nodes without `robot`; `lan_addresses` maps the radios of
+    robots with a LAN of their own to their addresses in it.
     """
     building = _Building(hardware, meshes, _only_meshes(meshes))
     nodes: dict[str, Node] = {}
     for spec in specs.values():
         node = building.node(spec, robot_of.get(spec.name, ""))
         if node is not None:
-            nodes[spec.name] = node
+            lan_address = lan_addresses.get(spec.name)
+            nodes[spec.name] = node if lan_address is None else replace(node, lan_address=lan_address)
     return BuiltNodes(nodes, tuple(building.diagnostics))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from ipaddress import IPv4Address, IPv4Interface
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network
 from types import MappingProxyType
 
 from meshctl.diagnostics import Position
@@ -97,7 +97,10 @@ class FixedPosition:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """One radio device. `address` is its management address with the prefix length, in its mesh's network."""
+    """One radio device. `address` is its management address with the prefix length, in its mesh's network.
+
+    `lan_address` is its address in its robot's own LAN, between which and the mesh it routes; None: it bridges the two.
+    """
 
     name: str
     hostname: str
@@ -119,6 +122,7 @@ class Node:
     packages: tuple[str, ...] = ()
     extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     gateway: IPv4Address | None = None
+    lan_address: IPv4Interface | None = None
     position: FixedPosition | None = None
 
     @property
@@ -143,20 +147,24 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Computer:
-    """A robot's computer, where the udp_mesh daemon runs."""
+    """A robot's computer, where the udp_mesh daemon runs. `gateway` is its next hop to other networks, by default the
+    robot's radio."""
 
     address: IPv4Interface
     ssh: SshSettings = SshSettings()
     python: str = "python3"
     arch: str = "x86_64"
     ros: str = ""
+    gateway: IPv4Address | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Robot:
     """A robot, or the operator's base station (`is_base`): the udp_mesh peer `name`.
 
-    `fielded` is the address of a robot that still runs the legacy udp_mesh, which meshctl does not manage.
+    `fielded` is the address of a robot that still runs the legacy udp_mesh, which meshctl does not manage. `lan` is the
+    subnet of the robot's own LAN, which its radios route; None: they bridge the mesh to its switch. `computers` are the
+    others on its switch by name, which run no daemon.
     """
 
     name: str
@@ -165,7 +173,21 @@ class Robot:
     is_base: bool = False
     carries: tuple[str, ...] = ()
     fielded: IPv4Address | None = None
+    lan: IPv4Network | None = None
+    computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
     position: FixedPosition | None = None
+
+    @property
+    def other_addresses(self) -> tuple[str, ...]:
+        """The addresses of its computers without a daemon."""
+        return tuple(str(computer.address.ip) for computer in self.computers.values())
+
+    def all_computers(self) -> Iterator[tuple[tuple[str, ...], str, Computer]]:
+        """All its computers, the daemon's first: the path below the robot, what it is, and its settings."""
+        if self.computer is not None:
+            yield ("computer",), f"the computer of {self.name}", self.computer
+        for name, computer in self.computers.items():
+            yield ("computers", name), f"{name} of {self.name}", computer
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +277,11 @@ class Fleet:
     def managed(self) -> Iterator[Node]:
         """The nodes that are neither lost nor retired, in order."""
         return (node for node in self.nodes.values() if node.state.is_managed)
+
+    def router(self, robot: Robot) -> Node | None:
+        """The radio that routes the robot's LAN: its first managed one with an address there."""
+        nodes = (self.nodes.get(name) for name in robot.nodes)
+        return next((node for node in nodes if node and node.state.is_managed and node.lan_address), None)
 
     def members(self, mesh: str) -> Iterator[Node]:
         """The managed nodes with at least one radio in `mesh`."""

@@ -74,9 +74,15 @@ class ConnectionPool:
         return Endpoint(host, port, node.ssh.user, identity=node.name, interface=self.interfaces.get(node.name, ""))
 
     def candidates(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
-        """The endpoints to try for a node: through its local interface, if known, then by the routing table."""
-        first = self.endpoint(node, address)
-        return (first, replace(first, interface="")) if first.interface else (first,)
+        """The endpoints to try for a node: through its local interface, if known, then by the routing table.
+
+        A router also answers at its address in the robot's LAN; over a wire to its LAN port only there.
+        """
+        endpoints = [self.endpoint(node, address)]
+        if address is None and node.lan_address is not None and not node.ssh.host:
+            endpoints.append(self.endpoint(node, node.lan_address.ip))
+        by_routing_table = [replace(one, interface="") for one in endpoints if one.interface]
+        return (*endpoints, *by_routing_table)
 
     def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:
         """The credentials for a node: keys, and no password only on the bench. At its own address only a login with a

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 
 from meshctl.model import Release
 from meshctl.plan.radios import RadioChange, radio_changes
+from meshctl.plan.seen import management_section
 from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
@@ -83,9 +84,20 @@ def _network(before: Package | None, after: Package | None) -> list[Effect]:
     if any(section.get("proto") in ("batadv", "batadv_hardif") for section in was_there):
         # any option of bat0 destroys and recreates it (openwrt-facts.md section 1)
         found.append(Effect("network", Cut.MESH, "bat0 is recreated"))
-    address = _address(old.get("lan")), _address(new.get("lan"))
-    if address[0] != address[1]:
-        found.append(Effect("network", Cut.LAN, f"its address changes from {address[0] or '-'} to {address[1] or '-'}"))
+    addresses = [_address(management_section(package)) for package in (before, after)]
+    if addresses[0] != addresses[1]:
+        found.append(
+            Effect("network", Cut.LAN, f"its address changes from {addresses[0] or '-'} to {addresses[1] or '-'}")
+        )
+    if before.section("backbone") is None and after.section("backbone") is not None:
+        found.append(Effect("network", Cut.LAN, "it routes its LAN, which leaves the mesh's network"))
+    elif before.section("backbone") is not None and after.section("backbone") is None:
+        found.append(Effect("network", Cut.LAN, "it bridges its LAN into the mesh's network"))
+    if not found and {section.type for section in was_there + [new[key] for key in differing if key in new]} == {
+        "route"
+    }:
+        # netifd replaces routes in place; a login from another robot's LAN may come over one of them
+        return [Effect("network", Cut.LOGIN, "routes to the robots' LANs change")]
     return found or [Effect("network", Cut.LAN, "network changes")]
 
 

@@ -12,7 +12,7 @@ from meshctl.device.observation import FileInfo, Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.plan.cell import Cell
 from meshctl.topology import NEIGHBOUR_FRESH_MS
-from meshctl.uci import Package, parse
+from meshctl.uci import Package, Section, parse
 
 CONFIG = "etc/config/"
 WIRELESS = f"{CONFIG}wireless"
@@ -57,11 +57,16 @@ def parsed(text: str | None, package: str) -> Package | None:
         return None
 
 
-def lan_address(network: str | None) -> IPv4Address | None:
+def management_section(network: Package) -> Section | None:
+    """The interface with the management address: a router's on the mesh, else `lan`."""
+    return network.section("backbone") or network.section("lan")
+
+
+def management_address(network: str | None) -> IPv4Address | None:
     """The management address in a network file; None if it has none, is missing or unreadable."""
     tree = parsed(network, "network")
-    lan = None if tree is None else tree.section("lan")
-    text = "" if lan is None else lan.get("ipaddr").partition("/")[0]
+    section = None if tree is None else management_section(tree)
+    text = "" if section is None else section.get("ipaddr").partition("/")[0]
     return IPv4Address(text) if text else None
 
 

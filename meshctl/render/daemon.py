@@ -1,8 +1,9 @@
 """Fleet -> the files of the udp_mesh daemon on a robot's computer: its configuration (TOML) and its key file.
 
 All robots get the same topics, because the sender selects a message's destinations and the receiver requests repair of
-a broadcast. The daemon uses only the interface with the computer's address. docs/udp-mesh.md describes the format; a
-test loads the output with the daemon's own reader.
+a broadcast. The daemon uses only the interface with the computer's address. If a robot has a LAN of its own, where no
+broadcast arrives, every daemon gets all others as fixed neighbors: a broadcast link would not reach all of them.
+docs/udp-mesh.md describes the format; a test loads the output with the daemon's own reader.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.errors import InputError
 from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, TopicLog, UdpMesh
+from meshctl.resolve import has_routed_lans
 
 # Values that the daemon would reject (docs/render.md).
 DAEMON = "RND030"
@@ -158,9 +160,10 @@ def _rates(transport: UdpMesh) -> Iterator[str]:
 
 
 def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
-    kind = "broadcast" if fleet.udp_mesh.broadcast else "neighbours"
+    uses_broadcast = fleet.udp_mesh.broadcast and not has_routed_lans(fleet)
+    kind = "broadcast" if uses_broadcast else "neighbours"
     yield from ("", "[[links]]", f'address = "{computer.address.ip}"', f'kind = "{kind}"')
-    if not fleet.udp_mesh.broadcast:
+    if not uses_broadcast:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
                 yield from _neighbor(peer.name, str(peer.computer.address.ip))

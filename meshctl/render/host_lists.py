@@ -43,15 +43,15 @@ def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
     ]
     computers = [
         HostEntry(
-            f"robot.{name}",
-            f"robot.{name}",
-            robot.computer.ssh.host or str(robot.computer.address.ip),
-            robot.computer.ssh,
+            ".".join(("robot", name, *place[1:])),
+            ".".join(("robot", name, *place[1:])),
+            computer.ssh.host or str(computer.address.ip),
+            computer.ssh,
             ("robots",),
             is_openwrt=False,
         )
         for name, robot in fleet.robots.items()
-        if robot.computer is not None
+        for place, _, computer in robot.all_computers()
     ]
     return (*radios, *computers)
 

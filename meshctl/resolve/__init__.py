@@ -1,7 +1,7 @@
 """Fleet -> Intent of each node: its complete desired configuration, as input for templates."""
 
 from meshctl.resolve.airtime import originator_airtime
-from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
+from meshctl.resolve.intent import Backbone, BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import MEASURED_HEAL_S, Intervals, UnreachableTarget, batman_intervals, heal_s
 from meshctl.resolve.node import resolve
 from meshctl.resolve.packages import (
@@ -13,10 +13,12 @@ from meshctl.resolve.packages import (
     supplicant_need,
     wireless_scripts,
 )
+from meshctl.resolve.routes import StaticRoute, computer_gateway, has_routed_lans, routes
 
 __all__ = [
     "FULL_SUPPLICANTS",
     "MEASURED_HEAL_S",
+    "Backbone",
     "BatmanInterface",
     "Intent",
     "Intervals",
@@ -26,13 +28,17 @@ __all__ = [
     "PackageNeed",
     "PackagePlan",
     "RadioIntent",
+    "StaticRoute",
     "UnreachableTarget",
     "batman_intervals",
+    "computer_gateway",
+    "has_routed_lans",
     "heal_s",
     "originator_airtime",
     "package_needs",
     "package_plan",
     "resolve",
+    "routes",
     "supplicant_need",
     "wireless_scripts",
 ]

@@ -20,6 +20,11 @@ from meshctl.model import (
     Secret,
     SystemSettings,
 )
+from meshctl.resolve.routes import StaticRoute
+
+# UCI interfaces: the wired ports, and a router's interface on the mesh
+LAN = "lan"
+BACKBONE = "backbone"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +79,8 @@ class BatmanInterface:
 
 @dataclass(frozen=True, slots=True)
 class Lan:
-    """The bridge of the node's wired ports and its mesh, with the management address. `switch_vlans` are the VLANs of
+    """The bridge of the node's wired ports and its mesh, with the management address; without the mesh, and with the
+    address in the robot's own LAN, if the node is a router (`Intent.backbone`). `switch_vlans` are the VLANs of
     `switch0` and their ports, empty without swconfig or if only the device has them."""
 
     bridge: str
@@ -83,6 +89,21 @@ class Lan:
     gateway: IPv4Address | None
     mtu: int
     switch_vlans: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Backbone:
+    """A router's interface on the mesh: the batman-adv interface `device`, with the management address."""
+
+    device: str
+    address: IPv4Interface
+    gateway: IPv4Address | None
+    mtu: int
+
+    @property
+    def mac(self) -> str:
+        """A locally administered MAC address for `device`, from the management address: unique and constant."""
+        return ":".join(f"{byte:02x}" for byte in (0x02, 0xBA, *self.address.ip.packed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +117,8 @@ class Login:
 
 @dataclass(frozen=True, slots=True)
 class Intent:
-    """One node, defined at `position`. `extra_uci` are options by their full names (`wireless.radio0.rts`), applied
-    after the templates; `extra_positions` are their positions."""
+    """One node, defined at `position`. `backbone` is None on a node that bridges mesh and LAN. `extra_uci` are options
+    by their full names (`wireless.radio0.rts`), applied after the templates; `extra_positions` are their positions."""
 
     fleet: str
     node: str
@@ -118,6 +139,13 @@ class Intent:
     position: Position
     extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     extra_positions: Mapping[str, Position] = field(default_factory=lambda: MappingProxyType({}))
+    backbone: Backbone | None = None
+    routes: tuple[StaticRoute, ...] = ()
+
+    @property
+    def management_network(self) -> str:
+        """The UCI interface with the management address, over which the mesh is reached."""
+        return BACKBONE if self.backbone is not None else LAN
 
     @property
     def interfaces(self) -> tuple[MeshInterface, ...]:

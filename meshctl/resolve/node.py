@@ -3,7 +3,8 @@
 A radio in a mesh gets the interface `mesh0`, `mesh1`, ... in the radios' order. Meshes with the same network and
 routing algorithm share one batman-adv interface (`bat0`), so that a node with several radios routes between them; any
 other mesh gets its own interface, which relays but is not bridged. The bridge connects the wired ports to the routing
-interface of the mesh whose network contains the node's address.
+interface of the mesh whose network contains the node's address. A node with an address in its robot's own LAN is a
+router instead: the bridge has the wired ports only, and the routing interface has the management address.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from ipaddress import IPv4Network
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
-from meshctl.resolve.intent import BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
+from meshctl.resolve.intent import Backbone, BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
 from meshctl.resolve.packages import package_plan
 from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, ValueChecks
+from meshctl.resolve.routes import routes
 
 BRIDGE = "br-lan"
 # dropbear's own default
@@ -40,6 +42,10 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         checks.add(
             COMBINATION, path, "meshes of one back end", ", ".join(f"{m.name}: {m.backend.value}" for m in meshes)
         )
+    if node.lan_address is not None and (primary is None or primary.backend is not Backend.BATMAN):
+        found = "no mesh" if primary is None else primary.backend.value
+        message = "a router between the mesh and a LAN needs batman-adv"
+        checks.add(COMBINATION, ("robots", node.robot, "lan"), Backend.BATMAN.value, found, message=message)
     plan = package_plan(fleet, node)
     radios = _radios(fleet, node, keys, masters, intervals)
     intent = Intent(
@@ -52,7 +58,9 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         board=node.hardware.board,
         radios=radios,
         batman=_batman(meshes, masters, intervals),
-        lan=_lan(node, primary, masters, radios),
+        lan=_lan(node, primary, masters),
+        backbone=_backbone(node, primary, masters),
+        routes=routes(fleet, node),
         login=Login(_ssh_port(node), fleet.operators.password_login, fleet.operators.ssh_keys),
         system=fleet.system,
         backend=primary.backend if primary is not None else Backend.BATMAN,
@@ -179,8 +187,21 @@ def _batman(
     return tuple(interfaces.values())
 
 
-def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tuple[RadioIntent, ...]) -> Lan:
+def _backbone(node: Node, primary: Mesh | None, masters: dict[str, str]) -> Backbone | None:
+    """A router's interface on the mesh; None on a node that bridges."""
+    if node.lan_address is None or primary is None or primary.name not in masters:
+        return None
+    gateway = None if node.gateway is None or node.gateway in node.lan_address.network else node.gateway
+    return Backbone(masters[primary.name], node.address, gateway, primary.lan_mtu)
+
+
+def _lan(node: Node, primary: Mesh | None, masters: dict[str, str]) -> Lan:
     ports = list(node.lan_ports)
+    mtu = primary.lan_mtu if primary is not None else 1500
+    if node.lan_address is not None:
+        gateway = node.gateway if node.gateway is not None and node.gateway in node.lan_address.network else None
+        address = node.lan_address
+        return Lan(BRIDGE, tuple(dict.fromkeys(ports)), address, gateway, mtu, node.hardware.switch_vlans)
     if primary is not None:
         match primary.backend:
             case Backend.BATMAN:
@@ -189,7 +210,6 @@ def _lan(node: Node, primary: Mesh | None, masters: dict[str, str], radios: tupl
                 ports.append(primary.operator_parts.interface)
             case Backend.MESHMERIZE:
                 pass
-    mtu = primary.lan_mtu if primary is not None else 1500
     return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu, node.hardware.switch_vlans)
 
 

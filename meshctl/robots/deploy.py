@@ -26,6 +26,8 @@ from meshctl.robots.preconditions import (
     clock_warning,
     computer_of,
     parse_facts,
+    route_warning,
+    routed_peers,
     unmet_disk_space,
     unmet_preconditions,
 )
@@ -90,7 +92,8 @@ class DeployOptions:
 def probe(host: Host, fleet: Fleet, robot: str) -> HostFacts:
     """Collect the facts of a computer. Changes nothing."""
     ros = ROS_1 if has_bridge(fleet, robot) else ""
-    return parse_facts(host.run("probe", computer_of(fleet, robot).python, ros, timeout_s=PROBE_TIMEOUT_S))
+    words = (computer_of(fleet, robot).python, ros, *routed_peers(fleet, robot))
+    return parse_facts(host.run("probe", *words, timeout_s=PROBE_TIMEOUT_S))
 
 
 def desired_bundle(options: DeployOptions, robot: str, facts: HostFacts) -> Bundle:
@@ -131,7 +134,7 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
     facts, release = plan
     if facts.current == release.id and facts.is_sound:
         same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id})
-        return _with_clock_warning(same, facts, options)
+        return _with_warnings(same, facts, options)
     if options.only_configuration and not _only_configuration(facts, release):
         return _refused(robot, [_more_than_configuration(facts, release)])
     is_new = release.id not in facts.releases or bool(facts.damaged)
@@ -145,7 +148,7 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
         with options.step(robot, "switch", f"to {release.id} ({how})"):
             outcome = switch(host, robot, release.id, how, options.wait_s)
     details = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
-    return _with_clock_warning(replace(outcome, facts=details), facts, options)
+    return _with_warnings(replace(outcome, facts=details), facts, options)
 
 
 def _transfer(
@@ -164,13 +167,12 @@ def _transfer(
     return sent
 
 
-def _with_clock_warning(outcome: Outcome, facts: HostFacts, options: DeployOptions) -> Outcome:
-    remark, hint = clock_warning(facts, options.now_s())
-    if not remark:
-        return outcome
-    return replace(
-        outcome, reason=f"{outcome.reason}; {remark}", hint="; ".join(text for text in (outcome.hint, hint) if text)
-    )
+def _with_warnings(outcome: Outcome, facts: HostFacts, options: DeployOptions) -> Outcome:
+    for remark, hint in (clock_warning(facts, options.now_s()), route_warning(facts, options.fleet, outcome.node)):
+        if remark:
+            hints = (text for text in (outcome.hint, hint) if text)
+            outcome = replace(outcome, reason=f"{outcome.reason}; {remark}", hint="; ".join(hints))
+    return outcome
 
 
 def _only_configuration(facts: HostFacts, release: Bundle) -> bool:

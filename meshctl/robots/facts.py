@@ -116,7 +116,8 @@ class RobotFacts:
 
     `error` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
     the inventory. `bridge` and `hosts` (the service for /etc/hosts) are None if neither expected nor installed.
-    `status` is the output of `udp-mesh status --json`, empty if the daemon does not answer.
+    `answering` are the pinged addresses that answered (None: it has no ping). `status` is the output of `udp-mesh
+    status --json`, empty if the daemon does not answer.
     """
 
     robot: str
@@ -139,6 +140,7 @@ class RobotFacts:
     queues: tuple[QueueFacts, ...] = ()
     topics: tuple[TopicFacts, ...] = ()
     computer: ComputerFacts = ComputerFacts()
+    answering: tuple[str, ...] | None = None
     status: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -188,16 +190,18 @@ def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Se
     return ExpectedRelease(files, own_wheel().sha256)
 
 
-def collect_facts(host: Host, robot: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
-    """Query one robot; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
-    return parse_robot_facts(robot, host.run("facts", timeout_s=FACTS_TIMEOUT_S), expected, now_s=now_s)
+def collect_facts(
+    host: Host, robot: str, expected: ExpectedRelease, *, now_s: float, others: Iterable[str] = ()
+) -> RobotFacts:
+    """Query one robot, which pings `others`; `now_s` is our clock (Unix time). Raises what `Host.run` raises."""
+    return parse_robot_facts(robot, host.run("facts", *others, timeout_s=FACTS_TIMEOUT_S), expected, now_s=now_s)
 
 
 def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s: float) -> RobotFacts:
     """Parse the sections of `scripts/facts.sh`; a missing section or invalid JSON counts as no answer."""
     sections = _sections(text)
     services = _services(sections.get("services", ()))
-    release = _values(sections.get("release", ()))
+    release, others = (_values(sections.get(name, ())) for name in ("release", "others"))
     status = _object(sections.get("status", ()))
     peers = tuple(_objects(_within(status, "conditions").get("peers")))
 
@@ -224,6 +228,7 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
         queues=_queues(peers),
         topics=tuple(_topic(topic) for topic in _objects(_object(sections.get("topics", ())).get("topics"))),
         computer=_computer(_values(sections.get("computer", ())), now_s),
+        answering=None if "ping" in others else tuple(others.get("answers", ())),
         status=status,
     )
 

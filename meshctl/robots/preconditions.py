@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from meshctl.errors import InputError
 from meshctl.model import Computer, Fleet
 from meshctl.report.duration import duration
+from meshctl.resolve import computer_gateway, has_routed_lans
 from meshctl.robots.wheel_tags import Target
 
 # udp_mesh uses asyncio.timeout and tomllib.
@@ -22,7 +23,7 @@ HEADROOM_KIB = 32 << 10
 @dataclass(frozen=True, slots=True)
 class HostFacts:
     """`files` are (path, hash) of the current release's manifest; `damaged` are paths that no longer match; `releases`
-    and `trees` are the intact ones; `python` is None if none runs."""
+    and `trees` are the intact ones; `python` is None if none runs; `no_route` are peers' addresses without a route."""
 
     arch: str = ""
     now_s: float = 0.0
@@ -48,6 +49,7 @@ class HostFacts:
     damaged: tuple[str, ...] = ()
     is_proven: bool = True
     services: tuple[tuple[str, str, str], ...] = ()
+    no_route: tuple[str, ...] = ()
 
     @property
     def units(self) -> tuple[tuple[str, str, str], ...]:
@@ -113,6 +115,7 @@ def parse_facts(text: str) -> HostFacts:
         damaged=tuple(many.get("damaged", ())),
         is_proven=one.get("proven") == "yes",
         services=tuple(_service(row) for row in many.get("unit", ())),
+        no_route=tuple(many.get("no_route", ())),
     )
 
 
@@ -165,6 +168,29 @@ def clock_warning(facts: HostFacts, now_s: float) -> tuple[str, str]:
         f"its clock is {duration(abs(skew_s))} {side} ours",
         "set it with `date -s` or NTP; until then log times are wrong",
     )
+
+
+def routed_peers(fleet: Fleet, robot: str) -> dict[str, str]:
+    """The computers' addresses outside the network of the robot's computer, and their robots' names.
+
+    None without routed LANs: separate meshes need no routes to each other.
+    """
+    if not has_routed_lans(fleet):
+        return {}
+    network = computer_of(fleet, robot).address.network
+    computers = ((peer.name, peer.computer) for peer in fleet.robots.values() if peer.computer is not None)
+    return {str(other.address.ip): name for name, other in computers if other.address.ip not in network}
+
+
+def route_warning(facts: HostFacts, fleet: Fleet, robot: str) -> tuple[str, str]:
+    """(which peers its computer has no route to, how to add them), or empty strings."""
+    names = routed_peers(fleet, robot)
+    missing = [f"{names[address]} ({address})" for address in facts.no_route if address in names]
+    if not missing:
+        return "", ""
+    gateway = computer_gateway(fleet, fleet.robots[robot])
+    hint = f"set a permanent route through {gateway} there, as `ip route add default via {gateway}` does until a reboot"
+    return f"it has no route to {', '.join(missing)}", hint if gateway is not None else ""
 
 
 def unmet_preconditions(facts: HostFacts, *, robot: str, arch: str, python: str) -> Iterator[tuple[str, str]]:

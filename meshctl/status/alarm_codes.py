@@ -33,7 +33,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "snr": "the signal to the next hop is hardly above the noise",
         "busy": "its channel is busy most of the time",
         "radio-queue": "many packets wait in its radio",
-        "dropped": "a beacon marked as carried relays for others, or did when last seen",
+        "dropped": "a beacon marked as carried relays for others, or did when last seen, or is away from its robot",
         "cut-vertex": "others reach the base only through it",
         "bridge": "a LAN port or the mesh is not in a bridge",
         "flash": "low on flash storage",
@@ -56,6 +56,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "topic-silent": "it sends nothing on a topic for longer than the topic's rate and deadline allow",
         "topic-not-arriving": "a robot it hears sends on a topic, but nothing arrives",
         "disk": "low on disk space",
+        "computer-silent": "another computer on its switch does not answer",
         # the fleet
         "stranger": "a device that is not in the inventory is in the mesh",
         "not-compared": "a device could not be compared with the inventory, usually because a secret is missing",

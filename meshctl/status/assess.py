@@ -6,13 +6,14 @@ This module assesses the radios; `robots` assesses the robots.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from meshctl.device.observation import Observation
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import RobotFacts
+from meshctl.status.dropped import dropped_beacons
 from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
 from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperature_of
 from meshctl.status.robots import RobotAnswers, robot_status
@@ -89,6 +90,8 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             own_lock=snapshot.own_lock,
         )
         statuses.append(_reachable_status(everything, now))
+    if not snapshot.is_partial:
+        statuses = _with_dropped(snapshot.fleet, statuses)
     names = set(snapshot.macs.values()) | set(snapshot.observations) | set(snapshot.fleet.nodes)
     strangers = tuple(name for name in snapshot.graph.nodes if name not in names)
     robot_answers = RobotAnswers(
@@ -104,6 +107,19 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
         tuple(_fleet_alarms(snapshot)),
         snapshot.took_s,
     )
+
+
+def _with_dropped(fleet: Fleet, statuses: list[NodeStatus]) -> list[NodeStatus]:
+    """With a note for each beacon that appears to have been dropped and has no such alarm yet."""
+    dropped = dropped_beacons(fleet, statuses)
+    found = []
+    for status in statuses:
+        if status.name in dropped and not any(alarm.code == "dropped" for alarm in status.alarms):
+            text = f"marked as carried, but {dropped[status.name]}"
+            hint = f"if it has been dropped: meshctl deployed {status.name}, or --watch 30 to mark all by themselves"
+            status = replace(status, alarms=(*status.alarms, Alarm(Level.NOTE, "dropped", text, hint)))
+        found.append(status)
+    return found
 
 
 def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:

@@ -195,10 +195,12 @@ class Collector:
 
     def _collect_robot(self, robot: str) -> RobotFacts:
         expected = self._expected_release(robot)
+        others = self.fleet.robots[robot].other_addresses
         with self.robot_host(robot) as host:
             if isinstance(expected, str):
-                return replace(collect_facts(host, robot, ExpectedRelease(), now_s=self.clock()), drift=())
-            return collect_facts(host, robot, expected, now_s=self.clock())
+                found = collect_facts(host, robot, ExpectedRelease(), now_s=self.clock(), others=others)
+                return replace(found, drift=())
+            return collect_facts(host, robot, expected, now_s=self.clock(), others=others)
 
     def _expected_release(self, robot: str) -> ExpectedRelease | str:
         with self._lock:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from meshctl.robots.facts import RobotFacts
 from meshctl.robots.position_facts import PositionFacts
 from meshctl.status.last_known import typed
 from meshctl.status.preflight import Check, verdict
@@ -144,6 +145,10 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
         "is_base": robot.robot.is_base,
         "state": None if robot.state is None else robot.state.value,
         "radios": list(robot.robot.nodes),
+        "computers": [
+            {"name": name, "address": str(one.address.ip), "answers": _answers(robot.facts, str(one.address.ip))}
+            for name, one in robot.robot.computers.items()
+        ],
         "address": None if robot.robot.computer is None else str(robot.robot.computer.address.ip),
         "health": robot.health.value,
         "answers": robot.facts is not None,
@@ -217,6 +222,11 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
             for topic in robot.topics
         ],
     }
+
+
+def _answers(facts: RobotFacts | None, address: str) -> bool | None:
+    """Whether another computer of the robot answered; None if nothing pinged it."""
+    return None if facts is None or facts.answering is None else address in facts.answering
 
 
 def preflight_json(checks: Iterable[Check]) -> dict[str, Any]:

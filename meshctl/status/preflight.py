@@ -298,5 +298,13 @@ _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
         "topic-not-arriving",
         daemons=True,
     ),
-    _alarm_check("computers", "disk, memory and clock are fine", "disk", "memory", "clock", robots=True),
+    _alarm_check(
+        "computers",
+        "all answer; disk, memory and clock are fine",
+        "computer-silent",
+        "disk",
+        "memory",
+        "clock",
+        robots=True,
+    ),
 )

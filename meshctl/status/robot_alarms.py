@@ -205,6 +205,17 @@ def size(kib: float) -> str:
     return f"{kib / (1 << 30):.0f} TiB"
 
 
+def _others(seen: RobotAlarmInput) -> Iterator[Alarm]:
+    """Computers on its switch that the robot's daemon computer does not reach."""
+    if seen.facts.answering is None:
+        return
+    for name, computer in seen.robot.computers.items():
+        address = str(computer.address.ip)
+        if address not in seen.facts.answering:
+            text = f"its computer {name} ({address}) does not answer a ping"
+            yield Alarm(Level.WARNING, "computer-silent", text, "check its power, its cable and its address")
+
+
 _CONCERNS: tuple[Callable[[RobotAlarmInput], Iterator[Alarm]], ...] = (
     _daemon,
     _restarts,
@@ -214,4 +225,5 @@ _CONCERNS: tuple[Callable[[RobotAlarmInput], Iterator[Alarm]], ...] = (
     _queues,
     _topics,
     _computer,
+    _others,
 )

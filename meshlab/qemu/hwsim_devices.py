@@ -89,7 +89,8 @@ def prepare(spec: FleetSpec, country: str = "US") -> None:
     ip(batch)
     for lan in spec.lans:
         address = [f"addr add {lan.computer} dev eth0"] if lan.computer else []
-        ip(["link set lo up", "link set eth0 up", *address], namespace=computer_namespace(lan))
+        gateway = [f"route add default via {lan.gateway}"] if lan.computer and lan.gateway else []
+        ip(["link set lo up", "link set eth0 up", *address, *gateway], namespace=computer_namespace(lan))
     # do not answer ARP on one bench cable for the address of another
     Path("/proc/sys/net/ipv4/conf/all/arp_ignore").write_text("1\n", encoding="ascii")
     run(("iw", "reg", "set", country))

@@ -117,9 +117,19 @@ class QemuPortForwarder(PortForwarder):
         if lan is None:
             raise LabError("the fleet has no base: its nodes are reachable on the bench only")
         space = hwsim_devices.computer_namespace(lan)
-        if not lan.computer or IPv4Interface(lan.computer).network != address.network:
+        is_local = bool(lan.computer) and IPv4Interface(lan.computer).network == address.network
+        if not is_local and self._is_on_wire_of_base(address):
             _add_address("eth0", hwsim_devices.operator_address(address, 0), namespace=space)
         return self._socket_in(space)
+
+    def _is_on_wire_of_base(self, address: IPv4Interface) -> bool:
+        """Whether a base's LAN is in the address's network; otherwise the base routes there."""
+        return any(
+            one.over_wire and IPv4Interface(f"{one.address}/{one.prefix}").network == address.network
+            for state in self._fleet.nodes.values()
+            if state.spec.medium is Medium.BASE
+            for one in state.effective.addresses
+        )
 
     def _socket_in(self, namespace: str) -> socket.socket:
         if namespace not in self._computers:

@@ -20,7 +20,7 @@ CELL = WirelessInterface(
 
 def node(number: int, **changes: object) -> EffectiveState:
     cell = replace(CELL, mac=f"02:00:00:00:00:{number:02x}", **changes)  # type: ignore[arg-type]
-    return EffectiveState((cell,), (Address("lan", f"10.42.0.{number}", 24, True, True),))
+    return EffectiveState((cell,), (Address("lan", "br-lan", f"10.42.0.{number}", 24, True, True),))
 
 
 def chain(count: int) -> tuple[dict[str, EffectiveState], list[LinkSpec]]:
@@ -105,3 +105,24 @@ def test_effective_state_written_by_the_stand_in_is_parsed() -> None:
     assert read.holds("10.42.0.11", over="mesh")
     assert not read.holds("10.42.0.11", over="wire")
     assert read.interfaces[0].ssid == "a team"
+
+
+BASE = """\
+forward\tbr-lan\tbat0
+addr\tlan\tbr-lan\t10.43.0.1\t24\t0\t1\t1
+addr\tbackbone\tbat0\t10.42.0.1\t24\t1\t0\t1
+"""
+
+
+def test_a_router_leads_into_the_mesh_only_if_its_firewall_forwards() -> None:
+    assert mesh_model.parse_effective(BASE).routes_lan_and_mesh
+    assert not mesh_model.parse_effective(BASE.replace("forward\tbr-lan\tbat0\n", "")).routes_lan_and_mesh
+    assert not mesh_model.parse_effective(BASE).bridges_lan_and_mesh
+
+
+def test_a_node_answers_through_a_router_only_with_a_route_back() -> None:
+    base = mesh_model.parse_effective(BASE)
+    route = "route\tbr-lan\t10.43.0.0\t24\t10.42.0.1\n"
+    assert mesh_model.parse_effective(route).answers_through(base)
+    assert not mesh_model.parse_effective(route.replace("10.42.0.1", "10.42.0.9")).answers_through(base)
+    assert not mesh_model.parse_effective("").answers_through(base)

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import PositionDocument, SshLayer
-from meshctl.inventory.fields import Address, Flag, Interface, Real, Text, Whole, Window
+from meshctl.inventory.fields import Address, Flag, Interface, Name, Network, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
 
@@ -23,6 +23,27 @@ class ComputerDocument(Document):
     """Architecture, as printed by `uname -m`."""
     ros: Text = ""
     """ROS distribution: noetic, humble..."""
+    gateway: Address = NOT_WRITTEN
+    """Its next hop to other networks: an address of one of the robot's radios. Default: that of the radio that routes
+    the robot's LAN, else of the robot's first radio."""
+
+
+class OtherComputerDocument(Document):
+    """Another computer on the robot's switch, without a daemon."""
+
+    address: Interface
+    """Address with prefix length."""
+    ssh: SshLayer = Field(default_factory=SshLayer)
+    """SSH login, for `meshctl inventory export`."""
+
+
+class LanDocument(Document):
+    """A robot's LAN with a subnet of its own, routed by the robot's radios instead of bridged into the mesh."""
+
+    network: Network
+    """Subnet, such as 10.43.1.0/24."""
+    addresses: dict[Name, Address] = Field(default_factory=dict)
+    """Addresses of the robot's radios in it. Default: its first addresses, in the order of `nodes`."""
 
 
 class RobotDocument(Document):
@@ -31,13 +52,18 @@ class RobotDocument(Document):
     nodes: tuple[Text, ...] = ()
     """Radios mounted on the robot; may contain ranges."""
     computer: ComputerDocument = NOT_WRITTEN
-    """The robot's computer."""
+    """The robot's computer, where the udp_mesh daemon runs."""
+    computers: dict[Name, OtherComputerDocument] = Field(default_factory=dict)
+    """Other computers on its switch by name. The one that runs the daemon pings them for `meshctl status`."""
     is_base: Flag = False
     """True for the operator's base station."""
     carries: tuple[Text, ...] = ()
     """Beacons in the robot's racks; may contain ranges."""
     fielded: Address = NOT_WRITTEN
     """Address of the robot's computer while it runs the legacy udp_mesh; replace it with `computer` at migration."""
+    lan: LanDocument = NOT_WRITTEN
+    """Subnet of the robot's own LAN; its first radio in service routes it. Default: its radios bridge the mesh to its
+    switch."""
     position: PositionDocument = NOT_WRITTEN
     """Where it stands, if it does not move, as a base station."""
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Interface, IPv6Address, ip_address
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates
+from meshctl.lint.grouping import duplicates, join_limited
+from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, Node
 
+# so many nodes of a mesh, and all of them, outside its network: the network is wrong, not each address
+_WRONG_NETWORK_NODES = 3
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
 
@@ -39,12 +42,29 @@ def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
     for node in fleet.managed():
         yield node.address.ip, (("nodes", node.name, "address"), node.name)
+        if node.lan_address is not None:
+            yield node.lan_address.ip, (lan_address_path(fleet, node), node.name)
     for robot in fleet.robots.values():
-        if robot.computer is not None:
-            path = ("robots", robot.name, "computer", "address")
-            yield robot.computer.address.ip, (path, f"the computer of {robot.name}")
-        elif robot.fielded is not None:
+        for place, what, computer in robot.all_computers():
+            yield computer.address.ip, (("robots", robot.name, *place, "address"), what)
+        if robot.computer is None and robot.fielded is not None:
             yield robot.fielded, (("robots", robot.name, "fielded"), f"the computer of {robot.name}")
+
+
+def lan_address_path(fleet: Fleet, node: Node) -> tuple[str, ...]:
+    """Where a radio's address in its robot's LAN is set, or the LAN that it is computed from."""
+    name = next((robot.name for robot in fleet.robots.values() if robot.lan and node.name in robot.nodes), node.robot)
+    lan = ("robots", name, "lan")
+    return first_written(fleet, (*lan, "addresses", node.name), (*lan, "network"))
+
+
+def networks(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], IPv4Network]]:
+    """The networks of the fleet with their paths: the meshes', then the robots' own LANs."""
+    for mesh in fleet.meshes.values():
+        yield ("meshes", mesh.name, "network"), mesh.network
+    for robot in fleet.robots.values():
+        if robot.lan is not None:
+            yield ("robots", robot.name, "lan", "network"), robot.lan
 
 
 @fleet_rule(
@@ -57,10 +77,23 @@ def stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...],
     passing="nodes: {b01: {address: 10.42.0.7}}",
 )
 def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    outside: dict[str, list[Node]] = {}
     for node in fleet.managed():
-        networks = [mesh.network for mesh in meshes_of(fleet, node)]
-        if networks and not any(node.address.ip in network for network in networks):
-            expected = f"an address in {' or '.join(str(network) for network in networks)}"
+        meshes = meshes_of(fleet, node)
+        if meshes and not any(node.address.ip in mesh.network for mesh in meshes):
+            outside.setdefault(meshes[0].name, []).append(node)
+    for name, nodes in outside.items():
+        mesh = fleet.meshes[name]
+        if len(nodes) >= _WRONG_NETWORK_NODES and not any(
+            other.address.ip in mesh.network for other in fleet.members(name)
+        ):
+            # one typo in the network, rather than one in each address
+            message = f"contains no address of {join_limited([node.name for node in nodes])}"
+            expected = f"a network with {nodes[0].address.ip}"
+            yield Finding(("meshes", name, "network"), message, expected, str(mesh.network))
+            continue
+        for node in nodes:
+            expected = f"an address in {' or '.join(str(mesh.network) for mesh in meshes_of(fleet, node))}"
             yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
 
 
@@ -77,8 +110,8 @@ def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         yield from _reserved(("nodes", node.name, "address"), node.address)
     for robot in fleet.robots.values():
-        if robot.computer is not None:
-            yield from _reserved(("robots", robot.name, "computer", "address"), robot.computer.address)
+        for place, _, computer in robot.all_computers():
+            yield from _reserved(("robots", robot.name, *place, "address"), computer.address)
 
 
 def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding]:
@@ -104,8 +137,10 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     for node in fleet.managed():
         if node.gateway is None:
             continue
-        if node.gateway == node.address.ip or node.gateway not in node.address.network:
-            expected = f"another station in {node.address.network}"
+        own = [address for address in (node.address, node.lan_address) if address is not None]
+        is_itself = any(node.gateway == address.ip for address in own)
+        if is_itself or not any(node.gateway in address.network for address in own):
+            expected = f"another station in {' or '.join(str(address.network) for address in own)}"
             yield Finding(("nodes", node.name, "gateway"), "not reachable from the node", expected, str(node.gateway))
 
 
@@ -124,34 +159,35 @@ def gateway_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     passing="meshes: {main: {network: 10.42.0.0/24}}",
 )
 def factory_address(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        if _FACTORY in mesh.network:
-            path = ("meshes", mesh.name, "network")
-            yield Finding(
-                path, f"contains {_FACTORY}, the address of factory-fresh devices", "another network", str(mesh.network)
-            )
+    for path, network in networks(fleet):
+        if _FACTORY in network:
+            message = f"contains {_FACTORY}, the address of factory-fresh devices"
+            yield Finding(path, message, "another network", str(network))
 
 
 @fleet_rule(
     "MC209",
     Severity.ERROR,
     "A robot's computer is in a different network than its radios",
-    why="""The radios bridge the mesh to the computer's switch. There is no router between them, so a computer in
-    another network is cut off.""",
-    fix="Give the computer an address in its radios' mesh network.",
+    why="""The radios bridge the mesh to the computer's switch, or route between the mesh and the robot's own `lan`. A
+    computer in another network is cut off.""",
+    fix="Give the computer an address in its radios' mesh network, or in the robot's `lan`.",
     failing="robots: {husky1: {computer: {address: 10.99.0.5/24}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
 def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
-        networks = dict.fromkeys(mesh.network for node in nodes for mesh in meshes_of(fleet, node))
-        if robot.computer is not None and networks:
-            address = robot.computer.address.ip
-            if not any(address in network for network in networks):
-                expected = f"an address in {' or '.join(str(network) for network in networks)}"
-                path = ("robots", robot.name, "computer", "address")
-                yield Finding(path, "outside the network of its radios", expected, str(address))
+        around = dict.fromkeys(mesh.network for node in nodes for mesh in meshes_of(fleet, node))
+        if robot.lan is not None:
+            around = dict.fromkeys((robot.lan,))
+        for place, _, computer in robot.all_computers() if around else ():
+            address = computer.address.ip
+            if not any(address in network for network in around):
+                expected = f"an address in {' or '.join(str(network) for network in around)}"
+                path = ("robots", robot.name, *place, "address")
+                message = "outside the network of its radios" if robot.lan is None else "outside the robot's LAN"
+                yield Finding(path, message, expected, str(address))
 
 
 @fleet_rule(
@@ -191,7 +227,7 @@ def _out_of_reach(fleet: Fleet, host: str) -> bool:
         return False
     address = as_address(host)
     # a name needs a resolver, which also is behind a gateway
-    return address is None or not any(address in mesh.network for mesh in fleet.meshes.values())
+    return address is None or not any(address in network for _, network in networks(fleet))
 
 
 def as_address(host: str) -> IPv4Address | IPv6Address | None:

@@ -74,7 +74,8 @@ def _bridged_pairs(fleet: Fleet) -> Iterator[tuple[str, Mesh, list[Node]]]:
     """Robots with several nodes of one mesh that are bridged onto the robot's switch."""
     for robot in fleet.robots.values():
         nodes = [fleet.nodes[name] for name in dict.fromkeys(robot.nodes) if name in fleet.nodes]
-        bridged = [node for node in nodes if node.state.is_managed and node.lan_ports]
+        # routers do not bridge
+        bridged = [node for node in nodes if node.state.is_managed and node.lan_ports and node.lan_address is None]
         for mesh, members in group_by_key((mesh, node) for node in bridged for mesh in node.meshes).items():
             if len(members) > 1 and mesh in fleet.meshes:
                 yield robot.name, fleet.meshes[mesh], members
@@ -131,7 +132,7 @@ def loop_over_other_back_end(fleet: Fleet, _context: LintContext) -> Iterator[Fi
 def confirm_window_short(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         avoiding = any(_avoids_loops(fleet, mesh) for mesh in node.meshes)
-        if avoiding and node.lan_ports and node.confirm_window_s <= _LOOP_AVOIDANCE_S:
+        if avoiding and node.lan_ports and node.lan_address is None and node.confirm_window_s <= _LOOP_AVOIDANCE_S:
             path = ("nodes", node.name, "confirm_window_s")
             if node.confirm_window_s == node.hardware.confirm_window_s:
                 path = ("hardware", node.hardware.name, "confirm_window_s")

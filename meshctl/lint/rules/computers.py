@@ -1,4 +1,4 @@
-"""The robots' computers: architecture, ROS distribution, names for /etc/hosts (MC631 to MC633)."""
+"""The robots' computers: architecture, ROS distribution, names for /etc/hosts (MC631 to MC634)."""
 
 from __future__ import annotations
 
@@ -96,3 +96,29 @@ def name_is_no_host_name(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if robot.computer is not None and not _HOST_LABEL.fullmatch(robot.name):
             expected = "letters, digits and hyphens, at most 63"
             yield Finding(("robots", robot.name), "not a host name", expected, robot.name)
+
+
+@fleet_rule(
+    "MC634",
+    Severity.WARNING,
+    "A robot's other computers are not monitored",
+    why="""The computer that runs the udp_mesh daemon pings the others on the robot's switch. Without one, `meshctl
+    status` says nothing about them.""",
+    fix="Name the computer that runs the daemon in `computer`.",
+    failing="""
+        robots:
+          husky1: {computer: <removed>, computers: {jetson: {address: 10.42.0.111/24}}}
+        topics:
+          commands: <removed>
+          artifacts: <removed>
+          map: <removed>
+          video: <removed>
+    """,
+    passing="robots: {husky1: {computers: {jetson: {address: 10.42.0.111/24}}}}",
+)
+def others_not_monitored(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        if robot.computers and robot.computer is None:
+            path = ("robots", robot.name, "computers")
+            found = join_limited(tuple(robot.computers))
+            yield Finding(path, "nothing pings them", "a `computer` that runs the daemon", found)

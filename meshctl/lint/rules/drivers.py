@@ -1,12 +1,14 @@
-"""Capabilities of radio drivers (MC841)."""
+"""Radio drivers and device paths (MC841 to MC843)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.openwrt_names import is_one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, RadioHardware
 
@@ -17,6 +19,21 @@ _LACKS = {
     "ath12k": frozenset({MeshMode.ADHOC}),
     "brcmfmac": frozenset({MeshMode.MESH}),
 }
+# kernel modules of radios in OpenWrt 19.07 to 25.12 (package/kernel/mac80211, mt76, ath10k-ct, mwlwifi)
+_DRIVERS = frozenset(
+    [
+        *("ath5k", "ath9k", "ath9k-htc", "ath10k", "ath10k-ct", "ath11k", "ath12k", "ar5523", "b43", "brcmfmac"),
+        *("brcmsmac", "carl9170", "iwlwifi", "mac80211-hwsim", "mt7601u", "mt7603", "mt7615e", "mt7663u", "mt76x0e"),
+        *("mt76x0u", "mt76x2", "mt76x2u", "mt7915e", "mt7921e", "mt7921u", "mt7925e", "mt7996e", "mwifiex-pcie"),
+        *("mwlwifi", "rt2800-pci", "rt2800-soc", "rt2800-usb", "rtl8192cu", "rtl8821ae", "rtl8xxxu", "rtw88", "rtw89"),
+        "wil6210",
+    ]
+)
+# PCI buses and slots in the kernel's device paths: domain:bus, domain:bus:device.function, and `+1` for a second radio
+_PCI_BUS = re.compile(r"pci[0-9a-f]{4}:[0-9a-f]{2}")
+_PCI_SLOT = re.compile(r"[0-9a-f]{4}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7](\+\d+)?")
+_LIKE_PCI_BUS = re.compile(r"[a-z]*[0-9a-f]{4}:[0-9a-f]{2}")
+_LIKE_PCI_SLOT = re.compile(r"[0-9a-z]+:[0-9a-z:]+\.[0-9+]+")
 _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
 
 
@@ -66,3 +83,57 @@ def _driver(profile: HardwareProfile, radio: RadioHardware) -> tuple[str, tuple[
         if package.startswith("kmod-") and driver in _LACKS:
             return driver, ("hardware", profile.name, "packages", str(index))
     return "", place
+
+
+@fleet_rule(
+    "MC842",
+    Severity.WARNING,
+    "A radio's driver is misspelled",
+    why="""Lint knows by the driver which modes the radio supports. With a misspelled name it checks nothing, and a mesh
+    that the radio cannot join shows only in the field.""",
+    fix="Use the kernel module's name as in OpenWrt: `kmod-NAME` without `kmod-`, such as ath9k or ath10k-ct.",
+    failing="hardware: {rocket: {radios: {radio0: {driver: aht9k}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {driver: ath9k}, radio1: {driver: my-vendor-driver}}}}",
+)
+def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            if not radio.driver or radio.driver in _DRIVERS:
+                continue
+            near = next((name for name in sorted(_DRIVERS) if is_one_edit_apart(radio.driver, name)), "")
+            if near or radio.driver.isdigit():
+                path = ("hardware", profile.name, "radios", radio.name, "driver")
+                hint = f"did you mean {near}?" if near else ""
+                yield Finding(path, "unknown driver", near or "a driver such as ath9k", radio.driver, hint)
+
+
+@fleet_rule(
+    "MC843",
+    Severity.WARNING,
+    "A radio's path is not a device path",
+    why="""The node's wifi scripts find the radio by its path in the kernel. With another path they find none: the
+    section is ignored, and the node comes up without a mesh.""",
+    fix="Copy the path from the device: `uci get wireless.radio0.path`.",
+    failing="hardware: {rocket: {radios: {radio0: {path: 'pci000:00/0000:00:00.0'}}}}",
+    passing="hardware: {rocket: {radios: {radio0: {path: '1e140000.pcie/pci0000:00/0000:00:01.0/0000:02:00.0'}}}}",
+)
+def path_of_no_device(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        for radio in profile.radios:
+            if not radio.path or _is_device_path(radio.path):
+                continue
+            path = ("hardware", profile.name, "radios", radio.name, "path")
+            expected = "a path such as platform/ahb/18100000.wmac or pci0000:00/0000:00:00.0"
+            yield Finding(path, "not a path in the kernel's device tree", expected, radio.path)
+
+
+def _is_device_path(path: str) -> bool:
+    """Whether it names a device below a bus, and its PCI buses and slots have the kernel's form."""
+    parts = path.split("/")
+    return len(parts) > 1 and all(parts) and not any(_is_bad_pci(part) for part in parts)
+
+
+def _is_bad_pci(part: str) -> bool:
+    if part.startswith("pci") or _LIKE_PCI_BUS.fullmatch(part):
+        return _PCI_BUS.fullmatch(part) is None
+    return _LIKE_PCI_SLOT.fullmatch(part) is not None and _PCI_SLOT.fullmatch(part) is None

@@ -91,7 +91,9 @@ def fielded_and_moved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="robots: {husky1: {computer: <removed>, fielded: 10.42.0.110}}",
 )
 def fielded_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    networks = {robot.computer.address.network for robot in fleet.robots.values() if robot.computer is not None}
+    # MC219 reports robots with a LAN of their own
+    bridged = [robot.computer for robot in fleet.robots.values() if robot.computer is not None and robot.lan is None]
+    networks = {computer.address.network for computer in bridged}
     for robot in _legacy_robots(fleet):
         apart = sorted(str(network) for network in networks if robot.fielded not in network)
         if apart:

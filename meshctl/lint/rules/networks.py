@@ -9,7 +9,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.addresses import meshes_of, stations
+from meshctl.lint.rules.addresses import meshes_of, networks, stations
 from meshctl.model import Backend, Fleet, Mesh
 
 # RFC 1918, and RFC 6598 (carrier-grade NAT)
@@ -77,12 +77,9 @@ def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
     passing="meshes: {main: {network: 10.42.0.0/24}}",
 )
 def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        network = mesh.network
+    for path, network in networks(fleet):
         if not any(network.subnet_of(private) for private in _PRIVATE) and not _unusable(network):
-            yield Finding(
-                ("meshes", mesh.name, "network"), "not a private network", "an RFC 1918 network", str(network)
-            )
+            yield Finding(path, "not a private network", "an RFC 1918 network", str(network))
 
 
 @fleet_rule(
@@ -99,10 +96,9 @@ def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="meshes: {main: {network: 10.42.0.0/24}}",
 )
 def network_unusable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for mesh in fleet.meshes.values():
-        if _unusable(mesh.network):
-            path = ("meshes", mesh.name, "network")
-            yield Finding(path, "reserved address range", "an RFC 1918 network", str(mesh.network))
+    for path, network in networks(fleet):
+        if _unusable(network):
+            yield Finding(path, "reserved address range", "an RFC 1918 network", str(network))
 
 
 def _unusable(network: IPv4Network) -> bool:
@@ -112,23 +108,26 @@ def _unusable(network: IPv4Network) -> bool:
 @fleet_rule(
     "MC210",
     Severity.ERROR,
-    "A computer's prefix length differs from the mesh's",
+    "A computer's prefix length differs from its network's",
     why="""With a longer prefix the computer sends part of the fleet's traffic to a gateway that does not exist; with a
     shorter one it expects remote stations on its own link.""",
-    fix="Use the prefix length of the mesh's network.",
+    fix="Use the prefix length of the mesh's network, or of the robot's `lan`.",
     failing="robots: {husky1: {computer: {address: 10.42.0.120/28}}}",
     passing="robots: {husky1: {computer: {address: 10.42.0.120/24}}}",
 )
 def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
-        if robot.computer is None:
-            continue
-        for mesh in fleet.meshes.values():
-            address = robot.computer.address
-            if address.ip in mesh.network and address.network != mesh.network:
-                path = ("robots", robot.name, "computer", "address")
-                expected = f"/{mesh.network.prefixlen} as in mesh {mesh.name}"
-                yield Finding(path, "prefix length differs from the mesh's", expected, f"/{address.network.prefixlen}")
+        around = [("the robot's LAN", "the LAN's", robot.lan)] if robot.lan is not None else []
+        if not around:
+            around = [(f"mesh {mesh.name}", "the mesh's", mesh.network) for mesh in fleet.meshes.values()]
+        for place, _, computer in robot.all_computers():
+            address = computer.address
+            for where, whose, network in around:
+                if address.ip in network and address.network != network:
+                    path = ("robots", robot.name, *place, "address")
+                    expected = f"/{network.prefixlen} as in {where}"
+                    found = f"/{address.network.prefixlen}"
+                    yield Finding(path, f"prefix length differs from {whose}", expected, found)
 
 
 @fleet_rule(

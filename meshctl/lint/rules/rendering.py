@@ -14,6 +14,7 @@ from meshctl.render import Rendered, Templates, render
 from meshctl.render.extra import EXTRA
 from meshctl.render.template_files import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
+from meshctl.resolve.intent import BACKBONE, LAN
 
 # replaces every secret: a valid passphrase that never leaves this module
 _PLACEHOLDER = Secret("placeholder-for-lint")
@@ -39,6 +40,7 @@ def _kinds(fleet: Fleet) -> Iterator[Node]:
             node.lan_ports,
             tuple(node.extra_uci.items()),
             node.gateway is None,
+            node.lan_address is None,
         )
         if kind not in seen:
             seen.add(kind)
@@ -87,7 +89,8 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     why="""From 23.05 on, OpenWrt rejects traffic that no zone allows, and meshctl's template does so on every release.
     It renders a zone for the management network; a template of your own or `extra_uci` that drops or closes this zone
     locks the operator out.""",
-    fix="Keep a zone with `list network 'lan'` and `option input 'ACCEPT'` in the firewall package.",
+    fix="""Keep a zone with `list network 'lan'` (on a router of a robot's LAN: `backbone`) and `option input 'ACCEPT'`
+    in the firewall package.""",
     failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
     passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
 )
@@ -96,16 +99,17 @@ def management_shut_out(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         if not isinstance(outcome, Rendered):
             continue
         for file in outcome.files:
-            if file.package is not None and file.package.name == "firewall" and not _lets_in(file.package):
+            network = LAN if node.lan_address is None else BACKBONE
+            if file.package is not None and file.package.name == "firewall" and not _lets_in(file.package, network):
                 extra = next((("extra_uci", key) for key in node.extra_uci if key.startswith("firewall.")), ())
-                expected = "a zone of network lan with input ACCEPT"
+                expected = f"a zone of network {network} with input ACCEPT"
                 yield Finding(("nodes", node.name, *extra), "SSH login would be blocked", expected, "none")
 
 
-def _lets_in(firewall: uci.Package) -> bool:
+def _lets_in(firewall: uci.Package, network: str) -> bool:
     for section in firewall.sections:
         is_open = section.get("input").upper() == "ACCEPT"
-        if is_open and section.type == "zone" and "lan" in section.get("network").split():
+        if is_open and section.type == "zone" and network in section.get("network").split():
             return True
         if is_open and section.type == "defaults":
             return True

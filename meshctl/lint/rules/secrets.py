@@ -70,8 +70,8 @@ def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
     for node in fleet.nodes.values():
         yield ("nodes", node.name, "ssh"), node.ssh
     for robot in fleet.robots.values():
-        if robot.computer is not None:
-            yield ("robots", robot.name, "computer", "ssh"), robot.computer.ssh
+        for place, _, computer in robot.all_computers():
+            yield ("robots", robot.name, *place, "ssh"), computer.ssh
 
 
 @text_rule(

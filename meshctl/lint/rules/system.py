@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.addresses import as_address
+from meshctl.lint.rules.addresses import as_address, networks, stations
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
 from meshctl.model import Fleet
@@ -86,16 +86,12 @@ def zone_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="system: {log_host: 10.42.0.100}",
 )
 def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    stations = {str(node.address.ip) for node in fleet.managed()}
-    for robot in fleet.robots.values():
-        if robot.computer is not None:
-            stations.add(str(robot.computer.address.ip))
-        if robot.fielded is not None:
-            stations.add(str(robot.fielded))
+    known = {str(address) for address, _ in stations(fleet)}
     places: list[tuple[tuple[str, ...], str]] = [(("system", "log_host"), fleet.system.log_host)]
     places += [(("system", "ntp_servers", str(index)), host) for index, host in enumerate(fleet.system.ntp_servers)]
-    networks = [mesh.network for mesh in fleet.meshes.values()]
     for path, host in places:
         address = as_address(host)
-        if address is not None and host not in stations and any(address in network for network in networks):
+        if address is None or host in known:
+            continue
+        if any(address in network for _, network in networks(fleet)):
             yield Finding(path, "no station in the inventory has this address", "the address of a computer", host)

@@ -11,6 +11,7 @@ from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, NodeState, Topic, TopicClass
 from meshctl.regdb import width_mhz
+from meshctl.resolve import has_routed_lans
 
 _ALL = "all"
 # IEEE 802.11-2020 table 21-29: MCS 7 and MCS 3 of one stream, long guard interval, by width; 40 MHz has 108 data
@@ -63,6 +64,8 @@ def offered_load(fleet: Fleet) -> dict[str, OfferedLoad]:
         robot.name: {mesh for name in robot.nodes if name in fleet.nodes for mesh in fleet.nodes[name].meshes}
         for robot in fleet.robots.values()
     }
+    # no broadcast reaches a robot behind a router: the daemons send to each robot
+    can_broadcast = fleet.udp_mesh.broadcast and not has_routed_lans(fleet)
     sums: dict[str, list[float]] = {}
     largest: dict[str, tuple[float, Topic]] = {}
     for topic in fleet.topics:
@@ -71,7 +74,7 @@ def offered_load(fleet: Fleet) -> dict[str, OfferedLoad]:
             bytes_per_s = topic.rate_hz * topic.size_bytes
             if topic.rate_limit_bytes_per_s is not None:
                 bytes_per_s = min(bytes_per_s, topic.rate_limit_bytes_per_s)
-            is_broadcast = _ALL in topic.destinations and fleet.udp_mesh.broadcast
+            is_broadcast = _ALL in topic.destinations and can_broadcast
             receivers = len(peers) - 1 if _ALL in topic.destinations else len(set(topic.destinations) - {source})
             total = bytes_per_s if is_broadcast else bytes_per_s * max(receivers, 0)
             for mesh in meshes_of[source]:

@@ -1,5 +1,6 @@
-# facts: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes nothing, and
-# reads little from the disk, since status calls it often.
+# facts [ADDRESS...]: state of the computer, its services and the daemon, in sections that start with `== NAME`. Changes
+# nothing, and reads little from the disk, since status calls it often. The addresses are those of other computers on its
+# switch.
 echo "== services"
 for service in $all_units; do
 	# of a service that was never installed systemd knows ActiveState=inactive, UnitFileState= and LoadState=not-found
@@ -15,6 +16,13 @@ if [ -e "$root/current/manifest" ]; then
 	(cd "$root/current" && sha256sum -c manifest 2>/dev/null) | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
 	sed 's/^/wheel=/' "$root/current/wheels"
 fi
+echo "== others"
+command -v ping >/dev/null 2>&1 || { [ $# = 0 ] || echo ping=missing; set --; }
+for address; do
+	# all at once, so that those that are off take one second together
+	(ping -c 1 -W 1 "$address" >/dev/null 2>&1 && echo "answers=$address") &
+done
+wait
 echo "== computer"
 echo "now=$(date +%s)"
 echo "uptime=$(cat /proc/uptime)"

@@ -1,5 +1,12 @@
-# probe PYTHON ROS: all facts that a deploy depends on, as NAME=VALUE lines. Changes nothing.
+# probe PYTHON ROS [ADDRESS...]: all facts that a deploy depends on, as NAME=VALUE lines. Changes nothing. The addresses
+# are those of peers in other networks.
 python=$1 ros=$2
+[ $# -lt 2 ] || shift 2
+if command -v ip >/dev/null 2>&1; then
+	for address; do
+		ip route get "$address" >/dev/null 2>&1 || echo "no_route=$address"
+	done
+fi
 
 echo "arch=$(uname -m)"
 echo "now=$(date +%s)"

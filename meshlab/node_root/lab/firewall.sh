@@ -35,6 +35,7 @@ shown_rules() { # [HANDLES]: as nft lists the input chain
 			told("\tchain input {", 1)
 			print "\t\ttype filter hook input priority filter; policy drop;"
 		}
+		$1 == "forward" { next }
 		NR == 1 {
 			told("\t\tiif \"lo\" accept comment \"!fw4: Accept traffic from loopback\"", $6 - 1)
 			told("\t\tct state vmap { established : accept, related : accept } comment \"!fw4: Handle inbound flows\"", $6)

@@ -1,6 +1,8 @@
 # Stand-in for fw3 and fw4: `uci export firewall` and the devices of the networks (NETWORK DEVICE, in the file `devices`)
 # -> the rules for a new SSH connection, one per line; the first that matches decides:
 #   rule DEVICE|* ADDRESS|* ACCEPT|REJECT|DROP COMMENT
+# and the devices between which new connections are forwarded, within a zone and from zone to zone:
+#   forward FROM TO ACCEPT COMMENT
 # Rules for certain senders (src_ip, src_mac, src_port, ipset) never match.
 BEGIN {
 	while ((getline line < devices) > 0) { split(line, part, " "); device_of[part[1]] = device_of[part[1]] " " part[2] }
@@ -51,4 +53,12 @@ END {
 	for (id = 1; id <= sections; id++) if (kind[id] == "zone" && !off(id))
 		each_device(get(id, "name", ""), "*", verdict_of(get(id, "input", input), "DROP"), get(id, "name", ""))
 	print "rule\t*\t*\t" input "\tdefaults"
+	for (id = 1; id <= sections; id++) {
+		if (kind[id] == "zone" && !off(id) && verdict_of(get(id, "forward", "DROP"), "DROP") == "ACCEPT") forward(get(id, "name", ""), get(id, "name", ""))
+		if (kind[id] == "forwarding" && !off(id)) forward(get(id, "src", ""), get(id, "dest", ""))
+	}
+}
+function forward(from, to,    n, m, i, j, list, others) {
+	n = split(devices_of[from], list, " "); m = split(devices_of[to], others, " ")
+	for (i = 1; i <= n; i++) for (j = 1; j <= m; j++) print "forward\t" list[i] "\t" others[j] "\tACCEPT\t" from "-" to
 }

@@ -258,8 +258,18 @@ function all_devices(    i, n, id, list, name) {
 	}
 }
 
-# a new address, as the kernel chooses a random one at each creation
-function soft_mac(name) { return "fe" substr(lan_mac, 3) }
+# as set in the configuration, else a new address, as the kernel chooses a random one at each creation
+function soft_mac(name,    set) { set = set_mac(name); return set == "" ? "fe" substr(lan_mac, 3) : set }
+# the MAC of a device by its own section (21.02 on) or by an interface's (19.07)
+function set_mac(name,    i, id) {
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (get(id, "macaddr", "") == "") continue
+		if (kind[id] == "network.device" && get(id, "name", "") == name) return get(id, "macaddr", "")
+		if (kind[id] == "network.interface" && get(id, "ifname", "") == name) return get(id, "macaddr", "")
+	}
+	return ""
+}
 
 function make_bridge(name, members,    n, i, list) {
 	exists[name] = 1; mac[name] = lan_mac; is_bridge[name] = 1
@@ -317,9 +327,22 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 			"\n\t\t\t\t{\n\t\t\t\t\t\"address\": " json(address) ",\n\t\t\t\t\t\"mask\": " prefix(mask) "\n\t\t\t\t}\n\t\t\t") "]"
 		if (errors != "") dump = dump ",\n\t\t\t\"errors\": [\n\t\t\t\t{\n\t\t\t\t\t\"subsystem\": \"interface\",\n\t\t\t\t\t\"code\": " json(errors) "\n\t\t\t\t}\n\t\t\t]"
 		dump = dump "\n\t\t}"
+		if (up) up_device[label[id]] = device
 		separator = ",\n"
 	}
 	print dump "\n\t]\n}" > (run "/dump")
+}
+
+# static routes of interfaces that are up: "route DEVICE TARGET PREFIX GATEWAY"
+function routes(    i, id, device, target, mask) {
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] != "network.route" || !(get(id, "interface", "") in up_device)) continue
+		device = up_device[get(id, "interface", "")]
+		target = get(id, "target", "0.0.0.0"); mask = get(id, "netmask", "255.255.255.255")
+		if (target ~ /\//) { mask = target; sub(/.*\//, "", mask); sub(/\/.*/, "", target) }
+		effective = effective "route\t" device "\t" target "\t" prefix(mask) "\t" get(id, "gateway", "") "\n"
+	}
 }
 
 function wireless_status(    i, d, text, n, list, j, id, m, k, o, first) {
@@ -411,6 +434,7 @@ END {
 	radio_interfaces()
 	all_devices()
 	interfaces()
+	routes()
 	wireless_status()
 	printf "%s", iw_line > (run "/iw")
 	for (i = 1; i <= ncells; i++) {

@@ -137,3 +137,35 @@ def test_an_encrypted_radio_without_wpa_supplicant_fails_the_health_check(
     assert f"'{encryption}'" in text
     sealed = replace(expected, wireless=parse(text, "wireless"))
     assert unmet(sealed, replace(good(), supplicants=supplicants)) == gaps
+
+
+ROUTER = parse(
+    """
+config interface 'lan'
+	option proto 'static'
+	option ipaddr '10.43.1.1'
+
+config interface 'backbone'
+	option device 'bat0'
+	option proto 'static'
+	option ipaddr '10.42.0.101'
+""",
+    "network",
+)
+
+
+@pytest.mark.parametrize(
+    ("is_up", "addresses", "gaps_found"),
+    [
+        (True, ("10.42.0.101/24",), ()),
+        (True, (), ("its mesh interface has no address, not 10.42.0.101",)),
+        (False, ("10.42.0.101/24",), ("its mesh interface is down",)),
+    ],
+)
+def test_a_router_needs_its_address_on_the_mesh_too(
+    is_up: bool, addresses: tuple[str, ...], gaps_found: tuple[str, ...]
+) -> None:
+    wanted_state = replace(expectation(wanted(fleet(), "b01"), good(), [BASE]), network=ROUTER)
+    lan = NetInterface("lan", True, False, "static", "br-lan", ("10.43.1.1/24",))
+    backbone = NetInterface("backbone", is_up, False, "static", "bat0", addresses)
+    assert unmet(wanted_state, replace(good(), interfaces=(lan, backbone)), since_s=20.0) == gaps_found

@@ -54,8 +54,19 @@ def test_the_nodes_of_the_example_load(tmp_path: Path) -> None:
     assert loaded.fleet.nodes["husky1-b03"].state is NodeState.LOST
 
 
+def test_the_robots_of_the_examples_load_with_their_lans_and_computers(tmp_path: Path) -> None:
+    lans, computers = (text for text in _examples() if text.startswith("robots:"))
+    fleet = load_text(tmp_path, HEAD + lans).fleet
+    assert fleet is not None
+    assert [str(robot.lan) for robot in fleet.robots.values()] == ["10.43.1.0/24", "10.43.2.0/24"]
+    fleet = load_text(tmp_path, HEAD + computers).fleet
+    assert fleet is not None
+    assert list(fleet.robots["husky1"].computers) == ["jetson", "lidar"]
+
+
 @pytest.mark.parametrize("number", range(3))
 def test_each_documented_secret_reference_loads(number: int, tmp_path: Path) -> None:
-    reference = _examples()[1].splitlines()[number].partition(": ")[2]
+    (example,) = (text for text in _examples() if text.startswith("key: "))
+    reference = example.splitlines()[number].partition(": ")[2]
     loaded = load_text(tmp_path, f"{HEAD}udp_mesh:\n  keys:\n  - {reference}\n")
     assert loaded.fleet is not None, loaded.diagnostics

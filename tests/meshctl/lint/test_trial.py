@@ -162,6 +162,28 @@ def test_a_finding_in_a_robots_list_points_at_the_element(fragment: str, code: s
     assert _at(finding, tmp_path).strip("- '\"").startswith(text)
 
 
+def test_a_network_without_any_address_of_its_nodes_is_one_finding_at_the_network(tmp_path: Path) -> None:
+    found = [item for item in _found("meshes: {main: {network: 10.24.0.0/24}}", tmp_path) if item.code == "MC202"]
+    assert [_at(item, tmp_path) for item in found] == ["10.24.0.0/24"]
+    assert found[0].message == "contains no address of base, husky1-front, b01"
+
+
+@pytest.mark.parametrize(
+    ("path", "codes"),
+    [
+        ("pi0000:00/0000:00:00.0", ["MC843"]),
+        ("7", ["MC843"]),
+        ("pci0000:00/000:00:00.0", ["MC843"]),
+        ("soc/1b500000.pci/pci0001:00/0001:00:00.0/0001:01:00.0", []),
+        ("pci0000:00/0000:00:00.0/usb1/1-1/1-1:1.0", []),
+        ("platform/soc/18000000.wifi+1", []),
+    ],
+)
+def test_only_paths_that_no_kernel_has_are_reported(path: str, codes: list[str], tmp_path: Path) -> None:
+    found = _codes(f"hardware: {{rocket: {{radios: {{radio0: {{path: '{path}'}}}}}}}}", tmp_path)
+    assert [code for code in found if code == "MC843"] == codes
+
+
 def test_each_invalid_list_element_is_a_finding_and_a_range_counts_as_one(tmp_path: Path) -> None:
     found = _found("robots: {husky1: {carries: [b01, x1, 'c[1-9]', x2]}}", tmp_path)
     assert [(item.code, item.found) for item in found] == [

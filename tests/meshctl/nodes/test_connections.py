@@ -44,3 +44,15 @@ def test_pooled_connections_close_in_parallel_before_their_jump_hosts(tmp_path: 
     assert access.acquire("b0") is None
     access.close()
     assert len(closed) == 9
+
+
+def test_a_router_is_also_tried_at_its_address_in_the_robots_lan(tmp_path: Path) -> None:
+    fleet = load_fleet(ROOT / "inventory/routed")
+    access = ConnectionPool(fleet, TrustStore(tmp_path / "known_hosts"))
+    tried = [end.address for end in access.candidates(fleet.nodes["rover1-radio"])]
+    # over a wire to its LAN port, only the second one answers
+    assert tried == ["10.42.0.11", "10.43.1.1"]
+    assert [end.address for end in access.candidates(fleet.nodes["b01"])] == ["10.42.0.101"]
+    access.interfaces["rover1-radio"] = "eth1"
+    ends = [(end.address, end.interface) for end in access.candidates(fleet.nodes["rover1-radio"])]
+    assert ends == [("10.42.0.11", "eth1"), ("10.43.1.1", "eth1"), ("10.42.0.11", ""), ("10.43.1.1", "")]

@@ -97,6 +97,52 @@ def test_dropbear_and_firewall_changes_cut_logins() -> None:
         assert effect.cut is Cut.LOGIN
 
 
+BRIDGED = """\
+config device 'br_lan'
+	option name 'br-lan'
+	list ports 'eth0'
+	list ports 'bat0'
+
+config interface 'lan'
+	option device 'br-lan'
+	option proto 'static'
+	option ipaddr '10.42.0.11'
+
+config interface 'bat0'
+	option proto 'batadv'
+
+config route
+	option interface 'lan'
+	option target '10.43.2.0'
+	option netmask '255.255.255.0'
+	option gateway '10.42.0.12'
+"""
+BACKBONE = """
+config interface 'backbone'
+	option device 'bat0'
+	option proto 'static'
+	option ipaddr '10.42.0.11'
+"""
+
+
+def network_effects(before: str, after: str) -> list[tuple[Cut, str]]:
+    old, new = ({"network": parse(text, "network")} for text in (before, after))
+    return [(effect.cut, effect.why) for effect in effects(["etc/config/network"], old, new, Release.V23_05)]
+
+
+def test_changed_routes_leave_every_interface_up() -> None:
+    other = BRIDGED.replace("10.43.2.0", "10.43.3.0")
+    assert network_effects(BRIDGED, other) == [(Cut.LOGIN, "routes to the robots' LANs change")]
+    without = BRIDGED[: BRIDGED.index("config route")]
+    assert network_effects(without, BRIDGED) == [(Cut.LOGIN, "routes to the robots' LANs change")]
+
+
+def test_a_bridge_that_becomes_a_router_cuts_its_lan_and_keeps_its_management_address() -> None:
+    routed = BRIDGED.replace("\tlist ports 'bat0'\n", "").replace("10.42.0.11", "10.43.1.1") + BACKBONE
+    assert network_effects(BRIDGED, routed) == [(Cut.LAN, "it routes its LAN, which leaves the mesh's network")]
+    assert network_effects(routed, BRIDGED) == [(Cut.LAN, "it bridges its LAN into the mesh's network")]
+
+
 IN_DEVICE = ("option htmode 'HT20'\n\toption country 'US'", "option country 'US'\n\toption htmode 'HT20'")
 IN_INTERFACE = ("option ifname 'mesh0'\n\toption mode 'adhoc'", "option mode 'adhoc'\n\toption ifname 'mesh0'")
 NO_CHANGE = Effect("wifi", Cut.NOTHING, "no radio changes")

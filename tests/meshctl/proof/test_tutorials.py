@@ -15,7 +15,7 @@ from meshctl.cli.main import build
 from meshctl.inventory import load_fleet
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = {"community-mesh": "community", "mine": "mine", "uav-swarm": "swarm"}
+PAGES = {"community-mesh": "community", "mine": "mine", "uav-swarm": "swarm", "routed-lans": "routed"}
 
 
 @pytest.mark.parametrize("name", PAGES.values())

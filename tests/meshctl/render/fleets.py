@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from ipaddress import IPv4Interface, IPv4Network
+from ipaddress import IPv4Address, IPv4Interface, IPv4Network
 from types import MappingProxyType
 from typing import Any
 
@@ -11,6 +11,7 @@ from meshctl.diagnostics import Position
 from meshctl.model import (
     ApplyPolicy,
     Band,
+    Computer,
     Encryption,
     Fleet,
     HardwareProfile,
@@ -109,6 +110,24 @@ def fleet(*nodes: Node, meshes: tuple[Mesh, ...] = (), **changes: Any) -> Fleet:
         files=("fleet.yaml",),
     )
     return replace(usual, **changes)
+
+
+def routed_lans(release: Release = Release.V23_05) -> Fleet:
+    """Two robots with LANs of their own and the operator's bridged one: the node of `husky1` routes."""
+    router = node(release, gateway=IPv4Address("10.42.0.254"), lan_address=IPv4Interface("10.43.1.1/24"))
+    other = replace(router, name="spot-radio", robot="spot", address=IPv4Interface("10.42.0.12/24"), gateway=None)
+    other = replace(other, lan_address=IPv4Interface("10.43.2.1/24"))
+    base = replace(
+        node(release), name="base", robot="base-station", role=Role.BASE, address=IPv4Interface("10.42.0.1/24")
+    )
+    robots = {
+        "base-station": Robot("base-station", ("base",), Computer(IPv4Interface("10.42.0.100/24")), is_base=True),
+        "husky1": Robot(
+            "husky1", (router.name,), Computer(IPv4Interface("10.43.1.10/24")), lan=IPv4Network("10.43.1.0/24")
+        ),
+        "spot": Robot("spot", (other.name,), Computer(IPv4Interface("10.43.2.10/24")), lan=IPv4Network("10.43.2.0/24")),
+    }
+    return fleet(router, other, base, meshes=(mesh(),), robots=MappingProxyType(robots))
 
 
 def origins(meshes: tuple[Mesh, ...], nodes: tuple[Node, ...]) -> MappingProxyType[tuple[str, ...], Origin]:

@@ -214,3 +214,14 @@ def test_a_missing_key_is_reported_at_its_position() -> None:
 def test_the_daemon_configuration_is_deterministic() -> None:
     source = fleet(ESTOP, MAPS, VIDEO)
     assert daemon_config(source, "spot") == daemon_config(source, "spot")
+
+
+def test_with_a_routed_lan_every_daemon_has_all_others_as_fixed_neighbors(tmp_path: Path) -> None:
+    source = fleets.routed_lans()
+    for name, others in {
+        "base-station": {("husky1", "10.43.1.10"), ("spot", "10.43.2.10")},
+        "spot": {("base-station", "10.42.0.100"), ("husky1", "10.43.1.10")},
+    }.items():
+        found = loaded(source, name, tmp_path)
+        assert {(one.name, one.address[0]) for one in found.settings.neighbours} == others
+        assert [link.broadcast for link in found.links] == [False]

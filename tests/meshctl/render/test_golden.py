@@ -38,7 +38,7 @@ def test_netjsonconfig_reads_the_same_values(name: str) -> None:
 
 
 def _render(fleet: Fleet) -> Rendered:
-    (name,) = fleet.nodes
+    name = next(iter(fleet.nodes))
     return render_node(fleet, name, fleets.secrets)
 
 
@@ -67,4 +67,6 @@ def _normalized(block: dict[str, Any]) -> dict[str, Any]:
     plain = dict(block)
     if plain.pop("bridge_21", False):
         plain[".type"] = "device"
+    elif plain.get("type") == "device":
+        plain[".type"] = plain.pop("type")
     return plain

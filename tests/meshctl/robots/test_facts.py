@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+from pathlib import Path
 
 from meshctl.robots.facts import ExpectedRelease, RobotFacts, facts_object, parse_robot_facts
+from meshctl.robots.scripts import script
 from meshctl.robots.status_table import table
 
 NOW_S = 1_800_000_000.0
@@ -155,3 +159,36 @@ def test_a_narrow_terminal_lists_hidden_columns_and_keeps_every_error() -> None:
         assert "husky9: husky9 (10.42.0.19): no answer" in " ".join(lines)
         assert lines[0].split()[:2] == ["robot", "service"]
         assert ("columns not shown" in " ".join(lines)) == (width < 100)
+
+
+PING = """#!/bin/sh
+# answers for one address, the last argument
+for address; do :; done
+[ "$address" = 10.42.0.31 ]
+"""
+
+
+def facts_of_script(tmp_path: Path, *, has_ping: bool) -> RobotFacts:
+    """What the real script prints here, with a `ping` of the test's own or none."""
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    for name in ("sh", "cat", "date", "grep", "sed", "df", "awk", "dirname", "readlink", "basename"):
+        found = shutil.which(name)
+        assert found is not None
+        (tools / name).symlink_to(found)
+    if has_ping:
+        (tools / "ping").write_text(PING, encoding="utf-8")
+        (tools / "ping").chmod(0o755)
+    words = ["sh", "-c", script("facts"), "facts", "10.42.0.31", "10.42.0.32"]
+    done = subprocess.run(words, env={"PATH": str(tools)}, capture_output=True, text=True, check=False, timeout=60)
+    return parse_robot_facts("husky1", done.stdout, WANTED, now_s=NOW_S)
+
+
+def test_the_script_pings_the_other_computers_of_the_robot(tmp_path: Path) -> None:
+    facts = facts_of_script(tmp_path, has_ping=True)
+    assert facts.answering == ("10.42.0.31",)
+    assert facts.computer.uptime_s is not None
+
+
+def test_a_computer_without_ping_does_not_call_the_others_silent(tmp_path: Path) -> None:
+    assert facts_of_script(tmp_path, has_ping=False).answering is None

@@ -5,11 +5,13 @@ from __future__ import annotations
 import zipfile
 from io import BytesIO
 from ipaddress import IPv4Address, IPv4Interface
+from pathlib import Path
 
 import pytest
 
 from meshctl.errors import InputError
 from meshctl.fleet import Result
+from meshctl.inventory import load_fleet
 from meshctl.model import Computer, Robot, SecretKind, SecretRef
 from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
 from meshctl.robots.connection import selected_robots
@@ -20,12 +22,16 @@ from meshctl.robots.preconditions import (
     changed_files,
     clock_warning,
     parse_facts,
+    route_warning,
+    routed_peers,
     unmet_disk_space,
     unmet_preconditions,
 )
 from meshctl.robots.wheel_tags import Target, is_compatible, parse_wheel, pip_options
 from meshctl.robots.wheels import own_wheel, stock_units
 from tests.meshctl.render import fleets
+
+ROOT = Path(__file__).resolve().parents[3]
 
 BOOKWORM = Target((3, 11), "x86_64", "glibc", (2, 36))
 PI = Target((3, 12), "aarch64", "glibc", (2, 39))
@@ -135,6 +141,22 @@ def test_a_clock_far_off_is_reported_but_does_not_block() -> None:
     assert clock_warning(facts, 1.2e9)[0] == "its clock is 6 years behind ours"
     assert clock_warning(facts, 1e9 - 7 * 86_400)[0] == "its clock is 7 d ahead of ours"
     assert _reasons(facts) == []
+
+
+def test_a_missing_route_to_a_peer_is_reported_with_its_gateway() -> None:
+    fleet = load_fleet(ROOT / "inventory/routed")
+    assert routed_peers(fleet, "rover1") == {
+        "10.43.0.10": "base-station",
+        "10.43.2.10": "rover2",
+        "10.42.0.23": "rover3",
+    }
+    facts = parse_facts(f"{PROBED}no_route=10.43.2.10\nno_route=10.42.0.23\n")
+    reason, hint = route_warning(facts, fleet, "rover1")
+    assert reason == "it has no route to rover2 (10.43.2.10), rover3 (10.42.0.23)"
+    assert "through 10.43.1.1" in hint
+    assert route_warning(parse_facts(PROBED), fleet, "rover1") == ("", "")
+    # separate meshes without routers between them need no routes
+    assert routed_peers(load_fleet(ROOT / "inventory/subt-final"), "husky1") == {}
 
 
 def test_required_disk_space_includes_a_reserve() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 
 import pytest
 
+from meshctl.cli.deployed_watch import TwoSnapshots
 from meshctl.model import Fleet, NodeState
 from meshctl.status.dropped import dropped_beacons
-from meshctl.status.values import Health, Neighbor, NodeStatus
-from tests.meshctl.status.fleets import status_of
+from meshctl.status.values import Health, Level, Neighbor, NodeStatus
+from tests.meshctl.status.fleets import HEALTHY, alarms, seen, status_of
 
 
 def judged(fleet: Fleet, *, rover: Health = Health.OK, b02: Health = Health.OK, **facts: object) -> dict[str, str]:
@@ -51,3 +53,25 @@ def test_only_carried_beacons_are_judged(fleet: Fleet) -> None:
     assert b02.state is NodeState.CARRIED
     deployed = replace(b02, state=NodeState.DEPLOYED)
     assert judged(fleet, node=deployed, relays=("b01",)) == {}
+
+
+def test_status_notes_a_beacon_that_is_away_from_its_robot_and_how_to_mark_it(fleet: Fleet) -> None:
+    rover = replace(fleet.robots["rover"], carries=("b02",))
+    team = replace(fleet, robots=MappingProxyType({**fleet.robots, "rover": rover}))
+    away = {**HEALTHY, "b02": seen("b02", {"b01": 250})}
+    note = alarms(status_of(team, away), "b02")["dropped"]
+    assert (note.level, note.text) == (Level.NOTE, "marked as carried, but hears b01, not its robot's rover")
+    assert "meshctl deployed b02" in note.hint
+    in_rack = {**HEALTHY, "b02": seen("b02", {"b01": 120, "rover": 60})}
+    # the fixture's stations are heard with -60 dBm, the weakest signal in a rack
+    assert "dropped" not in alarms(status_of(team, in_rack), "b02")
+
+
+def test_a_drop_is_confirmed_by_two_snapshots_in_a_row() -> None:
+    snapshots = TwoSnapshots()
+    assert snapshots.confirmed({"b01": "weak"}) == {}
+    assert snapshots.confirmed({"b01": "weak", "b02": "far"}) == {"b01": "weak"}
+    # b02 was back in the rack meanwhile
+    assert snapshots.confirmed({}) == {}
+    assert snapshots.confirmed({"b02": "far"}) == {}
+    assert snapshots.confirmed({"b02": "gone"}) == {"b02": "gone"}

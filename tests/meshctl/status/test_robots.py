@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from ipaddress import IPv4Interface
+from types import MappingProxyType
 from typing import Any
 
 import pytest
 
 from meshctl.errors import ExitCode
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet
+from meshctl.model import Computer, Fleet
 from meshctl.robots.facts import ComputerFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status import Health, Level
+from meshctl.status.json_output import as_json
 from meshctl.status.last_known import facts_to_record, merge_by_device
 from meshctl.status.text import text
 from meshctl.status.topics import limit_s
@@ -169,3 +172,30 @@ def test_an_urgent_topic_missing_from_a_daemon_is_an_error(fleet: Fleet) -> None
 def test_a_computer_is_listed_below_its_radio(fleet: Fleet) -> None:
     rows = [line.split()[:2] for line in text(status_of(fleet)).splitlines() if line.startswith(("rover", "station"))]
     assert rows == [["station", "computer"], ["rover", "robot"], ["rover", "computer"]]
+
+
+def with_others(fleet: Fleet) -> Fleet:
+    others = {
+        "jetson": Computer(IPv4Interface("10.42.0.31/24")),
+        "lidar": Computer(IPv4Interface("10.42.0.32/24")),
+    }
+    rover = replace(fleet.robots["rover"], computers=MappingProxyType(others))
+    return replace(fleet, robots=MappingProxyType({**fleet.robots, "rover": rover}))
+
+
+def test_another_computer_that_does_not_answer_a_ping_is_reported_by_name(fleet: Fleet) -> None:
+    status = status_of(with_others(fleet), robots=with_rover(answering=("10.42.0.31",)))
+    found = alarms(status, "rover", robot=True)
+    assert found["computer-silent"].text == "its computer lidar (10.42.0.32) does not answer a ping"
+    (rover,) = (robot for robot in as_json(status)["robots"] if robot["name"] == "rover")
+    assert rover["computers"] == [
+        {"name": "jetson", "address": "10.42.0.31", "answers": True},
+        {"name": "lidar", "address": "10.42.0.32", "answers": False},
+    ]
+
+
+def test_a_robot_without_ping_says_nothing_about_its_other_computers(fleet: Fleet) -> None:
+    status = status_of(with_others(fleet), robots=with_rover(answering=None))
+    assert "computer-silent" not in alarms(status, "rover", robot=True)
+    (rover,) = (robot for robot in as_json(status)["robots"] if robot["name"] == "rover")
+    assert [one["answers"] for one in rover["computers"]] == [None, None]

@@ -65,6 +65,8 @@ class Lab:
     """The running fleet, and the copy of the inventory that belongs to it. `NODES`: those of its mesh, base first."""
 
     NODES: ClassVar[tuple[str, ...]] = NODES
+    # of a robot whose path to the base station is the mesh's longest
+    FAR_COMPUTER: ClassVar[str] = "10.42.0.10"
 
     fleet: QemuFleet
     inventory: Path
@@ -200,7 +202,7 @@ class Lab:
         until(lambda: all(self.node(name).is_up() for name in self.NODES), "every node to boot")
         until(lambda: self.originators("base").keys() >= others, "routes from the base to every node")
         try:
-            until(lambda: self.answers("base-station", "10.42.0.10"), "the Husky's computer to answer")
+            until(lambda: self.answers("base-station", self.FAR_COMPUTER), "the Husky's computer to answer")
         except AssertionError as error:
             raise AssertionError(f"{error}\n{self.tables()}") from error
 

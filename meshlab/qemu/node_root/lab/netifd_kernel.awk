@@ -5,12 +5,13 @@
 # settings that this release changes in place have a line of their own, and so has the country, which all radios share.
 #
 #   bridge NAME MAC
-#   soft   NAME ALGORITHM OPTIONS
+#   soft   NAME ALGORITHM OPTIONS MAC
 #   radio  NAME NUMBER MODE MHZ WIDTH SSID BSSID MCAST_KBPS MAKING MAC BEACON_TU - - ALGORITHM KEY FORWARDING
 #   tune   NAME NUMBER DBM DISTANCE_M
 #   hard   NAME MASTER MTU OPTIONS
 #   port   BRIDGE NAME
 #   addr   DEVICE ADDRESS/PREFIX
+#   route  DEVICE TARGET/PREFIX GATEWAY
 
 function field(value) { return "\t" (value == "" ? "-" : value) }
 
@@ -49,7 +50,7 @@ function plan_batman(    i, id, name) {
 		if (kind[id] == "network.interface" && get(id, "proto", "") == "batadv" && name in is_soft)
 			add(name, "soft" field(name) field(algorithm[name]) field(chosen(id, "aggregated_ogms ap_isolation bonding " \
 				"bridge_loop_avoidance distributed_arp_table fragmentation gw_mode hop_penalty multicast_mode " \
-				"multicast_fanout orig_interval")))
+				"multicast_fanout orig_interval")) field(set_mac(name)))
 	}
 }
 
@@ -71,9 +72,19 @@ function plan_bridges(    name, n, i, list) {
 	}
 }
 
-function plan_addresses(    line) {
+# on bat0 they go with it when it is recreated
+function plan_addresses(    line, part) {
 	close(run "/addresses.new")
-	while ((getline line < (run "/addresses.new")) > 0) { sub(/ /, "\t", line); plan = plan "addr\t" line "\n" }
+	while ((getline line < (run "/addresses.new")) > 0) {
+		split(line, part, " ")
+		plan = plan "addr" field(part[1]) field(part[2]) standing_on(part[1]) "\n"
+	}
+}
+
+function plan_routes(    n, i, list, part) {
+	n = split(effective, list, "\n")
+	for (i = 1; i <= n; i++) if (split(list[i], part, "\t") && part[1] == "route")
+		plan = plan "route" field(part[2]) field(part[3] "/" part[4]) field(part[5]) standing_on(part[2]) "\n"
 }
 
 END {
@@ -83,6 +94,7 @@ END {
 		plan_bridges()
 		plan_hard()
 		plan_addresses()
+		plan_routes()
 	}
 	printf "%s", plan > (run "/kernel.new")
 }

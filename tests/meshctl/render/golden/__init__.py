@@ -30,6 +30,7 @@ def cases() -> Iterator[tuple[str, Fleet]]:
         for mode, mesh in fleets.modes(release).items():
             for backend in Backend:
                 yield f"{release}-{backend.value}-{mode}", _fleet(release, replace(mesh, backend=backend))
+        yield f"{release}-router", fleets.routed_lans(release)
 
 
 def _fleet(release: Release, mesh: Mesh) -> Fleet:
@@ -49,6 +50,6 @@ def text(rendered: Rendered) -> str:
 
 
 def render_case(fleet: Fleet) -> str:
-    """The golden text of a fleet of one node."""
-    (name,) = fleet.nodes
+    """The golden text of the fleet's first node."""
+    name = next(iter(fleet.nodes))
     return text(render_node(fleet, name, fleets.secrets))
