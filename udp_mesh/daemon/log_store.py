@@ -18,6 +18,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from udp_mesh.crypto.signing import SEED_BYTES
 
 log = logging.getLogger(__name__)
 
+LOCK_WAIT_S = 1.0
+"""How long to wait for another process to release the database, at the start."""
 MAX_BATCH = 256
 """Jobs in one transaction: a long one delays the answers."""
 LOG_AGAIN_S = 60.0
@@ -43,8 +46,21 @@ CREATE TABLE IF NOT EXISTS items (
 """
 _VERSION = 1
 
+FIRST_PLAUSIBLE_S = 1_704_067_200.0
+"""2024-01-01: a computer without a battery-backed clock starts long before, until it is set."""
+
 Job = Callable[[sqlite3.Connection], Callable[[], None] | None]
 """Runs in the thread, within a transaction; returns what to call on the loop once it is committed."""
+
+
+@dataclass(slots=True, eq=False)
+class Put:
+    """One item being stored, for a publisher that waits for it."""
+
+    stored: asyncio.Event = field(default_factory=asyncio.Event)
+    """Set once the disk has answered."""
+    problem: str | None = None
+    """Then: why the item is not on disk, or None."""
 
 
 class SqliteLogStore:
@@ -58,8 +74,8 @@ class SqliteLogStore:
         """Items not stored because the disk is full or failed."""
         self.problem: str | None = None
         """Why the last item was not stored; None after one was."""
-        self._unreported: str | None = None
-        """The same, since the last `flush`."""
+        self.last_put: Put | None = None
+        """The latest call of `put`."""
         self._memory_only: str | None = None
         """Why items are kept in memory only."""
         self._wall_clock = wall_clock
@@ -115,8 +131,10 @@ class SqliteLogStore:
         if name != ":memory:":
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             os.close(os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600))
-        connection = sqlite3.connect(name, isolation_level=None, check_same_thread=False)
+        connection = sqlite3.connect(name, isolation_level=None, check_same_thread=False, timeout=LOCK_WAIT_S)
         try:
+            # A second daemon on the same directory would number its items alike: it does not get the database.
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = FULL")
             version = connection.execute("PRAGMA user_version").fetchone()[0]
@@ -139,7 +157,7 @@ class SqliteLogStore:
         now = self._wall_clock()
         rows = connection.execute("SELECT log, number, length(data), stored_s, taken FROM items ORDER BY position")
         items = tuple(
-            StoredItem(ItemId(keys[log_number], number), size, max(0.0, now - stored_s), bool(taken))
+            StoredItem(ItemId(keys[log_number], number), size, _age_s(stored_s, now), bool(taken))
             for log_number, number, size, stored_s, taken in rows
         )
         return LogContents(bytes(seed), items, tuple(entry for entry in dropped if entry[1]))
@@ -148,6 +166,7 @@ class SqliteLogStore:
 
     def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
         stored_s = self._wall_clock()
+        put = self.last_put = Put()
 
         def insert(connection: sqlite3.Connection) -> Callable[[], None]:
             connection.execute(
@@ -157,11 +176,14 @@ class SqliteLogStore:
             return stored
 
         def stored() -> None:
-            self.problem = self._memory_only
+            self.problem = put.problem = self._memory_only
+            put.stored.set()
             done(True)
 
         def failed() -> None:
             self.refused += 1
+            put.problem = self.problem
+            put.stored.set()
             done(False)
 
         self._jobs.put((insert, failed))
@@ -169,7 +191,9 @@ class SqliteLogStore:
     def get(self, item: ItemId, done: Callable[[bytes | None], None]) -> None:
         def select(connection: sqlite3.Connection) -> Callable[[], None]:
             row = connection.execute(
-                "SELECT data FROM items WHERE log = ? AND number = ?", (_log_number(connection, item.log), item.number)
+                "SELECT data FROM items JOIN logs ON items.log = logs.id"
+                " WHERE topic = ? AND source = ? AND log_id = ? AND number = ?",
+                (*item.log, item.number),
             ).fetchone()
             return lambda: done(None if row is None else bytes(row[0]))
 
@@ -194,19 +218,6 @@ class SqliteLogStore:
                 connection.execute("UPDATE logs SET dropped = ? WHERE id = ?", (text, _log_number(connection, key)))
 
         self._jobs.put((delete, lambda: None))
-
-    async def flush(self) -> str | None:
-        """Waits until everything queued so far was done. Returns why an item since the last call was not stored, or
-        None."""
-        future: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
-
-        def finish() -> None:
-            problem, self._unreported = self._unreported or self._memory_only, None
-            if not future.done():
-                future.set_result(problem)
-
-        self._jobs.put((lambda connection: finish, finish))
-        return await future
 
     def close(self) -> None:
         """Waits until everything queued is done."""
@@ -239,7 +250,8 @@ class SqliteLogStore:
     ) -> list[Callable[[], None]]:
         """Does a batch in one transaction; returns what to call on the loop."""
         try:
-            connection.execute("BEGIN IMMEDIATE")
+            # Deferred: reading must go on while writing is impossible, as on a file system that became read-only.
+            connection.execute("BEGIN")
             results = [job(connection) for job, _ in batch]
             connection.execute("COMMIT")
         except sqlite3.Error as error:
@@ -256,7 +268,7 @@ class SqliteLogStore:
         return [result for result in results if result is not None]
 
     def _failed(self, problem: str, call: Callable[[], None]) -> None:
-        self.problem = self._unreported = problem
+        self.problem = problem
         call()
 
     def _report(self, calls: list[Callable[[], None]]) -> None:
@@ -281,6 +293,11 @@ def _log_number(connection: sqlite3.Connection, key: LogKey) -> int:
             (key.topic, key.source, key.log_id),
         ).fetchone()
     return int(row[0])
+
+
+def _age_s(stored_s: float, now: float) -> float:
+    """Time since an item was stored; 0 if the wall clock was not set then, or was set back since."""
+    return max(0.0, now - stored_s) if stored_s >= FIRST_PLAUSIBLE_S else 0.0
 
 
 def _is_damaged(error: sqlite3.DatabaseError) -> bool:

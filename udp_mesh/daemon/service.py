@@ -34,7 +34,7 @@ from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.legacy_positions import LegacyPositions
-from udp_mesh.daemon.log_store import SqliteLogStore
+from udp_mesh.daemon.log_store import Put, SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.pings import Pings
 from udp_mesh.daemon.position_exchange import PositionExchange
@@ -191,18 +191,20 @@ class Service:
             if len(self._outcomes) > MAX_OUTCOMES:
                 self._outcomes.popitem(last=False)
         if settings is not None and settings.log is not None:
-            return self._logged(outcome)
+            put = self.log_store.last_put
+            assert put is not None
+            return self._logged(outcome, put)
         return self._flushed(outcome) if self.store.puts > stored else outcome
 
     async def _flushed(self, message: int) -> int:
         await self._flusher.flush()
         return message
 
-    async def _logged(self, message: int) -> int:
+    async def _logged(self, message: int, put: Put) -> int:
         """The item is on disk. Raises RequestError if the disk refused it."""
-        problem = await self.log_store.flush()
-        if problem is not None:
-            raise RequestError("log-not-stored", f"the log is not on disk: {problem}")
+        await put.stored.wait()
+        if put.problem is not None:
+            raise RequestError("log-not-stored", f"the log is not on disk: {put.problem}")
         return message
 
     def topic(self, name: str) -> Topic | None:
