@@ -55,6 +55,33 @@ class RangeSet:
         firsts[begin:end] = [first]
         lasts[begin:end] = [last]
 
+    def remove(self, number: int) -> None:
+        """Take a number out, if it is contained."""
+        firsts, lasts = self._firsts, self._lasts
+        place = bisect_right(firsts, number) - 1
+        if place < 0 or number > lasts[place]:
+            return
+        first, last = firsts[place], lasts[place]
+        kept = [(begin, end) for begin, end in ((first, number - 1), (number + 1, last)) if begin <= end]
+        firsts[place : place + 1] = [begin for begin, _ in kept]
+        lasts[place : place + 1] = [end for _, end in kept]
+
+    def gaps(self, first: int, last: int) -> list[tuple[int, int]]:
+        """The ranges from `first` to `last` that are not contained, ascending. Looks at no range outside of these."""
+        firsts, lasts = self._firsts, self._lasts
+        missing: list[tuple[int, int]] = []
+        place = bisect_right(firsts, first)
+        if place:
+            first = max(first, lasts[place - 1] + 1)
+        while place < len(firsts) and firsts[place] <= last:
+            if firsts[place] > first:
+                missing.append((first, firsts[place] - 1))
+            first = lasts[place] + 1
+            place += 1
+        if first <= last:
+            missing.append((first, last))
+        return missing
+
     def without(self, other: "RangeSet") -> list[tuple[int, int]]:
         """The ranges of this set's numbers that `other` does not contain, ascending."""
         missing: list[tuple[int, int]] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from udp_mesh.core.events import Rejected
 from udp_mesh.core.logs.item import LogKey
 from udp_mesh.core.logs.knowledge import PeerView
 from udp_mesh.core.logs.messages import CONTROL_TOPIC, MAX_ENTRIES, Have, HaveEntry, encode_control
@@ -29,10 +30,12 @@ class Announcements:
         self._announced_at = float("-inf")
         self._announce_at = _NEVER
         self._complete_at = now + COMPLETE_INTERVAL_S
+        self._answer_at = _NEVER
+        """When a peer that asked again soon gets its answer."""
 
     @property
     def next_at(self) -> float:
-        return min(self._announce_at, self._complete_at)
+        return min(self._announce_at, self._complete_at, self._answer_at)
 
     def note(self, log: LogKey, now: float, *, heard: bool = False) -> None:
         """Something about this log changed; `heard`: only what its readers have, as reported by others. Peers with a
@@ -47,23 +50,35 @@ class Announcements:
             for view in peers.values():
                 view.needs_all = True
         everything = tuple(logs)
+        self._answer_at = _NEVER
         for peer, view in peers.items():
-            if view.needs_all:
-                view.needs_all = False
-                self._tell(peer, everything, complete=True, asks=not view.asked, now=now)
+            if not view.needs_all:
+                continue
+            if now < view.told_at + INTERVAL_S:
+                # A peer can ask with few bytes for many.
+                self._answer_at = min(self._answer_at, view.told_at + INTERVAL_S)
+                continue
+            view.needs_all, view.told_at = False, now
+            if self._tell(peer, everything, complete=True, asks=not view.asked, now=now):
                 view.asked = True
+            else:
+                view.needs_all = True
+                self._answer_at = min(self._answer_at, now + INTERVAL_S)
         if now < self._announce_at:
             return
         self._announce_at, self._announced_at = _NEVER, now
         changed, self._changed = self._changed, {}
         for peer, view in peers.items():
             relevant = [log for log, heard in changed.items() if not (heard and log in view.reader_online)]
-            if relevant:
-                self._tell(peer, relevant, complete=False, asks=False, now=now)
+            if relevant and not self._tell(peer, relevant, complete=False, asks=False, now=now):
+                view.needs_all = True
 
-    def _tell(self, peer: str, logs: Sequence[LogKey], *, complete: bool, asks: bool, now: float) -> None:
+    def _tell(self, peer: str, logs: Sequence[LogKey], *, complete: bool, asks: bool, now: float) -> bool:
+        """Returns whether the transport accepted all of it: its queue for the peer may be full."""
         entries = [entry for log in logs if (entry := self._entry(log, peer)) is not None]
         for start in range(0, max(len(entries), 1), MAX_ENTRIES):
             first = start == 0
             message = Have(tuple(entries[start : start + MAX_ENTRIES]), complete and first, asks and first)
-            self._send(CONTROL_TOPIC, encode_control(message), peer, now)
+            if isinstance(self._send(CONTROL_TOPIC, encode_control(message), peer, now), Rejected):
+                return False
+        return True

@@ -36,6 +36,8 @@ class Deliveries:
         self._receipts: dict[int, ItemId] = {}
         self._waiting: deque[ItemId] = deque()
         """Items to be read from the store and delivered."""
+        self._pending: set[ItemId] = set()
+        """These, and those with a receipt."""
         self._reading = False
 
     def deliver(self, item: LogItem, priority: int) -> None:
@@ -44,6 +46,7 @@ class Deliveries:
         if self._confirms:
             receipt = Receipt(LOG_RECEIPT, self._next_receipt)
             self._receipts[self._next_receipt] = item.id
+            self._pending.add(item.id)
             self._next_receipt += 1
         source, topic, number = item.id.log.source, item.id.log.topic, item.id.number
         self._emit(MessageReceived(source, topic, item.type_name, item.payload, priority, False, receipt, number))
@@ -54,17 +57,21 @@ class Deliveries:
         """A program took the item, or the driver keeps it on disk itself."""
         item = self._receipts.pop(receipt.message_id, None)
         if item is not None:
+            self._pending.discard(item)
             self._taken(item)
 
     def returned(self, receipt: Receipt) -> None:
         """No program took the item: it is to be read and delivered again."""
         item = self._receipts.pop(receipt.message_id, None)
         if item is not None:
+            self._pending.discard(item)
             self.again(item)
 
     def again(self, item: ItemId) -> None:
-        """Deliver an item on disk, at one of the next calls of `run`."""
-        self._waiting.append(item)
+        """Deliver an item on disk, at one of the next calls of `run`, unless a program may be reading it."""
+        if item not in self._pending:
+            self._pending.add(item)
+            self._waiting.append(item)
 
     def run(self, deliver: Callable[[ItemId, bytes | None, float], None]) -> None:
         """Read the next item, whatever its size, once the one before was delivered."""
@@ -75,6 +82,7 @@ class Deliveries:
 
         def on_read(data: bytes | None, now: float) -> None:
             self._reading = False
+            self._pending.discard(item)
             deliver(item, data, now)
 
         self._store.get(item, lambda data: self._defer(partial(on_read, data)))

@@ -16,6 +16,8 @@ MAX_LOGS = 4096
 """Logs that a node knows of: a key holder inventing sources."""
 MAX_KEPT_RANGES = 4096
 """Ranges of one log of one node: numbers chosen with gaps."""
+MAX_LOST_NUMBERS = 1 << 20
+"""Own numbers beyond the newest one known that others may have: items that the disk lost after all."""
 MAX_READERS = 64
 """Readers of one log that are remembered: a key holder inventing names."""
 
@@ -31,38 +33,40 @@ class LogState:
     """Numbers being written to the disk."""
     readers: dict[str, RangeSet] = field(default_factory=dict)
     """By reader, including this node: what it has, or has had. Only grows."""
+    used: int = 0
+    """If this node is the source: the highest number it gave an item, though the disk may not have it."""
     deferred_until: float | None = None
     """Until when a node that only carries leaves the items to their readers, which seem to be in reach of them."""
 
-    def remove_held(self, number: int) -> None:
-        """The item was dropped."""
-        gone = RangeSet()
-        gone.add(number)
-        kept = RangeSet()
-        for first, last in self.held.without(gone):
-            kept.add_range(first, last)
-        self.held = kept
+    def note_used(self, entry: HaveEntry) -> None:
+        """If this node is the source: numbers that others have are used, even if its disk lost them. Claims far beyond
+        its own numbers are not believed, so that a key holder cannot use all of them up."""
+        newest = max(self.used, max((last for _, last in self.received.ranges()[-1:]), default=0))
+        for ranges in (entry.held, *(holder.ranges for holder in entry.readers)):
+            if ranges and ranges[-1][1] <= newest + MAX_LOST_NUMBERS:
+                self.used = max(self.used, ranges[-1][1])
 
-    def add_readers(self, holders: tuple[Holder, ...], allowed: tuple[str, ...]) -> bool:
-        """Learn what readers have. Returns whether anything is new."""
-        new = False
-        for reader, ranges in holders:
-            if (not allowed or reader in allowed) and self.add_reader(reader, ranges):
-                new = True
-        return new
+    def add_readers(self, holders: tuple[Holder, ...], allowed: tuple[str, ...]) -> dict[str, Ranges]:
+        """Learn what readers have. Returns what is new, by reader."""
+        new = {
+            reader: self.add_reader(reader, ranges) for reader, ranges in holders if not allowed or reader in allowed
+        }
+        return {reader: ranges for reader, ranges in new.items() if ranges}
 
-    def add_reader(self, reader: str, ranges: Ranges) -> bool:
-        """Learn what one reader has. Returns whether anything is new."""
+    def add_reader(self, reader: str, ranges: Ranges) -> Ranges:
+        """Learn what one reader has. Returns what is new. The time it takes depends on the ranges given, hardly on
+        those known."""
         known = self.readers.get(reader)
         if known is None:
             if len(self.readers) >= MAX_READERS:
-                return False
+                return ()
             known = self.readers[reader] = RangeSet()
-        before = known.count
+        new: list[tuple[int, int]] = []
         for first, last in ranges:
-            if len(known) < MAX_KEPT_RANGES:
+            if len(known) < MAX_KEPT_RANGES and (gaps := known.gaps(first, last)):
                 known.add_range(first, last)
-        return known.count != before
+                new += gaps
+        return tuple(new)
 
     def readers_without(self, number: int, readers: tuple[str, ...]) -> list[str]:
         """The readers that are not known to have an item. With no named readers, those that are known at all."""
@@ -96,6 +100,8 @@ class PeerView:
     reader_online: set[LogKey] = field(default_factory=set)
     needs_all: bool = True
     """This node has not announced to it what it holds."""
+    told_at: float = float("-inf")
+    """When all that this node holds was announced to it last."""
     asked: bool = False
     """It was asked what it holds."""
     silent: bool = False

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from udp_mesh.core.events import Event, LogItemHeld, MessageDelivered, MessageId
-from udp_mesh.core.logs.item import ItemId
-from udp_mesh.core.logs.knowledge import LogState
-from udp_mesh.core.ranges import RangeSet
+from udp_mesh.core.logs.item import ItemId, LogKey
+from udp_mesh.core.logs.messages import Ranges
 
 MAX_OUTCOMES = 65_536
-"""Own items whose readers are still awaited; of older ones no more events are sent."""
+"""Own items of one log whose readers are still awaited; of older ones no more events are sent."""
 
 
 @dataclass(slots=True)
@@ -26,41 +25,57 @@ class Outcomes:
 
     def __init__(self, emit: Callable[[Event], None]) -> None:
         self._emit = emit
-        self._published: dict[ItemId, _Published] = {}
+        self._published: dict[LogKey, dict[int, _Published]] = {}
+        """By log and number, in ascending order."""
 
     def add(self, item: ItemId, message_id: MessageId, now: float) -> None:
-        self._published[item] = _Published(message_id, now)
-        if len(self._published) > MAX_OUTCOMES:
-            del self._published[next(iter(self._published))]
+        published = self._published.setdefault(item.log, {})
+        published[item.number] = _Published(message_id, now)
+        if len(published) > MAX_OUTCOMES:
+            del published[next(iter(published))]
 
     def drop(self, item: ItemId) -> None:
         """The item was dropped here; other nodes may still deliver it."""
-        self._published.pop(item, None)
+        self._published.get(item.log, {}).pop(item.number, None)
 
     def report(
         self,
-        state: LogState,
-        before: Mapping[str, int],
+        log: LogKey,
+        read: Mapping[str, Ranges],
         peer: str,
-        carried: RangeSet,
+        carried: Ranges,
         readers: Sequence[str],
         now: float,
     ) -> None:
-        """Compare what readers have with the counts before, and report what is new. `carried` is what `peer` newly
-        holds."""
-        changed = [name for name, have in state.readers.items() if have.count != before.get(name, 0)]
-        if not changed and not carried.count:
-            return
-        for item, published in list(self._published.items()):
-            if item.log != state.key:
+        """Report what is new: `read` is what readers, and `carried` what `peer`, have as of now. Other ranges are not
+        looked at, so that the time it takes does not depend on how many items still wait."""
+        published = self._published.get(log, {})
+        for name, ranges in read.items():
+            if name == log.source:
                 continue
-            for name in changed:
-                if item.number in state.readers[name] and name != state.key.source and name not in published.known_by:
-                    published.known_by.add(name)
-                    latency_s = now - published.accepted_at
-                    self._emit(MessageDelivered(published.message_id, name, item.log.topic, latency_s))
-            if item.number in carried and peer not in published.known_by and readers and peer not in readers:
-                published.known_by.add(peer)
-                self._emit(LogItemHeld(published.message_id, peer, item.log.topic, item.number))
-            if readers and all(name in published.known_by for name in readers if name != state.key.source):
-                del self._published[item]
+            for number in _numbers(published, ranges):
+                entry = published[number]
+                if name not in entry.known_by:
+                    entry.known_by.add(name)
+                    self._emit(MessageDelivered(entry.message_id, name, log.topic, now - entry.accepted_at))
+        if readers and peer not in readers:
+            for number in _numbers(published, carried):
+                entry = published[number]
+                if peer not in entry.known_by:
+                    entry.known_by.add(peer)
+                    self._emit(LogItemHeld(entry.message_id, peer, log.topic, number))
+        awaited = {name for name in readers if name != log.source}
+        if readers:
+            for ranges in read.values():
+                for number in list(_numbers(published, ranges)):
+                    if awaited <= published[number].known_by:
+                        del published[number]
+
+
+def _numbers(published: dict[int, _Published], ranges: Ranges) -> Iterator[int]:
+    """The published numbers in these ranges."""
+    if not published:
+        return
+    lowest, highest = next(iter(published)), next(reversed(published))
+    for first, last in ranges:
+        yield from (number for number in range(max(first, lowest), min(last, highest) + 1) if number in published)

@@ -104,6 +104,11 @@ class Pulling:
         if len(self._refused) > MAX_REFUSED:
             del self._refused[next(iter(self._refused))]
 
+    def not_sent(self, peer: str, now: float) -> None:
+        """The transport's queue for the peer is full: it gets no requests for a while."""
+        self.requests.forget(peer)
+        self._avoided[peer] = now + FULL_PAUSE_S
+
     def plan(
         self,
         logs: Mapping[LogKey, LogState],
@@ -130,15 +135,22 @@ class Pulling:
                     self._full_until[key.topic] = now + FULL_PAUSE_S
             if rooms[key.topic] <= 0:
                 continue
+            holders = [
+                (peer, held)
+                for peer, held in _holders(peers, key, self.requests.counts)
+                if self.requests.counts.get(peer, 0) < MAX_REQUESTED and self._avoided.get(peer, now) <= now
+            ]
+            if not holders:
+                continue
             skip = skips.get(key) or RangeSet()
             reads = policy.is_reader(key.topic)
             if not reads:
-                skip = self._carried(state, peers, policy, skip, now)
-            for peer, held in _holders(peers, key, self.requests.counts):
+                skip = self._carried(state, peers, policy, skip)
+            lacks = False
+            for peer, held in holders:
                 room = min(MAX_REQUESTED - self.requests.counts.get(peer, 0), rooms[key.topic])
-                if room <= 0 or self._avoided.get(peer, now) > now:
-                    continue
-                numbers = missing(state, held, skip, room)
+                numbers = missing(state, held, skip, room) if room > 0 else []
+                lacks = lacks or bool(numbers)
                 if not numbers or (not reads and self._is_deferred(state, peers, peer, policy, now)):
                     continue
                 rooms[key.topic] -= len(numbers)
@@ -147,6 +159,9 @@ class Pulling:
                     chosen.add(number)
                     skip.add_range(number, number)
                     self.requests.add(ItemId(key, number), peer, now)
+            if not lacks:
+                # The next items are again left to others for a while.
+                state.deferred_until = None
         return [want for peer, entries in wanted.items() for want in _in_messages(peer, entries)]
 
     def _requested(self, now: float) -> dict[LogKey, RangeSet]:
@@ -162,7 +177,6 @@ class Pulling:
         peers: Mapping[str, PeerView],
         policy: Policy,
         skip: RangeSet,
-        now: float,
     ) -> RangeSet:
         """`skip`, with what a node that only carries leaves alone."""
         key, topic = state.key, state.key.topic

@@ -7,7 +7,7 @@ does what is due. The package's docstring lists the steps.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from udp_mesh.core.events import Event, ExpiryReason, LogItemDropped, MessageId, Receipt, Rejected, RejectReason
 from udp_mesh.core.logs.announcements import Announcements
@@ -19,6 +19,7 @@ from udp_mesh.core.logs.messages import CONTROL_TOPIC, Have, HaveEntry, ItemRequ
 from udp_mesh.core.logs.outcomes import Outcomes
 from udp_mesh.core.logs.policy import Policy
 from udp_mesh.core.logs.pulling import Pulling
+from udp_mesh.core.logs.restore import Restorer
 from udp_mesh.core.logs.retention import HeldItem, Shelf
 from udp_mesh.core.logs.serving import Send, Serving
 from udp_mesh.core.logs.store import LogStore
@@ -64,33 +65,14 @@ class Replicator:
         self.duplicate_items = 0
         self.dropped_items = 0
         """Items dropped before all their readers were known to have them."""
-        self.apply(settings)
-        self._load(now)
-
-    def _load(self, now: float) -> None:
-        contents = self._store.load()
+        contents = store.load()
+        self._restorer = Restorer(contents, now)
         self._key = SigningKey(contents.seed)
-        for key, ranges in contents.dropped:
-            state = self._log(key)
-            if state is not None:
-                state.received = as_set(ranges)
-        for stored in contents.items:
-            state = self._log(stored.id.log)
-            if state is None:
-                # Its topic is no longer a log: it stays on disk for a run in which it is.
-                continue
-            state.held.add(stored.id.number)
-            state.received.add(stored.id.number)
-            held = HeldItem(stored.size_bytes, now - stored.age_s, stored.taken)
-            self.shelves[stored.id.log.topic].add(stored.id, held)
-            if not stored.taken:
-                self._deliveries.again(stored.id)
-        for state in self.logs.values():
-            if self.policy.is_reader(state.key.topic):
-                state.add_reader(self.policy.name, tuple(state.received.ranges()))
+        self.apply(settings)
 
     def apply(self, settings: Settings) -> None:
         """Take over changed topics. Items of a topic that is no log any more stay on disk."""
+        before = self.policy.topics
         self.policy.topics = {topic.name: topic for topic in settings.topics if topic.log is not None}
         for name, topic in self.policy.topics.items():
             assert topic.log is not None
@@ -98,7 +80,22 @@ class Replicator:
                 self.shelves[name].log = topic.log
             else:
                 self.shelves[name] = Shelf(topic.log, self._is_read, self._is_own)
+        added = [name for name in self.policy.topics if name not in before]
+        if added:
+            self._begin(added)
         self._run_soon = True
+
+    def _begin(self, topics: Sequence[str]) -> None:
+        """These topics are logs from now on, perhaps again."""
+        self._restorer.restore(topics, self._log, self.shelves)
+        for state in self.logs.values():
+            if state.key.topic in topics and self.policy.is_reader(state.key.topic):
+                state.add_reader(self.policy.name, tuple(state.received.ranges()))
+        for item in (item for name in topics for item, held in self.shelves[name].items.items() if not held.taken):
+            self._deliveries.again(item)
+        for view in self.peers.values():
+            # What they hold of these topics was ignored so far.
+            view.needs_all, view.asked = True, False
 
     # Questions
 
@@ -119,7 +116,10 @@ class Replicator:
         return conditions_of(declared, self.peers, self.shelves, readers)
 
     def _is_own(self, item: ItemId) -> bool:
-        return item.log.source == self.policy.name and item.log.log_id == self._key.public
+        return self._is_own_log(item.log)
+
+    def _is_own_log(self, key: LogKey) -> bool:
+        return key.source == self.policy.name and key.log_id == self._key.public
 
     def _is_read(self, item: ItemId) -> bool:
         state, readers = self.logs.get(item.log), self.policy.readers(item.log.topic)
@@ -127,7 +127,7 @@ class Replicator:
 
     def _log(self, key: LogKey) -> LogState | None:
         state = self.logs.get(key)
-        if state is None and key.topic in self.policy.topics and len(self.logs) < MAX_LOGS:
+        if state is None and key.topic in self.policy.topics and (len(self.logs) < MAX_LOGS or self._is_own_log(key)):
             state = self.logs[key] = LogState(key)
         return state
 
@@ -137,21 +137,21 @@ class Replicator:
         """Publish the next item of this node's log. It is announced once it is on disk."""
         key = LogKey(topic, self.policy.name, self._key.public)
         state = self._log(key)
-        if state is None:
-            return Rejected(RejectReason.LOG_FULL, f"limit of {MAX_LOGS} logs reached")
-        newest = max([last for _, last in state.received.ranges()[-1:]] + list(state.storing), default=0)
-        number = max(newest + 1, FIRST_NUMBER)
+        assert state is not None, "a node's own log does not count toward the limit"
+        newest = max((last for _, last in state.received.ranges()[-1:]), default=FIRST_NUMBER - 1)
+        number = max(newest, state.used) + 1
         item = LogItem(ItemId(key, number), self._store.unix_ms(), type_name, payload)
         data = encode_item(self._key, item)
         dropped = self.shelves[topic].make_room(len(data), own=True, wanted=False)
+        log = self.shelves[topic].log
         if dropped is None or number > MAX_NUMBER:
-            log = self.shelves[topic].log
             return Rejected(
                 RejectReason.LOG_FULL,
                 f"an item of {len(data)} bytes does not fit into {log.max_items} items and {log.max_bytes} bytes",
             )
         for old in dropped:
             self._drop(old, ExpiryReason.LOG_FULL, now)
+        state.used = number
         message_id = self._next_message_id()
         self._outcomes.add(item.id, message_id, now)
         self._put(item, data, taken=True)
@@ -246,32 +246,32 @@ class Replicator:
             # What was requested before may not have reached it.
             view.needs_all = True
             self._pulling.requests.forget(peer)
-        for entry in message.entries:
+        # Each log once, whatever a key holder lists: looking at one may take long.
+        for entry in {entry.log: entry for entry in message.entries}.values():
             state = self._log(entry.log)
             if state is None:
                 continue
-            new = view.set_held(entry)
-            before = {name: have.count for name, have in state.readers.items()}
-            if state.add_readers(entry.readers, self.policy.readers(entry.log.topic)):
+            carried = tuple(view.set_held(entry).ranges())
+            readers = self.policy.readers(entry.log.topic)
+            read = state.add_readers(entry.readers, readers)
+            if read:
                 self._announcements.note(entry.log, now, heard=True)
                 state.deferred_until = None
-            if entry.log.log_id == self._key.public and entry.log.source == self.policy.name:
-                self._outcomes.report(state, before, peer, new, self.policy.readers(entry.log.topic), now)
+            if self._is_own_log(entry.log):
+                state.note_used(entry)
+                self._outcomes.report(entry.log, read, peer, carried, readers, now)
             self._pulling.requests.keep_only(peer, entry.log, as_set(entry.held))
 
     def _on_request(self, peer: str, view: PeerView | None, key: LogKey, ranges: tuple[tuple[int, int], ...]) -> None:
         state = self.logs.get(key)
         if state is None:
             return
-        wanted = LogState(key)
-        for first, last in ranges:
-            wanted.held.add_range(first, last)
-        available = intersection(state.held, wanted.held)
-        for first, last in available.ranges():
-            for number in range(first, last + 1):
-                if not self._serving.request(peer, ItemId(key, number)):
-                    return
-        if view is not None and available.count < wanted.held.count:
+        wanted = as_set(ranges)
+        available = intersection(state.held, wanted)
+        numbers = (number for first, last in available.ranges() for number in range(first, last + 1))
+        if not all(self._serving.request(peer, ItemId(key, number)) for number in numbers):
+            return
+        if view is not None and available.count < wanted.count:
             # Something was dropped meanwhile: list what is left.
             view.needs_all = True
 
@@ -329,8 +329,8 @@ class Replicator:
         self.shelves[key.topic].release(size_bytes)
         if not stored:
             if self._is_own(item.id):
-                # The number stays used: an earlier attempt may be on the disk after all.
-                state.received.add(number)
+                # The number stays used: the item may be on the disk after all.
+                self._outcomes.drop(item.id)
                 self._emit(LogItemDropped(key.topic, key.source, number, ExpiryReason.DISK))
             else:
                 self._pulling.pause(now)
@@ -346,8 +346,14 @@ class Replicator:
 
     def _lost(self, item: ItemId, now: float) -> None:
         """The disk does not return an item: others may still have it."""
-        self.shelves[item.log.topic].remove(item)
-        self.logs[item.log].remove_held(item.number)
+        held, state = self.shelves[item.log.topic].remove(item), self.logs[item.log]
+        if held is None:
+            # Reported before, or dropped while it was read.
+            return
+        state.held.remove(item.number)
+        if not self._is_own(item) and not (held.taken and self.policy.is_reader(item.log.topic)):
+            # No program here has it yet.
+            state.received.remove(item.number)
         self._emit(LogItemDropped(item.log.topic, item.log.source, item.number, ExpiryReason.DISK))
         self._announcements.note(item.log, now)
 
@@ -357,7 +363,7 @@ class Replicator:
             self.dropped_items += 1
             self._emit(LogItemDropped(item.log.topic, item.log.source, item.number, reason))
         shelf.remove(item)
-        state.remove_held(item.number)
+        state.held.remove(item.number)
         self._outcomes.drop(item)
         self._store.drop((item,), ((item.log, tuple(state.received.ranges())),))
         self._announcements.note(item.log, now)
@@ -386,7 +392,8 @@ class Replicator:
         self._deliveries.run(self._deliver_read)
         self._announcements.run(self.logs, self.peers, now)
         for peer, message in self._pulling.plan(self.logs, self.peers, self.policy, now):
-            self._send(CONTROL_TOPIC, encode_control(message), peer, now)
+            if isinstance(self._send(CONTROL_TOPIC, encode_control(message), peer, now), Rejected):
+                self._pulling.not_sent(peer, now)
         self._serving.run(now, self._lost)
         while self._completed:
             self._completed.popleft()(now)

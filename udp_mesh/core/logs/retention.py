@@ -12,6 +12,10 @@ from dataclasses import dataclass
 from udp_mesh.core.logs.item import ItemId
 from udp_mesh.core.settings import Log
 
+MAX_WRITING_BYTES = 16 << 20
+"""Items of one topic that the disk has not stored yet, beyond which no more are requested: they are in memory until a
+slow disk has them."""
+
 
 @dataclass(slots=True)
 class HeldItem:
@@ -86,6 +90,8 @@ class Shelf:
 
     def room(self, limit: int, *, wanted: bool) -> int:
         """How many more items may be requested, at most `limit`; their sizes are not known yet."""
+        if self.writing_bytes >= MAX_WRITING_BYTES:
+            return 0
         free_items, free_bytes = self._free()
         if free_items >= limit and free_bytes > 0:
             return limit

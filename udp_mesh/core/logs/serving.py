@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from udp_mesh.core.events import MessageId, Rejected
+from udp_mesh.core.events import MessageId, Rejected, RejectReason
 from udp_mesh.core.logs.item import ItemId
 from udp_mesh.core.logs.messages import item_topic
 from udp_mesh.core.logs.store import LogStore
@@ -53,9 +53,11 @@ class Serving:
     def request(self, peer: str, item: ItemId) -> bool:
         """A peer requests an item that is held here. Returns whether it may request more."""
         service = self._peers.setdefault(peer, _Service())
+        if len(service.queue) >= MAX_QUEUED:
+            return False
         if item not in service.sending and item not in service.queue:
             service.queue.append(item)
-        return len(service.queue) < MAX_QUEUED
+        return True
 
     def peer_offline(self, peer: str) -> None:
         """Forget what waits; what the transport already has stays there for a while."""
@@ -71,6 +73,7 @@ class Serving:
             service.retry_at = float("inf")
             while (
                 service.queue
+                and service.retry_at == float("inf")
                 and len(service.sending) < MAX_SENDING
                 and sum(service.sending.values()) < MAX_SENDING_BYTES
             ):
@@ -98,9 +101,11 @@ class Serving:
             return
         outcome = self._send(item_topic(item.log.topic), data, peer, now)
         if isinstance(outcome, Rejected):
-            # Its queue is full, or it is gone: it will request the item again.
             del service.sending[item]
             service.retry_at = now + RETRY_S
+            if outcome.reason is RejectReason.QUEUE_FULL:
+                # It waits for the item, and does not request it again soon.
+                service.queue.appendleft(item)
             return
         service.sending[item] = len(data)
         self._messages[outcome] = (peer, item)

@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.logs.team import ARTIFACT, LogTeam
-from udp_mesh.core.logs.item import LogKey
-from udp_mesh.core.logs.knowledge import as_set
-from udp_mesh.core.logs.pulling import in_at_least, rank
+from udp_mesh.core.logs.item import ItemId, LogKey
+from udp_mesh.core.logs.knowledge import LogState, PeerView, as_set
+from udp_mesh.core.logs.policy import Policy
+from udp_mesh.core.logs.pulling import CUSTODY_DELAY_S, FULL_PAUSE_S, Pulling, in_at_least, rank
+from udp_mesh.core.logs.retention import Shelf
 
 
 @given(st.lists(st.lists(st.integers(1, 30), unique=True), max_size=6), st.integers(1, 4))
@@ -34,3 +36,48 @@ def test_a_crowd_of_carriers_takes_few_copies() -> None:
         sum(item.number == number for name in carriers for item in team.stores[name].items) for number in range(1, 6)
     ]
     assert copies == [3, 3, 3, 3, 3]
+
+
+class Carrier:
+    """What a node that only carries plans; Spot, the source, and the base, a reader, are in reach."""
+
+    def __init__(self) -> None:
+        assert ARTIFACT.log is not None
+        self.key = LogKey("artifact", "spot", bytes(32))
+        self.state = LogState(self.key)
+        self.peers = {"spot": PeerView(), "base": PeerView()}
+        shelves = {"artifact": Shelf(ARTIFACT.log, lambda _: False, lambda _: False)}
+        self.policy = Policy("husky", shelves, self.peers)
+        self.policy.topics = {"artifact": ARTIFACT}
+        self.pulling = Pulling()
+
+    def requested(self, now: float, *, newest: int) -> list[tuple[str, tuple[tuple[int, int], ...]]]:
+        """(peer, numbers) of the requests sent, if Spot has items up to `newest`."""
+        self.peers["spot"].held[self.key] = as_set([(1, newest)])
+        plan = self.pulling.plan({self.key: self.state}, self.peers, self.policy, now)
+        return [(peer, ranges) for peer, request in plan for _, ranges in request.entries]
+
+    def receive(self, number: int, now: float) -> None:
+        self.pulling.requests.received(ItemId(self.key, number), now)
+        self.state.received.add(number)
+
+
+def test_a_carrier_leaves_every_item_to_a_reader_in_reach_not_only_the_first() -> None:
+    carrier = Carrier()
+    assert carrier.requested(0.0, newest=1) == []
+    assert carrier.requested(CUSTODY_DELAY_S, newest=1) == [("spot", ((1, 1),))]
+    carrier.receive(1, CUSTODY_DELAY_S)
+    assert carrier.requested(CUSTODY_DELAY_S + 1, newest=1) == []
+    assert carrier.requested(100.0, newest=2) == []
+    assert carrier.requested(100.0 + CUSTODY_DELAY_S, newest=2) == [("spot", ((2, 2),))]
+
+
+def test_a_request_that_the_transport_refused_is_planned_again_soon() -> None:
+    carrier = Carrier()
+    carrier.requested(0.0, newest=1)
+    assert carrier.requested(CUSTODY_DELAY_S, newest=1) == [("spot", ((1, 1),))]
+    carrier.pulling.not_sent("spot", CUSTODY_DELAY_S)
+    assert carrier.requested(CUSTODY_DELAY_S, newest=1) == []
+    later = CUSTODY_DELAY_S + FULL_PAUSE_S
+    requests = [carrier.requested(later + step / 2, newest=1) for step in range(10)]
+    assert requests.count([("spot", ((1, 1),))]) == 1
