@@ -54,11 +54,11 @@ class Announcements:
         for peer, view in peers.items():
             if not view.needs_all:
                 continue
-            if now < view.told_at + INTERVAL_S:
+            if now < view.announced_at + INTERVAL_S:
                 # A peer can ask with few bytes for many.
-                self._answer_at = min(self._answer_at, view.told_at + INTERVAL_S)
+                self._answer_at = min(self._answer_at, view.announced_at + INTERVAL_S)
                 continue
-            view.needs_all, view.told_at = False, now
+            view.needs_all, view.announced_at = False, now
             if self._tell(peer, everything, complete=True, asks=not view.asked, now=now):
                 view.asked = True
             else:

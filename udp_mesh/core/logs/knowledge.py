@@ -100,7 +100,7 @@ class PeerView:
     reader_online: set[LogKey] = field(default_factory=set)
     needs_all: bool = True
     """This node has not announced to it what it holds."""
-    told_at: float = float("-inf")
+    announced_at: float = float("-inf")
     """When all that this node holds was announced to it last."""
     asked: bool = False
     """It was asked what it holds."""

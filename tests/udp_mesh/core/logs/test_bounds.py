@@ -57,7 +57,7 @@ def test_an_item_waits_while_the_queue_of_the_transport_is_full() -> None:
     assert sent == [b"data"]
 
 
-def test_a_peer_that_keeps_asking_is_told_everything_a_few_times_a_second() -> None:
+def test_a_peer_that_keeps_asking_is_answered_a_few_times_a_second() -> None:
     sent = 0
 
     def send(*_: object) -> MessageId:

@@ -11,7 +11,7 @@ from udp_mesh.core.settings import Topic
 OTHER = replace(ARTIFACT, name="other")
 
 
-def test_a_topic_that_becomes_a_log_again_after_a_restart_goes_on_with_its_numbers() -> None:
+def test_a_topic_that_becomes_a_log_again_after_a_restart_continues_its_numbers() -> None:
     team = LogTeam("base", "spot", topics=[ARTIFACT, OTHER])
     team.publish("spot", b"before")
     team.stop("spot")
