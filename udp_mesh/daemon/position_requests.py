@@ -54,9 +54,14 @@ def _meters(header: Header, key: str) -> float:
 
 def _number(header: Header, key: str, expected: str) -> float:
     value = header.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise RequestError("bad-request", f"{key}: expected {expected}, found {value!r}")
-    return float(value)
+    try:
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    except OverflowError:
+        # JSON's integers have no limit.
+        number = math.inf
+    if not math.isfinite(number):
+        raise RequestError("bad-request", f"{key}: expected {expected}, found {repr(value)[:80]}")
+    return number
 
 
 def publish_meter(service: Service, _client: Client, _header: Header, payload: bytes) -> Header:

@@ -115,8 +115,12 @@ class Positions:
     def receive(self, source: str, payload: bytes, now: float) -> Position | None:
         """Keeps a peer's position and returns it; None if it is not one."""
         position = decode(payload, now)
-        if position is None or (source not in self._peers and len(self._peers) >= MAX_POSITIONS):
+        if position is None:
             return None
+        # The one heard least recently makes room.
+        self._peers.pop(source, None)
+        if len(self._peers) >= MAX_POSITIONS:
+            del self._peers[next(iter(self._peers))]
         self._peers[source] = position
         return position
 

@@ -93,8 +93,12 @@ def test_invented_names_do_not_fill_the_memory() -> None:
     message = encode(HERE, 100.0)
     for number in range(MAX_POSITIONS + 50):
         positions.receive(f"n{number}", message, 0.0)
-    assert len(positions.json("own", 0.0)) == MAX_POSITIONS
-    assert positions.receive("n0", message, 1.0) is not None
+        if number % 100 == 0:
+            positions.receive("bob", message, 0.0)
+    assert positions.receive("alice", message, 1.0) is not None
+    known = [entry["name"] for entry in positions.json("own", 0.0)]
+    assert len(known) == MAX_POSITIONS
+    assert {"alice", "bob"} <= set(known)
 
 
 def test_peers_of_earlier_versions_get_nothing_that_they_would_pass_on() -> None:
@@ -190,6 +194,7 @@ def test_each_daemon_learns_the_others_position_and_records_it(pair: Pair) -> No
         ({"x_m": 1, "y_m": True}, "y_m: expected a number of meters, found True"),
         ({"x_m": 1, "y_m": 2e7}, "y_m: expected a number of meters from -1e+07 to 1e+07"),
         ({"x_m": 1, "y_m": 2, "frame": "a b"}, "frame: expected a name of 1 to 64 bytes without spaces"),
+        ({"x_m": 1, "y_m": 10**400}, "y_m: expected a number of meters, found 1000"),
         ({"x_m": 1, "y_m": 2, "frame": 7}, "frame: expected a name"),
         ({"x_m": 1, "y_m": 2, "time_s": "now"}, "time_s: expected a Unix time in seconds"),
     ],
