@@ -83,7 +83,7 @@ def test_the_shipped_templates_read_only_the_compat_version_of_the_device() -> N
         words
         for template in shipped("templates").rglob("*.j2")
         for words in re.findall(
-            r"\bdevice\b(?:\.\w+)?", "".join(re.findall(r"{[{%].*?[%}]}", template.read_text(), re.S))
+            r"(?<!\.)\bdevice\b(?:\.\w+)?", "".join(re.findall(r"{[{%].*?[%}]}", template.read_text(), re.S))
         )
     }
     assert used == {"device.compat_version"}
