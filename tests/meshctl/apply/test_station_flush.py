@@ -256,7 +256,11 @@ def known_for_s(rig: Rig) -> list[int]:
 
 def is_set_up(node: VirtualNode, *, distance: int) -> bool:
     """Whether netifd has set the node's radio up with this distance."""
-    radio = json.loads(node.exec("ubus call network.wireless status").check("status").stdout)["radio0"]
+    status = node.exec("ubus call network.wireless status").stdout
+    if not status.strip():
+        # netifd is replacing its program
+        return False
+    radio = json.loads(status)["radio0"]
     return radio["up"] and not radio["pending"] and int(radio["config"]["distance"]) == distance
 
 

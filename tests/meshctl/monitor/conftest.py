@@ -1,4 +1,4 @@
-"""One browser for all of the page's tests. The tests with a real prometheus are collected where there is one
+"""One browser for each module of the page's tests. The tests with a real prometheus are collected where there is one
 (scripts/setup-prometheus)."""
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from tests.meshctl.monitor.prometheus_program import expects_prometheus
 collect_ignore = [] if expects_prometheus() else ["test_prometheus.py"]
 
 
-@pytest.fixture(scope="session")
+# Not for the whole session: while it is open, Playwright's event loop runs in the main thread, and no other can.
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with chromium() as started:
         yield started

@@ -201,7 +201,7 @@ def test_kernel_devices_are_planned_from_uci_files_in_creation_order(tmp_path: P
         ["soft", "bat0"], ["radio", "mesh0"], ["tune", "mesh0"], ["bridge", "br-lan"], ["port", "br-lan"],
         ["port", "br-lan"], ["hard", "mesh0"], ["addr", "br-lan"],
     ]  # fmt: skip
-    assert plan[0][2:] == ["BATMAN_V", "orig_interval=500"]
+    assert plan[0][2:] == ["BATMAN_V", "orig_interval=500", "-"]
     assert plan[1][2:9] == ["0", "adhoc", "2437", "HT20", "a team", "02:ca:fe:00:00:01", "12000"]
     assert plan[2][2:5] == ["0", "24", "-"]
     assert plan[6][2:4] == ["bat0", "1536"]
