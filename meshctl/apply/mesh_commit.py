@@ -31,7 +31,6 @@ from meshctl.apply.change_in_progress import (
 )
 from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum, unmet_of
 from meshctl.device.openwrt import measure_uptime
 from meshctl.device.ssh import SshConnection
@@ -230,8 +229,7 @@ def _prove(participant: Participant) -> None:
         return
     try:
         action = observe_and_decide(change, connection)
-        participant.is_proven = action is Action.CONFIRM
-        participant.has_failed = action in (Action.ABORT, Action.WENT_BACK)
+        participant.decide(action)
         if change.last is not None:
             participant.ctx.run.record(participant.name, change.last)
     except NodeError as error:

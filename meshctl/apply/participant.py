@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext
+from meshctl.apply.next_action import Action
 from meshctl.device.openwrt import UptimeSample
 from meshctl.fleet import Outcome
 
@@ -49,6 +50,13 @@ class Participant:
     @property
     def leaves_cell(self) -> bool:
         return bool(self.ctx.plan.splits)
+
+    def decide(self, action: Action) -> None:
+        """Take over what a look at the node showed. One in the new cell may still prove itself although its reload
+        failed: given up too early, it would be left behind and need a cable."""
+        self.is_proven = action is Action.CONFIRM
+        gives_up = action is Action.ABORT and not self.leaves_cell
+        self.has_failed = gives_up or action is Action.WENT_BACK
 
 
 def canceled_because(participants: Iterable[Participant], step: str, what: str = "the mesh change") -> str:

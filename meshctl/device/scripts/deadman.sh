@@ -564,7 +564,7 @@ end_reload() {
 }
 
 # A restore ends the change before its reload has ended: another change would share the status of that reload.
-is_reloading() { read -r restoring_pid 2>/dev/null <"$RUN/restoring" && kill -0 "$restoring_pid" 2>/dev/null; }
+is_reloading() { alive "$RUN/restoring"; }
 
 await_restored() {
 	now

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import cast
 
 from meshctl.apply.context import NodeContext
+from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
 from meshctl.fleet import Outcome, Result
 
@@ -46,3 +47,27 @@ def test_a_canceled_change_names_the_nodes_that_were_not_ready_and_why() -> None
     many = [not_ready(f"b{number:02}", "it does not answer") for number in range(5)]
     assert canceled_because(many, "scheduled").endswith("b02 could not be scheduled: it does not answer; and 2 more")
     assert canceled_because([not_ready("b01", "")], "armed") == "the mesh change was canceled: interrupted"
+
+
+def looked_at(*actions: Action, leaves_cell: bool) -> Participant:
+    ctx = cast("NodeContext", SimpleNamespace(plan=SimpleNamespace(splits=("main",) if leaves_cell else ())))
+    looked = Participant(ctx)
+    for action in actions:
+        looked.decide(action)
+    return looked
+
+
+def test_a_node_in_the_new_cell_is_looked_at_again_after_a_failed_reload() -> None:
+    first = looked_at(Action.ABORT, leaves_cell=True)
+    assert not first.is_decided
+    second = looked_at(Action.ABORT, Action.CONFIRM, leaves_cell=True)
+    assert (second.is_proven, second.has_failed) == (True, False)
+
+
+def test_a_node_that_keeps_its_cell_is_given_up_after_a_failed_reload() -> None:
+    assert looked_at(Action.ABORT, leaves_cell=False).has_failed
+
+
+def test_a_node_that_went_back_is_given_up_in_either_case() -> None:
+    assert looked_at(Action.WENT_BACK, leaves_cell=True).has_failed
+    assert looked_at(Action.WENT_BACK, leaves_cell=False).has_failed

@@ -328,6 +328,17 @@ def test_no_change_is_staged_while_a_rollback_reloads(node: Sandbox) -> None:
         assert waiting.result() == "ok state=staged id=c1"
 
 
+def test_a_foreign_process_under_the_number_of_a_killed_rollback_holds_no_change_off(node: Sandbox) -> None:
+    prepare(node)
+    assert node.deadman("lock", OWNER, "600").startswith("ok")
+    foreign = node.run("/bin/sh", "-c", "sleep 600 >/dev/null 2>&1 & echo $!").stdout.strip()
+    try:
+        node.put("/tmp/meshctl/restoring", f"{foreign}\n")
+        assert node.deadman("stage", OWNER, "c1", BUNDLE) == "ok state=staged id=c1"
+    finally:
+        node.run("/bin/sh", "-c", f"kill {foreign}")
+
+
 OVERLAY_IN_RAM = "overlayfs:/tmp/root"
 INITRAMFS_19_07 = "rootfs"
 
