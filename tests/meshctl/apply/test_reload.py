@@ -192,7 +192,9 @@ def test_a_dropbear_with_changed_options_is_waited_for_until_its_old_process_exi
         (node.place / "dropbear").write_text(DROPBEAR % (old.pid, 22))
         (node.place / "dropbear.next").write_text(DROPBEAR % (old.pid, 2222))
         # procd lists the new command while the old process still runs
-        node.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; kill {old.pid}')
+        # the pause ends once the old process is reaped: a zombie still counts as running
+        stop = f"kill {old.pid}; while kill -0 {old.pid}; do /bin/sleep .01; done 2>/dev/null"
+        node.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; {stop}')
         reaper = threading.Thread(target=old.wait)
         reaper.start()
         try:
