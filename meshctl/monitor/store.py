@@ -70,12 +70,14 @@ class TimelineBucket:
 class FrameStore:
     """The open history. Safe for several threads; one process appends, others may read, acknowledge and silence.
 
-    `problem` says why the last frame is not in the file; empty if it is.
+    `problem` says why the last frame is not in the file; empty if it is. `clock_stepped_s` is by how much the clock was
+    set forward since the file was opened: frames from before are not that much older.
     """
 
     def __init__(self, path: Path, max_age_s: float, max_bytes: int, *, read_only: bool = False) -> None:
         self.path = path
         self.problem = ""
+        self.clock_stepped_s = 0.0
         self._max_age_ms = milliseconds(max_age_s)
         self._max_used_bytes = max_bytes - LOG_BYTES
         self._file = SqliteFile(path, SCHEMA, read_only=read_only)
@@ -131,9 +133,11 @@ class FrameStore:
 
     def claim(self) -> None:
         """Be the process that appends, until `close`. Raises InputError if another one is."""
-        descriptor = os.open(
-            self.path.with_name(self.path.name + ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600
-        )
+        lock = self.path.with_name(f"{self.path.name}.lock")
+        try:
+            descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise InputError(f"{lock}: cannot be created: {error.strerror}") from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -185,7 +189,9 @@ class FrameStore:
         }
         self._ended.update((alarm.key, alarm) for alarm in change.ended)
         for alarm in (*change.open.values(), *change.ended):
-            self._pending[alarm.device, alarm.code, alarm.first_s] = alarm
+            key = (alarm.device, alarm.code, alarm.first_s)
+            unwritten = self._pending.get(key)
+            self._pending[key] = replace(alarm, rose=True) if unwritten is not None and unwritten.rose else alarm
 
     def _write(self, frame: Frame, key: int, alarms: Mapping[Any, LoggedAlarm]) -> None:
         packed = zlib.compress(frame.json_text.encode(), _ZLIB_LEVEL)
@@ -201,7 +207,7 @@ class FrameStore:
 
     def _expire(self, database: Any, now_ms: int) -> None:
         """Remove what is too old, and the oldest frames while the file is too large; never the newest frame."""
-        oldest = now_ms - self._max_age_ms
+        oldest = now_ms - self._max_age_ms - milliseconds(self.clock_stepped_s)
         database.execute(_REMOVE_OLDEST, (oldest, _EXPIRE_BATCH * _EXPIRE_STEPS))
         database.execute("DELETE FROM alarms WHERE ended_ms IS NOT NULL AND ended_ms < ?", (oldest,))
         for _ in range(_EXPIRE_STEPS):
