@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,9 @@ from typing import Any
 from meshctl.status.preflight import Check, verdict
 
 SCHEMA = 1
+# No counter of a kernel is larger. What has so many digits may be larger.
+_MAX_INTEGER = 1 << 64
+_HUGE = re.compile(r"\d{20}")
 # The monitor sends no test messages between robots, so the frame's verdict leaves the check of their delivery out.
 _NOT_ASSESSED = "delivery"
 
@@ -73,12 +77,17 @@ class Frame:
         whole = {**document, "time_s": time_s}
         try:
             text = _dumped(whole)
+            is_exact = _HUGE.search(text) is None
         except ValueError:
+            is_exact = False
+        if not is_exact:
             whole = _finite(whole)
             text = _dumped(whole)
         # half of a surrogate pair is no character, and no encoding has it
-        frame = cls(time_s, text.encode("utf-8", "replace").decode())
-        frame._document = whole
+        encodable = text.encode("utf-8", "replace").decode()
+        frame = cls(time_s, encodable)
+        if encodable == text:
+            frame._document = whole
         return frame
 
     @property
@@ -194,9 +203,11 @@ def _dumped(document: Mapping[str, Any]) -> str:
 
 
 def _finite(value: Any) -> Any:
-    """The value with infinite and undefined numbers as null: JSON has none, and a browser rejects them."""
+    """The value with infinite, undefined and huge numbers as null: JSON has none, or readers overflow."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, int):
+        return value if abs(value) < _MAX_INTEGER else None
     if isinstance(value, Mapping):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
