@@ -6,6 +6,7 @@ What a device says reaches a hook as JSON and as environment variables, never as
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
@@ -14,7 +15,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -45,18 +46,26 @@ class HookSettings:
         """Raises InputError for what is no URL or no level."""
         if self.min_level not in LEVELS:
             raise InputError(f"hook level: expected {', '.join(LEVELS)}, found {self.min_level!r}")
-        parts = urlsplit(self.webhook)
-        if self.webhook and (parts.scheme not in ("http", "https") or not parts.hostname):
+        if self.webhook and not _is_url(self.webhook):
             raise InputError(f"webhook: expected an http or https URL, found {self.webhook!r}")
+
+
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
 
 
 @dataclass(slots=True)
 class AlarmHooks:
-    """The hooks and their thread. `problem` says why the last call failed; `dropped` counts alarms that were
-    never reported."""
+    """The hooks and their thread. `problem` says why the last call failed, also to `on_problem`; `dropped` counts
+    alarms that were never reported."""
 
     settings: HookSettings
     fleet: str = ""
+    on_problem: Callable[[str], None] = lambda text: None
     problem: str = ""
     dropped: int = 0
     _waiting: deque[LoggedAlarm] = field(default_factory=deque, repr=False)
@@ -114,6 +123,7 @@ class AlarmHooks:
         self.problem = "; ".join(problem for problem in problems if problem)
         if self.problem:
             event_log.emit(event_log.INFO, "hook failed", device=alarm.device, code=alarm.code, reason=self.problem)
+            self.on_problem(f"alarm not reported: {self.problem}")
 
 
 def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
@@ -128,7 +138,7 @@ def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
                 response.read(1)
         except urllib.error.HTTPError as error:
             failure.append(f"webhook {url}: {error.code} {error.reason}")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:
             failure.append(f"webhook {url}: {getattr(error, 'reason', None) or error}")
 
     thread = threading.Thread(target=send, name="webhook", daemon=True)

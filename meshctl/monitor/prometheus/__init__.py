@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -49,10 +49,12 @@ def file_sd(fleet: Fleet) -> str:
 
 
 class TextfileWriter:
-    """A listener of the sampler that writes every frame's metrics to a file; `problem` says why it could not."""
+    """A listener of the sampler that writes every frame's metrics to a file; `problem` says why it could not, also to
+    `on_problem`."""
 
-    def __init__(self, path: Path, store: FrameStore) -> None:
+    def __init__(self, path: Path, store: FrameStore, on_problem: Callable[[str], None] = lambda text: None) -> None:
         self.path = path
+        self._on_problem = on_problem
         self.problem = ""
         self._store = store
 
@@ -61,6 +63,8 @@ class TextfileWriter:
             replace_file(self.path, render_metrics(frame, self._store))
         except MeshctlError as error:
             # no reason to miss a frame
+            if str(error) != self.problem:
+                self._on_problem(str(error))
             self.problem = str(error)
         else:
             self.problem = ""
