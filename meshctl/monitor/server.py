@@ -234,6 +234,9 @@ class MonitorServer:
         """Frames newer than `last_s`, and the alarms whenever they changed, until the server stops."""
         yield ": meshctl monitor\n\n"
         sent_s = last_s if last_s is not None else -math.inf
+        if (newest := await run_in_threadpool(self.store.latest)) is not None and sent_s > newest.time_s:
+            # another history, or a clock that was set back: the browser has seen none of these frames
+            sent_s = -math.inf
         alarms = ""
         quiet_s = 0.0
         while not self.feed.is_closed:
