@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -52,7 +52,8 @@ DEFAULT_MB = 512
 
 def monitor(
     interval: Annotated[
-        float, typer.Option("--interval", min=1.0, metavar="S", help="Seconds between two looks at the fleet.")
+        float,
+        typer.Option("--interval", min=1.0, max=3600, metavar="S", help="Seconds between two looks at the fleet."),
     ] = 5.0,
     listen: Annotated[
         str, typer.Option("--listen", metavar="ADDRESS", help="IP address to serve the page on.")
@@ -84,7 +85,7 @@ def monitor(
     ] = None,
     store: HistoryFile = None,
     keep_days: Annotated[
-        float, typer.Option("--keep-days", min=0.01, help="Remove what is older from the history.")
+        float, typer.Option("--keep-days", min=0.01, max=36_500, help="Remove what is older from the history.")
     ] = DEFAULT_DAYS,
     max_mb: Annotated[int, typer.Option("--max-mb", min=16, help="Largest size of the history.")] = DEFAULT_MB,
     once: Annotated[bool, typer.Option("--once", help="Look once, store and print the result, and exit.")] = False,
@@ -129,6 +130,7 @@ def monitor(
             raise InputError("--replay goes with neither --once nor --allow-actions")
         _replay(replay, out, web, as_json=as_json)
         return
+    hook_settings = HookSettings(webhook, _words(hook), hook_level)
     with ExitStack() as stack:
         view = stack.enter_context(
             open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, ask_sudo=ask_sudo, no_robots=no_robots)
@@ -138,14 +140,23 @@ def monitor(
         sampler = sampler_of(view, history, interval)
         if once:
             raise typer.Exit(_look_once(sampler, as_json=as_json))
-        hooks = AlarmHooks(HookSettings(webhook, tuple(shlex.split(hook)), hook_level), view.fleet.name)
+        hooks = AlarmHooks(hook_settings, view.fleet.name)
         stack.callback(hooks.close, HOOK_CLOSE_S)
         sampler.listeners.append(lambda frame, began: hooks.notify(began))
         if textfile is not None:
-            sampler.listeners.append(TextfileWriter(textfile, history))
+            sampler.listeners.append(TextfileWriter(textfile, history, lambda text: sampler.on_problem(text)))
         watch = _Watch(sampler, as_json=as_json)
+        hooks.on_problem = sampler.on_problem
         options = _shared_options(inventory, key or (), lab)
         raise typer.Exit(watch.run(web, options))
+
+
+def _words(command: str) -> tuple[str, ...]:
+    """A command line as words. Raises InputError."""
+    try:
+        return tuple(shlex.split(command))
+    except ValueError as error:
+        raise InputError(f"--hook: expected a command line, found {command!r}: {error}") from error
 
 
 def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: int) -> FrameStore:
@@ -153,7 +164,10 @@ def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: 
     if path is None:
         lab = view.opened.lab
         path = history_path(view.fleet.name, None if lab is None else lab.directory)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot be created: {error.strerror}") from error
     return FrameStore.open(path, keep_days * 86400, max_mb << 20)
 
 
@@ -263,7 +277,9 @@ class _Watch:
                 self._say({"event": "alarm", **alarm.as_json()}, line)
 
     def _say(self, event: dict[str, object], line: str) -> None:
-        say(event, line, as_json=self._as_json)
+        # a pipe whose reader has left is no reason to stop watching
+        with suppress(OSError):
+            say(event, line, as_json=self._as_json)
 
 
 def say(event: dict[str, object], line: str, *, as_json: bool) -> None:

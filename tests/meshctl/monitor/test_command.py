@@ -17,6 +17,7 @@ from meshctl.cli.main import build
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
 from tests.meshctl.monitor.documents import frame
+from tests.meshctl.status.fleets import trio
 from tests.meshctl.status.line_fleet import Bench, line_of_three
 
 pytestmark = pytest.mark.xdist_group("browser")
@@ -106,6 +107,12 @@ def history(tmp_path: Path) -> Path:
         (["--replay", "nothing.sqlite"], "cannot read nothing.sqlite: No such file or directory"),
         (["--replay", "run.sqlite", "--once"], "--replay goes with neither --once nor --allow-actions"),
         (["--token-file", "nothing"], "cannot read nothing: No such file or directory"),
+        (["--hook", "notify 'unbalanced"], "--hook: expected a command line, found"),
+        (["--webhook", "http://x:port/"], "webhook: expected an http or https URL, found 'http://x:port/'"),
+        (["--hook-level", "loud"], "hook level: expected note, warning, error, found 'loud'"),
+        (["--interval", "nan"], "Invalid value for '--interval'"),
+        (["--keep-days", "nan"], "Invalid value for '--keep-days'"),
+        (["--keep-days", "inf"], "Invalid value for '--keep-days'"),
         (["--replay", "run.sqlite", "--listen", "192.0.2.1"], "cannot listen on 192.0.2.1 port 8765"),
     ],
 )
@@ -115,6 +122,18 @@ def test_wrong_options_are_named(
     monkeypatch.chdir(history.parent)
     code, output = run(*words)
     assert (code, expected in output) == (2, True), output
+
+
+def test_a_history_goes_where_a_directory_can_be_made(tmp_path: Path) -> None:
+    trio(tmp_path)
+    (tmp_path / "file").touch()
+    words = ("--once", "-i", str(tmp_path / "fleet.yaml"), "--store")
+    code, output = run(*words, str(tmp_path / "file/deep/run.sqlite"))
+    assert (code, f"{tmp_path}/file/deep: cannot be created: Not a directory" in output) == (2, True), output
+    # nothing answers, which is an answer
+    code, output = run(*words, str(tmp_path / "new/run.sqlite"), "--timeout", "0.5", "--no-robots")
+    assert (tmp_path / "new/run.sqlite").is_file(), output
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.parametrize("token", ["", "short", "with a space in it, which is long"])
