@@ -114,6 +114,16 @@ def reported_alarms(status: Mapping[str, Any]) -> ReportedAlarms:
     return ReportedAlarms(found, frozenset(unknown))
 
 
+def devices_of(status: Mapping[str, Any]) -> frozenset[str]:
+    """The devices that an alarm of this status document could name, without the fleet."""
+    return frozenset(
+        f"{prefix}{one['name']}"
+        for kind, prefix in (("nodes", ""), ("robots", ROBOT))
+        for one in _maps(status.get(kind))
+        if isinstance(one.get("name"), str)
+    )
+
+
 def _merge(found: dict[AlarmKey, tuple[str, str, str]], device: str, alarms: object) -> None:
     for alarm in _maps(alarms):
         level, code, text = alarm.get("level"), alarm.get("code"), alarm.get("text")

@@ -12,24 +12,27 @@ import os
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet.sqlite_file import SqliteFile
 from meshctl.monitor.alarm_log import (
+    FLEET,
     REOPEN_S,
     AlarmChange,
     AlarmKey,
     LoggedAlarm,
     Silence,
     advance,
+    devices_of,
     reported_alarms,
 )
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.history_file import (
     ALARM_COLUMNS,
+    ANY,
     LOG_ALARM,
     LOG_BYTES,
     SCHEMA,
@@ -38,6 +41,7 @@ from meshctl.monitor.history_file import (
     row_of,
     silence_of,
 )
+from meshctl.monitor.timeline import TimelineBucket, buckets_of, thinned
 
 # Below this a frame of a large fleet and its indexes would not fit.
 MIN_BYTES = 8 << 20
@@ -53,18 +57,7 @@ _READ_BATCH = 32
 _ZLIB_LEVEL = 1
 
 
-@dataclass(frozen=True, slots=True)
-class TimelineBucket:
-    """A stretch of time: `go` False if any of its frames was a no-go, None if none was assessed; the most alarms that
-    any of its frames had, by level. `frames` 0: nothing was recorded."""
-
-    start_s: float
-    end_s: float
-    frames: int
-    go: bool | None
-    errors: int
-    warnings: int
-    notes: int
+Revision = tuple[int, float | None]
 
 
 class FrameStore:
@@ -146,8 +139,9 @@ class FrameStore:
             raise InputError(f"{self.path}: another meshctl monitor writes this history", hint=hint) from error
         self._claim = descriptor
 
-    def append(self, frame: Frame) -> tuple[LoggedAlarm, ...]:
+    def append(self, frame: Frame, now_s: float | None = None) -> tuple[LoggedAlarm, ...]:
         """Store a frame, bring the alarm log up to date and drop what is too old or too much; the alarms that began.
+        `now_s` by the wall clock, which silences are set by, decides which are in force; default: the frame's time.
 
         A frame that cannot be written (full disk, locked file) sets `problem`: `latest` still returns it, and what
         became of the alarms is written with the next one. Raises ValueError if it is not newer than the last one.
@@ -168,7 +162,7 @@ class FrameStore:
                 self.problem = ""
                 self._unwritten = None
                 self._pending.clear()
-        return self._with_silences(change.began, frame.time_s)
+        return self._with_silences(change.began, frame.time_s if now_s is None else now_s)
 
     def _with_silences(self, alarms: tuple[LoggedAlarm, ...], now_s: float) -> tuple[LoggedAlarm, ...]:
         if not alarms:
@@ -229,6 +223,12 @@ class FrameStore:
             return unwritten
         return self._first("ORDER BY time_ms DESC LIMIT 1", ())
 
+    def revision(self) -> Revision:
+        """Differs from an earlier one if frames, alarms or silences changed since, also by another process."""
+        unwritten = self._unwritten
+        ((version,),) = self._reader.read("PRAGMA data_version", ())
+        return version, None if unwritten is None else unwritten.time_s
+
     def at(self, time_s: float) -> Frame | None:
         """The newest frame that is not after `time_s`."""
         unwritten = self._unwritten
@@ -288,19 +288,7 @@ class FrameStore:
             " FROM frames INDEXED BY timeline WHERE time_ms >= ?1 AND time_ms < ?2 GROUP BY 1",
             (start, end, buckets),
         )
-        by_bucket = {row[0]: row[1:] for row in rows}
-        width_s = (end - start) / buckets / 1000
-        return tuple(
-            TimelineBucket(
-                start / 1000 + index * width_s,
-                start / 1000 + (index + 1) * width_s,
-                count,
-                None if go is None else bool(go),
-                *(errors, warnings, notes),
-            )
-            for index in range(buckets)
-            for count, go, errors, warnings, notes in (by_bucket.get(index, (0, None, 0, 0, 0)),)
-        )
+        return buckets_of(rows, start, end, buckets)
 
     def alarms(self, *, active_only: bool = True, now_s: float) -> tuple[LoggedAlarm, ...]:
         """The alarms that are open, or all that are kept; the most severe first, then the newest. `now_s` decides which
@@ -336,15 +324,23 @@ class FrameStore:
             raise InputError(f"{device or 'the fleet'} has no open alarm {code}", hint="meshctl alarms lists them")
 
     def silence(self, device: str, code: str, silence: Silence) -> None:
-        """Silence an alarm, now and when it comes again; `*` stands for any device or code. Raises InputError."""
+        """Silence an alarm, now and when it comes again; `*` stands for any device or code. Raises InputError, also for
+        a device that no frame or alarm has."""
         if not silence.reason.strip():
             raise InputError("expected a reason for the silence")
+        if device not in (ANY, FLEET) and not self._knows(device):
+            raise InputError(f"unknown device {device!r}", hint="meshctl alarms lists them; robot:NAME is a computer")
         until = None if silence.until_s is None else milliseconds(silence.until_s)
         with self._file.write() as database:
             database.execute(
                 "INSERT OR REPLACE INTO silences (device, code, until_ms, reason, by) VALUES (?, ?, ?, ?, ?)",
                 (device, code, until, silence.reason, silence.by),
             )
+
+    def _knows(self, device: str) -> bool:
+        if (newest := self.latest()) is None or device in devices_of(newest.status):
+            return True
+        return bool(self._reader.read("SELECT 1 FROM alarms WHERE device = ? LIMIT 1", (device,)))
 
     def end_silence(self, device: str, code: str) -> None:
         """Raises InputError if there is none."""
@@ -369,15 +365,6 @@ class FrameStore:
     def _first(self, where: str, values: tuple[object, ...]) -> Frame | None:
         rows = self._reader.read(f"SELECT time_ms, document FROM frames {where}", values)
         return _frame(*rows[0]) if rows else None
-
-
-def thinned(items: list[int], limit: int) -> list[int]:
-    """At most `limit` of the items at even distances, the first and the last among them."""
-    if len(items) <= limit:
-        return items
-    if limit == 1:
-        return items[-1:]
-    return [items[round(index * (len(items) - 1) / (limit - 1))] for index in range(limit)]
 
 
 def _frame(time_ms: int, packed: bytes) -> Frame | None:
