@@ -157,7 +157,7 @@ def links_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Directed links: `to` hears `from`, as `to` reports it. A link that has one direction only is one-way."""
     found = []
     for node in status.get("nodes", ()):
-        age_s = node.get("age_s") or 0.0
+        age_s = node.get("age_s")
         for heard in node.get("neighbours") or ():
             found.append(
                 {
@@ -170,10 +170,16 @@ def links_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "snr_db": heard.get("snr_db"),
                     "mcs": heard.get("rx_mcs"),
                     "bitrate_kbit_s": heard.get("rx_bitrate_kbit_s"),
-                    "age_s": round(age_s + (heard.get("age_s") or 0.0), 3),
+                    "age_s": _sum(age_s, heard.get("age_s")),
                 }
             )
     return found
+
+
+def _sum(*ages_s: float | None) -> float | None:
+    """None if one is unknown."""
+    known = [age_s for age_s in ages_s if age_s is not None]
+    return round(sum(known), 3) if len(known) == len(ages_s) else None
 
 
 def _verdict(checks: Iterable[Check] | None) -> dict[str, Any] | None:

@@ -65,9 +65,9 @@ def reported_positions(status: Mapping[str, Any]) -> dict[str, FramePosition]:
     found: dict[str, FramePosition] = {}
     for robot in status.get("robots", ()):
         position = robot.get("position")
-        if isinstance(position, Mapping) and isinstance(position.get("x_m"), int | float):
+        if isinstance(position, Mapping) and all(isinstance(position.get(key), int | float) for key in ("x_m", "y_m")):
             place = FramePosition(
-                position["x_m"], position.get("y_m", 0.0), position.get("z_m"), position.get("age_s"), "daemon"
+                position["x_m"], position["y_m"], position.get("z_m"), position.get("age_s"), "daemon"
             )
             found |= dict.fromkeys((robot["name"], *robot.get("radios", ())), place)
     return found
@@ -138,6 +138,9 @@ class FrameSampler:
             self._end.wait(max(0.0, began_s + self._wait_s - self.clock.monotonic()))
 
     def _failed(self, problem: str) -> None:
+        if self._end.is_set():
+            # what it needs may be closed already
+            return
         self.problem = problem
         self._wait_s = self.interval_s
         event_log.emit(event_log.INFO, "sample failed", reason=problem)
@@ -166,7 +169,7 @@ class FrameSampler:
             topic_classes=self.topic_classes,
         )
         self.store.clock_stepped_s = self.clock.stepped_s
-        began = self.store.append(frame)
+        began = self.store.append(frame, self.clock.wall())
         for listener in self.listeners:
             listener(frame, began)
         return frame

@@ -9,6 +9,7 @@ import pytest
 
 from meshctl.errors import InputError, MeshctlError
 from meshctl.monitor.alarm_log import REOPEN_S, Silence
+from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
 
@@ -146,3 +147,17 @@ def test_a_silence_covers_later_alarms_until_it_ends(store: FrameStore) -> None:
         store.end_silence("*", "clock")
     with pytest.raises(InputError, match="reason"):
         store.silence("b01", "weak", Silence(None, "  ", "bob"))
+    with pytest.raises(InputError, match="unknown device 'b07'"):
+        store.silence("b07", "weak", Silence(None, "gone", "bob"))
+    store.silence("robot:rover", "disk", Silence(None, "known", "bob"))
+
+
+def test_silences_are_in_force_by_the_wall_clock_also_while_frames_are_ahead_of_it(store: FrameStore) -> None:
+    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"))
+    # the clock was set back: frames go on from the later time
+    (began,) = store.append(frame(1000.0, WEAK), now_s=40.0)
+    assert began.silenced is not None
+    for now_s, silenced in ((40.0, "true"), (60.0, "false")):
+        assert f'device="b01",code="weak",level="warning",acknowledged="false",silenced="{silenced}"' in render_metrics(
+            store.latest(), store, now_s
+        )
