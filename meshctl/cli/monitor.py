@@ -24,10 +24,11 @@ from meshctl import __version__
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab
 from meshctl.cli.fleet_view import CONNECT_S, FleetView, NoRobots, Timeout, collect, open_fleet_view
 from meshctl.cli.monitor_history import HistoryFile, history_path
-from meshctl.cli.monitor_web import TOKEN_VARIABLE, WebOptions
+from meshctl.cli.monitor_web import WebOptions
 from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.cli.robots_context import AskSudo
 from meshctl.errors import ExitCode, InputError
+from meshctl.monitor.access import TOKEN_VARIABLE
 from meshctl.monitor.actions import Actions
 from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.feed import Feed
@@ -46,6 +47,8 @@ from meshctl.monitor.store import FrameStore
 DEFAULT_PORT = 8765
 # Alarms that wait for a slow hook when the monitor ends.
 HOOK_CLOSE_S = 2.0
+# A round that is under way when the monitor ends.
+SAMPLER_CLOSE_S = 2.0
 DEFAULT_DAYS = 7.0
 DEFAULT_MB = 512
 
@@ -126,8 +129,12 @@ def monitor(
     if out is not None and not replay:
         raise InputError("--out needs --replay", hint="meshctl monitor --replay FILE --out run.html")
     if replay:
-        if once or allow_actions:
-            raise InputError("--replay goes with neither --once nor --allow-actions")
+        unused = {
+            "--once": once, "--allow-actions": allow_actions, "--store": store, "--webhook": webhook, "--hook": hook,
+            "--textfile": textfile,
+        }  # fmt: skip
+        if given := [option for option, value in unused.items() if value]:
+            raise InputError(f"--replay does not go with {', '.join(given)}")
         _replay(replay, out, web, as_json=as_json)
         return
     hook_settings = HookSettings(webhook, _words(hook), hook_level)
@@ -244,12 +251,15 @@ class _Watch:
                 command = [sys.executable, "-m", "meshctl"]
                 names = frozenset(node.name for node in fleet.managed())
                 actions = Actions(command, options, lambda: names, Path(directory), time.time)
+            thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)
             try:
                 app = MonitorServer(sampler.store, self._feed, settings, web.rules, actions, render_metrics).app()
-                thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)
                 return _serve(app, web, self._feed, as_json=self._as_json, sampler=thread)
             finally:
                 sampler.stop()
+                if thread.is_alive():
+                    # a radio that does not answer may hold it for longer; nothing is lost then
+                    thread.join(SAMPLER_CLOSE_S)
                 if actions is not None:
                     actions.close()
 

@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 from meshctl import event_log
 from meshctl.errors import InputError
+from meshctl.monitor.access import TOKEN_VARIABLE
 from meshctl.monitor.alarm_log import LEVELS, LoggedAlarm
 
 # Of one call; a hook that is slower is given up.
@@ -162,7 +163,7 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_environment(document)},
+            env={**_inherited(), **_environment(document)},
             start_new_session=True,
         )
     except (OSError, ValueError) as error:
@@ -178,6 +179,11 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
             process.communicate(timeout=1.0)
         return f"command {command[0]}: did not end within {timeout_s:g} s"
     return f"command {command[0]}: exit status {process.returncode}" if process.returncode else ""
+
+
+def _inherited() -> dict[str, str]:
+    """The environment without the token, which is for browsers."""
+    return {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
 
 
 def _environment(document: Mapping[str, Any]) -> dict[str, str]:

@@ -55,7 +55,8 @@ def receiver(status: int = 200, delay_s: float = 0.0) -> Iterator[tuple[str, lis
         server.server_close()
 
 
-def test_both_hooks_get_the_alarm_as_data(tmp_path: Path) -> None:
+def test_both_hooks_get_the_alarm_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MESHCTL_MONITOR_TOKEN", "for browsers alone")
     program = (
         "import json, os, sys; from pathlib import Path; "
         "Path(sys.argv[1]).write_text(json.dumps([json.load(sys.stdin), dict(os.environ), sys.argv[2:]]))"
@@ -72,6 +73,7 @@ def test_both_hooks_get_the_alarm_as_data(tmp_path: Path) -> None:
     assert (document["fleet"], document["device"], document["text"]) == ("lab", "b01", HOSTILE)
     assert arguments == ["two words"]
     assert environment["MESHCTL_ALARM_CODE"] == "unreachable"
+    assert "MESHCTL_MONITOR_TOKEN" not in environment
     assert environment["MESHCTL_ALARM_TEXT"] == 'x"; touch pwned; $(touch pwned) `touch pwned`  [31m  <script>'
     assert list(tmp_path.iterdir()) == [out]
 
