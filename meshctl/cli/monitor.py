@@ -34,6 +34,7 @@ from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.feed import Feed
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.hooks import AlarmHooks, HookSettings
+from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.page import recording_of, single_file
 from meshctl.monitor.prometheus import TextfileWriter
@@ -43,6 +44,7 @@ from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
 from meshctl.monitor.store import FrameStore
+from meshctl.robots.local_daemon import socket_path
 
 DEFAULT_PORT = 8765
 # Alarms that wait for a slow hook when the monitor ends.
@@ -252,10 +254,15 @@ class _Watch:
                 names = frozenset(node.name for node in fleet.managed())
                 actions = Actions(command, options, lambda: names, Path(directory), time.time)
             thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)
+            readings = MeterReadings(socket_path(None), self._feed.notify)
+            sampler.meters = readings.current
+            threading.Thread(target=readings.run, name="meters", daemon=True).start()
             try:
-                app = MonitorServer(sampler.store, self._feed, settings, web.rules, actions, render_metrics).app()
-                return _serve(app, web, self._feed, as_json=self._as_json, sampler=thread)
+                server = MonitorServer(sampler.store, self._feed, settings, web.rules, actions, render_metrics)
+                server.streams.meters = readings.current
+                return _serve(server.app(), web, self._feed, as_json=self._as_json, sampler=thread)
             finally:
+                readings.stop()
                 sampler.stop()
                 if thread.is_alive():
                     # a radio that does not answer may hold it for longer; nothing is lost then

@@ -9,8 +9,9 @@ from __future__ import annotations
 import json
 import math
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
@@ -46,6 +47,7 @@ class EventStreams:
         self._feed = feed
         self._clock = clock
         self._is_live = is_live
+        self.meters: Callable[[], Mapping[str, Any]] = dict
         self._lock = threading.Lock()
         self._built: _News | None = None
         self._open = 0
@@ -77,7 +79,7 @@ class EventStreams:
         for frame in await run_in_threadpool(self._missed, sent_s, news.latest):
             yield _frame_event(frame)
             sent_s = frame.time_s
-        alarms, quiet_s = "", 0.0
+        alarms, meters, quiet_s = "", "{}", 0.0
         while not self._feed.is_closed:
             quiet_s += POLL_S
             if news.latest is not None and news.latest.time_s > sent_s:
@@ -86,6 +88,10 @@ class EventStreams:
             if news.alarms != alarms:
                 alarms, quiet_s = news.alarms, 0.0
                 yield _event("alarms", alarms)
+            # newer than the newest frame
+            if (readings := _one_line(self.meters())) != meters:
+                meters, quiet_s = readings, 0.0
+                yield _event("meters", meters)
             if quiet_s >= HEARTBEAT_S:
                 yield ": alive\n\n"
                 quiet_s = 0.0
@@ -114,6 +120,10 @@ class EventStreams:
         if not self._is_live and (span := self._store.span()) is not None:
             now_s = span[1]
         return json.dumps([alarm.as_json() for alarm in self._store.alarms(active_only=False, now_s=now_s)])
+
+
+def _one_line(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"))
 
 
 def _frame_event(frame: Frame) -> str:

@@ -133,6 +133,7 @@ def frame_of(
     positions: Mapping[str, FramePosition] | None = None,
     airtime: Airtime | None = None,
     topic_classes: Mapping[str, str] | None = None,
+    meters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Frame:
     """The frame of a status document at `time_s`. `checks` None: go or no-go was not assessed. `topic_classes` are the
     inventory's, by topic name: without the inventory, a replay could not tell telemetry from artifacts."""
@@ -148,6 +149,8 @@ def frame_of(
         "positions": {name: _position(place) for name, place in (positions or {}).items()},
         "airtime": None if airtime is None else _airtime(airtime),
     }
+    if meters:
+        document["meters"] = dict(meters)
     if topic_classes:
         document["topic_classes"] = dict(topic_classes)
     return Frame.of(document)

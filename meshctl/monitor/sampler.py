@@ -112,6 +112,7 @@ class FrameSampler:
     limit_share: float = DEFAULT_LIMIT_SHARE
     traffic: Callable[[], Mapping[str, int]] = _no_bytes
     positions: Positions | None = None
+    meters: Callable[[], Mapping[str, Mapping[str, Any]]] = dict
     listeners: list[FrameListener] = field(default_factory=list)
     clock: FrameClock = field(default_factory=FrameClock)
     topic_classes: Mapping[str, str] = field(default_factory=dict)
@@ -167,6 +168,7 @@ class FrameSampler:
             positions=positions,
             airtime=self._airtime(document, began_s),
             topic_classes=self.topic_classes,
+            meters=self.meters(),
         )
         self.store.clock_stepped_s = self.clock.stepped_s
         began = self.store.append(frame, self.clock.wall())
