@@ -261,7 +261,7 @@ class SqliteLogStore:
             results = [job(connection) for job, _ in batch]
             connection.execute("COMMIT")
         except Exception as error:  # noqa: BLE001 - reported to each caller
-            # Whatever fails (memory, too), the thread goes on and every caller gets an answer.
+            # Whatever fails (memory, too), the thread continues and every caller gets an answer.
             with contextlib.suppress(sqlite3.Error):
                 connection.execute("ROLLBACK")
             if len(batch) > 1:

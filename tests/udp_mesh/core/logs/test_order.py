@@ -73,7 +73,7 @@ def test_what_the_peer_has_from_others_is_not_sent() -> None:
     assert sent[MAX_SENDING:] == [b"8"]
 
 
-def test_a_log_with_very_many_gaps_goes_on() -> None:
+def test_a_log_with_very_many_gaps_continues() -> None:
     state = LogState(KEY)
     for number in range(1, 2 * MAX_KEPT_RANGES + 100, 2):
         state.received.add(number)
