@@ -153,7 +153,7 @@ class PeerView:
 
 
 def limit_ranges(numbers: RangeSet) -> None:
-    """Bound the memory: beyond the limit the lowest gaps count as had, so that a log continues. Nobody fills them any
+    """Bound the memory: beyond the limit the lowest gaps count as had, so that a log continues. No node fills them any
     more: thousands of later items came meanwhile."""
     while len(numbers) > MAX_KEPT_RANGES:
         numbers.fill_lowest_gap()
