@@ -23,7 +23,7 @@ from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
 from meshctl.archive import TarMember, tar_of
-from meshctl.device import openwrt
+from meshctl.device import deadman, openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
 from meshctl.device.observation import Observation
@@ -42,7 +42,10 @@ INFO_NAME = "meshctl-backup.json"
 MAX_FILES, MAX_BYTES = 4000, 64 << 20
 # The dead-man's switch accepts absolute paths of at least two parts and plain characters, except its own state.
 _PATH = re.compile(r"(/[A-Za-z0-9._+@-]+){2,}")
-_OWN = ("/etc/meshctl/change", "/etc/meshctl/last", "/tmp/", "/var/", "/dev/", "/proc/", "/sys/")
+_OWN = (
+    *("/etc/meshctl/change", "/etc/meshctl/last", *deadman.installed_files()),
+    *("/tmp/", "/var/", "/dev/", "/proc/", "/sys/"),
+)
 # From 24.10 on sysupgrade adds a script to every archive that disables, at the next boot, the services that were
 # disabled when it was taken (base-files, sbin/sysupgrade). A rollback would not undo that, and the script may name the
 # boot hook of the dead-man's switch. So files in this directory are not restored; the services are only reported.
