@@ -35,6 +35,10 @@ _WHOLE_FILES = {
     "control character": ("fleet: a\x07b\n", "INV003", 1, 9),
     "deep nesting": ("[" * 100_000, "INV008", 1, 33),
     "deep blocks": ("".join(" " * depth + "a:\n" for depth in range(100)), "INV008", 33, 33),
+    # libyaml 0.2.6 stops at 1,000 levels itself
+    "deepest blocks": ("".join(" " * depth + "a:\n" for depth in range(1_500)), "INV008", 33, 33),
+    "deep lists": ("- " * 5_000, "INV008", 1, 65),
+    "deep nesting below keys": ("a: " + "{a: " * 5_000, "INV008", 1, 128),
     "alias bomb": (_BOMB, "INV007", 5, 4),
     "alias in itself": ("a: &a [*a]\n", "INV005", 1, 8),
     "alias of nothing": ("a: *b\n", "INV005", 1, 4),
