@@ -1,8 +1,9 @@
 """Addresses of nodes: literal, or a rule for all nodes that share it.
 
 `10.42.0.11` or `fd42::11` uses the prefix length of the mesh's network, `10.42.0.11/24` sets its own.
-`{from: 10.42.0.101}` counts up from that address, `{rule: network + 100 + 2 * index}` is a formula.
-`index` counts from 1 the nodes that the rule applies to, in the inventory's order: along its range, or through its group or the defaults.
+`{from: 10.42.0.101}` counts up from that address, `{rule: network + 100 + 2 * index}` is a formula. `index` counts
+from 1 the nodes that the rule applies to, in the inventory's order: along its range, or through its group or the
+defaults.
 """
 
 from __future__ import annotations
