@@ -15,7 +15,6 @@ import tarfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from ipaddress import IPv4Address
 from types import MappingProxyType
 
 from meshctl.apply.change_in_progress import ChangeInProgress
@@ -31,6 +30,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
+from meshctl.model.ip import IpAddress
 from meshctl.plan.lockout import lockout
 from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
@@ -211,7 +211,7 @@ def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
     return package == path or live.get(package) != new.content.decode("utf-8", "replace")
 
 
-def _address(backup: Backup) -> IPv4Address | None:
+def _address(backup: Backup) -> IpAddress | None:
     """The management address in the backup."""
     network = backup.files.get("/etc/config/network")
     return None if network is None else management_address(network.content.decode("utf-8", "replace"))

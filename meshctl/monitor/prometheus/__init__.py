@@ -13,6 +13,7 @@ from pathlib import Path
 
 from meshctl.errors import InputError, MeshctlError
 from meshctl.model import Fleet
+from meshctl.model.ip import host_and_port
 from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.metrics import render_metrics
@@ -40,7 +41,7 @@ def file_sd(fleet: Fleet) -> str:
     """
     groups = [
         {
-            "targets": [f"{node.address.ip}:{EXPORTER_PORT}"],
+            "targets": [host_and_port(str(node.address.ip), EXPORTER_PORT)],
             "labels": {"fleet": fleet.name, "node": node.name, "role": node.role.value, "robot": node.robot},
         }
         for node in fleet.managed()
