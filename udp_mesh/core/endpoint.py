@@ -27,7 +27,7 @@ from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.relaying import Relaying
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
-from udp_mesh.core.settings import Address, LinkInfo, Settings
+from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
 from udp_mesh.crypto.signing import SEED_BYTES
@@ -335,6 +335,9 @@ def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]
     session = peer.session
     if session is not None:
         path = session.path
+        if path.link == RELAY_LINK:
+            # Its address there means nothing outside.
+            return None, path.link, session.last_heard
         return (path.address, path.link, session.last_heard) if path.link else (None, None, session.last_heard)
     return peer.legacy_path or (None, None, None)
 
