@@ -13,7 +13,7 @@ from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
 from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.sender.rate_limit import TokenBucket
-from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Relay, Settings, Topic
+from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, RelaySettings, Settings, Topic
 from udp_mesh.core.state import State, live_keys
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
@@ -128,7 +128,7 @@ def _neighbours(old: tuple[Neighbour, ...], new: tuple[Neighbour, ...]) -> list[
     ]
 
 
-def _relay(old: Relay, new: Relay) -> list[str]:
+def _relay(old: RelaySettings, new: RelaySettings) -> list[str]:
     lines = [f"relay: {text}" for text in _differences(replace(old, keys=()), replace(new, keys=()))]
     return [*lines, "relay: keys changed"] if old.keys != new.keys else lines
 

@@ -201,7 +201,7 @@ class Neighbour:
 
 
 @dataclass(frozen=True, slots=True)
-class Relay:
+class RelaySettings:
     """Whether this node passes datagrams on between others, and how far its own may travel.
 
     `all`: for every node; otherwise only datagrams to or from the nodes in `names`. `hops` limits the links of a
@@ -348,7 +348,7 @@ class Settings:
     window: Literal["adaptive"] | int = "adaptive"
     fragment_bytes: int = 1400
     confirms: bool = False
-    relay: Relay = field(default_factory=Relay)
+    relay: RelaySettings = field(default_factory=RelaySettings)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
 

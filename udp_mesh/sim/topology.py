@@ -23,7 +23,7 @@ _MIN_STEP_S = 1e-6
 
 
 @dataclass(slots=True)
-class Network:
+class SimNetwork:
     """One broadcast domain: a radio mesh, a tether. `losses` overrides `loss` for (from, to)."""
 
     name: str
@@ -52,7 +52,7 @@ class Topology:
 
     def __init__(self, seed: int = 1) -> None:
         self.event_queue = SimEventQueue()
-        self.networks: dict[str, Network] = {}
+        self.networks: dict[str, SimNetwork] = {}
         self.nodes: dict[str, Endpoint] = {}
         self.events: dict[str, list[tuple[float, Event]]] = {}
         self.on_datagram: Callable[[str, str, Datagram, float], None] | None = None
@@ -65,13 +65,13 @@ class Topology:
     def now(self) -> float:
         return self.event_queue.now
 
-    def add_network(self, network: Network) -> Network:
+    def add_network(self, network: SimNetwork) -> SimNetwork:
         self.networks[network.name] = network
         return network
 
-    def network(self, name: str, **values: float) -> Network:
+    def network(self, name: str, **values: float) -> SimNetwork:
         """A new network, numbered after those before it."""
-        return self.add_network(replace(Network(name, len(self.networks) + 1), **values))  # type: ignore[arg-type]
+        return self.add_network(replace(SimNetwork(name, len(self.networks) + 1), **values))  # type: ignore[arg-type]
 
     def add(self, settings: Settings, networks: Iterable[str]) -> Endpoint:
         """Start (or restart) a node with a link, named like the network, on each of these networks."""
@@ -160,7 +160,7 @@ class Topology:
                 sent_at + network.delay_s, partial(self._arrive, member, network, datagram.data, source)
             )
 
-    def _arrive(self, name: str, network: Network, data: bytes, source: Address) -> None:
+    def _arrive(self, name: str, network: SimNetwork, data: bytes, source: Address) -> None:
         node = self.nodes.get(name)
         if node is not None and network.up:
             node.receive(data, network.name, source, self.now)

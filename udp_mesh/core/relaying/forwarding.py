@@ -11,7 +11,7 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.relaying.conditions import RelayCounters
 from udp_mesh.core.relaying.hop_channel import HopChannels
 from udp_mesh.core.relaying.hop_queue import QueueBudget, QueuedCarry
-from udp_mesh.core.relaying.neighbours import Neighbour
+from udp_mesh.core.relaying.neighbours import HopNeighbour
 from udp_mesh.core.relaying.routes import Routes
 from udp_mesh.core.state import State
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
@@ -32,7 +32,7 @@ class Forwarding:
         self._channels = channels
         self._routes = routes
         self.budget = QueueBudget(state.boot_id)
-        self.neighbours: dict[bytes, Neighbour] = {}
+        self.neighbours: dict[bytes, HopNeighbour] = {}
         self.counters = RelayCounters()
         self.tags: dict[bytes, bytes] = {}
         """First bytes of a boot id -> boot id, of selected routes."""

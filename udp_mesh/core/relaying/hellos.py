@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.relaying.hop_channel import HopChannels
-from udp_mesh.core.relaying.neighbours import Neighbour, heard_on
+from udp_mesh.core.relaying.neighbours import HopNeighbour, heard_on
 from udp_mesh.core.sender.path import header_bytes
 from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind
 from udp_mesh.core.state import State
@@ -35,7 +35,7 @@ MAX_PART_BYTES = 1152
 def hello_datagrams(
     state: State,
     channels: HopChannels,
-    neighbours: Sequence[Neighbour],
+    neighbours: Sequence[HopNeighbour],
     base: RelayHello,
     passes: Iterable[str] | None,
     now: float,

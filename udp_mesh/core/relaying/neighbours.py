@@ -79,7 +79,7 @@ class HopLink:
 
 
 @dataclass(eq=False, slots=True)
-class Neighbour:
+class HopNeighbour:
     """One boot of a node that is heard directly."""
 
     hop: Hop
@@ -130,12 +130,12 @@ class Neighbour:
         self.ack_at = now if self.unacknowledged >= ACK_EVERY else min(self.ack_at, now + ACK_DELAY_S)
 
 
-def make_neighbour(hop: Hop, budget: QueueBudget) -> Neighbour:
-    return Neighbour(hop, HopQueue(budget))
+def make_neighbour(hop: Hop, budget: QueueBudget) -> HopNeighbour:
+    return HopNeighbour(hop, HopQueue(budget))
 
 
 def on_hello(
-    neighbour: Neighbour, hello: RelayHello, own_tag: bytes, link: str, address: Address, mtu: int, now: float
+    neighbour: HopNeighbour, hello: RelayHello, own_tag: bytes, link: str, address: Address, mtu: int, now: float
 ) -> HopLink:
     """Record what a hello says about its sender and about the link it came on."""
     neighbour.name, neighbour.relays, neighbour.proofs = hello.name, hello.relays, hello.proofs
@@ -156,7 +156,7 @@ def on_hello(
     return hop_link
 
 
-def heard_on(link: HopLink, neighbour: Neighbour, *, passes: bool, now: float) -> HeardHop:
+def heard_on(link: HopLink, neighbour: HopNeighbour, *, passes: bool, now: float) -> HeardHop:
     """What we tell a neighbor about its hellos on a link."""
     quality = round(255 * link.quality(neighbour.interval_s, now))
     return HeardHop(neighbour.tag, max(0, link.round), quality, passes)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from udp_mesh.core.path_mtu import update_mtu
 from udp_mesh.core.peers.session import STALE_PATH_S
 from udp_mesh.core.relaying.hop_channel import membership_proof
-from udp_mesh.core.relaying.routes import Route
+from udp_mesh.core.relaying.routes import HopRoute
 from udp_mesh.core.sender.path import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.settings import MIN_LINK_MTU, RELAY_LINK, Address, LinkInfo, LinkKind, Neighbour
 from udp_mesh.core.state import State
@@ -49,7 +49,7 @@ class RelayedPeers:
         if len(self.paths) > MAX_PATHS:
             del self.paths[next(iter(self.paths))]
 
-    def has_common_key(self, route: Route) -> bool:
+    def has_common_key(self, route: HopRoute) -> bool:
         """Whether this node can be spoken to: it proved that it holds one of our fleet keys."""
         return any(membership_proof(key, route.boot_id) in route.proofs for key in self._state.keys)
 
@@ -71,7 +71,7 @@ class RelayedPeers:
         inner = mtu - headers - 1 - SHORT_OVERHEAD_BYTES - CARRY_BYTES - VISITED_BYTES * relays
         return max(MIN_LINK_MTU, inner + IP_UDP_BYTES)
 
-    def sync(self, boot_ids: Iterable[bytes], routes: Mapping[bytes, Route], active: bool, now: float) -> None:
+    def sync(self, boot_ids: Iterable[bytes], routes: Mapping[bytes, HopRoute], active: bool, now: float) -> None:
         """Tell the core which of these nodes are reached through relays."""
         state = self._state
         if active:

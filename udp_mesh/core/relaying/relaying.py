@@ -21,9 +21,9 @@ from udp_mesh.core.relaying.forwarding import BATCH_BYTES, Forwarding
 from udp_mesh.core.relaying.hellos import hello_datagrams
 from udp_mesh.core.relaying.hop_channel import HopChannels, membership_proof
 from udp_mesh.core.relaying.hop_queue import QueuedCarry
-from udp_mesh.core.relaying.neighbours import MISSED_HELLOS, Neighbour, make_neighbour, on_hello
+from udp_mesh.core.relaying.neighbours import MISSED_HELLOS, HopNeighbour, make_neighbour, on_hello
 from udp_mesh.core.relaying.relayed_peers import RelayedPeers
-from udp_mesh.core.relaying.routes import Route, Routes
+from udp_mesh.core.relaying.routes import HopRoute, Routes
 from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import RELAY_LINK, Address
@@ -140,7 +140,7 @@ class Relaying:
                 self._on_carry(neighbour, frame, now)
 
     def _on_hello(
-        self, neighbour: Neighbour | None, boot_id: bytes, hello: RelayHello, link: str, source: Address, now: float
+        self, neighbour: HopNeighbour | None, boot_id: bytes, hello: RelayHello, link: str, source: Address, now: float
     ) -> None:
         if neighbour is None:
             neighbour = make_neighbour(self._channels.add(boot_id), self.forwarding.budget)
@@ -162,7 +162,7 @@ class Relaying:
             about |= self.routes.known()
         self._select(about | {boot_id}, now)
 
-    def _on_carry(self, previous: Neighbour, carry: Carry, now: float) -> None:
+    def _on_carry(self, previous: HopNeighbour, carry: Carry, now: float) -> None:
         if self._own_mark in carry.visited or carry.origin == self._own_tag:
             self.counters.dropped_loop += 1
         elif carry.destination == self._own_tag:
@@ -312,7 +312,7 @@ class Relaying:
         for before, after in changed:
             self._on_changed(before, after)
 
-    def _on_changed(self, before: Route | None, after: Route | None) -> None:
+    def _on_changed(self, before: HopRoute | None, after: HopRoute | None) -> None:
         old = self.neighbours.get(before.via) if before is not None else None
         if old is not None and old.queue:
             waiting = []

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from udp_mesh.core.relaying.neighbours import Neighbour
+from udp_mesh.core.relaying.neighbours import HopNeighbour
 from udp_mesh.wire.relay import UNREACHABLE, RelayedNode
 
 KEEP_FACTOR = 1.25
@@ -23,7 +23,7 @@ RETRACT_ROUNDS = 3
 """Hellos in which a lost node is listed as unreachable: one may be lost."""
 
 
-class Route(NamedTuple):
+class HopRoute(NamedTuple):
     """How a node is reached."""
 
     boot_id: bytes
@@ -51,13 +51,13 @@ class Routes:
     """`selected` maps boot ids to routes. `own_round` is that of our newest hello."""
 
     def __init__(self) -> None:
-        self.selected: dict[bytes, Route] = {}
+        self.selected: dict[bytes, HopRoute] = {}
         self._offers: dict[bytes, dict[bytes, _Offer]] = {}
         """By node, then by the relay that offers it."""
         self._count = 0
         self._announced: dict[bytes, tuple[int, int]] = {}
         """What this node last announced: round and least cost. No larger offer is used (feasibility)."""
-        self._retracting: dict[bytes, tuple[Route, int]] = {}
+        self._retracting: dict[bytes, tuple[HopRoute, int]] = {}
 
     def on_offers(self, relay: bytes, nodes: Iterable[RelayedNode], own: bytes, now: float) -> set[bytes]:
         """Record the entries of a hello; returns the nodes they are about."""
@@ -83,7 +83,7 @@ class Routes:
         if not offers:
             del self._offers[boot_id]
 
-    def expire(self, neighbours: Mapping[bytes, Neighbour], now: float) -> None:
+    def expire(self, neighbours: Mapping[bytes, HopNeighbour], now: float) -> None:
         """Drop entries that were not repeated, or whose relay is gone."""
         for boot_id, offers in list(self._offers.items()):
             for relay, offer in list(offers.items()):
@@ -104,11 +104,11 @@ class Routes:
     def select(
         self,
         boot_ids: Iterable[bytes],
-        neighbours: Mapping[bytes, Neighbour],
+        neighbours: Mapping[bytes, HopNeighbour],
         own_round: int,
         max_hops: int,
         now: float,
-    ) -> list[tuple[Route | None, Route | None]]:
+    ) -> list[tuple[HopRoute | None, HopRoute | None]]:
         """Choose the routes to these nodes anew. Returns (before, after) of those that changed their next hop."""
         changed = []
         costs = {boot_id: neighbour.cost(own_round, now) for boot_id, neighbour in neighbours.items()}
@@ -137,16 +137,16 @@ class Routes:
     def _candidates(
         self,
         boot_id: bytes,
-        neighbours: Mapping[bytes, Neighbour],
+        neighbours: Mapping[bytes, HopNeighbour],
         costs: Mapping[bytes, int | None],
         own_round: int,
         now: float,
-    ) -> Iterable[Route]:
+    ) -> Iterable[HopRoute]:
         direct, cost = neighbours.get(boot_id), costs.get(boot_id)
         if direct is not None and cost is not None:
             link = direct.best_link(own_round, now)
             mtu = link.mtu if link is not None else 0
-            yield Route(boot_id, direct.name, boot_id, 1, cost, mtu, direct.round, True, direct.proofs)
+            yield HopRoute(boot_id, direct.name, boot_id, 1, cost, mtu, direct.round, True, direct.proofs)
         for relay, offer in self._offers.get(boot_id, {}).items():
             node, cost = offer.node, costs.get(relay)
             neighbour = neighbours.get(relay)
@@ -157,7 +157,7 @@ class Routes:
             link = neighbour.best_link(own_round, now)
             mtu = min(node.mtu, link.mtu if link is not None else node.mtu)
             total = min(UNREACHABLE - 1, node.cost + cost)
-            yield Route(boot_id, node.name, relay, node.hops + 1, total, mtu, node.round, node.open, node.proofs)
+            yield HopRoute(boot_id, node.name, relay, node.hops + 1, total, mtu, node.round, node.open, node.proofs)
 
     def _is_feasible(self, node: RelayedNode) -> bool:
         announced = self._announced.get(node.boot_id)
@@ -193,7 +193,7 @@ class Routes:
                 del self._announced[boot_id]
 
 
-def _entry(route: Route, cost: int, opened: bool) -> RelayedNode:
+def _entry(route: HopRoute, cost: int, opened: bool) -> RelayedNode:
     return RelayedNode(
         route.boot_id, route.round, cost, min(route.hops, 8), route.mtu, opened, route.name, route.proofs
     )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from udp_mesh.core.relaying.conditions import RelayConditions, RelayNeighbour, RelayRoute
 from udp_mesh.core.relaying.hop_channel import membership_proof
-from udp_mesh.core.relaying.neighbours import LINK_COST, Neighbour
-from udp_mesh.core.relaying.routes import Route
+from udp_mesh.core.relaying.neighbours import LINK_COST, HopNeighbour
+from udp_mesh.core.relaying.routes import HopRoute
 from udp_mesh.core.state import State
 from udp_mesh.wire.limits import HEARD_TAG_BYTES
 from udp_mesh.wire.relay import VISITED_BYTES
@@ -53,7 +53,7 @@ def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayN
 
 def _members(state: State, relaying: Relaying) -> set[bytes]:
     """Boot ids of the nodes that hold one of our fleet keys."""
-    known: list[Neighbour | Route] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
+    known: list[HopNeighbour | HopRoute] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
     return {one.boot_id for one in known if _is_member(state, one.boot_id, one.proofs)}
 
 
@@ -61,7 +61,7 @@ def _is_member(state: State, boot_id: bytes, proofs: tuple[bytes, ...]) -> bool:
     return any(membership_proof(key, boot_id) in proofs for key in state.keys)
 
 
-def _route(relaying: Relaying, route: Route, names: dict[bytes, str], members: set[bytes]) -> RelayRoute:
+def _route(relaying: Relaying, route: HopRoute, names: dict[bytes, str], members: set[bytes]) -> RelayRoute:
     marks = {boot_id[:VISITED_BYTES]: boot_id for boot_id in names}
     path = relaying.peers.paths.get(route.boot_id[:HEARD_TAG_BYTES], ())
     if not path or path[0] != route.via[:VISITED_BYTES]:

@@ -9,7 +9,7 @@ import pytest
 from tests.udp_mesh.core.relaying.topologies import EVERY, chain, node, online, relaying, reported, ring, via
 from udp_mesh.core.events import MessageDelivered, MessageReceived, PeerOffline, PeerOnline, PeerRouteChanged
 from udp_mesh.core.interfaces import Datagram
-from udp_mesh.core.settings import RELAY_LINK, Relay, Topic
+from udp_mesh.core.settings import RELAY_LINK, RelaySettings, Topic
 from udp_mesh.crypto import Key
 from udp_mesh.sim.topology import Topology
 from udp_mesh.wire.relay import RELAY_BYTE
@@ -45,7 +45,7 @@ def test_a_broadcast_reaches_nodes_behind_relays() -> None:
 
 
 def test_a_path_longer_than_configured_is_not_used() -> None:
-    topology = chain(4, relay=Relay(all=True, hops=2))
+    topology = chain(4, relay=RelaySettings(all=True, hops=2))
     topology.run(6)
     assert online(topology, "n1", "n3")
     assert not online(topology, "n1", "n4")
@@ -58,7 +58,7 @@ def test_a_relay_for_named_nodes_passes_on_only_what_is_to_or_from_them() -> Non
     topology.add(node("base"), ["mesh"])
     topology.add(node("uav"), ["tether"])
     topology.add(node("stranger"), ["other"])
-    topology.add(node("husky", Relay(names=("uav",))), ["mesh", "tether", "other"])
+    topology.add(node("husky", RelaySettings(names=("uav",))), ["mesh", "tether", "other"])
     topology.run(6)
     assert online(topology, "base", "uav")
     assert online(topology, "uav", "base")
@@ -99,9 +99,9 @@ def test_a_relay_without_the_fleet_key_passes_on_what_it_cannot_read_and_is_told
     topology = Topology()
     for network in ("left", "right"):
         topology.network(network)
-    ends = Relay(keys=hop_keys)
+    ends = RelaySettings(keys=hop_keys)
     topology.add(node("a", ends), ["left"])
-    topology.add(node("foreign", Relay(all=True, keys=hop_keys), keys=(other,)), ["left", "right"])
+    topology.add(node("foreign", RelaySettings(all=True, keys=hop_keys), keys=(other,)), ["left", "right"])
     topology.add(node("d", ends), ["right"])
     topology.run(8)
     topology.send("a", "map", bytes(50_000), destination="d")
@@ -120,7 +120,7 @@ def test_a_relay_without_the_fleet_key_passes_on_what_it_cannot_read_and_is_told
 def test_a_node_without_relays_keeps_working_beside_those_with_them_and_sees_none_of_their_datagrams() -> None:
     topology = chain(3)
     seen: list[Datagram] = []
-    old = replace(node("old"), relay=Relay(hops=1))
+    old = replace(node("old"), relay=RelaySettings(hops=1))
     topology.network("plain")
     topology.add(old, ["plain"])
     topology.connect("n2", "plain")

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from udp_mesh.core.events import Event
 from udp_mesh.core.relaying.conditions import RelayConditions
-from udp_mesh.core.settings import Relay, Settings, Topic
+from udp_mesh.core.settings import RelaySettings, Settings, Topic
 from udp_mesh.crypto import Key
 from udp_mesh.sim.topology import Topology
 
 KEY = Key(bytes(range(32)))
-EVERY = Relay(all=True)
+EVERY = RelaySettings(all=True)
 
 
-def node(name: str, relay: Relay | None = None, *topics: Topic, keys: tuple[Key, ...] = (KEY,)) -> Settings:
-    return Settings(name=name, keys=keys, topics=topics, undeclared=Topic("any"), relay=relay or Relay())
+def node(name: str, relay: RelaySettings | None = None, *topics: Topic, keys: tuple[Key, ...] = (KEY,)) -> Settings:
+    return Settings(name=name, keys=keys, topics=topics, undeclared=Topic("any"), relay=relay or RelaySettings())
 
 
-def chain(count: int, seed: int = 1, *, loss: float = 0.0, relay: Relay = EVERY) -> Topology:
+def chain(count: int, seed: int = 1, *, loss: float = 0.0, relay: RelaySettings = EVERY) -> Topology:
     """n1 - n2 - ... : those between the ends relay. The networks are called after their left end."""
     topology = Topology(seed)
     for number in range(1, count):
