@@ -25,6 +25,7 @@ from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.receive import receive_datagram
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.relaying import Relaying
+from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
@@ -192,7 +193,7 @@ class Endpoint:
 
     def relaying(self, now: float) -> RelayConditions:
         """A snapshot of relays: who is reached through whom, what is passed on."""
-        return self._relaying.conditions(now)
+        return snapshot(self._state, self._relaying, now)
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""

@@ -50,7 +50,7 @@ class HeardHop(NamedTuple):
     quality: int
     """Share of its hellos that arrived, 0 to 255."""
     passes: bool
-    """The sender passes on datagrams to and from this boot, whoever is at the other end."""
+    """The sender passes on datagrams to and from this boot, with any other end."""
 
 
 class RelayedNode(NamedTuple):

@@ -2,7 +2,7 @@
 
 A hop key is derived from the fleet key, or from a relay key that relays outside the fleet may hold too; it never seals
 what the ends of a path seal. A proof of membership shows the holders of a fleet key that another node holds it, so that
-a relay that could read what it passes on is told apart from one that cannot.
+a relay that could read what it passes on is distinguished from one that cannot.
 """
 
 from __future__ import annotations

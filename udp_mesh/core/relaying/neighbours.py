@@ -87,7 +87,7 @@ class HopNeighbour:
     name: str = ""
     relays: bool = False
     passes_us: bool = False
-    """It relays for us, whoever is at the other end."""
+    """It relays for us, with any other end."""
     interval_s: float = 1.0
     proofs: tuple[bytes, ...] = ()
     round: int = 0

@@ -16,7 +16,6 @@ from collections.abc import Iterable
 from udp_mesh.core.events import PeerRouteChanged
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.receive import receive_datagram
-from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.forwarding import BATCH_BYTES, Forwarding
 from udp_mesh.core.relaying.hellos import hello_datagrams
 from udp_mesh.core.relaying.hop_channel import HopChannels, membership_proof
@@ -24,7 +23,6 @@ from udp_mesh.core.relaying.hop_queue import QueuedCarry
 from udp_mesh.core.relaying.neighbours import MISSED_HELLOS, HopNeighbour, make_neighbour, on_hello
 from udp_mesh.core.relaying.relayed_peers import RelayedPeers
 from udp_mesh.core.relaying.routes import HopRoute, Routes
-from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import RELAY_LINK, Address
 from udp_mesh.core.state import State
@@ -298,7 +296,7 @@ class Relaying:
     # Routes
 
     def _select(self, boot_ids: Iterable[bytes], now: float) -> None:
-        """Choose routes anew, tell the core, and move what waits for a next hop that is no longer used."""
+        """Choose routes again, tell the core, and move what waits for a next hop that is no longer used."""
         boot_ids = set(boot_ids)
         changed = self.routes.select(boot_ids, self.neighbours, self.round, self._max_hops, now)
         for before, after in changed:
@@ -331,9 +329,6 @@ class Relaying:
         for neighbour in self.neighbours.values():
             for link in neighbour.links.values():
                 yield link.name, link.address
-
-    def conditions(self, now: float) -> RelayConditions:
-        return snapshot(self._state, self, now)
 
     @property
     def queued_bytes(self) -> int:

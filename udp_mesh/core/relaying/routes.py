@@ -109,7 +109,7 @@ class Routes:
         max_hops: int,
         now: float,
     ) -> list[tuple[HopRoute | None, HopRoute | None]]:
-        """Choose the routes to these nodes anew. Returns (before, after) of those that changed their next hop."""
+        """Choose the routes to these nodes again. Returns (before, after) of those that changed their next hop."""
         changed = []
         costs = {boot_id: neighbour.cost(own_round, now) for boot_id, neighbour in neighbours.items()}
         for boot_id in boot_ids:
@@ -187,7 +187,7 @@ class Routes:
         return nodes
 
     def forget_announced(self) -> None:
-        """Drop what was announced for nodes that nobody offers any more, so that restarted boots do not accumulate."""
+        """Drop what was announced for nodes that no relay offers any more, so that restarted boots do not accumulate."""
         for boot_id in [boot_id for boot_id in self._announced if boot_id not in self._offers]:
             if boot_id not in self.selected and boot_id not in self._retracting:
                 del self._announced[boot_id]

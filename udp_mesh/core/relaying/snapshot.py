@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
-    """See `Relaying.conditions`."""
+    """See `Endpoint.relaying`."""
     names = relaying.routes.names() | {boot_id: one.name for boot_id, one in relaying.neighbours.items()}
     members = _members(state, relaying)
     routes = [

@@ -93,7 +93,7 @@ def test_a_direct_link_replaces_the_relay_once_there_is_one() -> None:
     assert next(peer for peer in topology.conditions("n1").peers if peer.name == "n3").link == "direct"
 
 
-def test_a_relay_without_the_fleet_key_passes_on_what_it_cannot_read_and_is_told_apart() -> None:
+def test_a_relay_without_the_fleet_key_passes_on_what_it_cannot_read_and_is_distinguished() -> None:
     hop_keys = (Key(b"\x07" * 32),)
     other = Key(b"\x09" * 32)
     topology = Topology()
