@@ -187,7 +187,7 @@ class Routes:
         return nodes
 
     def forget_announced(self) -> None:
-        """Drop what was announced for nodes that no relay offers any more, so that restarted boots do not accumulate."""
+        """Drop what was announced for nodes that are no longer offered, so that restarted boots do not accumulate."""
         for boot_id in [boot_id for boot_id in self._announced if boot_id not in self._offers]:
             if boot_id not in self.selected and boot_id not in self._retracting:
                 del self._announced[boot_id]
