@@ -35,6 +35,8 @@ class Feature:
     """Accepts compact fragments."""
     LOGS = 32
     """Has topics that are shared logs, and takes part in passing on their items."""
+    RELAY = 256
+    """Accepts relay datagrams: it can be reached through relays, and may be one."""
 
 
 class Waiting(NamedTuple):
