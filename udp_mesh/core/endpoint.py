@@ -28,6 +28,7 @@ from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
+from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
 from udp_mesh.wire.legacy import decapsulate
@@ -126,7 +127,7 @@ class Endpoint:
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
-        return self._state.next_peer_at() < at or bool(self._state.compression_queue)
+        return self._state.next_peer_at() < at or bool(self._state.compression_queue or self._state.versions.jobs)
 
     @property
     def is_quiet(self) -> bool:
@@ -180,6 +181,10 @@ class Endpoint:
     def logs(self) -> tuple[LogConditions, ...]:
         """A snapshot of each shared log."""
         return () if self._logs is None else self._logs.conditions()
+
+    def versions(self) -> tuple[VersionConditions, ...]:
+        """What was sent and received as versions, by topic."""
+        return self._state.versions.conditions()
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
