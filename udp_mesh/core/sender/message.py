@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
-
-if TYPE_CHECKING:
-    from udp_mesh.core.versions.outgoing import OutgoingVersion
 
 MAX_SMALL_FRAGMENTS = 3
 """An urgent message of at most this many fragments is worth sending twice, and a newer message may replace it after its
@@ -53,6 +50,25 @@ class AcceptedMessage:
         return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
 
 
+class MessageVersion(Protocol):
+    """How a message is sent as a version of its topic (`versions.outgoing`)."""
+
+    whole: bool
+    prepared: bool
+    digest: bytes
+    is_difference: bool
+
+    def prepare(self, message: OutgoingMessage, epoch: int, *, accepted: bool, now: float) -> bool: ...
+
+    def restarted(self) -> MessageVersion: ...
+
+    def on_delivered(self, message: OutgoingMessage) -> None: ...
+
+    def on_fragment_arrived(self, message: OutgoingMessage, position: int) -> None: ...
+
+    def on_refused(self, message: OutgoingMessage) -> None: ...
+
+
 class OutgoingMessage:
     """The copy for one peer. `wire_id` is None until its first fragment is sent."""
 
@@ -84,7 +100,7 @@ class OutgoingMessage:
         self.body = accepted.body
         self.flags = accepted.flags
         """Bits of `MessageFlag`. Like `body`, they change when the message is sent as a version of its topic."""
-        self.version: OutgoingVersion | None = None
+        self.version: MessageVersion | None = None
         """Set if the topic's messages are sent as differences."""
         self.queued_bytes = len(accepted.body)
         """What it counts for in the statistics of its level, whatever becomes of its body."""

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from udp_mesh.core.sender.message import OutgoingMessage
-
-if TYPE_CHECKING:
-    from udp_mesh.core.versions.sent import PeerVersions
+from udp_mesh.core.versions.sent import PeerVersions
 
 
 class OutgoingVersion:
