@@ -343,6 +343,7 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         outbox_on_disk=document.outbox_on_disk,
         repair=document.repair,
         log=_log(document.log) if document.log is not None else None,
+        delta=document.delta,
     )
 
 

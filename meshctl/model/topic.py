@@ -60,3 +60,4 @@ class Topic:
     outbox_on_disk: bool = False
     repair: bool = False
     log: TopicLog | None = None
+    delta: bool = False

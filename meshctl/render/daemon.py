@@ -220,6 +220,8 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
         yield f"outbox_on_disk = {_boolean(topic.outbox_on_disk)}"
     if topic.repair:
         yield "repair = true"
+    if topic.delta:
+        yield "delta = true"
 
 
 def _log(topic: Topic, log: TopicLog) -> Iterator[str]:

@@ -24,12 +24,21 @@ from meshctl.robots.wheel_tags import Target, WheelName, is_compatible, parse_wh
 
 # Dependencies of udp_mesh, direct and transitive.
 REQUIREMENTS = ("cryptography", "cffi", "pycparser")
+# Only for differences and zstd, and part of Python from 3.14 on. A robot without it gets plain messages.
+_ZSTD = "backports-zstd"
+_ZSTD_ARCHITECTURES = ("x86_64", "aarch64")
 _PACKAGE = "udp_mesh"
 # The earliest zip timestamp, for reproducible wheels.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 # Size of .pyc files relative to their sources.
 _COMPILED_SHARE = 0.9
 _PIP_TIMEOUT_S = 600
+
+
+def requirements(target: Target) -> tuple[str, ...]:
+    """The projects of which a target needs a wheel."""
+    has_wheel = target.arch in _ZSTD_ARCHITECTURES and target.python < (3, 14)
+    return (*REQUIREMENTS, _ZSTD) if has_wheel else REQUIREMENTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +94,7 @@ def build_wheel(package: Path) -> Wheel:
     files[f"{info}/METADATA"] = (
         f"Metadata-Version: 2.1\nName: udp-mesh\nVersion: {version}\nRequires-Python: >=3.11\n"
         "License: Apache-2.0\nRequires-Dist: cryptography>=42\n"
+        "Requires-Dist: backports.zstd>=1.0; python_version < '3.14'\n"
     ).encode()
     files[f"{info}/WHEEL"] = b"Wheel-Version: 1.0\nGenerator: meshctl\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     files[f"{info}/entry_points.txt"] = b"[console_scripts]\nudp-mesh = udp_mesh.cli.main:main\n"
@@ -108,7 +118,7 @@ def download_wheels(target: Target, directory: Path) -> None:
     """Download the requirements for a target into `directory` with pip. Raises InputError."""
     directory.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    command += ["--only-binary", ":all:", "--dest", str(directory), *pip_options(target), *REQUIREMENTS]
+    command += ["--only-binary", ":all:", "--dest", str(directory), *pip_options(target), *requirements(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -128,7 +138,7 @@ def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
     wheels = [name for name in names if name is not None]
     picked = [own_wheel()]
     missing = []
-    for project in REQUIREMENTS:
+    for project in requirements(target):
         of_project = [wheel for wheel in wheels if wheel.project == project]
         fitting = [wheel for wheel in of_project if is_compatible(target, wheel)]
         if not fitting:
@@ -144,7 +154,7 @@ def select_wheels(target: Target, directory: Path) -> tuple[Wheel, ...]:
     if missing:
         version = ".".join(map(str, target.python))
         words = f"pip download --only-binary :all: --python-version {version} --platform manylinux2014_{target.arch}"
-        hint = f"download them with internet access: {words} -d DIR {' '.join(REQUIREMENTS)}"
+        hint = f"download them with internet access: {words} -d DIR {' '.join(requirements(target))}"
         raise InputError("\n".join(missing), hint=hint)
     return tuple(picked)
 
@@ -155,7 +165,8 @@ def has_all(target: Target, directory: Path) -> bool:
         return False
     there = [wheel for wheel in map(parse_wheel, (path.name for path in directory.iterdir())) if wheel is not None]
     return all(
-        any(wheel.project == project and is_compatible(target, wheel) for wheel in there) for project in REQUIREMENTS
+        any(wheel.project == project and is_compatible(target, wheel) for wheel in there)
+        for project in requirements(target)
     )
 
 

@@ -179,7 +179,25 @@ def topics_view(reply: Json) -> str:
     foot = "other topics are refused" if undeclared is None else f"other topics: priority {undeclared['priority']}"
     if not rows:
         return f"no topic is configured; {foot}"
-    return table(["topic", "priority", "delivery", "sent", "", "received", ""], rows) + f"\n{foot}"
+    lines = [table(["topic", "priority", "delivery", "sent", "", "received", ""], rows)]
+    differences = [
+        [
+            topic["name"],
+            str(versions["whole_sent"]),
+            str(versions["differences_sent"]),
+            size(versions["payload_bytes_sent"]),
+            size(versions["body_bytes_sent"]),
+            str(versions["whole_received"]),
+            str(versions["differences_received"]),
+            str(versions["bases_lost"] + versions["bases_missing"] + versions["damaged"]),
+        ]
+        for topic in reply["topics"]
+        if (versions := topic.get("versions")) is not None
+    ]
+    if differences:
+        head = ["versions of", "sent whole", "differences", "bytes", "on the wire", "received whole", "differences"]
+        lines += ["", table([*head, "sent again"], differences), ""]
+    return "\n".join([*lines, foot])
 
 
 def logs_view(reply: Json) -> str:
@@ -217,6 +235,8 @@ def _delivery(topic: Json) -> str:
         words.append(f"at most {size(topic['rate_limit_bytes_per_s'])}/s")
     if topic["compression"]:
         words.append("compressed")
+    if topic["delta"]:
+        words.append("differences")
     if topic["outbox"] != "none":
         words.append(f"outbox {topic['outbox']}" + (" on disk" if topic["outbox_on_disk"] else ""))
     if topic["destinations"]:

@@ -1,7 +1,8 @@
 """Compression of message bodies: on request of their topic, and never inflated beyond the receiver's limit.
 
 Both directions run in steps of about a millisecond, so that a map of 20 MB blocks nothing else. `Compression` and
-`Decompression` process one body; `CompressionQueue` holds what a node has yet to compress.
+`Decompression` process one zlib body, `zstd` has the same for zstd, which is used if all receivers accept it;
+`CompressionQueue` holds what a node has yet to compress.
 """
 
 import zlib
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.sender.message import TopicChannel
+from udp_mesh.core.zstd import ZstdCompression, ZstdDecompression
+from udp_mesh.wire.frames import MessageFlag
 
 LEVEL = 1
 """zlib's fastest: an embedded core compresses several times faster than a mesh transmits."""
@@ -102,9 +105,19 @@ class Decompression:
         return False
 
 
-def compress(payload: bytes) -> bytes | None:
+def start_compression(payload: bytes, *, zstd: bool) -> Compression | ZstdCompression:
+    """A payload being compressed with zstd or zlib."""
+    return ZstdCompression(payload, len(payload)) if zstd and len(payload) >= MIN_BYTES else Compression(payload)
+
+
+def start_decompression(body: bytes, flags: int, limit_bytes: int) -> Decompression | ZstdDecompression:
+    """A body with the flag COMPRESSED being inflated."""
+    return (ZstdDecompression if flags & MessageFlag.ZSTD else Decompression)(body, limit_bytes)
+
+
+def compress(payload: bytes, *, zstd: bool = False) -> bytes | None:
     """The compressed payload, or None if it is not shorter."""
-    compression = Compression(payload)
+    compression = start_compression(payload, zstd=zstd)
     while not compression.step():
         pass
     return compression.body
@@ -129,6 +142,7 @@ class Uncompressed:
     names: tuple[str, ...]
     accepted_at: float
     store_keys: tuple[int | None, ...] = ()
+    zstd: bool = False
 
 
 class CompressionQueue:
@@ -138,7 +152,7 @@ class CompressionQueue:
 
     def __init__(self) -> None:
         self._topics: dict[str, deque[Uncompressed]] = {}
-        self._in_progress: dict[str, Compression] = {}
+        self._in_progress: dict[str, Compression | ZstdCompression] = {}
         self.bytes = 0
 
     def __len__(self) -> int:
@@ -158,7 +172,8 @@ class CompressionQueue:
         name = min(self._topics, key=lambda topic: self._topics[topic][0].channel.topic.priority)
         compression = self._in_progress.get(name)
         if compression is None:
-            compression = self._in_progress[name] = Compression(self._topics[name][0].payload)
+            first = self._topics[name][0]
+            compression = self._in_progress[name] = start_compression(first.payload, zstd=first.zstd)
         if not compression.step():
             return None
         del self._in_progress[name]

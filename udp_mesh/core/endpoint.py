@@ -31,6 +31,7 @@ from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
+from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
 from udp_mesh.wire.legacy import decapsulate
@@ -135,7 +136,7 @@ class Endpoint:
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
-        return self._state.next_peer_at() < at or bool(self._state.compression_queue)
+        return self._state.next_peer_at() < at or bool(self._state.compression_queue or self._state.versions.jobs)
 
     @property
     def is_quiet(self) -> bool:
@@ -194,6 +195,10 @@ class Endpoint:
     def relaying(self, now: float) -> RelayConditions:
         """A snapshot of relays: who is reached through whom, what is passed on."""
         return snapshot(self._state, self._relaying, now)
+
+    def versions(self) -> tuple[VersionConditions, ...]:
+        """What was sent and received as versions, by topic."""
+        return self._state.versions.conditions()
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""

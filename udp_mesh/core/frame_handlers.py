@@ -96,20 +96,28 @@ def process_frames(
                 # Heartbeats are processed with long headers.
                 pass
     deliver(state, session, now)
+    deferred = receiver.take_deferred()
     if not wants_ack:
         receiver.acks.on_packet(number, now)
+    elif kept and deferred is not None:
+        deferred.numbers.append(number)
     elif kept:
         receiver.on_accepted(number, now, ack_now=ack_now)
         if receiver.acks.send_now:
             state.schedule_control(session)
     if receiver.confirmed:
         state.schedule_control(session)
-    if receiver.refusals:
-        for refusal in receiver.refusals:
-            session.queue_control(refusal)
-        receiver.refusals.clear()
-        state.schedule_control(session)
+    _send_refusals(state, session)
     state.arm(peer)
+
+
+def _send_refusals(state: State, session: Session) -> None:
+    refusals = session.receiver.refusals
+    if refusals:
+        for refusal in refusals:
+            session.queue_control(refusal)
+        refusals.clear()
+        state.schedule_control(session)
 
 
 def ack_mid_batch(state: State, session: Session, now: float) -> None:
@@ -136,9 +144,13 @@ def _on_refused(state: State, session: Session, refused: Refused) -> None:
     sender = peer.open_sender()
     message = sender.by_wire_id(refused.message_id)
     if message is None:
+        if refused.reason is RefuseReason.FORGOTTEN:
+            state.versions.of(peer.name).on_best_effort_refused()
         return
     match refused.reason:
         case RefuseReason.FORGOTTEN:
+            if message.version is not None:
+                message.version.on_refused(message)
             sender.resend_from_start(message)
         case RefuseReason.NO_MEMORY:
             # Its packets stay unacknowledged and are retransmitted anyway.
@@ -206,8 +218,12 @@ def inflate_step(state: State, now: float) -> None:
     """Inflate one step of a complete message, of each session in turn."""
     session = next(iter(state.inflating))
     held = sum(one.receiver.inflating_bytes for one in state.inflating)
-    if not session.receiver.inflate_step():
+    version = session.receiver.inflating[0].numbers
+    if not session.receiver.inflate_step(now) and not version:
         state.event_queue.counters.dropped_malformed += 1
+    if version:
+        _send_refusals(state, session)
+        state.schedule_control(session)
     if held <= 2 * state.settings.limits.message_bytes or not session.receiver.inflating:
         # In turn, unless much memory is held already: then finish this one before others grow.
         del state.inflating[session]

@@ -21,6 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.legacy.sender import can_publish
 from udp_mesh.core.outbox import HeldMessage
+from udp_mesh.core.peers.heartbeat import own_features
 from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
@@ -31,6 +32,7 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.send_quota import pack_until
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
+from udp_mesh.core.versions.outgoing import OutgoingVersion
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import ANNOUNCE_BYTES
 from udp_mesh.wire.fragment import FRAGMENT_BYTES, HEAD_BYTES, LENGTH_BYTES
@@ -80,13 +82,15 @@ def send(
     message_id = MessageId(state.next_message_id)
     state.next_message_id += 1
     state.event_queue.counters.messages_sent += 1
-    if topic.compression and (len(payload) > STEP_BYTES or state.compression_queue.has_topic(topic.name)):
+    compression = topic.compression and not (topic.delta and all_accept(state, names, Feature.VERSIONS))
+    zstd = compression and all_accept(state, names, Feature.ZSTD)
+    if compression and (len(payload) > STEP_BYTES or state.compression_queue.has_topic(topic.name)):
         plain = _accept(message_id, channel, payload, None, now)
         keys = tuple(state.outboxes.persist(name, plain, now) for name in names) if topic.reliable else ()
-        state.compression_queue.add(Uncompressed(message_id, channel, payload, tuple(names), now, keys))
+        state.compression_queue.add(Uncompressed(message_id, channel, payload, tuple(names), now, keys, zstd))
     else:
-        packed = compress(payload) if topic.compression else None
-        _enqueue_all(state, _accept(message_id, channel, payload, packed, now), names, now)
+        packed = compress(payload, zstd=zstd) if compression else None
+        _enqueue_all(state, _accept(message_id, channel, payload, packed, now, zstd=zstd), names, now)
     return message_id
 
 
@@ -95,7 +99,9 @@ def compress_step(state: State, now: float) -> None:
     done = state.compression_queue.step()
     if done is not None:
         message, packed = done
-        accepted = _accept(message.message_id, message.channel, message.payload, packed, message.accepted_at)
+        accepted = _accept(
+            message.message_id, message.channel, message.payload, packed, message.accepted_at, zstd=message.zstd
+        )
         _enqueue_all(state, accepted, message.names, now, message.store_keys)
 
 
@@ -154,12 +160,18 @@ def topic_channel(state: State, topic: Topic, type_name: str) -> TopicChannel | 
 
 
 def _accept(
-    message_id: MessageId, channel: TopicChannel, payload: bytes, packed: bytes | None, accepted_at: float
+    message_id: MessageId,
+    channel: TopicChannel,
+    payload: bytes,
+    packed: bytes | None,
+    accepted_at: float,
+    *,
+    zstd: bool = False,
 ) -> AcceptedMessage:
     topic = channel.topic
     flags = MessageFlag.RELIABLE if topic.reliable else 0
     if packed is not None:
-        flags |= MessageFlag.COMPRESSED
+        flags |= MessageFlag.COMPRESSED | (MessageFlag.ZSTD if zstd else 0)
     deadline = None if topic.deadline_s is None else accepted_at + topic.deadline_s
     body = payload if packed is None else packed
     return AcceptedMessage(message_id, channel, payload, body, flags, accepted_at, deadline)
@@ -172,8 +184,8 @@ def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, stor
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
         _hold(state, name, HeldMessage(accepted, store_key), now)
         return
-    if peer.session is not None and not accepts_compressed(peer.session):
-        accepted = uncompressed(accepted)
+    if peer.session is not None:
+        accepted = acceptable(accepted, peer.session)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
         # Older messages of the topic still wait in the outbox; only urgent ones go ahead of stale ones.
@@ -189,6 +201,8 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     topic = accepted.channel.topic
     message = OutgoingMessage(accepted, topic.priority, reliable=topic.reliable)
     message.store_key = store_key
+    if topic.delta:
+        message.version = OutgoingVersion(state.versions.of(peer.name))
     sender = peer.open_sender()
     sender.accept(message, now)
     if peer.state is PeerState.LOST:
@@ -206,24 +220,33 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
         state.arm(peer)
 
 
-def accepts_compressed(session: Session) -> bool:
-    """Whether the peer accepts compressed messages."""
-    return bool(session.features & Feature.ZLIB)
+def all_accept(state: State, names: Sequence[str], feature: int) -> bool:
+    """Whether these peers (none: all that are online) accept a feature, as far as they are known."""
+    peers = [state.peer_table.peers.get(name) for name in names] if names else state.peer_table.online()
+    sessions = [peer.session for peer in peers if peer is not None and peer.session is not None]
+    return bool(own_features(state.settings) & feature) and all(session.features & feature for session in sessions)
+
+
+def acceptable(accepted: AcceptedMessage, session: Session) -> AcceptedMessage:
+    """The message as it is, or uncompressed if the peer does not accept its compression."""
+    needed = Feature.ZSTD if accepted.flags & MessageFlag.ZSTD else Feature.ZLIB
+    return accepted if session.features & needed else uncompressed(accepted)
 
 
 def uncompressed(accepted: AcceptedMessage) -> AcceptedMessage:
     """The message as it was accepted."""
     if not accepted.flags & MessageFlag.COMPRESSED:
         return accepted
-    return replace(accepted, body=accepted.payload, flags=accepted.flags & ~MessageFlag.COMPRESSED)
+    flags = accepted.flags & ~(MessageFlag.COMPRESSED | MessageFlag.ZSTD)
+    return replace(accepted, body=accepted.payload, flags=flags)
 
 
 def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
-    if not all(map(accepts_compressed, sessions)):
-        accepted = uncompressed(accepted)
+    for session in sessions:
+        accepted = acceptable(accepted, session)
     fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
         state.broadcasts.push(accepted)
@@ -299,7 +322,7 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
                 state.arm(peer)
                 continue
             sender.cancel(started)
-        accepted = held.accepted if session is None or accepts_compressed(session) else uncompressed(held.accepted)
+        accepted = held.accepted if session is None else acceptable(held.accepted, session)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
         state.maintenance_at = min(state.maintenance_at, now + RELEASE_INTERVAL_S)
@@ -322,6 +345,8 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
         if outcome is Outcome.SENT:
             continue
         if outcome is Outcome.DELIVERED:
+            if message.version is not None:
+                message.version.on_delivered(message)
             counters.messages_delivered += 1
             if message.reliable:
                 latency_s = now - accepted.accepted_at

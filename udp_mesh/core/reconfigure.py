@@ -62,6 +62,7 @@ def apply(state: State, settings: Settings, now: float) -> list[str]:
     state.topics = {topic.name: topic for topic in settings.topics}
     state.event_queue.set_limit(settings.limits.events)
     state.peer_table.apply(settings)
+    state.versions.limit_bytes = settings.limits.version_bytes
     state.priority_backoff.apply(settings.rates)
     _retopic(state, now)
     keys = live_keys(settings)

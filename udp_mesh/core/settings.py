@@ -126,7 +126,8 @@ class Topic:
     `priority` 0 is the most urgent. `keep_last` limits how many messages of the topic wait for one destination: a newer
     one replaces the oldest (None: no limit). `deadline_s` is a message's lifetime from its `send`. `destinations` lists
     the peers that get a message sent without a destination (empty: all). `repair` lets receivers request a lost
-    broadcast again.
+    broadcast again. `delta` sends a message as the difference to the last one that its receiver has, if both have at
+    most `delta_bytes`.
     """
 
     name: str
@@ -142,6 +143,8 @@ class Topic:
     outbox_on_disk: bool = False
     repair: bool = False
     log: Log | None = None
+    delta: bool = False
+    delta_bytes: int = 16 << 20
 
     @property
     def keeps_on_disk(self) -> bool:
@@ -160,6 +163,8 @@ class Topic:
             raise ValueError(f"topic {self.name}: expected a positive rate limit, found {self.rate_limit_bytes_per_s}")
         if self.outbox_bytes < 0:
             raise ValueError(f"topic {self.name}: expected outbox_bytes of at least 0, found {self.outbox_bytes}")
+        if self.delta_bytes < 1:
+            raise ValueError(f"topic {self.name}: expected delta_bytes of at least 1, found {self.delta_bytes}")
         if self.log is not None:
             self._check_log()
 
@@ -175,6 +180,7 @@ class Topic:
             ("destinations", ()),
             ("outbox", Outbox.NONE),
             ("repair", False),
+            ("delta", False),
         ):
             if getattr(self, name) != unset:
                 raise ValueError(
@@ -320,6 +326,10 @@ class Limits:
     """Events not fetched: a driver that stopped reading. The oldest received messages are then dropped and counted."""
     topics_per_peer: int = 1024
     """Topic names a peer may announce: a key holder inventing names."""
+    version_bytes_per_peer: int = 64 << 20
+    """Versions of one peer's messages held as bases of differences: as for `partial_bytes_per_peer`."""
+    version_bytes: int = 128 << 20
+    """The same for all peers, and as much for the versions sent."""
 
     def __post_init__(self) -> None:
         for name in self.__slots__:

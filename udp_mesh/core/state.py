@@ -24,6 +24,7 @@ from udp_mesh.core.sender.message import TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Settings, Topic
+from udp_mesh.core.versions.sent import SentVersions
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
 _NEVER = float("inf")
@@ -58,6 +59,8 @@ class State:
         self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
         self.broadcasts = BroadcastQueue()
         self.compression_queue = CompressionQueue()
+        self.versions = SentVersions(settings.limits.version_bytes, self.peer_table.version_counters)
+        """What peers have of topics that are sent as differences."""
         self.inflating: dict[Session, None] = {}
         """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)

@@ -15,6 +15,7 @@ from udp_mesh.core.peers.heartbeat import heartbeat_datagrams
 from udp_mesh.core.peers.introduction import introduction
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, report_ended
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import send_copies, send_level
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkKind
@@ -49,6 +50,9 @@ def collect(state: State, now: float, max_bytes: int | None) -> list[Datagram]:
             _send_control(state, session, now, out)
     if state.ready or state.broadcasts.waiting:
         _send_levels(state, now, out, room)
+    if state.versions.blocked:
+        for name, message in state.versions.unblock():
+            _restore(state, name, message)
     return out
 
 
@@ -68,6 +72,14 @@ def count_sent(state: State, out: list[Datagram]) -> None:
     counters = state.event_queue.counters
     counters.datagrams_sent += len(out)
     counters.bytes_sent += sum([len(datagram[2]) for datagram in out]) + IP_UDP_BYTES * len(out)
+
+
+def _restore(state: State, name: str, message: OutgoingMessage) -> None:
+    """Queue a message again that was parked to be encoded."""
+    peer = state.peer_table.peers.get(name)
+    if peer is not None and peer.sender is not None and message in peer.sender.pending:
+        peer.sender.scheduler.restore(message)
+        state.ready[peer] = None
 
 
 def _send_control(state: State, session: Session, now: float, out: list[Datagram]) -> None:
@@ -243,7 +255,7 @@ def next_timer(state: State) -> float | None:
     for bucket in state.rate_limits.values():
         if bucket.parked:
             at = min(at, bucket.ready_at())
-    if (state.compression_queue or state.inflating) and not state.closed:
+    if (state.compression_queue or state.inflating or state.versions.jobs) and not state.closed:
         # Due at once, repeatedly; other timers are handled in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
@@ -292,6 +304,8 @@ def handle_timer(state: State, now: float) -> None:
         compress_step(state, now)
     if state.inflating:
         inflate_step(state, now)
+    if state.versions.jobs and (prepared := state.versions.step()) is not None:
+        _restore(state, *prepared)
     if state.maintenance_at <= now:
         state.maintenance_at = now + MAINTENANCE_INTERVAL_S
         maintain(state, now)

@@ -205,7 +205,7 @@ def peers(service: Service, _client: Client, _header: Header, _: bytes) -> Heade
 def topics(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
     undeclared = service.settings.undeclared
     return {
-        "topics": topics_json(service.settings, service.counts, service.driver.now()),
+        "topics": topics_json(service.settings, service.counts, service.driver.now(), service.driver.node.versions()),
         "undeclared": None if undeclared is None else topic_json(undeclared),
     }
 
@@ -242,6 +242,7 @@ def render_metrics(service: Service) -> str:
         visible,
         extra,
         logs=driver.node.logs(),
+        versions=driver.node.versions(),
         about=about,
         uptime_s=driver.now() - service.started,
         latencies=service.latencies.by_priority,

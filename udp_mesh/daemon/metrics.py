@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon.latencies import BOUNDS_S, Histogram
 from udp_mesh.daemon.status import TopicCount
 
@@ -57,6 +58,7 @@ def render(
     extra: Mapping[str, float],
     *,
     logs: Iterable[LogConditions] = (),
+    versions: Iterable[VersionConditions] = (),
     about: Mapping[str, str],
     uptime_s: float,
     latencies: Mapping[int, Histogram] | None = None,
@@ -100,6 +102,7 @@ def render(
         help_text = f"{field_name.replace('_', ' ').capitalize()} of the topic."
         _family(lines, f"topic_{field_name}_total", "counter", help_text, samples)
     lines += _log_lines(tuple(logs))
+    lines += _version_lines(tuple(versions))
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"
@@ -125,6 +128,15 @@ def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
         for reader, count in log.missing_readers
     ]
     _family(lines, "log_missing_items", "gauge", "Items that a reader is not known to have.", missing)
+    return lines
+
+
+def _version_lines(versions: tuple[VersionConditions, ...]) -> list[str]:
+    lines: list[str] = []
+    for item in dataclasses.fields(VersionCounters):
+        samples = [({"topic": entry.topic}, float(getattr(entry.counters, item.name))) for entry in versions]
+        help_text = f"{item.name.replace('_', ' ').capitalize()}, of topics with differences."
+        _family(lines, f"version_{item.name}_total", "counter", help_text, samples)
     return lines
 
 

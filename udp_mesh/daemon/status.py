@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from udp_mesh.core.events import Event
 from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import Address, Settings, Topic
+from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
 Json = dict[str, object]
@@ -137,9 +138,12 @@ def topic_json(topic: Topic) -> Json:
     return fields
 
 
-def topics_json(settings: Settings, counts: Mapping[str, TopicCount], now: float) -> list[Json]:
+def topics_json(
+    settings: Settings, counts: Mapping[str, TopicCount], now: float, versions: Iterable[VersionConditions] = ()
+) -> list[Json]:
     """Configured topics by priority, then topics that were only received; each with its counters and the age of its
-    last message in each direction."""
+    last message in each direction, and what was saved by differences."""
+    differences = {entry.topic: dataclasses.asdict(entry.counters) for entry in versions}
     configured = [topic for topic in settings.topics if not topic.name.startswith(RESERVED_PREFIX)]
     rows = [
         {**topic_json(topic), "configured": True, **_count_json(counts.get(topic.name, TopicCount()), now)}
@@ -151,6 +155,8 @@ def topics_json(settings: Settings, counts: Mapping[str, TopicCount], now: float
         for name, count in sorted(counts.items())
         if name not in known and not name.startswith(RESERVED_PREFIX)
     ]
+    for row in rows:
+        row["versions"] = differences.get(str(row["name"]))
     return rows
 
 

@@ -49,6 +49,8 @@ def read_topic(name: str, table: Table) -> Topic:
         outbox_bytes=or_default(table.integer("outbox_bytes", default.outbox_bytes, 0, 1 << 40), default.outbox_bytes),
         outbox_on_disk=table.boolean("outbox_on_disk", default.outbox_on_disk),
         repair=table.boolean("repair", default.repair),
+        delta=table.boolean("delta", default.delta),
+        delta_bytes=or_default(table.integer("delta_bytes", default.delta_bytes, 1, 1 << 30), default.delta_bytes),
     )
     log = _read_log(table.table("log")) if table.has("log") else None
     table.finish()

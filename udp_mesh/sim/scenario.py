@@ -252,13 +252,13 @@ def _path_loss(at: Entry) -> PathLoss:
 def _topic(name: str, at: Entry, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
-        "outbox", "repair", "log",
+        "outbox", "repair", "log", "delta", "delta_bytes",
     )  # fmt: skip
     entries = at.mapping(keys)
     values: dict[str, Any] = {}
     for key, entry in entries.items():
         match key:
-            case "reliable" | "compression" | "repair":
+            case "reliable" | "compression" | "repair" | "delta":
                 values[key] = entry.flag()
             case "deadline_s":
                 values[key] = entry.number(1.0, minimum=1e-3)

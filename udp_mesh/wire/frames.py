@@ -35,6 +35,10 @@ class Feature:
     """Accepts compact fragments."""
     LOGS = 32
     """Has topics that are shared logs, and takes part in passing on their items."""
+    ZSTD = 64
+    """Accepts messages compressed with zstd (RFC 8878)."""
+    VERSIONS = 128
+    """Keeps versions of a topic's content and accepts differences to them (see `version`)."""
     RELAY = 256
     """Accepts relay datagrams: it can be reached through relays, and may be one."""
 
@@ -87,7 +91,7 @@ class MessageFlag:
     RELIABLE = 1
     """Retransmitted until delivered, expired or the peer is lost; otherwise best effort."""
     COMPRESSED = 2
-    """The bytes are zlib (RFC 1950); the receiver bounds what they may inflate to."""
+    """The bytes are zlib (RFC 1950), with `ZSTD` zstd; the receiver bounds what they may inflate to."""
     TO_ALL = 4
     """Addressed to every node, whether this copy was broadcast or not."""
     REPAIR = 8
@@ -95,6 +99,11 @@ class MessageFlag:
     CONFIRM = 16
     """The sender waits for a `Delivered`: the receiving program took the message, or the receiver has it on disk.
     Set only to peers that announce `Feature.CONFIRM`."""
+    ZSTD = 64
+    """With `COMPRESSED`: the bytes are one zstd frame (RFC 8878) that states its content size."""
+    VERSION = 128
+    """The bytes begin with the header of `version`. The receiver keeps the version and acknowledges it only once its
+    hash is checked. Set only to peers that announce `Feature.VERSIONS`."""
 
 
 class MessageHead(NamedTuple):

@@ -182,5 +182,7 @@ class TopicDocument(Document):
     """Keep the outbox across restarts."""
     repair: Flag = False
     """Let receivers request lost broadcasts again."""
+    delta: Flag = False
+    """Send a message as the difference to the last one that its receiver has (maps, grids, images, states)."""
     log: TopicLogDocument = NOT_WRITTEN
     """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""

@@ -11,7 +11,7 @@ import udp_mesh
 from meshctl.robots.wheels import REQUIREMENTS, Wheel, build_wheel
 
 
-def repack(directory: Path, projects: tuple[str, ...] = REQUIREMENTS) -> Path:
+def repack(directory: Path, projects: tuple[str, ...] = (*REQUIREMENTS, "backports.zstd")) -> Path:
     """Write one wheel for each project into `directory`, with the tags it was installed with."""
     directory.mkdir(parents=True, exist_ok=True)
     for project in projects:

@@ -8,6 +8,7 @@ lists it: both then know that the link works both ways and that the other's hear
 from collections.abc import Iterable
 from dataclasses import replace
 
+from udp_mesh.core import zstd
 from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.receiver.datagram_age import clock_echo, clock_ms
@@ -19,11 +20,13 @@ from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_HEARD, MAX_HEARD_CLOCKS
 
 OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT
+ZSTD_FEATURES = Feature.ZSTD | Feature.VERSIONS if zstd.AVAILABLE else 0
+"""With a Python that has zstd."""
 
 
 def own_features(settings: Settings) -> int:
     """What this node announces."""
-    features = OWN_FEATURES
+    features = OWN_FEATURES | ZSTD_FEATURES
     if settings.confirms:
         features |= Feature.CONFIRM
     if any(topic.log is not None for topic in settings.topics):

@@ -11,6 +11,7 @@ from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.peers.session_state import SessionEvent, SessionState
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.settings import Settings
+from udp_mesh.core.versions.received import CounterTable, ReceivedVersions
 from udp_mesh.crypto import Key, ReceiveChannel
 
 MAX_RETIRED = 16
@@ -43,6 +44,8 @@ class PeerTable:
         "own_name",
         "peers",
         "sessions",
+        "version_counters",
+        "version_memory",
     )
 
     def __init__(self, settings: Settings, own_boot: bytes) -> None:
@@ -56,12 +59,15 @@ class PeerTable:
         """Sessions that are not the current one of any peer, by boot id."""
         self._boots = BootMemory()
         self.memory = MemoryBudget(settings.limits.partial_bytes)
+        self.version_memory = MemoryBudget(settings.limits.version_bytes)
+        self.version_counters = CounterTable()
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
         self.broadcast_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
 
     def apply(self, settings: Settings) -> None:
         self._limits = settings.limits
         self.memory.set_limit(settings.limits.partial_bytes)
+        self.version_memory.set_limit(settings.limits.version_bytes)
 
     def get_or_create(self, name: str, settings: Settings) -> Peer | None:
         """The peer of a name, created if needed. None if there are too many."""
@@ -75,6 +81,7 @@ class PeerTable:
         while len(self._unverified) >= self._limits.strangers:
             self.forget(self.sessions[next(iter(self._unverified))])
         session = Session(name, boot_id, self.own_boot, keys, settings, self.memory)
+        session.receiver.versions = ReceivedVersions(settings.limits, self.version_memory, self.version_counters)
         self._boots.restore(session)
         self.sessions[boot_id] = self._non_current[boot_id] = session
         self._unverified[boot_id] = None

@@ -371,3 +371,4 @@ class Session:
         self.path.timed = bool(beat.features & Feature.TIMED)
         self.path.compact = bool(beat.features & Feature.COMPACT)
         self.path.confirms = bool(beat.features & Feature.CONFIRM)
+        self.path.versions = bool(beat.features & Feature.VERSIONS)

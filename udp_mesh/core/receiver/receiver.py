@@ -8,12 +8,15 @@
 from collections import deque
 from typing import NamedTuple
 
-from udp_mesh.core.compression import Decompression
+from udp_mesh.core.compression import Decompression, start_decompression
 from udp_mesh.core.receiver.acks import MAX_PENDING, AckState
 from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, MemoryBudget
 from udp_mesh.core.receiver.reassembly import CompleteMessage, FragmentStatus, Reassembly
 from udp_mesh.core.sender.sent_packets import REORDER_PACKETS
 from udp_mesh.core.settings import Limits, Rates
+from udp_mesh.core.versions.decoding import VersionDecoding
+from udp_mesh.core.versions.received import CounterTable, ReceivedVersions
+from udp_mesh.core.zstd import ZstdDecompression
 from udp_mesh.wire.fragment import (
     FRAGMENT,
     FRAGMENT_ACK_NOW,
@@ -34,6 +37,10 @@ MAX_REFUSED_REMEMBERED = 256
 """Refused messages of one peer remembered, so that each of their fragments is refused again."""
 
 
+_Key = tuple[bool, int]
+"""Whether the message is numbered as a broadcast, and its number."""
+
+
 class ReceivedMessage(NamedTuple):
     """A complete message for the application."""
 
@@ -48,9 +55,24 @@ class ReceivedMessage(NamedTuple):
     """Its message id, if its sender waits for a confirmation."""
 
 
+class Inflating(NamedTuple):
+    """A complete message being inflated, with everything but its payload."""
+
+    work: Decompression | ZstdDecompression | VersionDecoding
+    message: ReceivedMessage
+    key: _Key
+    reserved_bytes: int
+    numbers: list[int]
+    """Packets to acknowledge once the version is decoded."""
+
+
 def _asks_to_confirm(fragment: Fragment) -> bool:
     head = fragment.head
     return head is not None and head.flags & MessageFlag.CONFIRM != 0 and not fragment.broadcast_id
+
+
+def _is_version(inflating: Inflating) -> bool:
+    return isinstance(inflating.work, VersionDecoding)
 
 
 def _topic_bytes(names: tuple[str, str]) -> int:
@@ -70,6 +92,7 @@ class Receiver:
         "broadcasts",
         "completed",
         "confirmed",
+        "deferred",
         "duplicates",
         "expired",
         "fragments",
@@ -79,6 +102,7 @@ class Receiver:
         "topics",
         "unconfirmed",
         "unicasts",
+        "versions",
     )
 
     def __init__(self, rates: Rates, limits: Limits, memory: MemoryBudget) -> None:
@@ -91,8 +115,10 @@ class Receiver:
         self.topics: dict[int, tuple[str, str]] = {}
         self.completed: list[ReceivedMessage] = []
         self.refusals: list[Refused] = []
-        self.inflating: deque[tuple[Decompression, ReceivedMessage]] = deque()
-        """Complete messages still being inflated, with everything but their payload."""
+        self.inflating: deque[Inflating] = deque()
+        self.versions = ReceivedVersions(limits, MemoryBudget(limits.version_bytes_per_peer), CounterTable())
+        self.deferred: Inflating | None = None
+        """A version that the datagram being processed completed: it is acknowledged once the version is decoded."""
         self.duplicates = 0
         self.expired = 0
         """Fragments of messages that their senders have given up by now."""
@@ -111,12 +137,13 @@ class Receiver:
 
     @property
     def inflating_bytes(self) -> int:
-        return sum([inflating.held_bytes for inflating, _ in self.inflating])
+        return sum([inflating.work.held_bytes for inflating in self.inflating])
 
     def apply(self, rates: Rates, limits: Limits) -> None:
         self._rates, self._limits = rates, limits
         self.unicasts.set_limits(limits)
         self.broadcasts.set_limits(limits)
+        self.versions.apply(limits)
 
     def receive_plain(self, frames: bytes, number: int, now: float) -> bool:
         """The fast path: one fragment without a head that fills its datagram. False for anything else."""
@@ -154,6 +181,7 @@ class Receiver:
     def close(self) -> None:
         """Release what is held for a dropped peer."""
         self._account.close()
+        self.versions.held.close()
 
     def receive_fragment(self, fragment: Fragment, now: float, *, broadcast: bool, late_s: float = 0.0) -> bool:
         """Process one fragment that was delayed by `late_s`. False if it was refused, so that its datagram must not be
@@ -176,6 +204,8 @@ class Receiver:
                 return True
             case FragmentStatus.DUPLICATE:
                 self.duplicates += 1
+                if any(inflating.key == key for inflating in self.inflating if _is_version(inflating)):
+                    return False
                 if _asks_to_confirm(fragment) and self._is_confirmed(fragment.message_id):
                     # The confirmation was lost.
                     self.confirmed.append(fragment.message_id)
@@ -249,43 +279,73 @@ class Receiver:
         to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
         confirm_id = complete.message_id if head.flags & MessageFlag.CONFIRM and not by_broadcast else None
         received = ReceivedMessage(*topic, complete.body, head.priority, to_all, number, confirm_id)
-        if confirm_id is not None:
-            self.unconfirmed.add(confirm_id)
-        if not head.flags & MessageFlag.COMPRESSED:
-            self.completed.append(received)
-            return True
-        inflating = Decompression(complete.body, self._limits.message_bytes)
-        if not inflating.step():
-            size = len(complete.body)
-            if (
-                self.inflating_bytes + inflating.held_bytes > self._limits.partial_bytes_per_peer
-                or not self._account.has_room(size)
-            ):
-                self.over_limit += 1
-                self._refuse_for_good(key, RefuseReason.TOO_LARGE)
+        work: Decompression | ZstdDecompression | VersionDecoding
+        if head.flags & MessageFlag.VERSION:
+            begun = self.versions.begin(topic, complete.body, head.flags)
+            if isinstance(begun, RefuseReason):
+                # The sender restarts it under another number; this one stays refused, should the refusal be lost.
+                self._refuse_for_good(key, begun)
                 return False
-            self._account.reserve(size)
-            self.inflating.append((inflating, received))
-            return True
-        if inflating.payload is None:
-            self._refuse_for_good(key, RefuseReason.CORRUPT)
+            work = begun
+        elif head.flags & MessageFlag.COMPRESSED:
+            work = start_decompression(complete.body, head.flags, self._limits.message_bytes)
+        else:
+            return self._complete(received)
+        inflating = Inflating(work, received, key, len(complete.body), [])
+        if work.step():
+            return self._finish_inflating(inflating)
+        if self.inflating_bytes + work.held_bytes > self._limits.partial_bytes_per_peer or not self._account.has_room(
+            inflating.reserved_bytes
+        ):
+            self.over_limit += 1
+            self._refuse_for_good(key, RefuseReason.TOO_LARGE)
             return False
-        self.completed.append(received._replace(payload=inflating.payload))
+        self._account.reserve(inflating.reserved_bytes)
+        self.inflating.append(inflating)
+        if _is_version(inflating):
+            self.deferred = inflating
         return True
 
-    def inflate_step(self) -> bool:
-        """Inflate more of the first waiting message. False if it turned out to be corrupt.
+    def take_deferred(self) -> Inflating | None:
+        """The version that the datagram being processed completed, if it is decoded in steps."""
+        deferred, self.deferred = self.deferred, None
+        return deferred
 
-        Its fragments are already acknowledged: only a faulty peer sends what cannot be inflated.
+    def inflate_step(self, now: float) -> bool:
+        """Inflate more of the first waiting message. False if it turned out to be corrupt, or, if it is a version, was
+        refused.
+
+        The fragments of a message that is not a version are already acknowledged: only a faulty peer sends what cannot
+        be inflated.
         """
-        inflating, received = self.inflating[0]
-        if not inflating.step():
+        inflating = self.inflating[0]
+        if not inflating.work.step():
             return True
         self.inflating.popleft()
-        self._account.release(len(received.payload))
-        if inflating.payload is None:
+        self._account.release(inflating.reserved_bytes)
+        if not self._finish_inflating(inflating):
             return False
-        self.completed.append(received._replace(payload=inflating.payload))
+        for number in inflating.numbers:
+            self.on_accepted(number, now, ack_now=True)
+        return True
+
+    def _finish_inflating(self, inflating: Inflating) -> bool:
+        work, message, key = inflating.work, inflating.message, inflating.key
+        if isinstance(work, VersionDecoding):
+            result = self.versions.finish((message.topic, message.type_name), work, inflating.reserved_bytes)
+            if isinstance(result, RefuseReason):
+                self._refuse_for_good(key, result)
+                return False
+            return self._complete(message._replace(payload=result))
+        if work.payload is None:
+            self._refuse_for_good(key, RefuseReason.CORRUPT)
+            return False
+        return self._complete(message._replace(payload=work.payload))
+
+    def _complete(self, message: ReceivedMessage) -> bool:
+        if message.confirm_id is not None:
+            self.unconfirmed.add(message.confirm_id)
+        self.completed.append(message)
         return True
 
     def _refuse(self, key: tuple[bool, int], reason: RefuseReason) -> None:

@@ -68,8 +68,8 @@ class PriorityLevels:
     def _count(self, message: OutgoingMessage, sign: int) -> None:
         level = self._levels[message.priority]
         level.messages += sign
-        level.bytes += sign * len(message.body)
-        self.queued_bytes += sign * len(message.body)
+        level.bytes += sign * message.queued_bytes
+        self.queued_bytes += sign * message.queued_bytes
 
     def reprioritize(self, messages: Iterable[OutgoingMessage]) -> bool:
         """Move each pending message (all of them, in the order accepted) to its topic's current priority. False if none

@@ -1,6 +1,9 @@
 """One message for one peer: its bytes, which fragments were sent and acknowledged, and how it is treated."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Protocol
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
@@ -47,6 +50,25 @@ class AcceptedMessage:
         return None if self.deadline is None else max(1, int((self.deadline - now) * 1000))
 
 
+class MessageVersion(Protocol):
+    """How a message is sent as a version of its topic (`versions.outgoing`)."""
+
+    whole: bool
+    prepared: bool
+    digest: bytes
+    is_difference: bool
+
+    def prepare(self, message: OutgoingMessage, epoch: int, *, accepted: bool, now: float) -> bool: ...
+
+    def restarted(self) -> MessageVersion: ...
+
+    def on_delivered(self, message: OutgoingMessage) -> None: ...
+
+    def on_fragment_arrived(self, message: OutgoingMessage, position: int) -> None: ...
+
+    def on_refused(self, message: OutgoingMessage) -> None: ...
+
+
 class OutgoingMessage:
     """The copy for one peer. `wire_id` is None until its first fragment is sent."""
 
@@ -57,6 +79,7 @@ class OutgoingMessage:
         "confirm",
         "ended",
         "first_bytes",
+        "flags",
         "fragment_bytes",
         "fragments",
         "missing",
@@ -64,15 +87,23 @@ class OutgoingMessage:
         "overdue",
         "priority",
         "queued_at",
+        "queued_bytes",
         "reliable",
         "store_key",
         "superseded",
+        "version",
         "wire_id",
     )
 
     def __init__(self, accepted: AcceptedMessage, priority: int, *, reliable: bool) -> None:
         self.accepted = accepted
         self.body = accepted.body
+        self.flags = accepted.flags
+        """Bits of `MessageFlag`. Like `body`, they change when the message is sent as a version of its topic."""
+        self.version: MessageVersion | None = None
+        """Set if the topic's messages are sent as differences."""
+        self.queued_bytes = len(accepted.body)
+        """What it counts for in the statistics of its level, whatever becomes of its body."""
         self.priority = priority
         self.reliable = reliable
         self.queued_at = accepted.accepted_at
@@ -110,16 +141,19 @@ class OutgoingMessage:
         start = self.first_bytes + (position - 1) * self.fragment_bytes
         return start, min(start + self.fragment_bytes, len(self.body))
 
-    def restarted(self) -> "OutgoingMessage":
+    def restarted(self) -> OutgoingMessage:
         """The same message with nothing sent: the peer lost what it had. The caller marks this one ended."""
         copy = OutgoingMessage(self.accepted, self.priority, reliable=self.reliable)
         copy.store_key = self.store_key
+        copy.queued_bytes = self.queued_bytes
+        copy.version = None if self.version is None else self.version.restarted()
         return copy
 
-    def resumed(self) -> "OutgoingMessage":
+    def resumed(self) -> OutgoingMessage:
         """The same message under the same wire id, with its acknowledged fragments. The caller marks this one ended."""
         copy = OutgoingMessage(self.accepted, self.accepted.channel.topic.priority, reliable=self.reliable)
         copy.store_key = self.store_key
+        copy.body, copy.flags, copy.version = self.body, self.flags, self.version
         assert self.wire_id is not None
         copy.begin(self.wire_id, self.fragment_bytes, self.first_bytes)
         copy.confirm = self.confirm

@@ -99,6 +99,12 @@ def send_level(
             bucket.parked.append((sender, run))
             continue
         if not message.started:
+            version = message.version
+            if version is not None and not version.prepared:
+                sender.scheduler.park_head(run)
+                if version.prepare(message, sender.epoch, accepted=path.versions, now=now):
+                    sender.scheduler.restore(message)
+                continue
             _begin(sender, path, message)
             run = Run(message, 0, message.fragments, retransmit=False, stale=run.stale)
         before = used
@@ -280,7 +286,8 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float
     if run is None or run.message.superseded or run.message.accepted.channel.topic.rate_limit_bytes_per_s is not None:
         return None, 0
     if not run.message.started:
-        if len(run.message.body) > room:
+        version = run.message.version
+        if len(run.message.body) > room or (version is not None and not version.prepared):
             return None, 0
         _begin(sender, path, run.message)
         run = Run(run.message, 0, run.message.fragments, retransmit=False, stale=run.stale)
@@ -327,7 +334,7 @@ def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) 
         message.fragments,
         accepted.channel.number,
         message.priority,
-        accepted.flags | MessageFlag.CONFIRM if message.confirm else accepted.flags,
+        message.flags | MessageFlag.CONFIRM if message.confirm else message.flags,
         max(0, int((now - accepted.accepted_at) * 1000)),
         accepted.life_ms(now) if _sends_life(path, message) else None,
     )

@@ -39,6 +39,7 @@ class Path:
         "mtu",
         "room_bytes",
         "timed",
+        "versions",
     )
 
     def __init__(self, channel: SendChannel) -> None:
@@ -59,9 +60,11 @@ class Path:
         self.compact = False
         """The peer accepts compact fragments."""
         self.timed = False
+        """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
         self.confirms = False
         """The peer confirms messages that ask for it."""
-        """The peer accepts timestamped datagrams and message heads with a remaining lifetime."""
+        self.versions = False
+        """The peer keeps versions and accepts differences to them."""
 
     def switch_to(self, link: str, address: Address, mtu: int, fragment_bytes: int) -> None:
         """Use this path from now on. Messages already started keep their fragments if these still fit."""

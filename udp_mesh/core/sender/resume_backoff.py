@@ -4,6 +4,11 @@ The first sign of life triggers a burst at once. While nothing is acknowledged, 
 the forward path may be down, or have a queue of seconds that more bursts would keep full.
 """
 
+STALE_AFTER_S = 1.0
+"""After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
+
+FAST_PROBE_FOR_S = 1.0
+
 RESUME_BURST_PACKETS = 10
 """Packets sent at once when an unresponsive peer is heard without acknowledging (the path to it may still be down)."""
 

@@ -74,6 +74,19 @@ class Scheduler:
             fresh.append(message)
         self.waiting |= 1 << message.priority
 
+    def restore(self, message: OutgoingMessage) -> None:
+        """Queue a parked message again: in front of its level, but behind earlier messages of its topic."""
+        level = self._levels[message.priority]
+        place = 0
+        for earlier in level.fresh:
+            same = earlier.accepted.channel is message.accepted.channel
+            if not same or earlier.accepted.message_id > message.accepted.message_id:
+                break
+            place += 1
+        level.fresh.insert(place, message)
+        level.fresh_bytes += len(message.body) + SMALL_OVERHEAD_BYTES
+        self.waiting |= 1 << message.priority
+
     def push_retransmit(self, message: OutgoingMessage, position: int) -> None:
         """Queue a lost fragment for retransmission."""
         self._levels[message.priority].retransmit.append((message, position))

@@ -22,7 +22,7 @@ from udp_mesh.core.sender.packing import Packing
 from udp_mesh.core.sender.pending import PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
-from udp_mesh.core.sender.resume_backoff import RESUME_BURST_PACKETS, ResumeBackoff
+from udp_mesh.core.sender.resume_backoff import FAST_PROBE_FOR_S, RESUME_BURST_PACKETS, STALE_AFTER_S, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
 from udp_mesh.core.sender.send_state import TRANSITIONS, SendEvent, SendState
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
@@ -34,8 +34,6 @@ FAST_PROBE_INTERVAL_S = 0.025
 
 PROBE_INTERVAL_S = 0.25
 """Probe interval later: the time lost when the link returns, at four packets a second to a dead peer."""
-
-FAST_PROBE_FOR_S = 1.0
 
 UNRESPONSIVE_AFTER_PTOS = 3
 UNRESPONSIVE_AFTER_S = 0.25
@@ -50,9 +48,6 @@ MAX_ACK_WAIT_S = 1.0
 
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
-
-STALE_AFTER_S = 1.0
-"""After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
 
 LOSS_MEMORY_PACKETS = 256
 """Packets over which loss is smoothed."""
@@ -229,6 +224,8 @@ class Sender(PendingMessages):
                 self.delivered_bytes += message.fragment_bytes if position else message.first_bytes
                 if not message.missing:
                     self.on_arrived(message)
+            elif message.version is not None:
+                message.version.on_fragment_arrived(message, position)
             for message, position in more:
                 if not position:
                     self.announced.add(message.accepted.channel.number)
@@ -236,6 +233,8 @@ class Sender(PendingMessages):
                     self.delivered_bytes += len(message.body)
                     if not message.missing:
                         self.on_arrived(message)
+                elif message.version is not None:
+                    message.version.on_fragment_arrived(message, position)
 
     def _requeue(self, packets: Iterable[Packet]) -> None:
         """Requeue the lost fragments of reliable messages on their level."""
