@@ -26,6 +26,8 @@ def environment(domain: int) -> dict[str, str]:
         **{name: text for name, text in os.environ.items() if not name.startswith(("ROS_", "RMW_", "PYTHON"))},
         "PYTHONPATH": f"{ROOT}:{Path(__file__).with_name('ros2_packages')}",
         "ROS_DOMAIN_ID": str(domain),
+        # shared memory is outside of network namespaces, and a killed process leaves its segments locked there
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
 
