@@ -123,6 +123,17 @@ def ipv6_neighbours() -> None:
         both.exchange()
 
 
+def ipv6_address_with_broadcast() -> None:
+    """The links that meshctl renders in an IPv6 network: one routable address, discovery over the all-nodes group."""
+    link = '[[links]]\nkind = "broadcast"\naddress = '
+    with pair(f'{link}"fd42::1"\n', f'{link}"fd42::2"\n') as both:
+        both.join("mesh0")
+        both.ip(both.alice, "addr add fd42::1/64 dev mesh0 nodad")
+        both.ip(both.bob, "addr add fd42::2/64 dev mesh0 nodad")
+        met(both)
+        both.exchange()
+
+
 def two_ipv6_links() -> None:
     """Link-local addresses are valid on one interface only: each link uses its own."""
     with pair() as both:
@@ -313,6 +324,7 @@ SCENARIOS: dict[str, Callable[[], None]] = {
     for scenario in (
         ipv6_only,
         ipv6_neighbours,
+        ipv6_address_with_broadcast,
         two_ipv6_links,
         ipv4_beside_ipv6,
         addresses_without_broadcast,
