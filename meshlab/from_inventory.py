@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from meshctl.model import Fleet, Node, Robot, Role
 from meshctl.resolve import computer_gateway
+from meshlab.errors import LabError
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 # the default topology is a chain up to this size, a tree above
@@ -21,9 +22,15 @@ def spec_of(
     """The spec of a fleet with the inventory's first `nodes` managed nodes (default: all), factory-fresh.
 
     Every node is on the bench; the operator's machine is on the LAN of the node with the role `base`. `links` None:
-    `default_links` in the inventory's order.
+    `default_links` in the inventory's order. Raises LabError for a node with an IPv6 address.
     """
     chosen = tuple(fleet.managed())[:nodes]
+    for node in chosen:
+        if node.address.version == 6:
+            raise LabError(
+                f"node {node.name} has the IPv6 address {node.address.ip}: the virtual fleet has IPv4 only",
+                hint="use IPv4 networks in a copy of the inventory for practice; provision supports both on real nodes",
+            )
     names = [node.name for node in chosen]
     used = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
     return FleetSpec(

@@ -52,6 +52,14 @@ def test_examples_name_a_release_of_this_version() -> None:
     assert set(tags) == {PROJECT["version"]}
 
 
+def test_the_changelog_has_a_dated_section_for_this_version() -> None:
+    headings = re.findall(r"^## \[([^]]+)\](.*)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert headings[0] == ("Unreleased", "")
+    version, date = headings[1]
+    assert version == PROJECT["version"]
+    assert re.fullmatch(r" - \d{4}-\d{2}-\d{2}", date)
+
+
 def _line_of(path: Path, offset: int) -> str:
     text = path.read_text(encoding="utf-8")
     return text[text.rfind("\n", 0, offset) + 1 : text.find("\n", offset)]

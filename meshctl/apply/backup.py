@@ -15,7 +15,6 @@ import tarfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from ipaddress import IPv4Address
 from types import MappingProxyType
 
 from meshctl.apply.change_in_progress import ChangeInProgress
@@ -23,7 +22,7 @@ from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
 from meshctl.archive import TarMember, tar_of
-from meshctl.device import openwrt
+from meshctl.device import deadman, openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
 from meshctl.device.observation import Observation
@@ -31,6 +30,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
+from meshctl.model.ip import IpAddress
 from meshctl.plan.lockout import lockout
 from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
@@ -42,7 +42,10 @@ INFO_NAME = "meshctl-backup.json"
 MAX_FILES, MAX_BYTES = 4000, 64 << 20
 # The dead-man's switch accepts absolute paths of at least two parts and plain characters, except its own state.
 _PATH = re.compile(r"(/[A-Za-z0-9._+@-]+){2,}")
-_OWN = ("/etc/meshctl/change", "/etc/meshctl/last", "/tmp/", "/var/", "/dev/", "/proc/", "/sys/")
+_OWN = (
+    *("/etc/meshctl/change", "/etc/meshctl/last", *deadman.installed_files()),
+    *("/tmp/", "/var/", "/dev/", "/proc/", "/sys/"),
+)
 # From 24.10 on sysupgrade adds a script to every archive that disables, at the next boot, the services that were
 # disabled when it was taken (base-files, sbin/sysupgrade). A rollback would not undo that, and the script may name the
 # boot hook of the dead-man's switch. So files in this directory are not restored; the services are only reported.
@@ -208,7 +211,7 @@ def _differs(path: str, new: NewFile, live: Mapping[str, str]) -> bool:
     return package == path or live.get(package) != new.content.decode("utf-8", "replace")
 
 
-def _address(backup: Backup) -> IPv4Address | None:
+def _address(backup: Backup) -> IpAddress | None:
     """The management address in the backup."""
     network = backup.files.get("/etc/config/network")
     return None if network is None else management_address(network.content.decode("utf-8", "replace"))

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from ipaddress import ip_address
 
 from meshctl.device.observation import Observation
 from meshctl.plan import DesiredState
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
+from meshctl.plan.seen import address_options
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 
@@ -96,11 +98,20 @@ def _lan(expected: Expectation, after: Observation) -> tuple[str, ...]:
         interface = next((found for found in after.interfaces if found.name == name), None)
         if interface is None or not interface.up:
             return (f"{what} is down",)
-        address = section.get("ipaddr").partition("/")[0]
-        if address and not any(found.partition("/")[0] == address for found in interface.addresses):
-            return (f"{what} has {', '.join(interface.addresses) or 'no address'}, not {address}",)
+        present = {_canonical(found) for found in interface.addresses}
+        if missing := [one for one in address_options(section) if _canonical(one) not in present]:
+            return (f"{what} has {', '.join(interface.addresses) or 'no address'}, not {missing[0]}",)
     lan = expected.network.section("lan")
     return () if lan is None else _bridge(expected.network, lan.get("device"), after)
+
+
+def _canonical(address: str) -> str:
+    """An address without its prefix length in the one spelling of RFC 5952; other text unchanged."""
+    bare = address.partition("/")[0]
+    try:
+        return str(ip_address(bare))
+    except ValueError:
+        return bare
 
 
 def _bridge(network: Package | None, device: str, after: Observation) -> tuple[str, ...]:

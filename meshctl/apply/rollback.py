@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from ipaddress import IPv4Address
 from typing import Any
 
 from meshctl.device.observation import Observation
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node, Secret
+from meshctl.model.ip import IpAddress
 from meshctl.nodes.desired import Renderer
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.masking import masked_text, secrets_of
@@ -43,7 +43,7 @@ class EarlierState:
     lasting: str = ""
 
     @property
-    def address(self) -> IPv4Address | None:
+    def address(self) -> IpAddress | None:
         """Its management address at that time."""
         return management_address(next((file.text for file in self.files if file.path == _NETWORK), None))
 

@@ -72,7 +72,7 @@ def _of_history(path: Path) -> str:
     from meshctl.monitor.store import FrameStore
 
     with FrameStore.open_running(path) as history:
-        return render_metrics(history.latest(), history)
+        return render_metrics(history.latest(), history, time.time())
 
 
 def _of_fleet(

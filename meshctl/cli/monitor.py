@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -24,15 +24,17 @@ from meshctl import __version__
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab
 from meshctl.cli.fleet_view import CONNECT_S, FleetView, NoRobots, Timeout, collect, open_fleet_view
 from meshctl.cli.monitor_history import HistoryFile, history_path
-from meshctl.cli.monitor_web import TOKEN_VARIABLE, WebOptions
+from meshctl.cli.monitor_web import WebOptions
 from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.cli.robots_context import AskSudo
 from meshctl.errors import ExitCode, InputError
+from meshctl.monitor.access import TOKEN_VARIABLE
 from meshctl.monitor.actions import Actions
 from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.feed import Feed
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.hooks import AlarmHooks, HookSettings
+from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.page import recording_of, single_file
 from meshctl.monitor.prometheus import TextfileWriter
@@ -42,17 +44,21 @@ from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
 from meshctl.monitor.store import FrameStore
+from meshctl.robots.local_daemon import socket_path
 
 DEFAULT_PORT = 8765
 # Alarms that wait for a slow hook when the monitor ends.
 HOOK_CLOSE_S = 2.0
+# A round that is under way when the monitor ends.
+SAMPLER_CLOSE_S = 2.0
 DEFAULT_DAYS = 7.0
 DEFAULT_MB = 512
 
 
 def monitor(
     interval: Annotated[
-        float, typer.Option("--interval", min=1.0, metavar="S", help="Seconds between two looks at the fleet.")
+        float,
+        typer.Option("--interval", min=1.0, max=3600, metavar="S", help="Seconds between two looks at the fleet."),
     ] = 5.0,
     listen: Annotated[
         str, typer.Option("--listen", metavar="ADDRESS", help="IP address to serve the page on.")
@@ -84,7 +90,7 @@ def monitor(
     ] = None,
     store: HistoryFile = None,
     keep_days: Annotated[
-        float, typer.Option("--keep-days", min=0.01, help="Remove what is older from the history.")
+        float, typer.Option("--keep-days", min=0.01, max=36_500, help="Remove what is older from the history.")
     ] = DEFAULT_DAYS,
     max_mb: Annotated[int, typer.Option("--max-mb", min=16, help="Largest size of the history.")] = DEFAULT_MB,
     once: Annotated[bool, typer.Option("--once", help="Look once, store and print the result, and exit.")] = False,
@@ -125,10 +131,15 @@ def monitor(
     if out is not None and not replay:
         raise InputError("--out needs --replay", hint="meshctl monitor --replay FILE --out run.html")
     if replay:
-        if once or allow_actions:
-            raise InputError("--replay goes with neither --once nor --allow-actions")
+        unused = {
+            "--once": once, "--allow-actions": allow_actions, "--store": store, "--webhook": webhook, "--hook": hook,
+            "--textfile": textfile,
+        }  # fmt: skip
+        if given := [option for option, value in unused.items() if value]:
+            raise InputError(f"--replay does not go with {', '.join(given)}")
         _replay(replay, out, web, as_json=as_json)
         return
+    hook_settings = HookSettings(webhook, _words(hook), hook_level)
     with ExitStack() as stack:
         view = stack.enter_context(
             open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, ask_sudo=ask_sudo, no_robots=no_robots)
@@ -138,14 +149,23 @@ def monitor(
         sampler = sampler_of(view, history, interval)
         if once:
             raise typer.Exit(_look_once(sampler, as_json=as_json))
-        hooks = AlarmHooks(HookSettings(webhook, tuple(shlex.split(hook)), hook_level), view.fleet.name)
+        hooks = AlarmHooks(hook_settings, view.fleet.name)
         stack.callback(hooks.close, HOOK_CLOSE_S)
         sampler.listeners.append(lambda frame, began: hooks.notify(began))
         if textfile is not None:
-            sampler.listeners.append(TextfileWriter(textfile, history))
+            sampler.listeners.append(TextfileWriter(textfile, history, lambda text: sampler.on_problem(text)))
         watch = _Watch(sampler, as_json=as_json)
+        hooks.on_problem = sampler.on_problem
         options = _shared_options(inventory, key or (), lab)
         raise typer.Exit(watch.run(web, options))
+
+
+def _words(command: str) -> tuple[str, ...]:
+    """A command line as words. Raises InputError."""
+    try:
+        return tuple(shlex.split(command))
+    except ValueError as error:
+        raise InputError(f"--hook: expected a command line, found {command!r}: {error}") from error
 
 
 def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: int) -> FrameStore:
@@ -153,7 +173,10 @@ def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: 
     if path is None:
         lab = view.opened.lab
         path = history_path(view.fleet.name, None if lab is None else lab.directory)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        raise InputError(f"{path.parent}: cannot be created: {error.strerror}") from error
     return FrameStore.open(path, keep_days * 86400, max_mb << 20)
 
 
@@ -230,12 +253,20 @@ class _Watch:
                 command = [sys.executable, "-m", "meshctl"]
                 names = frozenset(node.name for node in fleet.managed())
                 actions = Actions(command, options, lambda: names, Path(directory), time.time)
+            thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)
+            readings = MeterReadings(socket_path(None), self._feed.notify)
+            sampler.meters = readings.current
+            threading.Thread(target=readings.run, name="meters", daemon=True).start()
             try:
-                app = MonitorServer(sampler.store, self._feed, settings, web.rules, actions, render_metrics).app()
-                thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)
-                return _serve(app, web, self._feed, as_json=self._as_json, sampler=thread)
+                server = MonitorServer(sampler.store, self._feed, settings, web.rules, actions, render_metrics)
+                server.streams.meters = readings.current
+                return _serve(server.app(), web, self._feed, as_json=self._as_json, sampler=thread)
             finally:
+                readings.stop()
                 sampler.stop()
+                if thread.is_alive():
+                    # a radio that does not answer may hold it for longer; nothing is lost then
+                    thread.join(SAMPLER_CLOSE_S)
                 if actions is not None:
                     actions.close()
 
@@ -263,7 +294,9 @@ class _Watch:
                 self._say({"event": "alarm", **alarm.as_json()}, line)
 
     def _say(self, event: dict[str, object], line: str) -> None:
-        say(event, line, as_json=self._as_json)
+        # a pipe whose reader has left is no reason to stop watching
+        with suppress(OSError):
+            say(event, line, as_json=self._as_json)
 
 
 def say(event: dict[str, object], line: str, *, as_json: bool) -> None:

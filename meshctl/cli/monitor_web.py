@@ -9,17 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from meshctl.errors import InputError
-from meshctl.monitor.access import AccessRules, host_of, is_loopback
-from meshctl.monitor.serve import Certificate, is_address
+from meshctl.monitor.access import TOKEN_VARIABLE, AccessRules, host_of, is_loopback
+from meshctl.monitor.serve import Certificate, check_certificate, is_address
 
 _TOKEN_BYTES = 18
 MIN_TOKEN = 16
-TOKEN_VARIABLE = "MESHCTL_MONITOR_TOKEN"
 
 
 @dataclass(frozen=True, slots=True)
 class WebOptions:
-    """An address that is not this machine's own has a token or a certificate, and with actions a token."""
+    """An address that is not this machine's own has a token or a certificate; actions need a token everywhere."""
 
     host: str
     port: int
@@ -51,9 +50,12 @@ class WebOptions:
         if (certificate is None) != (key is None):
             raise InputError("expected --tls-cert and --tls-key together")
         pair = None if certificate is None or key is None else Certificate(certificate, key)
+        if pair is not None:
+            check_certificate(pair)
         token = _token(token_file)
         is_local = is_loopback(host)
-        if not token and not is_local and (pair is None or allow_actions):
+        # any program or web page on this machine reaches loopback
+        if not token and (allow_actions or (not is_local and pair is None)):
             token = secrets.token_urlsafe(_TOKEN_BYTES)
         names = frozenset(host_of(name) for name in host_names)
         return cls(host, port, token, pair, names, is_local, allow_actions)

@@ -77,7 +77,8 @@ def _fields(assignments: list[str]) -> dict[str, Value]:
             raise InputError(f"expected KEY=VALUE, found {assignment!r}")
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError:
+        # ValueError: a date such as 2026-99-99; RecursionError: deep nesting
+        except (yaml.YAMLError, ValueError, RecursionError):
             raise InputError(f"{name}: expected a YAML value, found {text!r}") from None
         if isinstance(value, list) and all(isinstance(item, str) for item in value):
             fields[name] = tuple(value)

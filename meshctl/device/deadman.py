@@ -26,6 +26,10 @@ from meshctl.model import Secret
 PROGRAM = "/usr/sbin/meshctl-deadman"
 INIT_SCRIPT = "/etc/init.d/meshctl-deadman"
 INIT_LINK = "/etc/rc.d/S05meshctl-deadman"
+# What a sysupgrade that someone else starts carries over, besides /etc/config: with the change in progress and the boot
+# hook, the new system returns to the configuration from before an unconfirmed change, as after a power cut.
+KEEP_LIST = "/lib/upgrade/keep.d/meshctl"
+_KEPT = ("/etc/meshctl", PROGRAM, INIT_SCRIPT, INIT_LINK, KEEP_LIST)
 # The bundle is in RAM until `stage` copies it to flash; a reboot may lose it.
 BUNDLE_DIRECTORY = "/tmp/meshctl"
 # Unpacking, copying and syncing into a jffs2 that has to erase blocks first can take a minute.
@@ -135,6 +139,7 @@ def installed_files() -> dict[str, tuple[int, bytes]]:
     return {
         PROGRAM: (0o755, script("deadman.sh").encode()),
         INIT_SCRIPT: (0o755, script("deadman.init").encode()),
+        KEEP_LIST: (0o644, "".join(f"{path}\n" for path in _KEPT).encode()),
     }
 
 

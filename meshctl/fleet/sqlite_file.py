@@ -6,10 +6,11 @@ are such files.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from meshctl.errors import MeshctlError
 
 # Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
 BUSY_TIMEOUT_S = 20.0
+_TABLE = re.compile(r"CREATE TABLE (\w+)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,10 @@ class Schema:
     statements: str
     space_hint: str
     pragmas: tuple[str, ...] = ()
+
+    @property
+    def tables(self) -> frozenset[str]:
+        return frozenset(_TABLE.findall(self.statements))
 
 
 class SqliteFile:
@@ -56,9 +62,11 @@ class SqliteFile:
         except (OSError, sqlite3.Error) as error:
             raise MeshctlError(f"{path}: cannot open the {schema.name}: {error}", hint=self._hint(error)) from error
         try:
+            # a foreign file stays as it is
+            self._retried(self._check_owner)
             for pragma in schema.pragmas:
                 self._database.execute(f"PRAGMA {pragma}")
-            self._enter_wal()
+            self._retried(lambda: self._database.execute("PRAGMA journal_mode = WAL"))
             self._database.execute("PRAGMA synchronous = NORMAL")
             self._database.execute("PRAGMA foreign_keys = ON")
             self._create()
@@ -82,10 +90,12 @@ class SqliteFile:
                 continue
             try:
                 version = self._version()
-                self._database.execute("SELECT count(*) FROM sqlite_schema").fetchone()
-            except sqlite3.Error as failed:
+                self._check_owner()
+            except (sqlite3.Error, MeshctlError) as failed:
                 error = failed
                 self._database.close()
+                if isinstance(failed, MeshctlError):
+                    raise
                 continue
             if version == self._schema.version:
                 return
@@ -94,12 +104,23 @@ class SqliteFile:
             break
         raise MeshctlError(f"{self.path}: cannot read as a {self._schema.name}: {error}") from error
 
-    def _enter_wal(self) -> None:
+    def _check_owner(self) -> None:
+        """Raises MeshctlError for a database with tables that are not ours."""
+        # in this order: while another process creates the file, there are no tables, or all of them
+        found = {row[0] for row in self._database.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
+        version, schema = self._version(), self._schema
+        if found and (version == 0 or (version == schema.version and not schema.tables <= found)):
+            raise MeshctlError(
+                f"{self.path}: not a {schema.name} of meshctl: found the tables {', '.join(sorted(found)[:5])}",
+                hint="name another file; this one was left as it is",
+            )
+
+    def _retried(self, step: Callable[[], object]) -> None:
         # When two processes create the file concurrently, SQLite reports "locked" here without waiting.
         deadline = time.monotonic() + BUSY_TIMEOUT_S
         while True:
             try:
-                self._database.execute("PRAGMA journal_mode = WAL")
+                step()
             except sqlite3.OperationalError as error:
                 if not _is_locked(error) or time.monotonic() > deadline:
                     raise

@@ -1,23 +1,25 @@
 """Addresses of nodes: literal, or a rule for all nodes that share it.
 
-`10.42.0.11` uses the prefix length of the mesh's network, `10.42.0.11/24` sets its own. `{from: 10.42.0.101}` counts up
-from that address, `{rule: network + 100 + 2 * index}` is a formula. `index` counts from 1 the nodes that the rule
-applies to, in the inventory's order: along its range, or through its group or the defaults.
+`10.42.0.11` or `fd42::11` uses the prefix length of the mesh's network, `10.42.0.11/24` sets its own.
+`{from: 10.42.0.101}` counts up from that address, `{rule: network + 100 + 2 * index}` is a formula. `index` counts
+from 1 the nodes that the rule applies to, in the inventory's order: along its range, or through its group or the
+defaults.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from ipaddress import AddressValueError, IPv4Address, IPv4Interface, IPv4Network, NetmaskValueError
+from ipaddress import AddressValueError, ip_address, ip_interface
 from typing import Annotated
 
 from pydantic import PlainValidator, WithJsonSchema
 
-from meshctl.inventory.fields import expected_error
+from meshctl.inventory.fields import expected_error, without_zone
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 
 _TERM = re.compile(
-    r"\s*([+-])?\s*(?:(\d{1,9})\s*\*\s*)?(network|index|\d{1,3}(?:\.\d{1,3}){3}|\d{1,9})(?:\s*\*\s*(\d{1,9}))?\s*"
+    r"\s*([+-])?\s*(?:(\d{1,9})\s*\*\s*)?(network|index|\d{1,3}(?:\.\d{1,3}){3}|[\da-fA-F]{0,4}:[\da-fA-F:]+|\d{1,9})(?:\s*\*\s*(\d{1,9}))?\s*"
 )
 
 
@@ -29,11 +31,11 @@ class BadAddress(ValueError):
 class AddressRule:
     """`start` (None: the mesh's network) + `offset` + `factor` x index."""
 
-    start: IPv4Address | None
+    start: IpAddress | None
     offset: int
     factor: int
 
-    def address(self, network: IPv4Network | None, index: int) -> IPv4Address:
+    def address(self, network: IpNetwork | None, index: int) -> IpAddress:
         """The address of the node with `index` (from 1). Raises BadAddress."""
         start = self.start
         if start is None:
@@ -43,10 +45,10 @@ class AddressRule:
         try:
             return start + (self.offset + self.factor * index)
         except AddressValueError:
-            raise BadAddress(f"the rule exceeds the IPv4 address range at index {index}") from None
+            raise BadAddress(f"the rule exceeds the address range at index {index}") from None
 
 
-AddressValue = IPv4Interface | IPv4Address | AddressRule
+AddressValue = IpInterface | IpAddress | AddressRule
 
 
 def parse_address(value: object) -> AddressValue:
@@ -56,20 +58,21 @@ def parse_address(value: object) -> AddressValue:
             return _static(str(value))
         case {"from": str() as text, **others} if not others:
             start = _static(str(text))
-            if isinstance(start, IPv4Address) and not isinstance(start, IPv4Interface):
+            if isinstance(start, IpAddress) and not isinstance(start, IpInterface):
                 return AddressRule(start, -1, 1)
-            raise expected_error("an IPv4 address without a prefix length under `from`")
+            raise expected_error("an IP address without a prefix length under `from`")
         case {"rule": str() as text, **others} if not others:
             return parse_rule(str(text))
         case _:
-            raise expected_error("an IPv4 address, {from: ADDRESS} or {rule: network + NUMBER + index}")
+            raise expected_error("an IP address, {from: ADDRESS} or {rule: network + NUMBER + index}")
 
 
-def _static(text: str) -> IPv4Interface | IPv4Address:
+def _static(text: str) -> IpInterface | IpAddress:
     try:
-        return IPv4Interface(text) if "/" in text else IPv4Address(text)
-    except (AddressValueError, NetmaskValueError):
-        raise expected_error("an IPv4 address such as 10.42.0.11 or 10.42.0.11/24") from None
+        found = ip_interface(text) if "/" in text else ip_address(text)
+    except ValueError:
+        raise expected_error("an IP address such as 10.42.0.11, 10.42.0.11/24 or fd42::11") from None
+    return without_zone(found)
 
 
 def parse_rule(text: str) -> AddressRule:
@@ -77,7 +80,7 @@ def parse_rule(text: str) -> AddressRule:
     refused = expected_error(
         "a sum such as network + 100 + index, of `network` or an address, numbers and multiples of index"
     )
-    start: list[IPv4Address | None] = []
+    start: list[IpAddress | None] = []
     offset = factor = at = 0
     while at < len(text):
         match = _TERM.match(text, at)
@@ -86,7 +89,7 @@ def parse_rule(text: str) -> AddressRule:
         sign = -1 if match[1] == "-" else 1
         times = int(match[2] or 1) * int(match[4] or 1)
         word = match[3]
-        if word == "network" or "." in word:
+        if word == "network" or "." in word or ":" in word:
             if match[2] or match[4] or sign < 0:
                 raise refused
             address = None if word == "network" else _static(word)
@@ -107,11 +110,15 @@ AddressField = Annotated[
     WithJsonSchema(
         {
             "anyOf": [
-                {"type": "string", "pattern": r"^[0-9]+(\.[0-9]+){3}(/[0-9]+)?$"},
+                {"type": "string", "pattern": r"^([0-9]+(\.[0-9]+){3}|[0-9a-fA-F:]*:[0-9a-fA-F:.]*)(/[0-9]+)?$"},
                 {
                     "type": "object",
                     "properties": {
-                        "from": {"type": "string", "format": "ipv4", "description": "The first node's address."}
+                        "from": {
+                            "type": "string",
+                            "anyOf": [{"format": "ipv4"}, {"format": "ipv6"}],
+                            "description": "The first node's address.",
+                        }
                     },
                     "required": ["from"],
                     "additionalProperties": False,

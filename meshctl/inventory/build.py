@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv4Interface
+from ipaddress import ip_interface
 from pathlib import Path
 from types import MappingProxyType
 
@@ -53,6 +53,7 @@ from meshctl.model import (
     TopicLog,
     UdpMesh,
 )
+from meshctl.model.ip import IpAddress, IpInterface
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,9 +251,9 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
 
 def _lan_addresses(
     document: InventoryDocument, robots: Mapping[str, Robot], root: MappingNode, diagnostics: list[Diagnostic]
-) -> dict[str, IPv4Interface]:
+) -> dict[str, IpInterface]:
     """The address of each radio in its robot's own LAN: as set, else the first ones in the order of `nodes`."""
-    found: dict[str, IPv4Interface] = {}
+    found: dict[str, IpInterface] = {}
     for name, robot in robots.items():
         if robot.lan is None:
             continue
@@ -270,11 +271,11 @@ def _lan_addresses(
                 message = f"{lan.network} has no address for the radio '{node}'"
                 diagnostics.append(codes.error(codes.BAD_ADDRESS, place, message, path=f"robots.{name}.lan"))
                 break
-            found.setdefault(node, IPv4Interface((address, lan.network.prefixlen)))
+            found.setdefault(node, ip_interface((address, lan.network.prefixlen)))
     return found
 
 
-def _host(lan: LanDocument, index: int) -> IPv4Address | None:
+def _host(lan: LanDocument, index: int) -> IpAddress | None:
     """The LAN's host address with `index` (from 0); None beyond its last."""
     return lan.network[index + 1] if index + 2 < lan.network.num_addresses else None
 

@@ -28,6 +28,9 @@ MAX_VALUES = 1_000_000
 _RANGE_IN_BRACES = re.compile(r"[{,]\s*[\w.-]+\[$")
 # libyaml's, which is several times as fast, where PyYAML was built with it
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# libyaml 0.2.6, in PyYAML from 6.0.4 on, stops at 1,000 levels. It reads ahead, so that can be before the event of the
+# first level that is too deep here.
+_LIBYAML_TOO_DEEP = "exceeded maximum nesting depth"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +43,34 @@ class Composed:
 
 def compose(source: Source) -> Composed:
     """The one document of `source`. Never raises for any text."""
-    composer = _Composer(source.file)
     try:
-        for event in yaml_events(source.text):
-            if not composer.handle(event):
-                break
-    except yaml.MarkedYAMLError as reason:
-        composer.fail(_syntax_error(source, reason))
-    except yaml.YAMLError as reason:
-        composer.fail(codes.error(codes.YAML_SYNTAX, Position(source.file), f"not valid YAML: {reason}"))
+        composer = _composed(source, LOADER)
+    except _LibyamlTooDeep:
+        # the parser in Python reads ahead less, so the place is that of the first level beyond MAX_DEPTH
+        composer = _composed(source, yaml.SafeLoader)
     if composer.root is None and not composer.is_broken:
         composer.fail(codes.error(codes.EMPTY, Position(source.file, 1, 1), "the file is empty", expected="a mapping"))
     return Composed(None if composer.is_broken else composer.root, tuple(composer.diagnostics))
+
+
+class _LibyamlTooDeep(Exception):
+    """libyaml refused the nesting before the events of its levels arrived."""
+
+
+def _composed(source: Source, loader: type[yaml.SafeLoader]) -> _Composer:
+    """Raises _LibyamlTooDeep."""
+    composer = _Composer(source.file)
+    try:
+        for event in yaml.parse(source.text, Loader=loader):
+            if not composer.handle(event):
+                break
+    except yaml.MarkedYAMLError as reason:
+        if reason.problem == _LIBYAML_TOO_DEEP:
+            raise _LibyamlTooDeep from None
+        composer.fail(_syntax_error(source, reason))
+    except yaml.YAMLError as reason:
+        composer.fail(codes.error(codes.YAML_SYNTAX, Position(source.file), f"not valid YAML: {reason}"))
+    return composer
 
 
 def yaml_events(text: str) -> Iterator[yaml.Event]:

@@ -7,16 +7,18 @@ misplaced secret.
 from __future__ import annotations
 
 import re
-from ipaddress import AddressValueError, IPv4Address, IPv4Interface, IPv4Network, NetmaskValueError
-from typing import Annotated
+from ipaddress import AddressValueError, IPv4Address, ip_address, ip_interface, ip_network
+from typing import Annotated, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, PlainValidator, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from meshctl.inventory.tree import Plain
 from meshctl.model import Release
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 
 FORMAT_VERSION = 1
+AnyAddress = TypeVar("AnyAddress", bound=IpAddress | IpInterface)
 
 _WHOLE = re.compile(r"[-+]?[0-9]{1,15}")
 _REAL = re.compile(r"[-+]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})(?:[eE][-+]?[0-9]{1,2})?")
@@ -96,31 +98,49 @@ def _switch_ports(value: str) -> str:
     raise expected_error("port numbers, with 't' after a tagged one, such as 3 0t")
 
 
-def _address(value: object) -> IPv4Address:
+def _address(value: object) -> IpAddress:
+    try:
+        return without_zone(ip_address(_text(value)))
+    except ValueError:
+        raise expected_error("an IP address such as 10.42.0.1 or fd42::1") from None
+
+
+def _ipv4_address(value: object) -> IPv4Address:
     try:
         return IPv4Address(_text(value))
     except AddressValueError:
-        raise expected_error("an IPv4 address such as 10.42.0.1") from None
+        raise expected_error("an IPv4 address such as 10.42.0.1 (the legacy udp_mesh has no IPv6)") from None
 
 
-def _interface(value: object) -> IPv4Interface:
+def _interface(value: object) -> IpInterface:
     text = _text(value)
     if "/" in text:
         try:
-            return IPv4Interface(text)
-        except (AddressValueError, NetmaskValueError):
+            return without_zone(ip_interface(text))
+        except ValueError:
             pass
-    raise expected_error("an IPv4 address with its prefix length such as 10.42.0.100/24")
+    raise expected_error("an IP address with its prefix length such as 10.42.0.100/24 or fd42::100/64")
 
 
-def _network(value: object) -> IPv4Network:
+def _network(value: object) -> IpNetwork:
+    text = _text(value)
     try:
-        return IPv4Network(_text(value))
-    except (AddressValueError, NetmaskValueError):
-        pass
+        return ip_network(text)
     except ValueError:
-        raise expected_error("a network address, with all host bits zero") from None
-    raise expected_error("an IPv4 network such as 10.42.0.0/24")
+        pass
+    try:
+        ip_network(text, strict=False)
+    except ValueError:
+        raise expected_error("a network such as 10.42.0.0/24 or fd42::/64") from None
+    raise expected_error("a network address, with all host bits zero")
+
+
+def without_zone(value: AnyAddress) -> AnyAddress:
+    """The address itself. Raises PydanticCustomError for a zone (`fe80::1%eth0`), which has a meaning on one machine
+    only."""
+    if "%" in str(value):
+        raise expected_error("an address without a zone; a link-local address belongs under `ssh.host`")
+    return value
 
 
 def _window(value: object) -> object:
@@ -175,10 +195,15 @@ Window = Annotated[
 # Releases look like numbers: editors must accept them unquoted, as the loader does.
 _RELEASES = [release.value for release in Release]
 ReleaseName = Annotated[Release, WithJsonSchema({"enum": [*_RELEASES, *map(float, _RELEASES)]})]
-Address = Annotated[IPv4Address, PlainValidator(_address), WithJsonSchema({"type": "string", "format": "ipv4"})]
+Address = Annotated[
+    IpAddress,
+    PlainValidator(_address),
+    WithJsonSchema({"type": "string", "anyOf": [{"format": "ipv4"}, {"format": "ipv6"}]}),
+]
+IPv4Only = Annotated[IPv4Address, PlainValidator(_ipv4_address), WithJsonSchema({"type": "string", "format": "ipv4"})]
 Interface = Annotated[
-    IPv4Interface, PlainValidator(_interface), WithJsonSchema({"type": "string", "pattern": "^[0-9.]+/[0-9]+$"})
+    IpInterface, PlainValidator(_interface), WithJsonSchema({"type": "string", "pattern": "^[0-9a-fA-F.:]+/[0-9]+$"})
 ]
 Network = Annotated[
-    IPv4Network, PlainValidator(_network), WithJsonSchema({"type": "string", "pattern": "^[0-9.]+/[0-9]+$"})
+    IpNetwork, PlainValidator(_network), WithJsonSchema({"type": "string", "pattern": "^[0-9a-fA-F.:]+/[0-9]+$"})
 ]

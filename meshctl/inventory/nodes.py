@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from ipaddress import IPv4Address, IPv4Interface, IPv4Network
+from ipaddress import IPv4Interface, ip_interface
 from types import MappingProxyType
 from typing import Any
 
@@ -19,6 +19,7 @@ from meshctl.inventory.documents import PositionDocument, RadioLayer, SshLayer
 from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Band, FixedPosition, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 
 # Placeholder in a template until the node's address is known.
 _NO_ADDRESS = IPv4Interface("0.0.0.0/0")
@@ -38,7 +39,7 @@ class _Template:
     address: AddressValue
     address_layer: Layer
     hostname: str
-    network: IPv4Network | None
+    network: IpNetwork | None
 
 
 def build_nodes(
@@ -46,7 +47,7 @@ def build_nodes(
     hardware: Mapping[str, HardwareProfile],
     meshes: Mapping[str, Mesh],
     robot_of: Mapping[str, str],
-    lan_addresses: Mapping[str, IPv4Interface],
+    lan_addresses: Mapping[str, IpInterface],
 ) -> BuiltNodes:
     """Build all nodes; errors of a range are reported once.
 
@@ -207,9 +208,9 @@ class _Building:
             for settings in (written.get(radio.name, {}),)
         )
 
-    def _address(self, spec: NodeSpec, template: _Template, index_of: Mapping[Layer, int]) -> IPv4Interface | None:
+    def _address(self, spec: NodeSpec, template: _Template, index_of: Mapping[Layer, int]) -> IpInterface | None:
         value, layer = template.address, template.address_layer
-        if isinstance(value, IPv4Interface):
+        if isinstance(value, IpInterface):
             return value
         if isinstance(value, AddressRule):
             try:
@@ -217,13 +218,13 @@ class _Building:
             except BadAddress as reason:
                 self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{spec.name}')", below=("address",))
                 return None
-        return IPv4Interface((value, self._prefix_length(value, template.network)))
+        return ip_interface((value, self._prefix_length(value, template.network)))
 
-    def _prefix_length(self, address: IPv4Address, network: IPv4Network | None) -> int:
-        """The prefix length of the node's mesh, or for a node without one of the mesh with the address; else 32."""
+    def _prefix_length(self, address: IpAddress, network: IpNetwork | None) -> int:
+        """The prefix length of the node's mesh, or that of a mesh with the address; else all bits."""
         if network is None:
             network = next((mesh.network for mesh in self.meshes.values() if address in mesh.network), None)
-        return 32 if network is None else network.prefixlen
+        return address.max_prefixlen if network is None else network.prefixlen
 
     def _report(
         self,

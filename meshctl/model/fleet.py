@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from ipaddress import IPv4Address, IPv4Interface, IPv4Network
+from ipaddress import IPv4Address
 from types import MappingProxyType
 
 from meshctl.diagnostics import Position
 from meshctl.model.hardware import HardwareProfile, RadioHardware
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 from meshctl.model.mesh import Mesh
 from meshctl.model.release import Release
 from meshctl.model.secret import SecretRef
@@ -108,7 +109,7 @@ class Node:
     state: NodeState
     hardware: HardwareProfile
     release: Release
-    address: IPv4Interface
+    address: IpInterface
     radios: tuple[Radio, ...]
     lan_ports: tuple[str, ...]
     ssh: SshSettings = SshSettings()
@@ -121,8 +122,8 @@ class Node:
     confirm_window_s: int = 120
     packages: tuple[str, ...] = ()
     extra_uci: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    gateway: IPv4Address | None = None
-    lan_address: IPv4Interface | None = None
+    gateway: IpAddress | None = None
+    lan_address: IpInterface | None = None
     position: FixedPosition | None = None
 
     @property
@@ -150,12 +151,12 @@ class Computer:
     """A robot's computer, where the udp_mesh daemon runs. `gateway` is its next hop to other networks, by default the
     robot's radio."""
 
-    address: IPv4Interface
+    address: IpInterface
     ssh: SshSettings = SshSettings()
     python: str = "python3"
     arch: str = "x86_64"
     ros: str = ""
-    gateway: IPv4Address | None = None
+    gateway: IpAddress | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +174,7 @@ class Robot:
     is_base: bool = False
     carries: tuple[str, ...] = ()
     fielded: IPv4Address | None = None
-    lan: IPv4Network | None = None
+    lan: IpNetwork | None = None
     computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
     position: FixedPosition | None = None
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from ipaddress import IPv4Network
 
 from meshctl.model.hardware import Band
+from meshctl.model.ip import IpNetwork
 from meshctl.model.secret import SecretRef
 
 
@@ -72,7 +72,7 @@ class Mesh:
     bssid: str
     band: Band
     channel: int
-    network: IPv4Network
+    network: IpNetwork
     htmode: str = "HT20"
     mode: MeshMode = MeshMode.ADHOC
     encryption: Encryption = Encryption.NONE

@@ -27,6 +27,8 @@ _HEADERS = {
     "cross-origin-opener-policy": "same-origin",
     "permissions-policy": "camera=(), microphone=(), geolocation=()",
 }
+# Names the operator's token in the environment.
+TOKEN_VARIABLE = "MESHCTL_MONITOR_TOKEN"
 _LOOPBACK_NAMES = frozenset(("localhost",))
 
 
@@ -102,8 +104,12 @@ class AccessControl:
         path: str = scope["path"]
         if not self._rules.accepts_host(headers.get("host", "")):
             return error_response(421, "this server does not have that host name; start it with --host-name NAME")
-        if (path.startswith("/api/") or path == "/metrics") and not self._rules.accepts_token(headers):
-            return error_response(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
+        if path.startswith("/api/") or path == "/metrics":
+            # `none`: typed into the address bar; programs send no such header
+            if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+                return error_response(403, "the request comes from another site's page")
+            if not self._rules.accepts_token(headers):
+                return error_response(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
         if scope["method"] not in ("GET", "HEAD"):
             if headers.get("sec-fetch-site", "same-origin") != "same-origin":
                 return error_response(403, "the request comes from another site's page")

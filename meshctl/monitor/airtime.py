@@ -60,4 +60,4 @@ def next_interval_s(wanted_s: float, airtime_s: float | None, limit_share: float
     """The time between two frames at which one frame's airtime stays within the limit."""
     if airtime_s is None:
         return wanted_s
-    return min(longest_s, max(wanted_s, airtime_s / limit_share))
+    return max(wanted_s, min(longest_s, airtime_s / limit_share))

@@ -3,6 +3,7 @@
 An alarm is one device and one code; a device with several of one code (two radios that are down) has one, with both
 texts. It ends when its device answers without it, or has left the inventory: of a device that does not answer it is not
 known, so it stays open. One that returns within `REOPEN_S` continues with its acknowledgment: a flapping link is one.
+One that rises to a level that it did not have yet is reported again.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ class LoggedAlarm:
     ended_s: float | None = None
     acknowledged: Acknowledgment | None = None
     silenced: Silence | None = None
+    peak: str = ""
+    """The highest level it has had, as far as this process knows; empty if it was read from a file."""
+    rose: bool = False
+    """It rose above its peak: an acknowledgment of the lower level does not cover it."""
 
     @property
     def key(self) -> AlarmKey:
@@ -85,7 +90,8 @@ class ReportedAlarms:
 
 @dataclass(frozen=True, slots=True)
 class AlarmChange:
-    """`open` are all that are open now; `began` those of them that were not before; `ended` those that ended."""
+    """`open` are all that are open now; `began` those of them that were not before, or rose to a level that they
+    did not have yet; `ended` those that ended."""
 
     open: Mapping[AlarmKey, LoggedAlarm]
     began: tuple[LoggedAlarm, ...]
@@ -106,6 +112,16 @@ def reported_alarms(status: Mapping[str, Any]) -> ReportedAlarms:
             _merge(found, device, one.get("alarms"))
     _merge(found, FLEET, status.get("alarms"))
     return ReportedAlarms(found, frozenset(unknown))
+
+
+def devices_of(status: Mapping[str, Any]) -> frozenset[str]:
+    """The devices that an alarm of this status document could name, without the fleet."""
+    return frozenset(
+        f"{prefix}{one['name']}"
+        for kind, prefix in (("nodes", ""), ("robots", ROBOT))
+        for one in _maps(status.get(kind))
+        if isinstance(one.get("name"), str)
+    )
 
 
 def _merge(found: dict[AlarmKey, tuple[str, str, str]], device: str, alarms: object) -> None:
@@ -141,9 +157,14 @@ def advance(
             if ended is not None and ended.ended_s is not None and now_s - ended.ended_s <= REOPEN_S:
                 known = replace(ended, ended_s=None)
         if known is None:
-            known = LoggedAlarm(device, code, level, text, hint, first_s=now_s, last_s=now_s)
+            known = LoggedAlarm(device, code, level, text, hint, first_s=now_s, last_s=now_s, peak=level)
             began.append(known)
-        after[device, code] = replace(known, level=level, text=text, hint=hint, last_s=now_s)
+        peak = known.peak or known.level
+        rose = LEVELS.index(level) > LEVELS.index(peak)
+        if rose:
+            began.append(known)
+            peak = level
+        after[device, code] = replace(known, level=level, text=text, hint=hint, last_s=now_s, peak=peak, rose=rose)
     ended_now = []
     for key, alarm in open_alarms.items():
         if key in after:

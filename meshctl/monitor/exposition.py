@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -21,8 +22,11 @@ class MetricFamily:
 
     def add(self, value: object, **labels: object) -> None:
         """Add a sample; what is not a finite number is unknown, and left out. Labels that are None are empty."""
-        if isinstance(value, bool | int | float) and math.isfinite(value):
-            self.samples.append((labels, float(value)))
+        if isinstance(value, bool | int | float):
+            with suppress(OverflowError):
+                number = float(value)
+                if math.isfinite(number):
+                    self.samples.append((labels, number))
 
 
 def exposition(families: Iterable[MetricFamily]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,9 @@ from typing import Any
 from meshctl.status.preflight import Check, verdict
 
 SCHEMA = 1
+# No counter of a kernel is larger. What has so many digits may be larger.
+_MAX_INTEGER = 1 << 64
+_HUGE = re.compile(r"\d{20}")
 # The monitor sends no test messages between robots, so the frame's verdict leaves the check of their delivery out.
 _NOT_ASSESSED = "delivery"
 
@@ -73,12 +77,17 @@ class Frame:
         whole = {**document, "time_s": time_s}
         try:
             text = _dumped(whole)
+            is_exact = _HUGE.search(text) is None
         except ValueError:
+            is_exact = False
+        if not is_exact:
             whole = _finite(whole)
             text = _dumped(whole)
         # half of a surrogate pair is no character, and no encoding has it
-        frame = cls(time_s, text.encode("utf-8", "replace").decode())
-        frame._document = whole
+        encodable = text.encode("utf-8", "replace").decode()
+        frame = cls(time_s, encodable)
+        if encodable == text:
+            frame._document = whole
         return frame
 
     @property
@@ -124,6 +133,7 @@ def frame_of(
     positions: Mapping[str, FramePosition] | None = None,
     airtime: Airtime | None = None,
     topic_classes: Mapping[str, str] | None = None,
+    meters: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Frame:
     """The frame of a status document at `time_s`. `checks` None: go or no-go was not assessed. `topic_classes` are the
     inventory's, by topic name: without the inventory, a replay could not tell telemetry from artifacts."""
@@ -139,6 +149,8 @@ def frame_of(
         "positions": {name: _position(place) for name, place in (positions or {}).items()},
         "airtime": None if airtime is None else _airtime(airtime),
     }
+    if meters:
+        document["meters"] = dict(meters)
     if topic_classes:
         document["topic_classes"] = dict(topic_classes)
     return Frame.of(document)
@@ -148,7 +160,7 @@ def links_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Directed links: `to` hears `from`, as `to` reports it. A link that has one direction only is one-way."""
     found = []
     for node in status.get("nodes", ()):
-        age_s = node.get("age_s") or 0.0
+        age_s = node.get("age_s")
         for heard in node.get("neighbours") or ():
             found.append(
                 {
@@ -161,10 +173,16 @@ def links_of(status: Mapping[str, Any]) -> list[dict[str, Any]]:
                     "snr_db": heard.get("snr_db"),
                     "mcs": heard.get("rx_mcs"),
                     "bitrate_kbit_s": heard.get("rx_bitrate_kbit_s"),
-                    "age_s": round(age_s + (heard.get("age_s") or 0.0), 3),
+                    "age_s": _sum(age_s, heard.get("age_s")),
                 }
             )
     return found
+
+
+def _sum(*ages_s: float | None) -> float | None:
+    """None if one is unknown."""
+    known = [age_s for age_s in ages_s if age_s is not None]
+    return round(sum(known), 3) if len(known) == len(ages_s) else None
 
 
 def _verdict(checks: Iterable[Check] | None) -> dict[str, Any] | None:
@@ -194,9 +212,11 @@ def _dumped(document: Mapping[str, Any]) -> str:
 
 
 def _finite(value: Any) -> Any:
-    """The value with infinite and undefined numbers as null: JSON has none, and a browser rejects them."""
+    """The value with infinite, undefined and huge numbers as null: JSON has none, or readers overflow."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, int):
+        return value if abs(value) < _MAX_INTEGER else None
     if isinstance(value, Mapping):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -45,7 +45,10 @@ CREATE TABLE silences (
 LOG_ALARM = (
     "INSERT INTO alarms (device, code, first_ms, last_ms, ended_ms, level, text, hint)"
     " VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8) ON CONFLICT (device, code, first_ms)"
-    " DO UPDATE SET last_ms = ?4, ended_ms = ?5, level = ?6, text = ?7, hint = ?8"
+    " DO UPDATE SET last_ms = ?4, ended_ms = ?5, level = ?6, text = ?7, hint = ?8,"
+    # the acknowledgment of a warning does not cover the error that it became
+    " acknowledged_by = CASE WHEN ?9 THEN NULL ELSE acknowledged_by END,"
+    " acknowledged_ms = CASE WHEN ?9 THEN NULL ELSE acknowledged_ms END"
 )
 ALARM_COLUMNS = "device, code, level, text, hint, first_ms, last_ms, ended_ms, acknowledged_by, acknowledged_ms"
 # stands for every device, or every code, in a silence
@@ -73,7 +76,7 @@ def row_of(alarm: LoggedAlarm) -> tuple[object, ...]:
     ended = None if alarm.ended_s is None else milliseconds(alarm.ended_s)
     return (
         *(alarm.device, alarm.code, milliseconds(alarm.first_s), milliseconds(alarm.last_s), ended),
-        *(alarm.level, alarm.text, alarm.hint),
+        *(alarm.level, alarm.text, alarm.hint, int(alarm.rose)),
     )
 
 

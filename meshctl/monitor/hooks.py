@@ -6,6 +6,7 @@ What a device says reaches a hook as JSON and as environment variables, never as
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import signal
@@ -14,7 +15,7 @@ import threading
 import urllib.error
 import urllib.request
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,6 +23,7 @@ from urllib.parse import urlsplit
 
 from meshctl import event_log
 from meshctl.errors import InputError
+from meshctl.monitor.access import TOKEN_VARIABLE
 from meshctl.monitor.alarm_log import LEVELS, LoggedAlarm
 
 # Of one call; a hook that is slower is given up.
@@ -45,18 +47,26 @@ class HookSettings:
         """Raises InputError for what is no URL or no level."""
         if self.min_level not in LEVELS:
             raise InputError(f"hook level: expected {', '.join(LEVELS)}, found {self.min_level!r}")
-        parts = urlsplit(self.webhook)
-        if self.webhook and (parts.scheme not in ("http", "https") or not parts.hostname):
+        if self.webhook and not _is_url(self.webhook):
             raise InputError(f"webhook: expected an http or https URL, found {self.webhook!r}")
+
+
+def _is_url(text: str) -> bool:
+    try:
+        parts = urlsplit(text)
+        return parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
 
 
 @dataclass(slots=True)
 class AlarmHooks:
-    """The hooks and their thread. `problem` says why the last call failed; `dropped` counts alarms that were
-    never reported."""
+    """The hooks and their thread. `problem` says why the last call failed, also to `on_problem`; `dropped` counts
+    alarms that were never reported."""
 
     settings: HookSettings
     fleet: str = ""
+    on_problem: Callable[[str], None] = lambda text: None
     problem: str = ""
     dropped: int = 0
     _waiting: deque[LoggedAlarm] = field(default_factory=deque, repr=False)
@@ -114,6 +124,7 @@ class AlarmHooks:
         self.problem = "; ".join(problem for problem in problems if problem)
         if self.problem:
             event_log.emit(event_log.INFO, "hook failed", device=alarm.device, code=alarm.code, reason=self.problem)
+            self.on_problem(f"alarm not reported: {self.problem}")
 
 
 def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
@@ -128,7 +139,7 @@ def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
                 response.read(1)
         except urllib.error.HTTPError as error:
             failure.append(f"webhook {url}: {error.code} {error.reason}")
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:
             failure.append(f"webhook {url}: {getattr(error, 'reason', None) or error}")
 
     thread = threading.Thread(target=send, name="webhook", daemon=True)
@@ -152,7 +163,7 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_environment(document)},
+            env={**_inherited(), **_environment(document)},
             start_new_session=True,
         )
     except (OSError, ValueError) as error:
@@ -168,6 +179,11 @@ def _run(command: Sequence[str], document: Mapping[str, Any], timeout_s: float) 
             process.communicate(timeout=1.0)
         return f"command {command[0]}: did not end within {timeout_s:g} s"
     return f"command {command[0]}: exit status {process.returncode}" if process.returncode else ""
+
+
+def _inherited() -> dict[str, str]:
+    """The environment without the token, which is for browsers."""
+    return {name: value for name, value in os.environ.items() if name != TOKEN_VARIABLE}
 
 
 def _environment(document: Mapping[str, Any]) -> dict[str, str]:

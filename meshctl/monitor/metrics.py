@@ -17,14 +17,18 @@ from meshctl.monitor.frame import Frame
 from meshctl.monitor.store import FrameStore
 
 _COUNTER = re.compile(r"[a-z][a-z0-9_]*")
+_OF_ONLINE_PEERS = frozenset(("round_trip_s", "loss", "capacity_bits_per_s"))
+# The device of alarms that concern the whole fleet: an empty label would be none.
+_FLEET = "fleet"
 Document = Mapping[str, Any]
 
 
-def render_metrics(frame: Frame | None, store: FrameStore | None = None) -> str:
-    """The page for `/metrics` or a textfile. With `store`, alarms say whether they are acknowledged and silenced."""
+def render_metrics(frame: Frame | None, store: FrameStore | None = None, now_s: float | None = None) -> str:
+    """The page for `/metrics` or a textfile. With `store`, alarms say whether they are acknowledged and, at `now_s` by
+    the wall clock, silenced; default: at the frame's time."""
     alarms = None
     if store is not None and frame is not None:
-        alarms = store.alarms(now_s=frame.time_s)
+        alarms = store.alarms(now_s=frame.time_s if now_s is None else now_s)
     return exposition(metric_families(frame, alarms))
 
 
@@ -211,7 +215,9 @@ def _robots(status: Document) -> Iterator[MetricFamily]:
         daemon.add((robot.get("daemon") or {}).get("answers"), robot=name)
         for one in robot.get("peers") or ():
             for key, family in peer.items():
-                family.add(one.get(key), robot=name, peer=one.get("name"))
+                # what the link to an offline peer was like last is not what it is now
+                if one.get("online") or key not in _OF_ONLINE_PEERS:
+                    family.add(one.get(key), robot=name, peer=one.get("name"))
         for one in robot.get("queues") or ():
             for key, family in queue.items():
                 family.add(one.get(key), robot=name, priority=one.get("priority"))
@@ -240,7 +246,7 @@ def _alarms(status: Document, logged: Iterable[LoggedAlarm] | None) -> MetricFam
         for alarm in logged:
             family.add(
                 1,
-                device=alarm.device,
+                device=alarm.device or _FLEET,
                 code=alarm.code,
                 level=alarm.level,
                 acknowledged=str(alarm.acknowledged is not None).lower(),
@@ -248,15 +254,17 @@ def _alarms(status: Document, logged: Iterable[LoggedAlarm] | None) -> MetricFam
             )
         return family
     # without a log, as of this frame
+    devices = [(_FLEET, status)]
     for kind, prefix in (("nodes", ""), ("robots", "robot:")):
-        for device in status.get(kind) or ():
-            for one in device.get("alarms") or ():
-                family.add(
-                    1,
-                    device=f"{prefix}{device.get('name')}",
-                    code=one.get("code"),
-                    level=one.get("level"),
-                    acknowledged="false",
-                    silenced="false",
-                )
+        devices += [(f"{prefix}{device.get('name')}", device) for device in status.get(kind) or ()]
+    for name, device in devices:
+        for one in device.get("alarms") or ():
+            family.add(
+                1,
+                device=name,
+                code=one.get("code"),
+                level=one.get("level"),
+                acknowledged="false",
+                silenced="false",
+            )
     return family

@@ -29,6 +29,10 @@ DEFAULT_INTERVAL_S = 5.0
 DEFAULT_LIMIT_SHARE = 0.03
 # However expensive, the mesh is looked at this often.
 LONGEST_INTERVAL_S = 300.0
+# What a document that no version of a device should send may cause.
+_UNEXPECTED = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
+# The wall clock was set (or the computer slept), rather than being corrected by a little.
+_CLOCK_STEP_S = 60.0
 Positions = Callable[[], Mapping[str, FramePosition]]
 FrameListener = Callable[[Frame, Sequence[LoggedAlarm]], None]
 
@@ -61,9 +65,9 @@ def reported_positions(status: Mapping[str, Any]) -> dict[str, FramePosition]:
     found: dict[str, FramePosition] = {}
     for robot in status.get("robots", ()):
         position = robot.get("position")
-        if isinstance(position, Mapping) and isinstance(position.get("x_m"), int | float):
+        if isinstance(position, Mapping) and all(isinstance(position.get(key), int | float) for key in ("x_m", "y_m")):
             place = FramePosition(
-                position["x_m"], position.get("y_m", 0.0), position.get("z_m"), position.get("age_s"), "daemon"
+                position["x_m"], position["y_m"], position.get("z_m"), position.get("age_s"), "daemon"
             )
             found |= dict.fromkeys((robot["name"], *robot.get("radios", ())), place)
     return found
@@ -72,17 +76,22 @@ def reported_positions(status: Mapping[str, Any]) -> dict[str, FramePosition]:
 @dataclass(slots=True)
 class FrameClock:
     """The times of frames: the wall clock, which may be set backward, made strictly increasing. While it is behind the
-    last frame, time continues from there at the pace of the monotonic clock."""
+    last frame, time continues from there at the pace of the monotonic clock. `stepped_s` is by how much it was set
+    forward so far."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = time.monotonic
+    stepped_s: float = 0.0
     _last: tuple[float, float] | None = None
 
     def next_s(self, newest_s: float | None) -> float:
         """The time of a frame after the one at `newest_s`."""
         now_s, tick_s = self.wall(), self.monotonic()
         if self._last is not None:
-            now_s = max(now_s, self._last[0] + (tick_s - self._last[1]))
+            expected_s = self._last[0] + (tick_s - self._last[1])
+            if now_s - expected_s > _CLOCK_STEP_S:
+                self.stepped_s += now_s - expected_s
+            now_s = max(now_s, expected_s)
         if newest_s is not None:
             now_s = max(now_s, newest_s + 0.001)
         self._last = (now_s, tick_s)
@@ -103,6 +112,7 @@ class FrameSampler:
     limit_share: float = DEFAULT_LIMIT_SHARE
     traffic: Callable[[], Mapping[str, int]] = _no_bytes
     positions: Positions | None = None
+    meters: Callable[[], Mapping[str, Mapping[str, Any]]] = dict
     listeners: list[FrameListener] = field(default_factory=list)
     clock: FrameClock = field(default_factory=FrameClock)
     topic_classes: Mapping[str, str] = field(default_factory=dict)
@@ -115,18 +125,27 @@ class FrameSampler:
     _wait_s: float = 0.0
 
     def run(self) -> None:
-        """Sample until `stop`. Raises what is no error of the field, such as a bug."""
+        """Sample until `stop`. A round that fails is reported, and the next one tried at its time: what one device
+        says must not end the watching of all."""
         while not self._end.is_set():
             began_s = self.clock.monotonic()
             try:
                 self.sample()
                 self.problem = ""
             except MeshctlError as error:
-                self.problem = str(error)
-                self._wait_s = self.interval_s
-                event_log.emit(event_log.INFO, "sample failed", reason=self.problem)
-                self.on_problem(self.problem)
+                self._failed(str(error))
+            except _UNEXPECTED as error:
+                self._failed(f"internal error: {type(error).__name__}: {error}")
             self._end.wait(max(0.0, began_s + self._wait_s - self.clock.monotonic()))
+
+    def _failed(self, problem: str) -> None:
+        if self._end.is_set():
+            # what it needs may be closed already
+            return
+        self.problem = problem
+        self._wait_s = self.interval_s
+        event_log.emit(event_log.INFO, "sample failed", reason=problem)
+        self.on_problem(problem)
 
     def stop(self) -> None:
         self._end.set()
@@ -149,8 +168,10 @@ class FrameSampler:
             positions=positions,
             airtime=self._airtime(document, began_s),
             topic_classes=self.topic_classes,
+            meters=self.meters(),
         )
-        began = self.store.append(frame)
+        self.store.clock_stepped_s = self.clock.stepped_s
+        began = self.store.append(frame, self.clock.wall())
         for listener in self.listeners:
             listener(frame, began)
         return frame

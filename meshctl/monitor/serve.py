@@ -6,6 +6,7 @@ import ipaddress
 import logging
 import signal
 import socket
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -26,6 +27,20 @@ class Certificate:
 
     certificate: Path
     key: Path
+
+
+def check_certificate(certificate: Certificate) -> None:
+    """Raises InputError for files that are missing, damaged, encrypted or do not belong together."""
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        # asks no terminal for a password
+        context.load_cert_chain(certificate.certificate, certificate.key, password="")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(
+            f"cannot use {certificate.certificate} and {certificate.key}: {reason}",
+            hint="expected a certificate chain and its unencrypted key, both PEM",
+        ) from error
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -72,8 +87,7 @@ class _Server(uvicorn.Server):
 
 
 def serve(app: Starlette, listening: socket.socket, feed: Feed, certificate: Certificate | None) -> int:
-    """Serve until a signal; returns its number, and leaves the handlers as they were. Raises InputError for an invalid
-    certificate."""
+    """Serve until a signal; returns its number, and leaves the handlers as they were."""
     log = logging.getLogger("uvicorn.error")
     log.setLevel(logging.WARNING)
     # an answer that was cut off because the server ends is no fault of the program
@@ -87,11 +101,6 @@ def serve(app: Starlette, listening: socket.socket, feed: Feed, certificate: Cer
         ssl_certfile=None if certificate is None else str(certificate.certificate),
         ssl_keyfile=None if certificate is None else str(certificate.key),
     )
-    try:
-        config.load()
-    except OSError as error:
-        assert certificate is not None, "only a certificate is read"
-        raise InputError(f"cannot use {certificate.certificate} and {certificate.key}: {error}") from error
     server = _Server(config, feed)
     # uvicorn raises the signal again at its end, for the handlers of others
     before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGINT, signal.SIGTERM)}

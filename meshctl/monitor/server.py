@@ -10,7 +10,7 @@ import getpass
 import json
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -27,18 +27,15 @@ from meshctl.errors import InputError, MeshctlError
 from meshctl.monitor.access import AccessControl, AccessRules, error_response
 from meshctl.monitor.actions import Actions
 from meshctl.monitor.alarm_log import Silence
+from meshctl.monitor.event_stream import EventStreams
 from meshctl.monitor.feed import Feed
 from meshctl.monitor.frame import Frame
+from meshctl.monitor.history_file import ANY
 from meshctl.monitor.page import ASSETS
 from meshctl.monitor.series import charts_of
 from meshctl.monitor.store import FrameStore
+from meshctl.status.alarm_codes import CODES
 
-# Another process may append to the history or acknowledge an alarm: look again after this long.
-POLL_S = 1.0
-# A comment after this long without news tells a browser that the connection lives.
-HEARTBEAT_S = 5.0
-# A browser that was away gets so many of the frames it missed, evenly thinned, and the newest.
-MAX_CATCH_UP = 20
 MAX_FRAMES = 500
 MAX_BUCKETS = 2000
 # Points in a chart: about one per pixel of a side panel.
@@ -74,8 +71,13 @@ class MonitorServer:
     settings: PageSettings
     rules: AccessRules = field(default_factory=AccessRules)
     actions: Actions | None = None
-    metrics: Callable[[Frame | None, FrameStore], str] | None = None
+    metrics: Callable[[Frame | None, FrameStore, float], str] | None = None
     clock: Callable[[], float] = time.time
+    streams: EventStreams = field(init=False)
+
+    def __post_init__(self) -> None:
+        streams = EventStreams(self.store, self.feed, self.clock, is_live=self.settings.mode == "live")
+        object.__setattr__(self, "streams", streams)
 
     def app(self) -> Starlette:
         routes = [
@@ -170,14 +172,7 @@ class MonitorServer:
         return start_s, end_s
 
     async def _alarms(self, request: Request) -> Response:
-        return _json_text(await run_in_threadpool(self._alarms_text))
-
-    def _alarms_text(self) -> str:
-        # a recording's alarms are those of its end
-        now_s = self.clock()
-        if self.settings.mode != "live" and (span := self.store.span()) is not None:
-            now_s = span[1]
-        return json.dumps([alarm.as_json() for alarm in self.store.alarms(active_only=False, now_s=now_s)])
+        return _json_text(await run_in_threadpool(self.streams.alarms_text))
 
     async def _acknowledge(self, request: Request) -> Response:
         body = await self._change_body(request)
@@ -193,7 +188,10 @@ class MonitorServer:
             raise BadRequest(f"for_s: expected seconds from 0 to {MAX_SILENCE_S:g}, or null, found {for_s!r}")
         until_s = None if for_s is None else self.clock() + for_s
         silence = Silence(until_s, _text(body, "reason"), _text(body, "by", getpass.getuser()))
-        await run_in_threadpool(self.store.silence, _text(body, "device"), _text(body, "code"), silence)
+        code = _text(body, "code")
+        if code != ANY and code not in CODES:
+            raise BadRequest(f"code: expected a code of an alarm or {ANY}, found {code!r}")
+        await run_in_threadpool(self.store.silence, _text(body, "device"), code, silence)
         self.feed.notify()
         return await self._alarms(request)
 
@@ -206,7 +204,7 @@ class MonitorServer:
         if self.metrics is None:
             return error_response(404, "a recording has no metrics")
         render = self.metrics
-        text = await run_in_threadpool(lambda: render(self.store.latest(), self.store))
+        text = await run_in_threadpool(lambda: render(self.store.latest(), self.store, self.clock()))
         return PlainTextResponse(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _action(self, request: Request) -> Response:
@@ -222,51 +220,15 @@ class MonitorServer:
         return _json(job.as_json())
 
     async def _events(self, request: Request) -> Response:
+        if self.streams.is_full:
+            return error_response(503, "too many pages are open on this monitor: close one of them")
         last_id = request.headers.get("last-event-id", "")
         last_s = int(last_id) / 1000 if last_id.isdecimal() and len(last_id) < 16 else None
         return StreamingResponse(
-            self._stream(last_s),
+            self.streams.stream(last_s),
             media_type="text/event-stream",
             headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
         )
-
-    async def _stream(self, last_s: float | None) -> AsyncIterator[str]:
-        """Frames newer than `last_s`, and the alarms whenever they changed, until the server stops."""
-        yield ": meshctl monitor\n\n"
-        sent_s = last_s if last_s is not None else -math.inf
-        alarms = ""
-        quiet_s = 0.0
-        while not self.feed.is_closed:
-            news = []
-            for frame in await run_in_threadpool(self._frames_after, sent_s, is_first=quiet_s == 0.0 and not alarms):
-                news.append(_event("frame", frame.json_text, round(frame.time_s * 1000)))
-                sent_s = frame.time_s
-            now_alarms = await run_in_threadpool(self._alarms_text)
-            if now_alarms != alarms:
-                news.append(_event("alarms", now_alarms))
-                alarms = now_alarms
-            quiet_s = 0.0 if news else quiet_s + POLL_S
-            if quiet_s >= HEARTBEAT_S:
-                news.append(": alive\n\n")
-                quiet_s = 0.0
-            for text in news:
-                yield text
-            await self.feed.wait(POLL_S)
-
-    def _frames_after(self, sent_s: float, *, is_first: bool) -> tuple[Frame, ...]:
-        latest = self.store.latest()
-        if latest is None or latest.time_s <= sent_s:
-            return ()
-        if not is_first or not math.isfinite(sent_s):
-            return (latest,)
-        missed = self.store.between(sent_s + 0.001, latest.time_s, MAX_CATCH_UP)
-        return (*missed, *(() if missed and missed[-1].time_s == latest.time_s else (latest,)))
-
-
-def _event(kind: str, data: str, number: int | None = None) -> str:
-    head = f"event: {kind}\n" + (f"id: {number}\n" if number is not None else "")
-    # the documents are JSON on one line
-    return f"{head}data: {data}\n\n"
 
 
 def _json(value: object) -> Response:
@@ -295,6 +257,10 @@ def _text(body: Mapping[str, Any], name: str, default: str | None = None) -> str
     value = body.get(name, default)
     if not isinstance(value, str) or len(value) > 500:
         raise BadRequest(f"{name}: expected a text of at most 500 characters, found {type(value).__name__}")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise BadRequest(f"{name}: expected a text, found half a character") from error
     return value
 
 
@@ -306,7 +272,7 @@ async def _body(request: Request) -> Mapping[str, Any]:
             raise BadRequest(f"expected at most {MAX_BODY_BYTES} bytes")
     try:
         body = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise BadRequest(f"expected JSON: {error}") from error
     if not isinstance(body, dict):
         raise BadRequest(f"expected a JSON object, found {type(body).__name__}")

@@ -12,24 +12,27 @@ import os
 import threading
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet.sqlite_file import SqliteFile
 from meshctl.monitor.alarm_log import (
+    FLEET,
     REOPEN_S,
     AlarmChange,
     AlarmKey,
     LoggedAlarm,
     Silence,
     advance,
+    devices_of,
     reported_alarms,
 )
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.history_file import (
     ALARM_COLUMNS,
+    ANY,
     LOG_ALARM,
     LOG_BYTES,
     SCHEMA,
@@ -38,6 +41,7 @@ from meshctl.monitor.history_file import (
     row_of,
     silence_of,
 )
+from meshctl.monitor.timeline import TimelineBucket, buckets_of, thinned
 
 # Below this a frame of a large fleet and its indexes would not fit.
 MIN_BYTES = 8 << 20
@@ -53,29 +57,20 @@ _READ_BATCH = 32
 _ZLIB_LEVEL = 1
 
 
-@dataclass(frozen=True, slots=True)
-class TimelineBucket:
-    """A stretch of time: `go` False if any of its frames was a no-go, None if none was assessed; the most alarms that
-    any of its frames had, by level. `frames` 0: nothing was recorded."""
-
-    start_s: float
-    end_s: float
-    frames: int
-    go: bool | None
-    errors: int
-    warnings: int
-    notes: int
+Revision = tuple[int, float | None]
 
 
 class FrameStore:
     """The open history. Safe for several threads; one process appends, others may read, acknowledge and silence.
 
-    `problem` says why the last frame is not in the file; empty if it is.
+    `problem` says why the last frame is not in the file; empty if it is. `clock_stepped_s` is by how much the clock was
+    set forward since the file was opened: frames from before are not that much older.
     """
 
     def __init__(self, path: Path, max_age_s: float, max_bytes: int, *, read_only: bool = False) -> None:
         self.path = path
         self.problem = ""
+        self.clock_stepped_s = 0.0
         self._max_age_ms = milliseconds(max_age_s)
         self._max_used_bytes = max_bytes - LOG_BYTES
         self._file = SqliteFile(path, SCHEMA, read_only=read_only)
@@ -131,9 +126,11 @@ class FrameStore:
 
     def claim(self) -> None:
         """Be the process that appends, until `close`. Raises InputError if another one is."""
-        descriptor = os.open(
-            self.path.with_name(self.path.name + ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600
-        )
+        lock = self.path.with_name(f"{self.path.name}.lock")
+        try:
+            descriptor = os.open(lock, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise InputError(f"{lock}: cannot be created: {error.strerror}") from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -142,8 +139,9 @@ class FrameStore:
             raise InputError(f"{self.path}: another meshctl monitor writes this history", hint=hint) from error
         self._claim = descriptor
 
-    def append(self, frame: Frame) -> tuple[LoggedAlarm, ...]:
+    def append(self, frame: Frame, now_s: float | None = None) -> tuple[LoggedAlarm, ...]:
         """Store a frame, bring the alarm log up to date and drop what is too old or too much; the alarms that began.
+        `now_s` by the wall clock, which silences are set by, decides which are in force; default: the frame's time.
 
         A frame that cannot be written (full disk, locked file) sets `problem`: `latest` still returns it, and what
         became of the alarms is written with the next one. Raises ValueError if it is not newer than the last one.
@@ -164,7 +162,7 @@ class FrameStore:
                 self.problem = ""
                 self._unwritten = None
                 self._pending.clear()
-        return self._with_silences(change.began, frame.time_s)
+        return self._with_silences(change.began, frame.time_s if now_s is None else now_s)
 
     def _with_silences(self, alarms: tuple[LoggedAlarm, ...], now_s: float) -> tuple[LoggedAlarm, ...]:
         if not alarms:
@@ -185,7 +183,9 @@ class FrameStore:
         }
         self._ended.update((alarm.key, alarm) for alarm in change.ended)
         for alarm in (*change.open.values(), *change.ended):
-            self._pending[alarm.device, alarm.code, alarm.first_s] = alarm
+            key = (alarm.device, alarm.code, alarm.first_s)
+            unwritten = self._pending.get(key)
+            self._pending[key] = replace(alarm, rose=True) if unwritten is not None and unwritten.rose else alarm
 
     def _write(self, frame: Frame, key: int, alarms: Mapping[Any, LoggedAlarm]) -> None:
         packed = zlib.compress(frame.json_text.encode(), _ZLIB_LEVEL)
@@ -201,7 +201,7 @@ class FrameStore:
 
     def _expire(self, database: Any, now_ms: int) -> None:
         """Remove what is too old, and the oldest frames while the file is too large; never the newest frame."""
-        oldest = now_ms - self._max_age_ms
+        oldest = now_ms - self._max_age_ms - milliseconds(self.clock_stepped_s)
         database.execute(_REMOVE_OLDEST, (oldest, _EXPIRE_BATCH * _EXPIRE_STEPS))
         database.execute("DELETE FROM alarms WHERE ended_ms IS NOT NULL AND ended_ms < ?", (oldest,))
         for _ in range(_EXPIRE_STEPS):
@@ -222,6 +222,12 @@ class FrameStore:
         if (unwritten := self._unwritten) is not None:
             return unwritten
         return self._first("ORDER BY time_ms DESC LIMIT 1", ())
+
+    def revision(self) -> Revision:
+        """Differs from an earlier one if frames, alarms or silences changed since, also by another process."""
+        unwritten = self._unwritten
+        ((version,),) = self._reader.read("PRAGMA data_version", ())
+        return version, None if unwritten is None else unwritten.time_s
 
     def at(self, time_s: float) -> Frame | None:
         """The newest frame that is not after `time_s`."""
@@ -282,19 +288,7 @@ class FrameStore:
             " FROM frames INDEXED BY timeline WHERE time_ms >= ?1 AND time_ms < ?2 GROUP BY 1",
             (start, end, buckets),
         )
-        by_bucket = {row[0]: row[1:] for row in rows}
-        width_s = (end - start) / buckets / 1000
-        return tuple(
-            TimelineBucket(
-                start / 1000 + index * width_s,
-                start / 1000 + (index + 1) * width_s,
-                count,
-                None if go is None else bool(go),
-                *(errors, warnings, notes),
-            )
-            for index in range(buckets)
-            for count, go, errors, warnings, notes in (by_bucket.get(index, (0, None, 0, 0, 0)),)
-        )
+        return buckets_of(rows, start, end, buckets)
 
     def alarms(self, *, active_only: bool = True, now_s: float) -> tuple[LoggedAlarm, ...]:
         """The alarms that are open, or all that are kept; the most severe first, then the newest. `now_s` decides which
@@ -330,15 +324,23 @@ class FrameStore:
             raise InputError(f"{device or 'the fleet'} has no open alarm {code}", hint="meshctl alarms lists them")
 
     def silence(self, device: str, code: str, silence: Silence) -> None:
-        """Silence an alarm, now and when it comes again; `*` stands for any device or code. Raises InputError."""
+        """Silence an alarm, now and when it comes again; `*` stands for any device or code. Raises InputError, also for
+        a device that no frame or alarm has."""
         if not silence.reason.strip():
             raise InputError("expected a reason for the silence")
+        if device not in (ANY, FLEET) and not self._knows(device):
+            raise InputError(f"unknown device {device!r}", hint="meshctl alarms lists them; robot:NAME is a computer")
         until = None if silence.until_s is None else milliseconds(silence.until_s)
         with self._file.write() as database:
             database.execute(
                 "INSERT OR REPLACE INTO silences (device, code, until_ms, reason, by) VALUES (?, ?, ?, ?, ?)",
                 (device, code, until, silence.reason, silence.by),
             )
+
+    def _knows(self, device: str) -> bool:
+        if (newest := self.latest()) is None or device in devices_of(newest.status):
+            return True
+        return bool(self._reader.read("SELECT 1 FROM alarms WHERE device = ? LIMIT 1", (device,)))
 
     def end_silence(self, device: str, code: str) -> None:
         """Raises InputError if there is none."""
@@ -363,15 +365,6 @@ class FrameStore:
     def _first(self, where: str, values: tuple[object, ...]) -> Frame | None:
         rows = self._reader.read(f"SELECT time_ms, document FROM frames {where}", values)
         return _frame(*rows[0]) if rows else None
-
-
-def thinned(items: list[int], limit: int) -> list[int]:
-    """At most `limit` of the items at even distances, the first and the last among them."""
-    if len(items) <= limit:
-        return items
-    if limit == 1:
-        return items[-1:]
-    return [items[round(index * (len(items) - 1) / (limit - 1))] for index in range(limit)]
 
 
 def _frame(time_ms: int, packed: bytes) -> Frame | None:

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Protocol
 
@@ -24,6 +23,7 @@ from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.inventory.file_paths import file_path
 from meshctl.model import Fleet, Node
+from meshctl.model.ip import IpAddress
 from meshctl.nodes.slots import ChannelSlots
 
 # Closing waits up to two seconds for a connection whose other side is gone, so a fleet's are closed in parallel.
@@ -33,10 +33,10 @@ MAX_PARALLEL_CLOSES = 32
 class Locate(Protocol):
     """The host and port at which a node with this address is reached."""
 
-    def __call__(self, node: Node, address: IPv4Address) -> tuple[str, int]: ...
+    def __call__(self, node: Node, address: IpAddress) -> tuple[str, int]: ...
 
 
-def as_written(node: Node, address: IPv4Address) -> tuple[str, int]:
+def as_written(node: Node, address: IpAddress) -> tuple[str, int]:
     """The inventory's `ssh.host`, or the address itself."""
     return node.ssh.host or str(address), node.ssh.port
 
@@ -69,11 +69,11 @@ class ConnectionPool:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _jump_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
-    def endpoint(self, node: Node, address: IPv4Address | None = None) -> Endpoint:
+    def endpoint(self, node: Node, address: IpAddress | None = None) -> Endpoint:
         host, port = self.locate(node, address or node.address.ip)
         return Endpoint(host, port, node.ssh.user, identity=node.name, interface=self.interfaces.get(node.name, ""))
 
-    def candidates(self, node: Node, address: IPv4Address | None = None) -> tuple[Endpoint, ...]:
+    def candidates(self, node: Node, address: IpAddress | None = None) -> tuple[Endpoint, ...]:
         """The endpoints to try for a node: through its local interface, if known, then by the routing table.
 
         A router also answers at its address in the robot's LAN; over a wire to its LAN port only there.

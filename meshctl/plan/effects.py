@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 
 from meshctl.model import Release
 from meshctl.plan.radios import RadioChange, radio_changes
-from meshctl.plan.seen import management_section
+from meshctl.plan.seen import address_options, management_section
 from meshctl.plan.values import Cut, Effect
 from meshctl.uci import Package, Section
 
@@ -106,4 +106,4 @@ def _by_key(package: Package) -> dict[str, Section]:
 
 
 def _address(section: Section | None) -> str:
-    return "" if section is None else section.get("ipaddr").partition("/")[0]
+    return ", ".join(address_options(section))

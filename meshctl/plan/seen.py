@@ -6,10 +6,11 @@ Paths have no leading slash (`etc/config/network`), as in rendered files.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from ipaddress import IPv4Address
+from ipaddress import ip_address
 
 from meshctl.device.observation import FileInfo, Observation
 from meshctl.diagnostics import InvalidInput
+from meshctl.model.ip import IpAddress
 from meshctl.plan.cell import Cell
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section, parse
@@ -62,12 +63,26 @@ def management_section(network: Package) -> Section | None:
     return network.section("backbone") or network.section("lan")
 
 
-def management_address(network: str | None) -> IPv4Address | None:
-    """The management address in a network file; None if it has none, is missing or unreadable."""
+def address_options(section: Section | None) -> tuple[str, ...]:
+    """The addresses of an interface section without prefix lengths, as written: IPv4, then IPv6.
+
+    Both options may be lists (netifd's `proto_static`).
+    """
+    if section is None:
+        return ()
+    written = (*section.items("ipaddr"), *section.items("ip6addr"))
+    return tuple(bare for text in written for word in text.split() if (bare := word.partition("/")[0]))
+
+
+def management_address(network: str | None) -> IpAddress | None:
+    """The management address in a network file; None if it has none that is an address, is missing or unreadable."""
     tree = parsed(network, "network")
-    section = None if tree is None else management_section(tree)
-    text = "" if section is None else section.get("ipaddr").partition("/")[0]
-    return IPv4Address(text) if text else None
+    for text in () if tree is None else address_options(management_section(tree)):
+        try:
+            return ip_address(text)
+        except ValueError:
+            continue
+    return None
 
 
 def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]:

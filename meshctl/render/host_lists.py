@@ -63,7 +63,7 @@ def ssh_config(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callab
 
 def _block(entry: HostEntry, known_hosts: Path, key_path: Callable[[str], Path]) -> Iterator[str]:
     yield f"Host {entry.name}"
-    yield f"    HostName {entry.address}"
+    yield f"    HostName {_literal(entry.address)}"
     if entry.ssh.port != 22:
         yield f"    Port {entry.ssh.port}"
     if entry.ssh.user:
@@ -103,6 +103,11 @@ def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path:
 def _group_name(name: str) -> str:
     """Ansible's group names are identifiers."""
     return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def _literal(text: str) -> str:
+    """ssh_config expands %-tokens in HostName, which the zone of fe80::1%eth0 must not be."""
+    return text.replace("%", "%%")
 
 
 def _quoted(path: Path) -> str:

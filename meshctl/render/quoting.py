@@ -6,7 +6,7 @@ error.
 
 from __future__ import annotations
 
-from ipaddress import IPv4Address, IPv4Interface
+from ipaddress import IPv4Address, IPv4Interface, IPv6Address, IPv6Interface, IPv6Network
 
 from jinja2 import Undefined
 
@@ -39,7 +39,7 @@ def quoted(value: object) -> Quoted:
             return Quoted(uci.quote(_not_empty(value.reveal())))
         case str():
             return Quoted(uci.quote(_not_empty(value)))
-        case int() | float() | IPv4Address() | IPv4Interface():
+        case int() | float() | IPv4Address() | IPv4Interface() | IPv6Address() | IPv6Interface() | IPv6Network():
             return Quoted(uci.quote(str(value)))
         case _:
             raise TypeError(f"expected text, a number, an address or a boolean, found {type(value).__name__}")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from ipaddress import IPv4Address, IPv4Interface
 from types import MappingProxyType
 
 from meshctl.diagnostics import Position
@@ -20,6 +20,7 @@ from meshctl.model import (
     Secret,
     SystemSettings,
 )
+from meshctl.model.ip import IpAddress, IpInterface
 from meshctl.resolve.routes import StaticRoute
 
 # UCI interfaces: the wired ports, and a router's interface on the mesh
@@ -85,8 +86,8 @@ class Lan:
 
     bridge: str
     ports: tuple[str, ...]
-    address: IPv4Interface
-    gateway: IPv4Address | None
+    address: IpInterface
+    gateway: IpAddress | None
     mtu: int
     switch_vlans: tuple[tuple[str, str], ...] = ()
 
@@ -96,14 +97,17 @@ class Backbone:
     """A router's interface on the mesh: the batman-adv interface `device`, with the management address."""
 
     device: str
-    address: IPv4Interface
-    gateway: IPv4Address | None
+    address: IpInterface
+    gateway: IpAddress | None
     mtu: int
 
     @property
     def mac(self) -> str:
         """A locally administered MAC address for `device`, from the management address: unique and constant."""
-        return ":".join(f"{byte:02x}" for byte in (0x02, 0xBA, *self.address.ip.packed))
+        packed = self.address.ip.packed
+        # an IPv6 address has more bits than fit, and fleets differ in which of them they count with
+        own = packed if len(packed) == 4 else hashlib.sha256(packed).digest()[:4]
+        return ":".join(f"{byte:02x}" for byte in (0x02, 0xBA, *own))
 
 
 @dataclass(frozen=True, slots=True)

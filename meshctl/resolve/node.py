@@ -10,11 +10,11 @@ router instead: the bridge has the wired ports only, and the routing interface h
 from __future__ import annotations
 
 from collections.abc import Callable
-from ipaddress import IPv4Network
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
+from meshctl.model.ip import IpNetwork
 from meshctl.resolve.intent import Backbone, BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
 from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
 from meshctl.resolve.packages import package_plan
@@ -46,6 +46,11 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         found = "no mesh" if primary is None else primary.backend.value
         message = "a router between the mesh and a LAN needs batman-adv"
         checks.add(COMBINATION, ("robots", node.robot, "lan"), Backend.BATMAN.value, found, message=message)
+    if node.lan_address is not None and node.lan_address.version != node.address.version:
+        message = "a router's LAN and mesh need addresses of one family"
+        expected = f"an IPv{node.address.version} network"
+        found = f"an IPv{node.lan_address.version} network"
+        checks.add(COMBINATION, ("robots", node.robot, "lan"), expected, found, message=message)
     plan = package_plan(fleet, node)
     radios = _radios(fleet, node, keys, masters, intervals)
     intent = Intent(
@@ -101,14 +106,14 @@ def _keys(
 
 def _masters(meshes: tuple[Mesh, ...]) -> dict[str, str]:
     """Mesh -> its batman-adv interface."""
-    names: dict[tuple[IPv4Network, str], str] = {}
+    names: dict[tuple[IpNetwork, str], str] = {}
     for mesh in meshes:
         if mesh.backend is Backend.BATMAN:
             names.setdefault(_group(mesh), f"bat{len(names)}")
     return {mesh.name: names[_group(mesh)] for mesh in meshes if mesh.backend is Backend.BATMAN}
 
 
-def _group(mesh: Mesh) -> tuple[IPv4Network, str]:
+def _group(mesh: Mesh) -> tuple[IpNetwork, str]:
     return mesh.network, mesh.batman.routing_algo
 
 

@@ -8,9 +8,9 @@ the inventory only; batman-adv finds the path to the router.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from ipaddress import IPv4Address, IPv4Network
 
 from meshctl.model import Fleet, Node, Robot
+from meshctl.model.ip import IpAddress, IpNetwork
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +18,8 @@ class StaticRoute:
     """`target` is the LAN of `robot`, `gateway` its router's address in the mesh."""
 
     robot: str
-    target: IPv4Network
-    gateway: IPv4Address
+    target: IpNetwork
+    gateway: IpAddress
 
 
 def routes(fleet: Fleet, node: Node) -> tuple[StaticRoute, ...]:
@@ -39,7 +39,7 @@ def has_routed_lans(fleet: Fleet) -> bool:
     return any(robot.lan is not None for robot in fleet.robots.values())
 
 
-def computer_gateway(fleet: Fleet, robot: Robot) -> IPv4Address | None:
+def computer_gateway(fleet: Fleet, robot: Robot) -> IpAddress | None:
     """The next hop of the robot's computer to other networks: as set, else the robot's router or first managed radio.
 
     None without a radio, and in a fleet without routed LANs.

@@ -44,6 +44,32 @@ class LocalDaemon:
             self.close()
             raise DaemonError(f"{self.path}: {error}") from error
 
+    def event(self) -> tuple[dict[str, Any], bytes] | None:
+        """The next event of a subscription: its header and payload; None if none comes for a while. Raises
+        DaemonError."""
+        assert self._connection is not None, "subscribe first"
+        try:
+            try:
+                first = self._connection.recv(1)
+            except TimeoutError:
+                return None
+            if not first:
+                raise ConnectionError("the daemon closed the connection")
+            return self._frame(first + self._read(_LENGTHS.size - 1))
+        except (OSError, ValueError) as error:
+            self.close()
+            raise DaemonError(f"{self.path}: {error}") from error
+
+    def _frame(self, lengths: bytes) -> tuple[dict[str, Any], bytes]:
+        header_bytes, payload_bytes = _LENGTHS.unpack(lengths)
+        if header_bytes + payload_bytes > MAX_REPLY_BYTES:
+            raise ValueError(f"a reply of {header_bytes + payload_bytes} bytes")
+        header = json.loads(self._read(header_bytes))
+        payload = self._read(payload_bytes)
+        if not isinstance(header, dict):
+            raise ValueError("a reply that is no object")
+        return header, payload
+
     def _request(self, op: str, payload: bytes, fields: Mapping[str, object]) -> dict[str, Any]:
         if self._connection is None:
             self._connection = socket.socket(socket.AF_UNIX)
@@ -52,13 +78,7 @@ class LocalDaemon:
         header = json.dumps({"op": op, "id": 1, **fields}).encode()
         self._connection.sendall(_LENGTHS.pack(len(header), len(payload)) + header + payload)
         # without a subscription, the reply is the next frame
-        header_bytes, payload_bytes = _LENGTHS.unpack(self._read(_LENGTHS.size))
-        if header_bytes + payload_bytes > MAX_REPLY_BYTES:
-            raise ValueError(f"a reply of {header_bytes + payload_bytes} bytes")
-        reply = json.loads(self._read(header_bytes))
-        self._read(payload_bytes)
-        if not isinstance(reply, dict):
-            raise ValueError("a reply that is no object")
+        reply, _ = self._frame(self._read(_LENGTHS.size))
         if not reply.get("ok"):
             raise DaemonError(f"{self.path}: {reply.get('error', 'refused')}")
         return reply

@@ -5,6 +5,7 @@
 2. From the mesh: a message whose definition is known is published; others wait while the source is asked for it.
 3. From other bridges: a `Hello` is answered with the missing latched messages, a `Want` with definitions.
 4. Peers that come online get a `Hello`. `tick` repeats unanswered requests.
+5. A message of the other version of ROS is converted if its type is declared (`mixed_team`), else left out.
 """
 
 from __future__ import annotations
@@ -13,10 +14,16 @@ import hashlib
 from collections import OrderedDict, deque
 from typing import Deque, Iterable, Literal, Mapping, NamedTuple, Union
 
+from udp_mesh.bridges.message_definition import MessageDefinition
+from udp_mesh.bridges.message_types import TYPES
+from udp_mesh.bridges.mixed_team import ConversionError, to_ros1, to_ros2
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
 from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, decode, encode
+from udp_mesh.bridges.ros2.quality import history_depth
 from udp_mesh.bridges.types import Definitions, LatchMark, MessageKind, TypeKey, kind_text, parse_kind
 
+PROTOCOL_TOPICS = {1: "bridge/ros1", 2: "bridge/ros2"}
+"""By version of ROS. A bridge sends on its own topic, and reads every `Hello`: robots of both versions share topics."""
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
 """Per source, while a definition is requested: a second's worth of messages; beyond it, the oldest is dropped."""
 MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
@@ -74,20 +81,31 @@ class Relay:
     """State of one bridge. ROS 1 types have two parts (`pkg/Type`) and are published with their definition; ROS 2 types
     have three (`pkg/msg/Type`) and must be installed on both sides."""
 
-    def __init__(self, own: str, protocol_topic: str, *, ros_version: Literal[1, 2], nonce: bytes) -> None:
-        """`nonce`: random, so that message numbers of different runs of this bridge are never compared."""
+    def __init__(
+        self,
+        own: str,
+        protocol_topic: str,
+        *,
+        ros_version: Literal[1, 2],
+        nonce: bytes,
+        types: Mapping[str, MessageDefinition] = TYPES,
+    ) -> None:
+        """`nonce`: random, so that message numbers of different runs of this bridge are never compared. `types` are
+        converted from the other version of ROS."""
         self.own = own
         self._nonce = nonce
         self._number = 0
         self.protocol_topic = protocol_topic
         self.dropped = 0
         self._needs_definitions = ros_version == 1
-        self._slashes = ros_version
+        self._ros_version = ros_version
+        self._types = types
         self._definitions = Definitions()
         self._sent_definitions: set[tuple[TypeKey, str | None]] = set()
-        self._latched: OrderedDict[tuple[Route, str], tuple[MessageKind, bytes]] = OrderedDict()
+        self._latched: OrderedDict[tuple[Route, str], Deque[tuple[MessageKind, bytes]]] = OrderedDict()
         self._latched_bytes = 0
         self._last_numbers: dict[str, dict[str, OrderedDict[str, int]]] = {}
+        self._recent_numbers: OrderedDict[tuple[str, str, str], Deque[int]] = OrderedDict()
         self._waiting: dict[str, Deque[_Waiting]] = {}
         self._requested_at: dict[tuple[str, TypeKey], float] = {}
         self._destinations: Mapping[str, Iterable[str]] = {}
@@ -123,30 +141,42 @@ class Relay:
         return effects
 
     def _keep_latched(self, route: Route, publisher: str, kind: MessageKind, payload: bytes) -> None:
-        old = self._latched.pop((route, publisher), None)
-        self._latched_bytes += len(payload) - (0 if old is None else len(old[1]))
-        self._latched[route, publisher] = (kind, payload)
-        same_route = [held for held in self._latched if held[0] == route]
+        """Stores a latched message, and of its publisher as many as late joiners get in ROS."""
+        held = self._latched.pop((route, publisher), deque())
+        held.append((kind, payload))
+        self._latched_bytes += len(payload)
+        while len(held) > history_depth(kind.key.checksum):
+            self._latched_bytes -= len(held.popleft()[1])
+        self._latched[route, publisher] = held
+        same_route = [key for key in self._latched if key[0] == route]
         if len(same_route) > MAX_LATCHED_PER_ROUTE:
-            self._latched_bytes -= len(self._latched.pop(same_route[0])[1])
+            self._forget_latched(same_route[0])
         while len(self._latched) > MAX_LATCHED or self._latched_bytes > MAX_LATCHED_BYTES:
-            _, (_, forgotten) = self._latched.popitem(last=False)
-            self._latched_bytes -= len(forgotten)
+            self._forget_latched(next(iter(self._latched)))
+
+    def _forget_latched(self, key: tuple[Route, str]) -> None:
+        self._latched_bytes -= sum(len(payload) for _, payload in self._latched.pop(key))
 
     # From the mesh
 
     def from_mesh(self, source: str, topic: str, type_text: str, payload: bytes, now: float) -> list[Effect]:
         """Handles a message from the mesh."""
-        if topic == self.protocol_topic:
-            return self._from_bridge(source, payload)
+        if topic in PROTOCOL_TOPICS.values() or topic == self.protocol_topic:
+            return self._from_bridge(source, topic, payload)
         kind = parse_kind(type_text)
-        if kind is None or kind.key.name.count("/") != self._slashes:
+        if kind is None or kind.key.name.count("/") not in (1, 2):
             return []
         if ros_word(source) == ros_word(self.own):
             text = "{}: same ROS name as this robot: its messages are not published".format(source)
             return self._note_once(source, text)
-        if kind.mark is not None and not self._is_newer(source, topic, kind.mark):
+        if kind.mark is not None and not self._is_newer(source, topic, kind):
             return []
+        if kind.key.name.count("/") != self._ros_version:
+            try:
+                kind, payload = self._converted(kind, payload)
+            except ConversionError as error:
+                about = "{}/{}: {}".format(source, topic, kind.key.name)
+                return self._note_once(about, "{} from {} is not published: {}".format(topic, source, error))
         message = _Waiting(topic, kind, payload, now)
         waiting = self._waiting.get(source)
         blocked = waiting is not None and any(other.topic == topic for other in waiting)
@@ -155,13 +185,35 @@ class Relay:
         self._enqueue(source, message)
         return self._request_definition(source, kind.key, now)
 
-    def _is_newer(self, source: str, topic: str, mark: LatchMark) -> bool:
-        """Whether neither this message nor a later one of its publisher was received before."""
+    def _converted(self, kind: MessageKind, payload: bytes) -> tuple[MessageKind, bytes]:
+        """A message of the other version of ROS as one of this. Raises ConversionError."""
+        if self._ros_version == 2:
+            key, payload = to_ros2(self._types, kind.key, payload, latched=kind.mark is not None)
+            return MessageKind(key, kind.mark), payload
+        definition, payload = to_ros1(self._types, kind.key, payload)
+        key = TypeKey(definition.name, definition.md5sum)
+        if key not in self._definitions:
+            self._definitions.put(key, definition.text)
+        return MessageKind(key, kind.mark), payload
+
+    def _is_newer(self, source: str, topic: str, kind: MessageKind) -> bool:
+        """Whether this message was not received before, nor a later one in whose place late joiners would get it."""
+        assert kind.mark is not None
+        publisher, number = kind.mark
         held = self._last_numbers.setdefault(source, {}).setdefault(topic, OrderedDict())
-        if held.get(mark.publisher, -1) >= mark.number:
+        last = held.get(publisher, -1)
+        depth = history_depth(kind.key.checksum)
+        if depth > 1:
+            recent = self._recent_numbers.setdefault((source, topic, publisher), deque(maxlen=depth))
+            if number in recent or number <= last - depth:
+                return False
+            recent.append(number)
+            if len(self._recent_numbers) > MAX_LATCHED:
+                self._recent_numbers.popitem(last=False)
+        elif last >= number:
             return False
-        held.pop(mark.publisher, None)
-        held[mark.publisher] = mark.number
+        held.pop(publisher, None)
+        held[publisher] = max(last, number)
         while len(held) > MAX_TRACKED_PUBLISHERS:
             held.popitem(last=False)
         return True
@@ -190,11 +242,14 @@ class Relay:
 
     # From other bridges
 
-    def _from_bridge(self, source: str, payload: bytes) -> list[Effect]:
+    def _from_bridge(self, source: str, topic: str, payload: bytes) -> list[Effect]:
         try:
             message = decode(payload)
         except ProtocolError as error:
-            return [Note("invalid message from {} on {}: {}".format(source, self.protocol_topic, error))]
+            return [Note("invalid message from {} on {}: {}".format(source, topic, error))]
+        if topic != self.protocol_topic and not isinstance(message, Hello):
+            # definitions concern only bridges of the same version of ROS
+            return []
         if isinstance(message, Definition):
             if not self._definitions.put(message.key, message.text):
                 return []
@@ -211,12 +266,13 @@ class Relay:
     def _missing_latched(self, peer: str, holds: Mapping[str, Mapping[str, int]]) -> list[Effect]:
         """Our latched messages that the peer does not have."""
         effects: list[Effect] = []
-        for (route, _), (kind, payload) in self._latched.items():
+        for (route, _), held in self._latched.items():
             allowed = list(self._destinations.get(route.topic, ()))
             if route.peer not in (None, peer) or (route.peer is None and allowed and peer not in allowed):
                 continue
-            if kind.mark is None or holds.get(route.topic, {}).get(kind.mark.publisher, -1) < kind.mark.number:
-                effects.append(ToMesh(route.topic, payload, peer, kind_text(kind)))
+            for kind, payload in held:
+                if kind.mark is None or holds.get(route.topic, {}).get(kind.mark.publisher, -1) < kind.mark.number:
+                    effects.append(ToMesh(route.topic, payload, peer, kind_text(kind)))
         return effects
 
     def _publish_waiting(self) -> list[Effect]:

@@ -14,7 +14,7 @@ from typing import Callable, Mapping
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS
-from udp_mesh.bridges.relay import Effect, Note, Relay, ToMesh, ToRos
+from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Effect, Note, Relay, ToMesh, ToRos
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import Frame, as_message
 
@@ -35,7 +35,7 @@ class BridgeRuntime:
         self._daemon = daemon
         self._relay = relay
         self._to_ros = to_ros
-        self._wanted = {relay.protocol_topic: TOPIC_SETTINGS, **(wanted or {})}
+        self._wanted = {**dict.fromkeys(PROTOCOL_TOPICS.values(), TOPIC_SETTINGS), **(wanted or {})}
         self._lock = threading.Lock()
 
     def on_daemon_up(self) -> None:

@@ -97,6 +97,8 @@ def status_view(status: Json) -> str:
         f"for {duration(stranger['heard_for_s'])}"
         for stranger in conditions["strangers"]
     ]
+    if status.get("relaying"):
+        lines += relays_view(status["relaying"])
     if status.get("positions"):
         rows = [
             [
@@ -127,6 +129,36 @@ def status_view(status: Json) -> str:
     if status["recording"]:
         lines.append(f"recording to {status['recording']['path']} ({size(status['recording']['bytes'])})")
     return "\n".join(lines)
+
+
+def relays_view(relaying: Json) -> list[str]:
+    """One line per node behind relays, and what this node passes on."""
+    lines: list[str] = []
+    rows = [
+        [
+            route["name"],
+            " > ".join(route["via"]),
+            str(route["hops"]),
+            f"{route['cost']:.1f}",
+            "NO COMMON KEY" if not route["common_key"] else "in use" if route["in_use"] else "not in use",
+            ", ".join(route["readable_by"]) or "none",
+        ]
+        for route in relaying["routes"]
+    ]
+    if rows:
+        lines += ["", table(["relayed", "through", "links", "cost", "state", "relays with our key"], rows)]
+    lines += [
+        f"relay {one['name']} DOES NOT ANSWER" for one in relaying["neighbours"] if one["relays"] and one["unanswered"]
+    ]
+    if relaying["relays"]:
+        counters = relaying["counters"]
+        dropped = sum(count for name, count in counters.items() if name.startswith("dropped_"))
+        lines += [
+            "",
+            f"relay: {counters['passed_on']} datagrams passed on ({size(counters['passed_on_bytes'])}), "
+            f"{dropped} dropped, {size(relaying['queued_bytes'])} queued",
+        ]
+    return lines
 
 
 def topics_view(reply: Json) -> str:

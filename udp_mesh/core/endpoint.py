@@ -23,9 +23,12 @@ from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.receive import receive_datagram
+from udp_mesh.core.relaying.conditions import RelayConditions
+from udp_mesh.core.relaying.relaying import Relaying
+from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
-from udp_mesh.core.settings import Address, LinkInfo, Settings
+from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
 from udp_mesh.core.versions.conditions import VersionConditions
@@ -33,6 +36,7 @@ from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
 from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
+from udp_mesh.wire.relay import RELAY_BYTE
 
 REPORTED_RATE_VALID_S = 2.0
 """A rate reported in an acknowledgement is valid for the second it averages, and one more."""
@@ -61,6 +65,7 @@ class Endpoint:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
         self._state = State(with_log_topics(settings), boot_id, rng, now, store)
         self._legacy = LegacyPeers(self._state, legacy_positions)
+        self._relaying = Relaying(self._state, now)
         self._log_store = log_store
         self._logs: SharedLogs | None = None
         self._start_logs(settings, now)
@@ -83,7 +88,9 @@ class Endpoint:
             inner = decapsulate(data)
             if inner is not None:
                 data = inner
-        if len(data) and data[0] < MARK and self._legacy:
+        if len(data) and data[0] == RELAY_BYTE:
+            self._relaying.receive(data, link, source, now)
+        elif len(data) and data[0] < MARK and self._legacy:
             self._legacy.receive(data, link, source, now)
         else:
             receive_datagram(self._state, data, link, source, now)
@@ -95,7 +102,7 @@ class Endpoint:
         """
         if self._logs is not None:
             self._logs.process(now)
-        out = transmit.collect(self._state, now, max_bytes)
+        out = self._relaying.transmit(transmit.collect(self._state, now, max_bytes), now, max_bytes)
         if self._legacy:
             out = self._legacy.encapsulate_broadcasts(out)
             self._legacy.send(now, out)
@@ -108,6 +115,7 @@ class Endpoint:
         at = transmit.next_timer(self._state)
         if at is None:
             return None
+        at = min(at, self._relaying.next_at())
         if self._legacy:
             at = min(at, self._legacy.next_at())
         return at if self._logs is None else min(at, self._logs.next_at)
@@ -115,6 +123,7 @@ class Endpoint:
     def handle_timer(self, now: float) -> None:
         """Do what is due at `now`. Calling early or late is harmless."""
         transmit.handle_timer(self._state, now)
+        self._relaying.handle_timer(now)
         if self._legacy:
             self._legacy.handle_timer(now)
 
@@ -123,7 +132,7 @@ class Endpoint:
         """Whether `datagrams_to_send` may return something. False right after it returned everything."""
         if self._logs is not None and self._logs.has_work:
             return True
-        return bool(self._legacy) or transmit.has_datagrams(self._state)
+        return bool(self._legacy) or self._relaying.has_work or transmit.has_datagrams(self._state)
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
@@ -137,7 +146,7 @@ class Endpoint:
         """
         if self._logs is not None and self._logs.has_work:
             return False
-        return not self._legacy and transmit.is_quiet(self._state)
+        return not self._legacy and not self._relaying.has_work and transmit.is_quiet(self._state)
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
@@ -173,6 +182,7 @@ class Endpoint:
         """
         lines = reconfigure.apply(self._state, with_log_topics(settings), now)
         self._legacy.apply()
+        self._relaying.apply(now)
         self._start_logs(settings, now)
         if self._logs is not None:
             self._logs.apply(settings)
@@ -181,6 +191,10 @@ class Endpoint:
     def logs(self) -> tuple[LogConditions, ...]:
         """A snapshot of each shared log."""
         return () if self._logs is None else self._logs.conditions()
+
+    def relaying(self, now: float) -> RelayConditions:
+        """A snapshot of relays: who is reached through whom, what is passed on."""
+        return snapshot(self._state, self._relaying, now)
 
     def versions(self) -> tuple[VersionConditions, ...]:
         """What was sent and received as versions, by topic."""
@@ -212,10 +226,13 @@ class Endpoint:
     def peer_addresses(self) -> dict[str, set[Address]]:
         """Link -> the addresses from which authenticated peers send: a driver reads what comes from elsewhere with less
         priority. It changes with the events of peers and with links."""
-        addresses: dict[str, set[Address]] = {name: set() for name in self._state.links}
+        addresses: dict[str, set[Address]] = {link.name: set() for link in self._state.own_links()}
         for peer in self._state.peer_table.online():
             if peer.session is not None and peer.session.path.link in addresses:
                 addresses[peer.session.path.link].add(peer.session.path.address)
+        for name, address in self._relaying.addresses():
+            if name in addresses:
+                addresses[name].add(address)
         return addresses
 
     @property
@@ -324,6 +341,9 @@ def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]
     session = peer.session
     if session is not None:
         path = session.path
+        if path.link == RELAY_LINK:
+            # Its address there means nothing outside.
+            return None, path.link, session.last_heard
         return (path.address, path.link, session.last_heard) if path.link else (None, None, session.last_heard)
     return peer.legacy_path or (None, None, None)
 

@@ -81,6 +81,15 @@ class PeerAddressChanged:
 
 
 @dataclass(frozen=True, slots=True)
+class PeerRouteChanged:
+    """A peer behind relays is now reached through the neighbor `via`, over `hops` links."""
+
+    peer: str
+    via: str
+    hops: int
+
+
+@dataclass(frozen=True, slots=True)
 class NameConflict:
     """Two running nodes use one name (ours if `own`). Messages go to the one that appeared last."""
 
@@ -207,6 +216,7 @@ Event = (
     | PeerOffline
     | PeerRestarted
     | PeerAddressChanged
+    | PeerRouteChanged
     | NameConflict
     | KeyMismatch
     | Incompatible

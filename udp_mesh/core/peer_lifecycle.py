@@ -120,7 +120,7 @@ def _own_name(state: State, session: Session, now: float) -> None:
     if now - state.own_name_reported_at < REPORT_INTERVAL_S:
         return
     state.own_name_reported_at = now
-    own = next(iter(state.links.values())).address if state.links else ("", state.settings.port)
+    own = next((link.address for link in state.own_links()), ("", state.settings.port))
     state.event_queue.emit(NameConflict(session.name, own, session.path.address, own=True))
 
 
@@ -211,12 +211,13 @@ def migrate_path(state: State, session: Session, link: str, source: Address, now
     sender = session.peer.sender if session.peer is not None else None
     timing_out = sender is not None and sender.state is not SendState.ACTIVE
     first = not path.link
+    better = state.is_better_path(session, link)
     quiet = now - path.heard_at >= STALE_PATH_S or path.link not in state.links
-    if not first and not quiet and not timing_out:
+    if not (first or quiet or timing_out or better):
         return
     peer = session.peer
     if not first and session.verified and peer is not None and (session.timed or not quiet or not peer.online):
-        validate_path(state, session, link, source, now)
+        validate_path(state, session, link, source, now, better=better)
         return
     _switch_path(state, session, link, source, now)
 

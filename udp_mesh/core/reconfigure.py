@@ -13,7 +13,7 @@ from udp_mesh.core.peers.heartbeat import uses_link
 from udp_mesh.core.publish import enqueue, flush_compression, report_ended, report_expired, topic_channel
 from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.sender.rate_limit import TokenBucket
-from udp_mesh.core.settings import LinkInfo, LinkKind, Neighbour, Settings, Topic
+from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, RelaySettings, Settings, Topic
 from udp_mesh.core.state import State, live_keys
 from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.codec import encode
@@ -98,6 +98,7 @@ def _changes(old: Settings, new: Settings) -> list[str]:
         lines += [f"topic {name}: {text}" for text in _differences(before[name], after[name])]
     if old.keys != new.keys:
         lines.append("keys: changed")
+    lines += _relay(old.relay, new.relay)
     for what in ("rates", "limits"):
         lines += [f"{what}: {text}" for text in _differences(getattr(old, what), getattr(new, what))]
     lines += _topic_without_name(old.undeclared, new.undeclared)
@@ -126,6 +127,11 @@ def _neighbours(old: tuple[Neighbour, ...], new: tuple[Neighbour, ...]) -> list[
             for text in _differences(before[address], after[address])
         ),
     ]
+
+
+def _relay(old: RelaySettings, new: RelaySettings) -> list[str]:
+    lines = [f"relay: {text}" for text in _differences(replace(old, keys=()), replace(new, keys=()))]
+    return [*lines, "relay: keys changed"] if old.keys != new.keys else lines
 
 
 def _differences(old: object, new: object) -> list[str]:
@@ -194,7 +200,10 @@ def close(state: State, now: float) -> None:
         report_ended(state, peer, now)
     for name, held in state.outboxes.drop_all():
         report_expired(state, name, held.accepted, ExpiryReason.CLOSED)
-    links = list(state.links.values())
+    links = state.own_links()
+    for target in state.relay_targets.values():
+        _, data = state.broadcast_channel.seal_long(encode([Bye("closed")]))
+        state.outgoing.append(Datagram(RELAY_LINK, target.address, data, True))
     for link in links:
         _, data = state.broadcast_channel.seal_long(encode([Bye("closed")]))
         if link.kind is LinkKind.BROADCAST:

@@ -9,10 +9,20 @@ from enum import Enum
 from typing import Literal
 
 from udp_mesh.crypto import Key
-from udp_mesh.wire.limits import MAX_LOG_TOPIC_BYTES, MAX_NAME_BYTES, MAX_TOPIC_BYTES, MAX_TYPE_BYTES, PRIORITY_LEVELS
+from udp_mesh.wire.limits import (
+    MAX_LOG_TOPIC_BYTES,
+    MAX_NAME_BYTES,
+    MAX_RELAY_HOPS,
+    MAX_TOPIC_BYTES,
+    MAX_TYPE_BYTES,
+    PRIORITY_LEVELS,
+)
 
 Address = tuple[str, int]
 """IPv4 or IPv6 host and UDP port."""
+
+RELAY_LINK = "~relay"
+"""The link on which nodes behind relays are reached; addresses on it are boot ids (see `core.relaying`)."""
 
 DEFAULT_PORT = 8700
 """UDP port of the legacy system, kept so that one firewall rule serves both."""
@@ -197,6 +207,36 @@ class Neighbour:
 
 
 @dataclass(frozen=True, slots=True)
+class RelaySettings:
+    """Whether this node passes datagrams on between others, and how far its own may travel.
+
+    `all`: for every node; otherwise only datagrams to or from the nodes in `names`. `hops` limits the links of a
+    relayed path (1: no relays, neither for others nor for itself). `keys` are those of hops (none: derived from the
+    fleet keys); with them, relays need not hold a fleet key.
+    """
+
+    names: tuple[str, ...] = ()
+    all: bool = False
+    hops: int = 4
+    keys: tuple[Key, ...] = ()
+
+    @property
+    def enabled(self) -> bool:
+        """Whether this node is a relay."""
+        return self.hops > 1 and (self.all or bool(self.names))
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            _check_name(name, "relay", MAX_NAME_BYTES)
+        if not 1 <= self.hops <= MAX_RELAY_HOPS:
+            raise ValueError(f"relay_hops: expected 1 to {MAX_RELAY_HOPS}, found {self.hops}")
+        if (self.all or self.names) and self.hops == 1:
+            raise ValueError("relay_hops: expected at least 2 beside relay, found 1")
+        if len(self.keys) > 2:
+            raise ValueError(f"relay keys: expected at most two live keys, found {len(self.keys)}")
+
+
+@dataclass(frozen=True, slots=True)
 class Rates:
     """Times and thresholds of the protocol, in seconds, priorities and packets."""
 
@@ -318,6 +358,7 @@ class Settings:
     window: Literal["adaptive"] | int = "adaptive"
     fragment_bytes: int = 1400
     confirms: bool = False
+    relay: RelaySettings = field(default_factory=RelaySettings)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
 

@@ -23,7 +23,7 @@ from udp_mesh.core.priority_backoff import PriorityBackoff
 from udp_mesh.core.sender.message import TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sender import Sender
-from udp_mesh.core.settings import LinkInfo, LinkKind, Settings, Topic
+from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.versions.sent import SentVersions
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
@@ -81,6 +81,10 @@ class State:
         """Sessions with an acknowledgement or control frames to send now."""
         self.outgoing: list[Datagram] = []
         """Datagrams already built: heartbeats, redundant copies."""
+        self.relayed: list[tuple[int, Datagram]] = []
+        """Datagrams for nodes behind relays, each with its priority."""
+        self.relay_targets: dict[bytes, Neighbour] = {}
+        """Boots that are better reached through relays than directly, by boot id."""
         self.timers: list[tuple[float, int, Peer]] = []
         self.timer_serial = 0
         self.maintenance_at = now
@@ -144,6 +148,17 @@ class State:
         for peer in self.peer_table.peers.values():
             if peer.sender is not None and peer.online and peer.sender.pending:
                 yield peer.sender
+
+    def own_links(self) -> list[LinkInfo]:
+        """The links that are network attachments of this node."""
+        return [link for link in self.links.values() if link.name != RELAY_LINK]
+
+    def is_better_path(self, session: Session, link: str) -> bool:
+        """Whether the session's path should move to this link: from a relay to a direct link, or to a relay."""
+        relayed = link == RELAY_LINK
+        if (session.path.link == RELAY_LINK) == relayed:
+            return False
+        return (session.boot_id in self.relay_targets) == relayed
 
     def can_broadcast(self) -> bool:
         """Whether a link reaches all nodes with one datagram."""

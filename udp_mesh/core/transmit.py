@@ -18,7 +18,7 @@ from udp_mesh.core.publish import broadcast_room, compress_step, expire_held, re
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import send_copies, send_level
 from udp_mesh.core.sender.path import IP_UDP_BYTES
-from udp_mesh.core.settings import Address, LinkKind
+from udp_mesh.core.settings import RELAY_LINK, Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Cancel, Delivered, Frame, Ping
@@ -164,13 +164,16 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             before = len(out)
             _send_broadcasts(state, priority, now, out)
             room -= sum(len(datagram.data) for datagram in out[before:])
+            _set_relayed_aside(state, priority, out, before)
         for peer in peers:
             sender = peer.open_sender()
             if not sender.scheduler.waiting & bit:
                 continue
             session = peer.session
             assert session is not None
+            before = len(out)
             used = send_level(sender, session.path, priority, now, out, room, state.rate_limits)
+            _set_relayed_aside(state, priority, out, before)
             if used:
                 sender.served |= bit
             room -= used
@@ -194,6 +197,13 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
                 peer.record_held(held & sender.scheduler.waiting, now, until)
                 sender.wake_at = min(sender.wake_at, until)
         state.arm(peer)
+
+
+def _set_relayed_aside(state: State, priority: int, out: list[Datagram], start: int) -> None:
+    """Move the datagrams for nodes behind relays, whose next hop is chosen later, with their priority."""
+    if RELAY_LINK in state.links and len(out) > start:
+        state.relayed += [(priority, datagram) for datagram in out[start:] if datagram.link == RELAY_LINK]
+        out[start:] = [datagram for datagram in out[start:] if datagram.link != RELAY_LINK]
 
 
 def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
@@ -308,7 +318,10 @@ def _send_heartbeats(state: State, now: float) -> None:
     waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
     sent = state.sent.per_s(now)
     beat = state.heartbeats.build(state.settings, sessions, waiting, state.broadcasts.next_number, sent, now)
-    datagrams = heartbeat_datagrams(beat, state.broadcast_channel, state.links.values(), state.settings.neighbours)
+    datagrams = heartbeat_datagrams(beat, state.broadcast_channel, state.own_links(), state.settings.neighbours)
+    if state.relay_targets and RELAY_LINK in state.links:
+        targets = tuple(state.relay_targets.values())
+        datagrams += heartbeat_datagrams(beat, state.broadcast_channel, [state.links[RELAY_LINK]], targets)
     state.event_queue.counters.heartbeats_sent += len(datagrams)
     state.outgoing.extend(datagrams)
 

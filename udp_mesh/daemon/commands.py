@@ -6,6 +6,7 @@ every request with its reply.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -30,7 +31,15 @@ from udp_mesh.daemon.neighbours import (
 )
 from udp_mesh.daemon.position_requests import publish_meter, set_position
 from udp_mesh.daemon.service import Service
-from udp_mesh.daemon.status import conditions_json, log_json, plain, show_address, topic_json, topics_json
+from udp_mesh.daemon.status import (
+    conditions_json,
+    log_json,
+    plain,
+    relaying_json,
+    show_address,
+    topic_json,
+    topics_json,
+)
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.daemon.topic_settings import topic_from_values
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
@@ -184,6 +193,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
         "conditions": conditions_json(driver.conditions()),
+        "relaying": relaying_json(driver.node.relaying(driver.now())),
         "positions": service.positions.json(),
     }
 
@@ -211,8 +221,10 @@ def metrics_page(service: Service, client: Client, header: Header, _: bytes) -> 
 def render_metrics(service: Service) -> str:
     """The metrics in Prometheus text format."""
     driver = service.driver
+    relay_counters = dataclasses.asdict(driver.node.relaying(driver.now()).counters)
     extra = {
         "wakeups": driver.wakeups,
+        **{f"relay_{name}": count for name, count in relay_counters.items()},
         "datagrams_lost_on_full_socket": driver.output.lost_on_full_socket,
         "datagrams_lost_on_send": sum(link.datagrams_lost_on_send for link in driver.hub.links.values()),
         "outbox_messages_refused_by_disk": service.store.refused,

@@ -49,6 +49,7 @@ from udp_mesh.daemon.positions import (
     PositionSource,
     is_frame,
 )
+from udp_mesh.daemon.relay_settings import read_relay
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, parse
 from udp_mesh.daemon.topic_settings import or_default, problem_from, read_topic
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
@@ -115,24 +116,30 @@ def load(path: Path) -> Configuration:
     if key_file is not None and unkeyed:
         top.source.report(("unkeyed",), "either key_file or unkeyed", "both")
     if key_file is not None:
-        try:
-            # Relative to the configuration file, so that a bundle can be moved as a whole.
-            keys = read_keys(path.parent / key_file)
-        except ConfigurationError as error:
-            line = top.source.line(("key_file",))
-            top.source.problems += [
-                dataclasses.replace(
-                    problem, file=str(path), line=line, key="key_file", found=f"{problem.file}: {problem.found}"
-                )
-                if problem.line == 0
-                else problem
-                for problem in error.problems
-            ]
+        keys = _read_named_keys(top, path, "key_file", key_file)
     elif not unkeyed:
         top.source.report(
             ("key_file",), "a file with the fleet's key", "none", "set unkeyed = true to run without protection"
         )
-    return dataclasses.replace(read(top, keys), file=path)
+    relay_key_file = top.text("relay_key_file")
+    relay_keys = () if relay_key_file is None else _read_named_keys(top, path, "relay_key_file", relay_key_file)
+    return dataclasses.replace(read(top, keys, relay_keys), file=path)
+
+
+def _read_named_keys(top: Table, path: Path, key: str, name: str) -> tuple[Key, ...]:
+    """The keys of the file that the configuration names; its problems are added to those of the configuration."""
+    try:
+        # Relative to the configuration file, so that a bundle can be moved as a whole.
+        return read_keys(path.parent / name)
+    except ConfigurationError as error:
+        line = top.source.line((key,))
+        top.source.problems += [
+            dataclasses.replace(problem, file=str(path), line=line, key=key, found=f"{problem.file}: {problem.found}")
+            if problem.line == 0
+            else problem
+            for problem in error.problems
+        ]
+        return ()
 
 
 def read_keys(path: Path) -> tuple[Key, ...]:
@@ -178,7 +185,7 @@ def _read_text(path: Path) -> str:
         raise ConfigurationError([Problem(name, place, "", "UTF-8", f"byte {raw[error.start]:#04x}")]) from error
 
 
-def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
+def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) -> Configuration:
     """The configuration in a parsed file. Raises ConfigurationError with every problem found."""
     source = top.source
     top.text("key_file")
@@ -195,6 +202,8 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
     neighbours = read_neighbours(top, port)
     rates, limits = read_rates(top.table("rates")), _read_limits(top.table("limits"))
     daemon = _read_daemon(top.table("daemon"))
+    top.text("relay_key_file")
+    relay = read_relay(top, relay_keys)
     position = _read_position(top.table("position")) if top.has("position") else None
     top.finish()
     if source.problems:
@@ -202,6 +211,7 @@ def read(top: Table, keys: tuple[Key, ...]) -> Configuration:
     try:
         settings = Settings(
             name=name,
+            relay=relay,
             port=port,
             keys=keys,
             unkeyed=unkeyed,

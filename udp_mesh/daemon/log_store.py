@@ -154,6 +154,12 @@ class SqliteLogStore:
         for number, topic, source, log_id, ranges in connection.execute("SELECT * FROM logs"):
             keys[number] = LogKey(topic, source, bytes(log_id))
             dropped.append((keys[number], tuple((int(first), int(last)) for first, last in json.loads(ranges))))
+        orphans = "FROM items WHERE log NOT IN (SELECT id FROM logs)"
+        (lost,) = connection.execute(f"SELECT count(*) {orphans}").fetchone()
+        if lost:
+            # Nothing says which topic they belong to.
+            log.error("log-items-without-log path=%s items=%d: deleted", self.path, lost)
+            connection.execute(f"DELETE {orphans}")
         now = self._wall_clock()
         rows = connection.execute("SELECT log, number, length(data), stored_s, taken FROM items ORDER BY position")
         items = tuple(
@@ -254,7 +260,8 @@ class SqliteLogStore:
             connection.execute("BEGIN")
             results = [job(connection) for job, _ in batch]
             connection.execute("COMMIT")
-        except sqlite3.Error as error:
+        except Exception as error:  # noqa: BLE001 - reported to each caller
+            # Whatever fails (memory, too), the thread continues and every caller gets an answer.
             with contextlib.suppress(sqlite3.Error):
                 connection.execute("ROLLBACK")
             if len(batch) > 1:

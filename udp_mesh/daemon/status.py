@@ -14,6 +14,7 @@ from pathlib import Path
 from udp_mesh.core.conditions import Conditions, PeerConditions
 from udp_mesh.core.events import Event
 from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import Address, Settings, Topic
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
@@ -108,6 +109,13 @@ def log_json(log: LogConditions) -> Json:
     fields = plain(log)
     assert isinstance(fields, dict)
     fields["missing_readers"] = dict(log.missing_readers)
+    return fields
+
+
+def relaying_json(relaying: RelayConditions) -> Json:
+    """Relays as this node sees them."""
+    fields = plain(relaying)
+    assert isinstance(fields, dict)
     return fields
 
 

@@ -24,7 +24,14 @@ class SimEventQueue:
 
     def run_until(self, time_s: float) -> None:
         """Runs everything due up to and at `time_s`, then sets `now` to `time_s`."""
-        while self._entries and self._entries[0][0] <= time_s:
-            self.now, _, action = heapq.heappop(self._entries)
-            action()
-        self.now = time_s
+        while self.step(time_s):
+            pass
+
+    def step(self, time_s: float) -> bool:
+        """Runs the next action due up to `time_s`; if there is none, sets `now` to `time_s` and returns False."""
+        if not self._entries or self._entries[0][0] > time_s:
+            self.now = time_s
+            return False
+        self.now, _, action = heapq.heappop(self._entries)
+        action()
+        return True

@@ -39,6 +39,8 @@ class Feature:
     """Accepts messages compressed with zstd (RFC 8878)."""
     VERSIONS = 128
     """Keeps versions of a topic's content and accepts differences to them (see `version`)."""
+    RELAY = 256
+    """Accepts relay datagrams: it can be reached through relays, and may be one."""
 
 
 class Waiting(NamedTuple):

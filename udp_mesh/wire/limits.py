@@ -61,6 +61,18 @@ BOOT_ID_BYTES = 16
 HEARD_TAG_BYTES = 8
 """Leading bytes of a boot id that identify heard nodes in a heartbeat: 64 bits do not collide within a team."""
 
+MAX_RELAY_HOPS = 8
+"""Links between the ends of a relayed path: bounds how often one datagram is sent, and fits four bits."""
+
+MAX_HEARD_HOPS = 64
+"""Boots that a relay hello lists as heard (14 B each): keeps a part of it in one datagram."""
+
+MAX_RELAYED_NODES = 32
+"""Nodes in a part of a relay hello: bounds the routes one datagram can change."""
+
+MAX_PROOFS = 2
+"""Proofs of fleet keys of one node: it has one or two live keys."""
+
 MAX_LEGACY_FRAGMENT_BYTES = 1300
 """Fragment payload of the legacy format."""
 

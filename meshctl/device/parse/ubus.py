@@ -67,7 +67,8 @@ def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
             device=string(item.get("l3_device")) or string(item.get("device")),
             addresses=tuple(
                 f"{string(address.get('address'))}/{integer(address.get('mask'))}"
-                for address in maps(item.get("ipv4-address"))
+                for family in ("ipv4-address", "ipv6-address")
+                for address in maps(item.get(family))
                 if string(address.get("address")) and integer(address.get("mask")) is not None
             ),
             errors=tuple(string(error.get("code")) for error in maps(item.get("errors"))),

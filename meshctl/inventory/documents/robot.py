@@ -6,7 +6,7 @@ from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import PositionDocument, SshLayer
-from meshctl.inventory.fields import Address, Flag, Interface, Name, Network, Real, Text, Whole, Window
+from meshctl.inventory.fields import Address, Flag, Interface, IPv4Only, Name, Network, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
 
@@ -59,7 +59,7 @@ class RobotDocument(Document):
     """True for the operator's base station."""
     carries: tuple[Text, ...] = ()
     """Beacons in the robot's racks; may contain ranges."""
-    fielded: Address = NOT_WRITTEN
+    fielded: IPv4Only = NOT_WRITTEN
     """Address of the robot's computer while it runs the legacy udp_mesh; replace it with `computer` at migration."""
     lan: LanDocument = NOT_WRITTEN
     """Subnet of the robot's own LAN; its first radio in service routes it. Default: its radios bridge the mesh to its

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Interface, IPv4Network, IPv6Address, ip_address
+from ipaddress import IPv4Address, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -11,6 +11,7 @@ from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, Node
+from meshctl.model.ip import IpAddress, IpInterface, IpNetwork, host_and_port
 
 # so many nodes of a mesh, and all of them, outside its network: the network is wrong, not each address
 _WRONG_NETWORK_NODES = 3
@@ -39,7 +40,7 @@ def address_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             yield Finding(path, f"{first} has the same address", "a unique address", str(address))
 
 
-def stations(fleet: Fleet) -> Iterator[tuple[IPv4Address, tuple[tuple[str, ...], str]]]:
+def stations(fleet: Fleet) -> Iterator[tuple[IpAddress, tuple[tuple[str, ...], str]]]:
     for node in fleet.managed():
         yield node.address.ip, (("nodes", node.name, "address"), node.name)
         if node.lan_address is not None:
@@ -58,7 +59,7 @@ def lan_address_path(fleet: Fleet, node: Node) -> tuple[str, ...]:
     return first_written(fleet, (*lan, "addresses", node.name), (*lan, "network"))
 
 
-def networks(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], IPv4Network]]:
+def networks(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], IpNetwork]]:
     """The networks of the fleet with their paths: the meshes', then the robots' own LANs."""
     for mesh in fleet.meshes.values():
         yield ("meshes", mesh.name, "network"), mesh.network
@@ -114,11 +115,13 @@ def address_reserved(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             yield from _reserved(("robots", robot.name, *place, "address"), computer.address)
 
 
-def _reserved(path: tuple[str, ...], address: IPv4Interface) -> Iterator[Finding]:
+def _reserved(path: tuple[str, ...], address: IpInterface) -> Iterator[Finding]:
     # computed directly: ipaddress would take longer for the two ends than all other rules for the node
-    host_bits = 32 - address.network.prefixlen
-    ends = (0, (1 << host_bits) - 1)
-    if host_bits >= 2 and int(address.ip) & ends[1] in ends:
+    host_bits = address.max_prefixlen - address.network.prefixlen
+    host_mask = (1 << host_bits) - 1
+    # IPv6 has no broadcast address; its network address is every router's (RFC 4291, 2.6.1)
+    ends = (0, host_mask) if address.version == 4 else (0,)
+    if host_bits >= 2 and int(address.ip) & host_mask in ends:
         network = address.network
         expected = f"an address between {network.network_address} and {network.broadcast_address}"
         yield Finding(path, "not a host address", expected, str(address.ip))
@@ -230,7 +233,7 @@ def _out_of_reach(fleet: Fleet, host: str) -> bool:
     return address is None or not any(address in network for _, network in networks(fleet))
 
 
-def as_address(host: str) -> IPv4Address | IPv6Address | None:
+def as_address(host: str) -> IpAddress | None:
     """The IP address that `host` is; None for a name."""
     try:
         return ip_address(host)
@@ -263,4 +266,6 @@ def ssh_endpoint_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     for (host, port, _), names in duplicates(endpoints):
         for name in names[1:]:
             path = ("nodes", name, "ssh", "host")
-            yield Finding(path, f"{names[0]} has the same host and port", "a unique host and port", f"{host}:{port}")
+            yield Finding(
+                path, f"{names[0]} has the same host and port", "a unique host and port", host_and_port(host, port)
+            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Address, IPv4Network
+from ipaddress import ip_network
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -11,13 +11,19 @@ from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import meshes_of, networks, stations
 from meshctl.model import Backend, Fleet, Mesh
+from meshctl.model.ip import IpAddress, IpNetwork, end_of, sorting_key
 
-# RFC 1918, and RFC 6598 (carrier-grade NAT)
-_PRIVATE = tuple(IPv4Network(text) for text in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10"))
+# RFC 1918, RFC 6598 (carrier-grade NAT), and RFC 4193 (unique local IPv6)
+_PRIVATE = tuple(
+    ip_network(text) for text in ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "fc00::/7")
+)
 
 
-# 0/8, loopback, link-local, multicast, reserved
-_UNUSABLE = tuple(IPv4Network(text) for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3"))
+# 0/8, loopback, link-local, multicast, reserved; in IPv6 loopback and mapped IPv4, link-local, multicast
+_UNUSABLE = tuple(
+    ip_network(text)
+    for text in ("0.0.0.0/8", "127.0.0.0/8", "169.254.0.0/16", "224.0.0.0/3", "::/32", "fe80::/10", "ff00::/8")
+)
 
 
 @fleet_rule(
@@ -45,11 +51,11 @@ _UNUSABLE = tuple(IPv4Network(text) for text in ("0.0.0.0/8", "127.0.0.0/8", "16
 def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # sorted by first address: a network overlaps either the widest network before it or none
     widest: Mesh | None = None
-    for mesh in sorted(fleet.meshes.values(), key=lambda mesh: (mesh.network.network_address, mesh.network.prefixlen)):
+    for mesh in sorted(fleet.meshes.values(), key=lambda mesh: sorting_key(mesh.network)):
         if widest is not None and mesh.network.overlaps(widest.network) and not _routed_as_one(mesh, widest):
             message = f"overlaps {widest.network} of mesh {widest.name}"
             yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(mesh.network))
-        if widest is None or mesh.network.broadcast_address > widest.network.broadcast_address:
+        if widest is None or end_of(mesh.network) > end_of(widest.network):
             widest = mesh
 
 
@@ -68,7 +74,7 @@ def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
     "The network is not private",
     why="""Internet hosts with these addresses become unreachable from every robot and laptop, and replies leak through
     the uplink.""",
-    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
+    fix="Use an RFC 1918 network, such as 10.42.0.0/24, or a unique local IPv6 network, such as fd42::/64.",
     failing="""
     meshes: {main: {network: 11.42.0.0/24}}
     nodes: {base: {address: 11.42.0.1}, husky1-front: {address: 11.42.0.11}, b01: {address: 11.42.0.101}}
@@ -78,8 +84,8 @@ def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
 )
 def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for path, network in networks(fleet):
-        if not any(network.subnet_of(private) for private in _PRIVATE) and not _unusable(network):
-            yield Finding(path, "not a private network", "an RFC 1918 network", str(network))
+        if not any(_is_within(network, private) for private in _PRIVATE) and not _unusable(network):
+            yield Finding(path, "not a private network", "an RFC 1918 network, or one of fd00::/8", str(network))
 
 
 @fleet_rule(
@@ -87,7 +93,7 @@ def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The network is not usable for stations",
     why="Loopback, link-local, multicast and reserved ranges are not routed or not accepted on an interface.",
-    fix="Use an RFC 1918 network, such as 10.42.0.0/24.",
+    fix="Use an RFC 1918 network, such as 10.42.0.0/24, or a unique local IPv6 network, such as fd42::/64.",
     failing="""
     meshes: {main: {network: 127.42.0.0/24}}
     nodes: {base: {address: 127.42.0.1}, husky1-front: {address: 127.42.0.11}, b01: {address: 127.42.0.101}}
@@ -98,10 +104,15 @@ def network_public(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def network_unusable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for path, network in networks(fleet):
         if _unusable(network):
-            yield Finding(path, "reserved address range", "an RFC 1918 network", str(network))
+            yield Finding(path, "reserved address range", "an RFC 1918 network, or one of fd00::/8", str(network))
 
 
-def _unusable(network: IPv4Network) -> bool:
+def _is_within(network: IpNetwork, other: IpNetwork) -> bool:
+    """Whether `other` contains the whole of `network`."""
+    return network.network_address in other and network.prefixlen >= other.prefixlen
+
+
+def _unusable(network: IpNetwork) -> bool:
     return any(network.overlaps(unusable) for unusable in _UNUSABLE)
 
 
@@ -151,13 +162,15 @@ def prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # a spare and the operator's laptop
     reserve = 2
-    taken: dict[str, set[IPv4Address]] = {name: set() for name in fleet.meshes}
+    taken: dict[str, set[IpAddress]] = {name: set() for name in fleet.meshes}
     by_network = group_by_key((mesh.network, name) for name, mesh in fleet.meshes.items())
     # one lookup per prefix length instead of one per network
-    lengths = {network.prefixlen for network in by_network}
+    lengths = {(network.version, network.prefixlen) for network in by_network}
     for address, _ in stations(fleet):
-        for length in lengths:
-            for name in by_network.get(IPv4Network((address, length), strict=False), ()):
+        for version, length in lengths:
+            if version != address.version:
+                continue
+            for name in by_network.get(ip_network((address, length), strict=False), ()):
                 taken[name].add(address)
     for name, mesh in fleet.meshes.items():
         room = mesh.network.num_addresses - 2 - len(taken[name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from ipaddress import IPv4Network
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -13,6 +12,7 @@ from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.addresses import lan_address_path, meshes_of, networks
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Robot
+from meshctl.model.ip import IpNetwork, end_of, sorting_key
 
 # the robot of the examples with a LAN of its own
 _ROUTED = """
@@ -21,7 +21,7 @@ robots:
 """
 
 
-def _routed(fleet: Fleet) -> Iterator[tuple[Robot, IPv4Network]]:
+def _routed(fleet: Fleet) -> Iterator[tuple[Robot, IpNetwork]]:
     return ((robot, robot.lan) for robot in fleet.robots.values() if robot.lan is not None)
 
 
@@ -37,13 +37,13 @@ def _routed(fleet: Fleet) -> Iterator[tuple[Robot, IPv4Network]]:
 )
 def lan_overlaps(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     # sorted by first address: a network overlaps either the widest network before it or none
-    widest: tuple[tuple[str, ...], IPv4Network] | None = None
-    for path, network in sorted(networks(fleet), key=lambda item: (item[1].network_address, item[1].prefixlen)):
+    widest: tuple[tuple[str, ...], IpNetwork] | None = None
+    for path, network in sorted(networks(fleet), key=lambda item: sorting_key(item[1])):
         if widest is not None and network.overlaps(widest[1]) and "robots" in (path[0], widest[0][0]):
             lan, other = ((path, network), widest) if path[0] == "robots" else (widest, (path, network))
             owner = f"mesh {other[0][1]}" if other[0][0] == "meshes" else f"the LAN of {other[0][1]}"
             yield Finding(lan[0], f"overlaps {other[1]} of {owner}", "a separate network", str(lan[1]))
-        if widest is None or network.broadcast_address > widest[1].broadcast_address:
+        if widest is None or end_of(network) > end_of(widest[1]):
             widest = path, network
 
 

@@ -58,3 +58,28 @@ async function finished(job, source, output) {
     now = await source.post("api/actions/job", { id: now.id });
   }
 }
+
+const SILENCE_S = [["1 hour", 3600], ["4 hours", 14400], ["1 day", 86400], ["until it is ended", null]];
+
+// Ask for a reason and a time; `send(reason, for_s)` silences.
+export function openSilence(alarm, send) {
+  const dialog = byId("action");
+  const reason = el("input", { id: "reason", maxlength: "200", autocomplete: "off" });
+  const time = el("select", { id: "silence-time" }, ...SILENCE_S.map(([text], index) => el("option", { value: index }, text)));
+  const problem = el("p", { role: "alert" });
+  const button = el("button", { type: "button", disabled: true }, "Silence");
+  reason.addEventListener("input", () => { button.disabled = reason.value.trim() === ""; });
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    try {
+      await send(reason.value, SILENCE_S[Number(time.value)][1]);
+      dialog.close();
+    } catch (error) {
+      problem.textContent = error.message;
+      button.disabled = false;
+    }
+  });
+  dialog.replaceChildren(el("h2", {}, `Silence ${alarm.code} of ${alarm.device === "" ? "the fleet" : alarm.device}`), el("label", { for: "reason" }, "Reason"), reason, el("label", { for: "silence-time" }, "For"), time, problem, el("div", { class: "buttons" }, button, el("button", { type: "button", onclick: () => dialog.close() }, "Close")));
+  dialog.showModal();
+  reason.focus();
+}

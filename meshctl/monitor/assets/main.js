@@ -8,6 +8,7 @@ import { drawSample, MeshCanvas } from "./mesh.js";
 import { Charts } from "./charts.js";
 import { Timeline } from "./timeline.js";
 import { AlarmSound } from "./sound.js";
+import { openSilence } from "./actions.js";
 import { openSource } from "./source.js";
 import { alarmsAt, isQuiet, showAlarms, showChanges, showDetails, showRadios, showRobots } from "./panels.js";
 
@@ -99,9 +100,12 @@ function stop() {
 function show(frame) {
   if (frame === null || frame === undefined) return;
   state.frame = frame;
-  state.view = viewOf(frame, state.meta);
+  state.view = viewOf(withMeters(frame), state.meta);
   render();
 }
+
+// Live, readings of the placement meter arrive between frames.
+const withMeters = (frame) => (state.at_s === null && state.meters !== undefined ? { ...frame, meters: state.meters } : frame);
 
 function render() {
   const { view } = state;
@@ -303,6 +307,7 @@ const alarmHandlers = {
   acknowledge: async (alarm) => {
     try { receiveAlarms(await source.post("api/alarms/ack", { device: alarm.device, code: alarm.code })); } catch (error) { notice(`Cannot acknowledge: ${error.message}`); }
   },
+  silence: (alarm) => openSilence(alarm, async (reason, for_s) => receiveAlarms(await source.post("api/alarms/silence", { device: alarm.device, code: alarm.code, reason, for_s }))),
 };
 
 function receiveAlarms(alarms) {
@@ -433,7 +438,12 @@ const events = {
     if (state.at_s === null) show(frame); else showTimeline();
   },
   alarms: receiveAlarms,
+  meters(readings) {
+    state.meters = readings;
+    if (state.at_s === null && state.live !== null) show(state.live);
+  },
   state(link, reason) {
+    if (link !== "live") state.meters = {};
     if (link !== "live" && state.lostAt_s === null) state.lostAt_s = now_s();
     if (link === "live") { state.lostAt_s = null; timelineAt = -Infinity; }
     state.link = link;

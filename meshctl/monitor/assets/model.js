@@ -127,7 +127,8 @@ export function pathOf(view, name) {
 
 function robotOf(robot, status, devices, meta, meters) {
   const baseName = (status.robots ?? []).find((one) => one.is_base)?.name;
-  const toBase = (robot.peers ?? []).find((peer) => peer.name === baseName) ?? null;
+  // what an offline peer had last is not what it has now
+  const toBase = (robot.peers ?? []).find((peer) => peer.name === baseName && peer.online) ?? null;
   const radios = (robot.radios ?? []).map((name) => devices.get(name)).filter((device) => device !== undefined && device.role !== "beacon");
   const best = radios.filter((device) => isKnown(device.hops)).sort((x, y) => x.hops - y.hops || (y.quality ?? 0) - (x.quality ?? 0))[0] ?? null;
   const beacons = [...devices.values()].filter((device) => device.role === "beacon" && device.robot === robot.name);
@@ -140,7 +141,7 @@ function robotOf(robot, status, devices, meta, meters) {
     queues: robot.queues ?? null, meter: meters?.[robot.name] ?? null,
     roundTrip_s: toBase?.round_trip_s ?? null, loss: toBase?.loss ?? null,
     capacity: toBase?.capacity_bits_per_s ?? null,
-    outbox: peers === null || peers === undefined ? null : sum(peers.map((peer) => peer.outbox_messages ?? 0)),
+    outbox: peers === null || peers === undefined ? null : peers.every((peer) => isKnown(peer.outbox_messages)) ? sum(peers.map((peer) => peer.outbox_messages)) : null,
     peersOnline: peers === null || peers === undefined ? null : peers.filter((peer) => peer.online).length,
     peerCount: peers === null || peers === undefined ? null : peers.length,
     telemetry_s: lastOf(robot, meta, "telemetry"), artifact_s: lastOf(robot, meta, "artifact"),

@@ -73,9 +73,8 @@ function fillRobot(card, { robot, isCompact, isSelected }, onSelect) {
 // The placement meter's advice, in the largest type of the card.
 function meterOf(meter) {
   const advice = typeof meter.advice === "string" ? meter.advice : "no advice";
-  const left = isKnown(meter.meters_left) ? `${Math.round(meter.meters_left)} m left` : `${MISSING} m left`;
-  const margin = isKnown(meter.margin_db) ? `margin ${Math.round(meter.margin_db)} dB` : `margin ${MISSING}`;
-  return el("div", { class: "meter", "data-advice": advice, title: meter.reason ?? null }, el("strong", {}, advice), el("span", {}, left), el("span", {}, margin));
+  const large = (value, unit) => el("span", { class: "meter-value" }, el("b", {}, isKnown(value) ? String(Math.floor(value)) : MISSING), ` ${unit}`);
+  return el("div", { class: "meter", "data-advice": advice }, el("strong", {}, advice), large(meter.meters_left, "m left"), large(meter.margin_db, "dB margin"), meter.reason ? el("span", { class: "meter-reason" }, meter.reason) : null);
 }
 
 // One cell per priority, the most urgent first: messages and the age of the oldest.
@@ -138,6 +137,7 @@ function fillAlarm(card, { alarm, canAcknowledge }, handlers) {
   if (alarm.acknowledged !== null) times.push(`acknowledged by ${alarm.acknowledged.by} ${clockTime(alarm.acknowledged.at_s)}`);
   if (alarm.silenced !== null) times.push(`silenced by ${alarm.silenced.by}: ${alarm.silenced.reason}`);
   const buttons = [el("button", { type: "button", onclick: () => handlers.jump(alarm) }, "Jump to start")];
+  if (canAcknowledge && alarm.silenced === null) buttons.unshift(el("button", { type: "button", onclick: () => handlers.silence(alarm) }, "Silence…"));
   if (canAcknowledge && alarm.acknowledged === null) buttons.unshift(el("button", { type: "button", onclick: () => handlers.acknowledge(alarm) }, "Acknowledge"));
   card.replaceChildren(
     el("h3", {}, el("span", { class: "level" }, MARKS[alarm.level] ?? alarm.level), deviceButton(alarm, handlers), el("code", {}, alarm.code)),

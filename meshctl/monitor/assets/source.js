@@ -95,6 +95,7 @@ class LiveSource {
     const body = JSON.parse(data.join("\n"));
     if (kind === "frame") on.frame(body);
     else if (kind === "alarms") on.alarms(body);
+    else if (kind === "meters") on.meters(body);
   }
 }
 

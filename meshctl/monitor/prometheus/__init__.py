@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 
 from meshctl.errors import InputError, MeshctlError
 from meshctl.model import Fleet
+from meshctl.model.ip import host_and_port
 from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.metrics import render_metrics
@@ -39,7 +41,7 @@ def file_sd(fleet: Fleet) -> str:
     """
     groups = [
         {
-            "targets": [f"{node.address.ip}:{EXPORTER_PORT}"],
+            "targets": [host_and_port(str(node.address.ip), EXPORTER_PORT)],
             "labels": {"fleet": fleet.name, "node": node.name, "role": node.role.value, "robot": node.robot},
         }
         for node in fleet.managed()
@@ -49,18 +51,29 @@ def file_sd(fleet: Fleet) -> str:
 
 
 class TextfileWriter:
-    """A listener of the sampler that writes every frame's metrics to a file; `problem` says why it could not."""
+    """A listener of the sampler that writes every frame's metrics to a file; `problem` says why it could not, also to
+    `on_problem`."""
 
-    def __init__(self, path: Path, store: FrameStore) -> None:
+    def __init__(
+        self,
+        path: Path,
+        store: FrameStore,
+        on_problem: Callable[[str], None] = lambda text: None,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
         self.path = path
+        self._on_problem = on_problem
         self.problem = ""
         self._store = store
+        self._clock = clock
 
     def __call__(self, frame: Frame, began: Sequence[LoggedAlarm]) -> None:
         try:
-            replace_file(self.path, render_metrics(frame, self._store))
+            replace_file(self.path, render_metrics(frame, self._store, self._clock()))
         except MeshctlError as error:
             # no reason to miss a frame
+            if str(error) != self.problem:
+                self._on_problem(str(error))
             self.problem = str(error)
         else:
             self.problem = ""

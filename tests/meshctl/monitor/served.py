@@ -49,7 +49,7 @@ class Served:
         self.feed.notify()
 
     def ask(self, path: str, body: object = None, headers: Mapping[str, str] | None = None) -> Answer:
-        data = None if body is None else json.dumps(body).encode()
+        data = body if body is None or isinstance(body, bytes) else json.dumps(body).encode()
         given = {**({} if data is None else {"Content-Type": "application/json"}), **(headers or {})}
         request = urllib.request.Request(self.url + path, data, given)
         try:

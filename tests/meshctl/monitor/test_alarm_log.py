@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.errors import InputError
+from meshctl.errors import InputError, MeshctlError
 from meshctl.monitor.alarm_log import REOPEN_S, Silence
+from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
 
@@ -72,6 +73,40 @@ def test_a_flapping_alarm_is_one_and_a_later_one_is_new(store: FrameStore) -> No
     assert [one.acknowledged is None for one in store.alarms(active_only=False, now_s=400.0)] == [True, False]
 
 
+def test_an_alarm_that_becomes_an_error_is_reported_again_and_needs_its_own_acknowledgment(store: FrameStore) -> None:
+    error = {("b01", "weak"): "error"}
+    store.append(frame(10.0, WEAK))
+    store.acknowledge("b01", "weak", "alice", 11.0)
+    (worse,) = store.append(frame(20.0, error))
+    assert (worse.level, worse.first_s) == ("error", 10.0)
+    (weak,) = store.alarms(now_s=20.0)
+    assert weak.acknowledged is None
+    # it was an error before: nothing new, and its acknowledgment stays
+    store.acknowledge("b01", "weak", "bob", 21.0)
+    assert store.append(frame(30.0, WEAK)) == ()
+    assert store.append(frame(40.0, error)) == ()
+    (weak,) = store.alarms(now_s=40.0)
+    assert weak.acknowledged is not None
+    assert weak.acknowledged.by == "bob"
+
+
+def test_an_alarm_that_becomes_an_error_while_the_disk_is_full_loses_its_acknowledgment(
+    store: FrameStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.append(frame(10.0, WEAK))
+    store.acknowledge("b01", "weak", "alice", 11.0)
+
+    def full(*arguments: object) -> None:
+        raise MeshctlError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "_write", full)
+        store.append(frame(20.0, {("b01", "weak"): "error"}))
+    store.append(frame(30.0, {("b01", "weak"): "error"}))
+    (weak,) = store.alarms(now_s=30.0)
+    assert (weak.level, weak.acknowledged) == ("error", None)
+
+
 def test_open_alarms_are_known_to_the_next_process(tmp_path: Path) -> None:
     with FrameStore.open(tmp_path / "one", 86400.0, MIN_BYTES) as store:
         store.append(frame(10.0, WEAK))
@@ -112,3 +147,17 @@ def test_a_silence_covers_later_alarms_until_it_ends(store: FrameStore) -> None:
         store.end_silence("*", "clock")
     with pytest.raises(InputError, match="reason"):
         store.silence("b01", "weak", Silence(None, "  ", "bob"))
+    with pytest.raises(InputError, match="unknown device 'b07'"):
+        store.silence("b07", "weak", Silence(None, "gone", "bob"))
+    store.silence("robot:rover", "disk", Silence(None, "known", "bob"))
+
+
+def test_silences_are_in_force_by_the_wall_clock_also_while_frames_are_ahead_of_it(store: FrameStore) -> None:
+    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"))
+    # the clock was set back: frames go on from the later time
+    (began,) = store.append(frame(1000.0, WEAK), now_s=40.0)
+    assert began.silenced is not None
+    for now_s, silenced in ((40.0, "true"), (60.0, "false")):
+        assert f'device="b01",code="weak",level="warning",acknowledged="false",silenced="{silenced}"' in render_metrics(
+            store.latest(), store, now_s
+        )

@@ -14,9 +14,11 @@ from playwright.sync_api import Browser, expect
 from typer.testing import CliRunner
 
 from meshctl.cli.main import build
+from meshctl.cli.monitor_web import WebOptions
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
 from tests.meshctl.monitor.documents import frame
+from tests.meshctl.status.fleets import trio
 from tests.meshctl.status.line_fleet import Bench, line_of_three
 
 pytestmark = pytest.mark.xdist_group("browser")
@@ -104,8 +106,17 @@ def history(tmp_path: Path) -> Path:
         (["--tls-cert", "cert.pem"], "expected --tls-cert and --tls-key together"),
         (["--out", "run.html"], "--out needs --replay"),
         (["--replay", "nothing.sqlite"], "cannot read nothing.sqlite: No such file or directory"),
-        (["--replay", "run.sqlite", "--once"], "--replay goes with neither --once nor --allow-actions"),
+        (["--replay", "run.sqlite", "--once"], "--replay does not go with --once"),
+        (["--replay", "run.sqlite", "--store", "x", "--hook", "y"], "--replay does not go with --store, --hook"),
+        (["--tls-cert", "nothing", "--tls-key", "run.sqlite"], "cannot use nothing and run.sqlite: No such file"),
+        (["--tls-cert", "run.sqlite", "--tls-key", "run.sqlite"], "cannot use run.sqlite and run.sqlite: "),
         (["--token-file", "nothing"], "cannot read nothing: No such file or directory"),
+        (["--hook", "notify 'unbalanced"], "--hook: expected a command line, found"),
+        (["--webhook", "http://x:port/"], "webhook: expected an http or https URL, found 'http://x:port/'"),
+        (["--hook-level", "loud"], "hook level: expected note, warning, error, found 'loud'"),
+        (["--interval", "nan"], "Invalid value for '--interval'"),
+        (["--keep-days", "nan"], "Invalid value for '--keep-days'"),
+        (["--keep-days", "inf"], "Invalid value for '--keep-days'"),
         (["--replay", "run.sqlite", "--listen", "192.0.2.1"], "cannot listen on 192.0.2.1 port 8765"),
     ],
 )
@@ -117,11 +128,37 @@ def test_wrong_options_are_named(
     assert (code, expected in output) == (2, True), output
 
 
+def test_a_history_goes_where_a_directory_can_be_made(tmp_path: Path) -> None:
+    trio(tmp_path)
+    (tmp_path / "file").touch()
+    words = ("--once", "-i", str(tmp_path / "fleet.yaml"), "--store")
+    code, output = run(*words, str(tmp_path / "file/deep/run.sqlite"))
+    assert (code, f"{tmp_path}/file/deep: cannot be created: Not a directory" in output) == (2, True), output
+    # nothing answers, which is an answer
+    code, output = run(*words, str(tmp_path / "new/run.sqlite"), "--timeout", "0.5", "--no-robots")
+    assert (tmp_path / "new/run.sqlite").is_file(), output
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o700
+
+
 @pytest.mark.parametrize("token", ["", "short", "with a space in it, which is long"])
 def test_a_weak_token_is_refused(token: str, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(token)
     code, output = run("--token-file", str(tmp_path / "token"))
     assert (code, "expected a token of at least 16 printable ASCII characters" in output) == (2, True), output
+
+
+def test_actions_need_a_token_everywhere() -> None:
+    def token(host: str, *, allow_actions: bool) -> str:
+        return WebOptions.checked(host, 0, None, None, None, (), allow_actions=allow_actions).token
+
+    assert token("127.0.0.1", allow_actions=False) == ""
+    made = {
+        token("127.0.0.1", allow_actions=True),
+        token("::1", allow_actions=True),
+        token("0.0.0.0", allow_actions=False),
+    }
+    assert len(made) == 3
+    assert min(map(len, made)) >= 24
 
 
 def test_a_history_becomes_one_file(history: Path, tmp_path: Path) -> None:

@@ -55,7 +55,8 @@ def receiver(status: int = 200, delay_s: float = 0.0) -> Iterator[tuple[str, lis
         server.server_close()
 
 
-def test_both_hooks_get_the_alarm_as_data(tmp_path: Path) -> None:
+def test_both_hooks_get_the_alarm_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MESHCTL_MONITOR_TOKEN", "for browsers alone")
     program = (
         "import json, os, sys; from pathlib import Path; "
         "Path(sys.argv[1]).write_text(json.dumps([json.load(sys.stdin), dict(os.environ), sys.argv[2:]]))"
@@ -72,6 +73,7 @@ def test_both_hooks_get_the_alarm_as_data(tmp_path: Path) -> None:
     assert (document["fleet"], document["device"], document["text"]) == ("lab", "b01", HOSTILE)
     assert arguments == ["two words"]
     assert environment["MESHCTL_ALARM_CODE"] == "unreachable"
+    assert "MESHCTL_MONITOR_TOKEN" not in environment
     assert environment["MESHCTL_ALARM_TEXT"] == 'x"; touch pwned; $(touch pwned) `touch pwned`  [31m  <script>'
     assert list(tmp_path.iterdir()) == [out]
 
@@ -99,15 +101,21 @@ def test_a_hook_that_hangs_is_given_up_and_notify_never_waits(tmp_path: Path) ->
     ("settings", "problem"),
     [
         (HookSettings("http://127.0.0.1:9/"), "webhook http://127.0.0.1:9/: "),
+        (
+            HookSettings("http://127.0.0.1:9/a b"),
+            "webhook http://127.0.0.1:9/a b: URL can't contain",
+        ),
         (HookSettings(command=("/nonexistent/hook",)), "command /nonexistent/hook: "),
         (HookSettings(command=("false",)), "command false: exit status 1"),
     ],
 )
 def test_a_failed_hook_is_a_problem(settings: HookSettings, problem: str) -> None:
-    hooks = AlarmHooks(settings)
+    said: list[str] = []
+    hooks = AlarmHooks(settings, on_problem=said.append)
     hooks.notify([alarm()])
     hooks.close(20)
     assert hooks.problem.startswith(problem)
+    assert said == [f"alarm not reported: {hooks.problem}"]
 
 
 @pytest.mark.parametrize(("status", "problem"), [(200, ""), (500, "500"), (302, "302"), (307, "307")])
@@ -139,7 +147,13 @@ def test_an_alarm_that_begins_silenced_is_not_reported_and_one_that_continues_is
     assert [one["device"] for one in got] == ["b01"]
 
 
-@pytest.mark.parametrize("url", ["ftp://x/", "file:///etc/passwd", "example.org/hook", "http://"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("ftp://x/", "file:///etc/passwd", "example.org/hook", "http://"),
+        *("http://x:port/", "http://x:99999/", "http://x:0/", "http://[::1/"),
+    ],
+)
 def test_a_webhook_must_be_a_web_address(url: str) -> None:
     with pytest.raises(InputError, match="expected an http or https URL"):
         HookSettings(url)

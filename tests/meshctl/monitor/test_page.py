@@ -121,6 +121,21 @@ def test_what_is_not_known_is_shown_as_missing_and_never_as_zero(
         expect(page.locator("#totals")).to_contain_text("– air")
 
 
+def test_readings_of_the_placement_meter_are_shown_live_and_in_the_past(
+    browser: Browser, store: FrameStore, frames: list[Frame]
+) -> None:
+    reading = {"advice": "DROP SOON", "meters_left": 12.9, "margin_db": None, "reason": "weak next hop"}
+    store.append(Frame.of({**frames[0].document, "meters": {"spot1": reading}}))
+    store.append(frames[1])
+    with served(store, SETTINGS) as server, opened(browser, server.url, width=1600) as page:
+        meter = page.locator("#robots .meter")
+        expect(meter).to_have_count(0)
+        page.keyboard.press("ArrowLeft")
+        expect(meter).to_contain_text("DROP SOON")
+        expect(meter.locator("b")).to_have_text(["12", "–"])
+        expect(meter).to_contain_text("weak next hop")
+
+
 def test_the_slider_shows_any_moment_and_alarms_lead_to_theirs(
     browser: Browser, store: FrameStore, frames: list[Frame]
 ) -> None:
@@ -134,6 +149,11 @@ def test_the_slider_shows_any_moment_and_alarms_lead_to_theirs(
         page.click("#tab-alarms")
         alarm = page.locator("#alarms article", has_text="b02").first
         expect(alarm).to_contain_text("no answer")
+        alarm.get_by_role("button", name="Silence").click()
+        expect(page.get_by_role("button", name="Silence", exact=True)).to_be_disabled()
+        page.get_by_label("Reason").fill("in repair")
+        page.get_by_role("button", name="Silence", exact=True).click()
+        expect(page.locator("#alarms")).to_contain_text("in repair")
         alarm.get_by_role("button", name="Jump to start").click()
         page.wait_for_selector(f'html[data-shown="{frames[dark].time_s:.0f}"]', state="attached")
         expect(page.locator("#mode")).to_contain_text("past")

@@ -55,7 +55,7 @@ class Rig:
     time: Time = field(default_factory=Time)
     bytes_per_round: int = 10_000
     sent: dict[str, int] = field(default_factory=dict)
-    failure: MeshctlError | None = None
+    failure: Exception | None = None
     seen: list[tuple[Frame, Sequence[LoggedAlarm]]] = field(default_factory=list)
 
     def collect(self) -> Snapshot:
@@ -121,6 +121,7 @@ def test_the_airtime_counts_every_hop_at_the_rate_of_the_first() -> None:
 )
 def test_the_interval_is_stretched_over_the_limit(airtime_s: float | None, expected_s: float) -> None:
     assert next_interval_s(5.0, airtime_s, 0.03, 300.0) == pytest.approx(expected_s)
+    assert next_interval_s(600.0, airtime_s, 0.03, 300.0) == 600.0, "never shorter than asked for"
 
 
 def test_an_expensive_fleet_is_looked_at_less_often_and_stays_within_the_limit(fleet: Fleet, store: FrameStore) -> None:
@@ -136,8 +137,19 @@ def test_an_expensive_fleet_is_looked_at_less_often_and_stays_within_the_limit(f
     assert sampler.sample().document["airtime"]["interval_s"] == 1.0
 
 
-def test_a_failed_round_is_a_problem_and_the_next_one_is_tried(fleet: Fleet, store: FrameStore) -> None:
-    rig = Rig(fleet, store, failure=MeshctlError("the journal is locked"))
+@pytest.mark.parametrize(
+    ("failure", "problem"),
+    [
+        (MeshctlError("the journal is locked"), "the journal is locked"),
+        (KeyError("nodes"), "internal error: KeyError: 'nodes'"),
+        (RecursionError("too deep"), "internal error: RecursionError: too deep"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_failed_round_is_a_problem_and_the_next_one_is_tried(
+    fleet: Fleet, store: FrameStore, failure: Exception, problem: str
+) -> None:
+    rig = Rig(fleet, store, failure=failure)
     sampler = rig.sampler(interval_s=0.001)
     failed, frames = threading.Event(), threading.Event()
     sampler.listeners.append(lambda frame, began: frames.set())
@@ -146,7 +158,7 @@ def test_a_failed_round_is_a_problem_and_the_next_one_is_tried(fleet: Fleet, sto
     thread.start()
     while not sampler.problem:
         failed.wait(0.001)
-    assert sampler.problem == "the journal is locked"
+    assert sampler.problem == problem
     rig.failure = None
     assert frames.wait(10)
     sampler.stop()
@@ -164,9 +176,25 @@ def test_frames_stay_in_order_while_the_clock_is_set_back(fleet: Fleet, store: F
     assert sampler.sample().time_s == first + 5.5, "it continues at the pace of the monotonic clock"
     rig.time.wall_s += 7200
     assert sampler.sample().time_s == first + 3600 + 6, "a clock that is set forward is followed"
+    assert store.clock_stepped_s == pytest.approx(3600.0)
     # another process whose clock is wrong
     behind = Rig(fleet, store, Time(wall_s=NOW - 500))
     assert behind.sampler().sample().time_s == first + 3606.001
+
+
+def test_a_clock_that_is_set_forward_expires_nothing(fleet: Fleet, tmp_path: Path) -> None:
+    with FrameStore.open(tmp_path / "short.sqlite", 60.0, MIN_BYTES) as store:
+        rig = Rig(fleet, store)
+        sampler = rig.sampler()
+        first = sampler.sample().time_s
+        rig.time.wall_s += 40 * 365 * 86400.0
+        sampler.sample()
+        assert store.span() is not None
+        assert (store.span() or (0.0,))[0] == first
+        # it is old after its time all the same
+        rig.time.forward(60)
+        newest = sampler.sample().time_s
+        assert (store.span() or (0.0,))[0] == pytest.approx(newest - 60.5)
 
 
 def test_what_daemons_report_goes_before_the_inventory(fleet: Fleet) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from meshctl.monitor import event_stream
 from meshctl.monitor.access import AccessRules, host_of
+from meshctl.monitor.alarm_log import LoggedAlarm
 from meshctl.monitor.server import PageSettings
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
@@ -76,6 +79,8 @@ def test_an_alarm_is_acknowledged_once_it_is_open(server: Served) -> None:
     silence = {"device": "b02", "code": "unreachable", "reason": "in repair", "by": "ann", "for_s": 60}
     assert server.ask("api/alarms/silence", silence).body[0]["silenced"]["until_s"] == 1069.5
     assert server.ask("api/alarms/silence", {**silence, "for_s": -1}).status == 400
+    assert server.ask("api/alarms/silence", {**silence, "device": "b07"}).body["error"] == "unknown device 'b07'"
+    assert server.ask("api/alarms/silence", {**silence, "code": "tired"}).status == 400
     assert (
         server.ask("api/alarms/silence", {**silence, "reason": " "}).body["error"]
         == "expected a reason for the silence"
@@ -109,6 +114,29 @@ def test_a_token_guards_the_data_and_not_the_empty_page(store: FrameStore) -> No
             assert server.ask(path).status == 401
             assert server.ask(path, headers={"Authorization": "Bearer wrong"}).status == 401
         assert server.ask("api/frame", headers={"Authorization": f"Bearer {TOKEN}"}).status == 200
+
+
+def test_another_sites_page_reads_nothing(server: Served) -> None:
+    for site, status in (("cross-site", 403), ("same-site", 403), ("same-origin", 200), ("none", 200)):
+        for path in ("api/frame", "api/alarms", "metrics"):
+            found = server.ask(path, headers={"Sec-Fetch-Site": site}).status
+            # this server has no metrics
+            assert found == (404 if path == "metrics" and status == 200 else status), (path, site)
+    assert server.ask("", headers={"Sec-Fetch-Site": "cross-site"}).status == 200, "a link to the page may be followed"
+
+
+@pytest.mark.parametrize(
+    ("body", "expected"),
+    [
+        (b'{"device": "b02", "code": "unreachable", "by": "\\ud800"}', "by: expected a text, found half a character"),
+        (b"[" * 16_000, "expected JSON: "),
+        (b'{"device": "\xff"}', "expected JSON: "),
+        (b"[]", "expected a JSON object, found list"),
+    ],
+)
+def test_a_hostile_body_is_refused(server: Served, body: bytes, expected: str) -> None:
+    answer = server.ask("api/alarms/ack", body)
+    assert (answer.status, answer.body["error"].startswith(expected)) == (400, True), answer
 
 
 @pytest.mark.parametrize(
@@ -161,9 +189,9 @@ def test_a_stream_begins_with_the_newest_frame_and_resumes_after_the_last_one_se
     assert (head, json.loads(data)["time_s"], alarms) == ("frame 1009000", 1009.0, "alarms")
     missed = events(server, "1006000", 4)
     assert [head for head, _ in missed] == ["frame 1007000", "frame 1008000", "frame 1009000", "alarms"]
-    # from another history, or from nowhere
+    # from nowhere, or from another history
     assert events(server, "not-a-number", 1)[0][0] == "frame 1009000"
-    assert events(server, "99999999999999", 1)[0][0] == "alarms"
+    assert events(server, "99999999999999", 1)[0][0] == "frame 1009000"
 
 
 def test_a_new_frame_is_sent_to_open_streams(server: Served) -> None:
@@ -177,3 +205,35 @@ def test_a_new_frame_is_sent_to_open_streams(server: Served) -> None:
         assert line
     assert answer.fp.readline() == b"id: 1010000\n"
     connection.close()
+
+
+def test_what_is_sent_is_built_once_for_all_pages_and_these_are_limited(
+    store: FrameStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[float] = []
+    alarms = FrameStore.alarms
+
+    def counted(self: FrameStore, *, active_only: bool = True, now_s: float) -> tuple[LoggedAlarm, ...]:
+        built.append(now_s)
+        return alarms(self, active_only=active_only, now_s=now_s)
+
+    monkeypatch.setattr(FrameStore, "alarms", counted)
+    monkeypatch.setattr(event_stream, "MAX_STREAMS", 4)
+    with served(store, clock=lambda: 1009.5) as server, ExitStack() as stack:
+        answers = []
+        for _ in range(4):
+            connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+            stack.callback(connection.close)
+            connection.request("GET", "/api/events")
+            answers.append(connection.getresponse())
+        for answer in answers:
+            while not answer.fp.readline().startswith(b"event: alarms"):
+                pass
+        assert len(built) == 1
+        refused = server.ask("api/events")
+        assert (refused.status, "too many pages" in refused.body["error"]) == (503, True)
+        server.append(frame(1010.0))
+        for answer in answers:
+            while answer.fp.readline() != b"id: 1010000\n":
+                pass
+        assert len(built) == 2

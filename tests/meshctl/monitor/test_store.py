@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.errors import InputError, MeshctlError
+from meshctl.monitor.alarm_log import Silence
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
@@ -266,6 +267,40 @@ def test_wrong_files_are_named(tmp_path: Path) -> None:
         FrameStore.open(newer, DAY_S, MIN_BYTES)
     with pytest.raises(ValueError, match="at least"):
         FrameStore.open(newer, DAY_S, 1000)
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_a_database_of_another_program_is_left_as_it_is(tmp_path: Path, version: int) -> None:
+    foreign = tmp_path / "photos.sqlite"
+    with sqlite3.connect(foreign) as database:
+        database.execute("CREATE TABLE photos (name TEXT)")
+        database.execute(f"PRAGMA user_version = {version}")
+    database.close()
+    before = foreign.read_bytes()
+    with pytest.raises(MeshctlError, match=r"photos\.sqlite: not a history of meshctl: found the tables photos"):
+        FrameStore.open(foreign, DAY_S, MIN_BYTES)
+    with pytest.raises(MeshctlError, match=r"photos\.sqlite: "):
+        FrameStore.open_recording(foreign)
+    assert [file.name for file in tmp_path.iterdir()] == ["photos.sqlite"]
+    assert foreign.read_bytes() == before
+
+
+def test_the_revision_follows_every_change_also_of_another_process(store: FrameStore, path: Path) -> None:
+    seen = [store.revision()]
+
+    def is_new() -> bool:
+        seen.append(store.revision())
+        return seen[-1] not in seen[:-1]
+
+    assert seen[0] == store.revision()
+    store.append(frame(1.0, {("b01", "weak"): "warning"}))
+    assert is_new()
+    store.acknowledge("b01", "weak", "alice", 2.0)
+    assert is_new()
+    with FrameStore.open_running(path) as other:
+        other.silence("b01", "weak", Silence(None, "known", "bob"))
+    assert is_new()
+    assert not is_new()
 
 
 def test_a_damaged_frame_is_left_out(store: FrameStore, path: Path) -> None:

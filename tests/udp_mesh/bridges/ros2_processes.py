@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.udp_mesh.bridges.bridge_processes import BridgeProcess, NodeProcess
@@ -23,33 +24,49 @@ def environment(domain: int) -> dict[str, str]:
     """One robot's ROS: nothing of another domain is heard, nothing leaves this machine."""
     return {
         **{name: text for name, text in os.environ.items() if not name.startswith(("ROS_", "RMW_", "PYTHON"))},
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": f"{ROOT}:{Path(__file__).with_name('ros2_packages')}",
         "ROS_DOMAIN_ID": str(domain),
+        # shared memory is outside of network namespaces, and a killed process leaves its segments locked there
+        "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
 
 
 class Ros2Node(NodeProcess):
-    """A node of a robot."""
+    """A node of a robot. `inside` goes before its command: what enters the robot's own network."""
 
-    def __init__(self, folder: Path, name: str, domain: int) -> None:
-        command = [str(PYTHON), str(Path(__file__).with_name("ros2_robot.py")), name]
+    def __init__(self, folder: Path, name: str, domain: int, inside: Sequence[str] = ()) -> None:
+        command = [*inside, str(PYTHON), str(Path(__file__).with_name("ros2_robot.py")), name]
         super().__init__(command, environment(domain), folder / f"{name}-ros2.log")
 
-    def publish(self, name: str, data: str, **qos: bool) -> None:
-        self._command(publish=name, data=data, **qos)
+    def publish(self, name: str, data: object, **more: object) -> None:
+        self._command(publish=name, data=data, **more)
 
-    def subscribe(self, name: str, **qos: bool) -> None:
-        self._command(subscribe=name, **qos)
+    def subscribe(self, name: str, **more: object) -> None:
+        self._command(subscribe=name, **more)
+
+    def request(self, kind: str, name: str, **more: object) -> None:
+        """Any other request of `ros2_robot`."""
+        self._command(**{kind: name}, **more)
+
+    def is_available(self, name: str) -> bool:
+        """Whether a service has a server in this robot's graph."""
+        self._command(is_available=name)
+        return bool(self.expect("of", name)["available"])
 
 
 class Ros2Bridge(BridgeProcess):
-    """One robot's bridge."""
+    """One robot's bridge, with `configuration` as its file."""
 
-    def __init__(self, daemon: RunningDaemon, domain: int) -> None:
+    def __init__(
+        self, daemon: RunningDaemon, domain: int, inside: Sequence[str] = (), configuration: str = "", *more: str
+    ) -> None:
         super().__init__(daemon.folder / f"{daemon.name}-bridge2.log")
-        self._socket, self._domain = daemon.socket, domain
+        self._socket, self._domain, self._inside, self._more = daemon.socket, domain, inside, more
+        self._file = daemon.folder / f"{daemon.name}-bridge2.yaml"
+        self._file.write_text(configuration)
 
     def start(self) -> None:
         command = [str(PYTHON), "-m", "udp_mesh.bridges.ros2", "--socket", str(self._socket)]
-        self._run(command, environment(self._domain))
+        command += ["--config", str(self._file), *self._more]
+        self._run([*self._inside, *command], environment(self._domain))

@@ -32,14 +32,16 @@ image = { priority = 9, keep_last = 1 }
 class RobotsDaemon(RunningDaemon):
     """A daemon in a robot's own network, on the shared link, which finds its peers."""
 
-    def __init__(self, folder: Path, name: str, inside: Sequence[str], topics: str = TOPICS) -> None:
+    def __init__(
+        self, folder: Path, name: str, inside: Sequence[str], topics: str = TOPICS, rates: str = PATIENT_RATES
+    ) -> None:
         key = folder / f"{name}.key"
         key.write_text(KEY + "\n")
         self._inside = tuple(inside)
         super().__init__(
             folder,
             name,
-            f'name = "{name}"\nkey_file = "{key}"\n[[links]]\ninterface = "{INTERFACE}"\n{topics}{PATIENT_RATES}'
+            f'name = "{name}"\nkey_file = "{key}"\n[[links]]\ninterface = "{INTERFACE}"\n{topics}{rates}'
             f'[daemon]\nsocket = "{folder / name}.sock"\nstate_directory = "{folder / name}"\n',
         )
 

@@ -177,16 +177,11 @@ def test_messages_of_other_bridges_are_left_alone() -> None:
     for type_text in (
         "",
         "zenoh",
-        "std_msgs/msg/String reliable:volatile:10:",
         "a/B c d",
         "a/B c latched",
         "a/B c latched:ab:1 e",
     ):
         assert relay("bob").from_mesh("alice", "status", type_text, b"x", 0.0) == []
-    assert (
-        Relay("bob", "bridge/ros2", ros_version=2, nonce=b"b").from_mesh("alice", "t", "std_msgs/String", b"x", 0.0)
-        == []
-    )
 
 
 def test_a_robot_whose_ros_name_equals_ours_is_reported_and_not_published() -> None:

@@ -1,23 +1,52 @@
-"""Two robots with a real ROS 2 each, in ROS domains of their own: node, bridge, daemon, and back."""
+"""Two robots with a real ROS 2 each, in networks and ROS domains of their own, on a lossy link that is cut."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
+from benchmarks.link.laboratory import Laboratory, Link, laboratory
 from tests.udp_mesh.bridges.ros2_processes import Ros2Bridge, Ros2Node
-from tests.udp_mesh.daemon.processes import RunningDaemon, poll, two_daemons
+from tests.udp_mesh.bridges.ros_team import RobotsDaemon
+from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, poll, wait_online
+from udp_mesh.bridges.message_codec import decode, encode
+from udp_mesh.bridges.transforms import DEFINITION
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
 
 pytestmark = pytest.mark.xdist_group("ros2")
 
+LINK = Link(rate=20e6, delay_ms=5.0, loss=0.05)
+TF_TYPE = "tf2_msgs/msg/TFMessage"
 DOMAINS = {"alice": 71, "bob": 72}
 TO_BOB = "/alice/mesh_comm/bob/status"
 TO_BOB_MAP = "/alice/mesh_comm/bob/map"
 TO_ALICE = "/bob/mesh_comm/alice/status"
+
+
+CONFIGURATION = """
+topics:
+  history: { depth: 4 }
+tf: { rate_hz: 5 }
+services:
+  /reset: { timeout_s: 2 }
+  /mute: { timeout_s: 1 }
+actions:
+  /count: { timeout_s: 5, lost_s: 60 }
+  /short: { timeout_s: 5, lost_s: 0.5 }
+"""
+TOPICS = """
+[topics]
+status = { priority = 0 }
+map = { priority = 5 }
+history = { priority = 5 }
+camera = { priority = 5 }
+"""
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
 
 @dataclass
@@ -27,19 +56,56 @@ class Side:
     node: Ros2Node
 
 
+@dataclass
+class Team:
+    lab: Laboratory
+    alice: Side
+    bob: Side
+
+    def cut(self) -> None:
+        """Nothing crosses the link from now on; both robots have noticed."""
+        self.lab.set(loss=1.0)
+        wait_online(self.alice.daemon, "bob", online=False)
+        wait_online(self.bob.daemon, "alice", online=False)
+
+    def join(self) -> None:
+        self.lab.set(loss=LINK.loss)
+        wait_online(self.alice.daemon, "bob")
+        wait_online(self.bob.daemon, "alice")
+
+
 @pytest.fixture(scope="module")
-def team() -> Iterator[tuple[Side, Side]]:
-    with two_daemons() as daemons, ExitStack() as kept:
+def whole() -> Iterator[Team]:
+    """Two robots, each in a network and a ROS domain of its own, on one lossy link."""
+    # A Unix socket's path has at most 107 bytes: pytest's folders are too long.
+    with (
+        tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
+        laboratory(2, link=LINK) as lab,
+        ExitStack() as kept,
+    ):
         sides = []
-        for daemon in daemons:
-            domain = DOMAINS[daemon.name]
-            bridge = Ros2Bridge(daemon, domain)
+        for place, (name, domain) in enumerate(DOMAINS.items()):
+            # Fast DDS finds the nodes of one machine by multicast
+            lab.run(place, ["ip", "link", "set", "lo", "up", "multicast", "on"])
+            lab.run(place, ["ip", "route", "replace", "239.0.0.0/8", "dev", "lo"])
+            inside = lab.inside(place, [])
+            daemon = RobotsDaemon(Path(path), name, inside, TOPICS, RATES)
+            kept.enter_context(daemon)
+            remapped = ["--ros-args", "-r", f"/{name}/mesh_comm/camera:=/sensors/front/camera"]
+            bridge = Ros2Bridge(daemon, domain, inside, CONFIGURATION, *remapped)
             kept.callback(bridge.stop)
             bridge.start()
-            node = Ros2Node(daemon.folder, f"{daemon.name}_node", domain)
+            node = Ros2Node(daemon.folder, f"{name}_node", domain, inside)
             kept.callback(node.close)
             sides.append(Side(daemon, bridge, node))
-        yield sides[0], sides[1]
+        made = Team(lab, *sides)
+        made.join()
+        yield made
+
+
+@pytest.fixture
+def team(whole: Team) -> tuple[Side, Side]:
+    return whole.alice, whole.bob
 
 
 def test_messages_cross_in_both_directions(team: tuple[Side, Side]) -> None:
@@ -78,3 +144,148 @@ def test_an_uninstalled_type_is_reported_and_does_not_stop_the_bridge(team: tupl
     poll(lambda: f"type-unknown type={name}" in bob.bridge.log.read_text() or None, "the report")
     bob.node.subscribe(TO_BOB)
     alice.node.publish_until_received(TO_BOB, f"after {name}", bob.node)
+
+
+def test_late_subscribers_get_as_many_messages_as_the_configured_depth(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    name = "/alice/mesh_comm/bob/history"
+    with bob.daemon.client() as client:
+        client.subscribe("history")
+        heard: set[bytes] = set()
+        for number in range(6):
+            alice.node.publish(name, f"entry {number}", latched=True, depth=4)
+
+        def complete() -> bool:
+            heard.update(message.payload[8:15] for message in client.messages(0.1))
+            return b"entry 5" in heard and len(heard) >= 4
+
+        poll(complete, "the history at bob's daemon")
+    # the bridge of a robot that was started after all that gets them from the other robot's
+    bob.bridge.kill()
+    bob.bridge.start()
+    bob.node.subscribe(name, latched=True)
+    for number in range(2, 6):
+        bob.node.expect("data", f"entry {number}")
+    assert not [line for line in bob.node.received() if line["data"] in ("entry 0", "entry 1")]
+
+
+def test_a_best_effort_publisher_stays_one_on_the_other_robot(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    name = "/alice/mesh_comm/bob/camera"
+    bob.node.subscribe(name, best_effort=True)
+    alice.node.publish_until_received(name, "a frame", bob.node, best_effort=True)
+    with bob.daemon.client() as client:
+        client.subscribe("camera")
+
+        def kind() -> str | None:
+            alice.node.publish(name, "a frame", best_effort=True)
+            return next((message.type for message in client.messages(0.2)), None)
+
+        assert poll(kind, "the type").startswith("std_msgs/msg/String best_effort:volatile:10:RIHS01_")
+
+
+def test_a_remapped_topic_is_sent_under_its_mesh_name(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    received = "/alice/mesh_comm/bob/camera"
+    bob.node.subscribe(received)
+    alice.node.publish_until_received("/sensors/front/camera", "remapped", bob.node, received_as=received)
+
+
+def test_a_type_with_another_hash_is_reported_and_not_published(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    bob.node.subscribe("/alice/mesh_comm/bob/map")
+    kind = kind_text(MessageKind(TypeKey("std_msgs/msg/String", "reliable:volatile:10:RIHS01_" + "0" * 64)))
+
+    def reported() -> bool:
+        with alice.daemon.client() as client:
+            client.publish("map", b"\0\1\0\0\6\0\0\0other\0", to="bob", type=kind)
+        return "another definition of the type" in bob.bridge.log.read_text()
+
+    poll(reported, "the report")
+
+
+def test_transforms_of_many_nodes_are_sent_together(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    with bob.daemon.client() as client:
+        client.subscribe("tf", "tf_static")
+        seen: dict[str, set[str]] = {"tf": set(), "tf_static": set()}
+
+        def complete() -> bool:
+            for child in ("wheel", "arm", "head"):
+                alice.node.publish("/tf", {"cdr": transform(child)}, type=TF_TYPE)
+            alice.node.publish("/tf_static", {"cdr": transform("lidar")}, type=TF_TYPE, latched=True)
+            for message in client.messages(0.1):
+                decoded = decode(DEFINITION, message.payload, 2)["transforms"]
+                seen[message.topic] |= {each["child_frame_id"] for each in decoded}
+            return seen == {"tf": {"wheel", "arm", "head"}, "tf_static": {"lidar"}}
+
+        poll(complete, "all transforms")
+
+
+def test_a_service_of_another_robot_is_called(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    alice.node.request("serve", "/reset")
+    bob.node.request("call", "/alice/mesh_comm/bob/reset")
+    found = bob.node.expect("answer", "/alice/mesh_comm/bob/reset")
+    assert (found["success"], found["message"]) == (True, "done")
+    alice.node.expect("served", "/reset")
+
+
+def test_a_service_that_does_not_respond_ends_with_an_error_at_its_deadline(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    alice.node.request("serve", "/mute", mute=True)
+    bob.node.request("call", "/alice/mesh_comm/bob/mute")
+    found = bob.node.expect("answer", "/alice/mesh_comm/bob/mute")
+    assert (found["success"], found["message"]) == (
+        False,
+        "no response from alice within 1 s; the call may have been executed",
+    )
+
+
+def test_an_action_of_another_robot_gives_feedback_and_a_result_and_can_be_canceled(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    name = "/alice/mesh_comm/bob/count"
+    alice.node.request("serve_action", "/count", pause_s=0.1)
+    bob.node.request("goal", name, order=4)
+    assert bob.node.expect("accepted")["accepted"] is True
+    assert bob.node.expect("feedback", name)["sequence"][:2] == [0, 1]
+    found = bob.node.expect("result", name)
+    assert (found["sequence"], found["status"]) == ([0, 1, 1, 2, 3, 5], SUCCEEDED)
+    bob.node.request("goal", name, order=1000)
+    assert bob.node.expect("accepted")["accepted"] is True
+    bob.node.request("cancel", name)
+    assert bob.node.expect("canceling")["canceling"] == 1
+    assert bob.node.expect("result", name)["status"] == CANCELED
+
+
+def test_a_cut_ends_calls_and_short_actions_and_nothing_else(whole: Team) -> None:
+    alice, bob = whole.alice, whole.bob
+    count, short = "/alice/mesh_comm/bob/count", "/alice/mesh_comm/bob/short"
+    alice.node.request("serve_action", "/short", pause_s=0.1)
+    for name, order in ((short, 1000), (count, 60)):
+        bob.node.request("goal", name, order=order)
+        assert bob.node.expect("accepted")["accepted"] is True
+    whole.cut()
+    assert bob.node.expect("result", short)["status"] == ABORTED
+    poll(lambda: not bob.node.is_available("/alice/mesh_comm/bob/reset"), "reset is gone")
+    whole.join()
+    assert bob.node.expect("result", count)["status"] == SUCCEEDED
+    bob.node.request("call", "/alice/mesh_comm/bob/reset")
+    assert bob.node.expect("answer", "/alice/mesh_comm/bob/reset")["success"] is True
+    bob.node.subscribe(TO_BOB)
+    alice.node.publish_until_received(TO_BOB, "after the cut", bob.node)
+
+
+def test_a_restarted_daemon_is_taken_up_again(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    alice.daemon.kill()
+    alice.daemon.start()
+    wait_online(alice.daemon, "bob")
+    bob.node.subscribe(TO_BOB)
+    alice.node.publish_until_received(TO_BOB, "after the daemon's restart", bob.node)
+
+
+def transform(child: str) -> str:
+    """A tf2_msgs/msg/TFMessage of one transform, as hex."""
+    stamped = {"header": {"frame_id": "base"}, "child_frame_id": child}
+    return encode(DEFINITION, {"transforms": [stamped]}, 2).hex()

@@ -117,3 +117,40 @@ def test_reading_an_unknown_item_writes_nothing(tmp_path: Path) -> None:
     with_store(tmp_path / "items.db", use)
     with sqlite3.connect(tmp_path / "items.db") as connection:
         assert connection.execute("SELECT count(*) FROM logs").fetchone() == (0,)
+
+
+def test_an_item_whose_log_is_unknown_is_left_out(tmp_path: Path) -> None:
+    path = tmp_path / "items.db"
+
+    async def write(store: Store, _: LogContents) -> None:
+        for number in (1, 2):
+            put(store, ItemId(ITEM.log._replace(topic=f"topic{number}"), number), b"data")
+        assert store.last_put is not None
+        await asyncio.wait_for(store.last_put.stored.wait(), 10)
+
+    async def read(_: Store, contents: LogContents) -> None:
+        assert [item.id.number for item in contents.items] == [2]
+
+    with_store(path, write)
+    connection = sqlite3.connect(path)
+    connection.execute("DELETE FROM logs WHERE topic = 'topic1'")
+    connection.commit()
+    connection.close()
+    with_store(path, read)
+
+
+def test_a_job_that_fails_in_any_way_does_not_end_the_thread(tmp_path: Path) -> None:
+    async def use(store: Store, _: LogContents) -> None:
+        def fail(connection: sqlite3.Connection) -> None:
+            raise MemoryError("no memory")
+
+        answered = asyncio.Event()
+        store._jobs.put((fail, answered.set))
+        await asyncio.wait_for(answered.wait(), 10)
+        assert store.problem == "no memory"
+        put(store, ITEM, b"data")
+        assert store.last_put is not None
+        await asyncio.wait_for(store.last_put.stored.wait(), 10)
+        assert store.last_put.problem is None
+
+    with_store(tmp_path / "items.db", use)

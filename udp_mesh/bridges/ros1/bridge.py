@@ -27,14 +27,13 @@ from udp_mesh.bridges.names import (
     undeclared_route,
 )
 from udp_mesh.bridges.position_input import PositionInput
-from udp_mesh.bridges.relay import Relay, ToRos
+from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
 
-PROTOCOL_TOPIC = "bridge/ros1"
 ANY = "any"
 """The legacy system's topic for messages of any type, at priority 1."""
 TICK_S = 0.1
@@ -55,7 +54,7 @@ class Ros1Bridge:
             log.error("parameter-refused %s", problem)
         wanted = {topic.topic: {"priority": topic.priority} for topic in listed}
         wanted.setdefault(ANY, {"priority": 1})
-        relay = Relay(own, PROTOCOL_TOPIC, ros_version=1, nonce=os.urandom(16))
+        relay = Relay(own, PROTOCOL_TOPICS[1], ros_version=1, nonce=os.urandom(16))
         self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
         self._master_gone = False
         self._positions = PositionInput(daemon, 1, given.odometry, [str(frame) for frame in given.tf_frames])

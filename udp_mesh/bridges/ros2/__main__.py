@@ -9,22 +9,30 @@ subscriptions.
 from __future__ import annotations
 
 import argparse
-import importlib
 import logging
 import os
-import re
 import sys
 import threading
 import time
 from collections import deque
-from typing import Any, Deque, Sequence
+from typing import Any, Callable, Deque, Sequence
 
+from udp_mesh.bridges.configuration import (
+    EMPTY,
+    BridgeConfiguration,
+    BridgeConfigurationError,
+    TopicOptions,
+    load_configuration,
+)
 from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.message_types import TYPES
+from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.position_input import PositionInput
-from udp_mesh.bridges.relay import Relay, ToRos
-from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
+from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
+from udp_mesh.bridges.ros2.quality import MAX_DEPTH, Quality, common, parse_quality, quality_text, ros2_name
 from udp_mesh.bridges.runtime import BridgeRuntime
+from udp_mesh.bridges.transforms import DEFINITION, TF, TF_STATIC, TOPIC_SETTINGS, TransformGatherer
 from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
@@ -33,15 +41,19 @@ try:
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.node import Node
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    from udp_mesh.bridges.ros2.interfaces import interface_class
+    from udp_mesh.bridges.ros2.services import Ros2Calls
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.ros2: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
 
 log = logging.getLogger(__name__)
 
-PROTOCOL_TOPIC = "bridge/ros2"
 REFRESH_S = 1.0
-# https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html: package and message names
-_TYPE_NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
+TF_TICK_S = 0.02
+STATIC_TF = Quality(durability="transient_local", depth=1)
+MOVING_TF = Quality(depth=100)
+"""As tf2_ros subscribes to them."""
 MAX_ARRIVED = 1000
 """Messages from the mesh waiting for the executor; the oldest are dropped."""
 
@@ -56,8 +68,9 @@ def profile(quality: Quality) -> Any:
     )
 
 
-def quality_of(info: Any) -> Quality:
-    """The quality offered by an endpoint; the graph does not report its depth."""
+def quality_of(info: Any, depth: int | None = None) -> Quality:
+    """The quality offered by an endpoint. `depth` is the configured one, for middlewares that do not report it, such as
+    Fast DDS."""
     reliable = info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     # Since Iron; "INVALID" if the middleware does not report it.
@@ -65,32 +78,29 @@ def quality_of(info: Any) -> Quality:
     return Quality(
         "reliable" if reliable else "best_effort",
         "transient_local" if latched else "volatile",
-        1 if latched else 10,
+        min(depth or info.qos_profile.depth or (1 if latched else 10), MAX_DEPTH),
         type_hash if type_hash.startswith("RIHS") else "",
     )
-
-
-def message_class(name: str) -> Any:
-    """`std_msgs/msg/String` -> its class. A peer chooses the name, so only messages of a package are imported.
-
-    rosidl_runtime_py has such a function but is not part of every distribution of rclpy. Raises ValueError,
-    ModuleNotFoundError or AttributeError.
-    """
-    found = _TYPE_NAME.fullmatch(name)
-    if found is None:
-        raise ValueError("expected PACKAGE/msg/TYPE")
-    return getattr(importlib.import_module("{}.msg".format(found[1])), found[2])
 
 
 class Ros2Bridge:
     """The running bridge."""
 
     def __init__(
-        self, node: Any, daemon: DaemonClient, own: str, odometry: str = "", tf_frames: Sequence[str] = ()
+        self,
+        node: Any,
+        daemon: DaemonClient,
+        own: str,
+        odometry: str = "",
+        tf_frames: Sequence[str] = (),
+        options: BridgeConfiguration = EMPTY,
     ) -> None:
-        self._node, self._daemon, self._own = node, daemon, own
-        relay = Relay(own, PROTOCOL_TOPIC, ros_version=2, nonce=os.urandom(16))
-        self._runtime = BridgeRuntime(daemon, relay, self._to_ros)
+        self._node, self._daemon, self._own, self._options = node, daemon, own, options
+        relay = Relay(own, PROTOCOL_TOPICS[2], ros_version=2, nonce=os.urandom(16), types={**TYPES, **options.types})
+        wanted = TOPIC_SETTINGS if options.tf is not None else {}
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
+        self._calls = Ros2Calls(node, daemon, own, options, os.urandom(8).hex())
+        self._gatherer = None if options.tf is None else TransformGatherer(2, options.tf.rate_hz)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
@@ -99,17 +109,31 @@ class Ros2Bridge:
         node.create_timer(REFRESH_S, self.refresh)
         positions = PositionInput(daemon, 2, odometry, tf_frames)
         for name, type_name in positions.topics.items():
-            self._watch(name, type_name.replace("/", "/msg/"), positions)
+            self._watch(name, type_name, positions.arrived)
+        if self._gatherer is not None:
+            for topic in (TF, TF_STATIC):
+                self._watch("/" + topic, DEFINITION.name, self._gather)
+            node.create_timer(TF_TICK_S, self._send_transforms)
 
-    def _watch(self, name: str, type_name: str, positions: PositionInput) -> None:
-        """Subscribes to a name for the robot's own position. Best effort matches every publisher; static transforms are
+    def _gather(self, name: str, data: bytes) -> None:
+        if self._gatherer is not None:
+            self._gatherer.add(data, static=name.endswith("_static"))
+
+    def _send_transforms(self) -> None:
+        for topic, data in (self._gatherer.due(time.monotonic()) if self._gatherer is not None else {}).items():
+            quality = STATIC_TF if topic == TF_STATIC else MOVING_TF
+            key = TypeKey(ros2_type(DEFINITION.name), quality_text(quality))
+            self._runtime.from_ros(Route(topic, None), "/" + topic, key, "", quality.latched, data)
+
+    def _watch(self, name: str, ros1_name: str, on_bytes: Callable[[str, bytes], None]) -> None:
+        """Subscribes to a name for the bridge itself. Best effort matches every publisher; static transforms are
         latched."""
-        message_class = self._class(type_name)
+        message_class = self._class(ros2_type(ros1_name))
         if message_class is None:
             return
 
         def arrived(data: bytes) -> None:
-            positions.arrived(name, bytes(data))
+            on_bytes(name, bytes(data))
 
         static = name.endswith("_static")
         wanted = Quality("reliable" if static else "best_effort", "transient_local" if static else "volatile", 100)
@@ -117,6 +141,13 @@ class Ros2Bridge:
 
     def _to_ros(self, message: ToRos) -> None:
         self._arrived.append(message)
+        if self._gatherer is not None and self._options.tf is not None and self._options.tf.merge:
+            topic = message.name.rpartition("/")[2]
+            if topic in (TF, TF_STATIC) and message.key.name == ros2_type(DEFINITION.name):
+                merged = self._gatherer.merge(message.payload, static=topic == TF_STATIC)
+                quality = STATIC_TF if topic == TF_STATIC else MOVING_TF
+                key = TypeKey(message.key.name, quality_text(quality))
+                self._arrived.append(ToRos("/" + topic, key, None, quality.latched, merged))
         self._wake.trigger()
 
     # The daemon client's thread
@@ -124,10 +155,12 @@ class Ros2Bridge:
     def on_daemon_up(self) -> None:
         """Called by the daemon client after each connect. Raises MeshError."""
         self._runtime.on_daemon_up()
+        self._calls.on_daemon_up()
 
     def on_frame(self, frame: Frame) -> None:
         """Called by the daemon client for each frame."""
         self._runtime.on_frame(frame)
+        self._calls.on_frame(frame)
 
     # The executor's thread
 
@@ -150,7 +183,8 @@ class Ros2Bridge:
         if not infos:
             return
         type_name = str(infos[0].topic_type)
-        quality = common(quality_of(info) for info in infos if info.topic_type == type_name)
+        options = self._options.topics.get(route.topic, TopicOptions())
+        quality = common(quality_of(info, options.depth) for info in infos if info.topic_type == type_name)
         key = TypeKey(type_name, quality_text(quality))
         known = self._subscriptions.get(name)
         if known is not None and known[0] == key:
@@ -164,8 +198,8 @@ class Ros2Bridge:
         def arrived(data: bytes) -> None:
             self._runtime.from_ros(route, name, key, "", quality.latched, bytes(data))
 
-        # The graph does not report depths; ten messages cover the time the executor is busy.
-        wanted = profile(quality._replace(depth=10))
+        # At least ten messages cover the time the executor is busy.
+        wanted = profile(quality._replace(depth=max(10, quality.depth)))
         self._subscriptions[name] = (
             key,
             self._node.create_subscription(message_class, name, arrived, wanted, raw=True),
@@ -205,7 +239,7 @@ class Ros2Bridge:
 
     def _class(self, name: str) -> Any:
         try:
-            return message_class(name)
+            return interface_class(name, "msg")
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
             self._warn_once(name, "type-unknown type={} {}".format(name, error))
             return None
@@ -228,7 +262,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar=("MAP", "ROBOT"),
         help="take the robot's position from /tf: the map's frame and the robot's",
     )
+    parser.add_argument("--config", default="", metavar="FILE", help="the bridge's file: topics, tf, services, actions")
     options, ros_arguments = parser.parse_known_args(argv)
+    try:
+        configuration = load_configuration(options.config) if options.config else EMPTY
+    except BridgeConfigurationError as error:
+        sys.stderr.write("{}\n".format(error))
+        return 2
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     daemon = DaemonClient(options.socket, ["*"])
     stop = threading.Event()
@@ -238,7 +278,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if own is None:
             return 0
         node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Ros2Bridge(node, daemon, own, options.odometry, options.tf_frames)
+        bridge = Ros2Bridge(node, daemon, own, options.odometry, options.tf_frames, configuration)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)

@@ -44,6 +44,12 @@ def parse_quality(text: str) -> Quality | None:
     return Quality(parts[0], parts[1], int(parts[2]), parts[3]) if _TYPE_HASH.fullmatch(parts[3]) else None
 
 
+def history_depth(text: str) -> int:
+    """How many messages of a latched publisher late joiners get: in ROS 2 its depth, in ROS 1 one."""
+    quality = parse_quality(text)
+    return quality.depth if quality is not None and quality.latched else 1
+
+
 def common(qualities: Iterable[Quality]) -> Quality:
     """The quality that all publishers of a topic offer: a subscription that requests more than a publisher offers does
     not receive from it. Requires at least one quality."""

@@ -305,6 +305,6 @@ class LegacyPeers:
 
     def _links(self, legacy: LegacyPeer) -> list[LinkInfo]:
         # The legacy format has room for an IPv4 address only.
-        links = [link for link in self._state.links.values() if ":" not in link.address[0]]
+        links = [link for link in self._state.own_links() if ":" not in link.address[0]]
         named = [link for link in links if link.name == (legacy.neighbour.link or legacy.link)]
         return named or links

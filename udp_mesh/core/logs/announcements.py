@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from udp_mesh.core.events import Rejected
 from udp_mesh.core.logs.item import LogKey
 from udp_mesh.core.logs.knowledge import PeerView
-from udp_mesh.core.logs.messages import CONTROL_TOPIC, MAX_ENTRIES, Have, HaveEntry, encode_control
+from udp_mesh.core.logs.messages import CONTROL_TOPIC, MAX_ENTRIES, MAX_ORDER, Have, HaveEntry, encode_control
 from udp_mesh.core.logs.serving import Send
 
 GATHER_S = 0.05
@@ -16,6 +16,8 @@ INTERVAL_S = 0.25
 """Minimum interval of announcements: a burst of small items costs few of them."""
 COMPLETE_INTERVAL_S = 60.0
 """Interval of complete announcements: they repair what a lost one left."""
+MAX_ORDERS = 4096
+"""Peers whose announcements are counted: a key holder inventing names."""
 _NEVER = float("inf")
 
 
@@ -27,6 +29,8 @@ class Announcements:
         self._entry = entry
         self._changed: dict[LogKey, bool] = {}
         """Changed logs; True if only what readers have was heard from others."""
+        self._orders: dict[str, int] = {}
+        """By peer, least recent first: the order of the last announcement, kept while it is offline."""
         self._announced_at = float("-inf")
         self._announce_at = _NEVER
         self._complete_at = now + COMPLETE_INTERVAL_S
@@ -78,7 +82,12 @@ class Announcements:
         entries = [entry for log in logs if (entry := self._entry(log, peer)) is not None]
         for start in range(0, max(len(entries), 1), MAX_ENTRIES):
             first = start == 0
-            message = Have(tuple(entries[start : start + MAX_ENTRIES]), complete and first, asks and first)
+            order = self._orders.pop(peer, 0) % MAX_ORDER + 1
+            self._orders[peer] = order
+            if len(self._orders) > MAX_ORDERS:
+                del self._orders[next(iter(self._orders))]
+            part = tuple(entries[start : start + MAX_ENTRIES])
+            message = Have(part, complete and first, asks and first, order)
             if isinstance(self._send(CONTROL_TOPIC, encode_control(message), peer, now), Rejected):
                 return False
         return True

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from udp_mesh.core.logs.item import LogKey
-from udp_mesh.core.logs.messages import HaveEntry, Holder, Ranges
+from udp_mesh.core.logs.messages import MAX_ORDER, Have, HaveEntry, Holder, Ranges
 from udp_mesh.core.ranges import RangeSet
 
 MAX_LOGS = 4096
@@ -63,9 +63,10 @@ class LogState:
             known = self.readers[reader] = RangeSet()
         new: list[tuple[int, int]] = []
         for first, last in ranges:
-            if len(known) < MAX_KEPT_RANGES and (gaps := known.gaps(first, last)):
+            if gaps := known.gaps(first, last):
                 known.add_range(first, last)
                 new += gaps
+                limit_ranges(known)
         return tuple(new)
 
     def readers_without(self, number: int, readers: tuple[str, ...]) -> list[str]:
@@ -106,21 +107,56 @@ class PeerView:
     """It was asked what it holds."""
     silent: bool = False
     """Nothing was heard from it for a while: it is online, but probably out of reach already."""
+    heard_at: int = 0
+    """The newest `Have` from it, counted on beyond `MAX_ORDER`."""
+    cleared_at: int = 0
+    """The newest complete one."""
+    listed_at: dict[LogKey, int] = field(default_factory=dict)
+    """The newest one that listed each log."""
 
-    def set_held(self, entry: HaveEntry) -> RangeSet:
-        """Replace what it holds of one log; returns what is new."""
+    def place(self, message: Have) -> int:
+        """Where a message is in the order of those from this peer. One that does not count comes after all others. If
+        it is complete, what only earlier ones listed is forgotten."""
+        ahead = (message.order - self.heard_at) % MAX_ORDER if message.order else 1
+        if ahead > MAX_ORDER // 2 and self.heard_at:
+            ahead -= MAX_ORDER
+        place = self.heard_at + ahead
+        self.heard_at = max(self.heard_at, place)
+        if message.complete:
+            self._clear_before(place)
+        return place
+
+    def _clear_before(self, place: int) -> None:
+        if place < self.cleared_at:
+            return
+        self.cleared_at = place
+        for log in [log for log in self.held if self.listed_at.get(log, 0) < place]:
+            self.held.pop(log)
+            self.listed_at.pop(log, None)
+            self.reader_online.discard(log)
+
+    def set_held(self, entry: HaveEntry, place: int) -> RangeSet | None:
+        """Replace what it holds of one log; returns what is new, or None if a newer message said otherwise."""
         before = self.held.get(entry.log)
-        now = RangeSet()
-        for first, last in entry.held:
-            now.add_range(first, last)
+        if place < max(self.cleared_at, self.listed_at.get(entry.log, 0)):
+            return None
+        now = as_set(entry.held)
         if before is None and len(self.held) >= MAX_LOGS:
             return RangeSet()
         self.held[entry.log] = now
+        self.listed_at[entry.log] = place
         if entry.reader_online:
             self.reader_online.add(entry.log)
         else:
             self.reader_online.discard(entry.log)
         return now if before is None else as_set(now.without(before))
+
+
+def limit_ranges(numbers: RangeSet) -> None:
+    """Bound the memory: beyond the limit the lowest gaps count as had, so that a log continues. No node fills them any
+    more: thousands of later items came meanwhile."""
+    while len(numbers) > MAX_KEPT_RANGES:
+        numbers.fill_lowest_gap()
 
 
 def as_set(ranges: Ranges | list[tuple[int, int]]) -> RangeSet:

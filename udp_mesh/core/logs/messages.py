@@ -4,7 +4,7 @@ Both travel as messages of the reserved topic `CONTROL_TOPIC`, items as messages
 priorities, acknowledgements and encryption apply to them. Each list and range is bounded; a decoder returns a value or
 raises `DecodeError`.
 
-    Have: 1 | flags 1 (bit 0: complete, bit 1: asks) | entries 2, each:
+    Have: 1 | flags 1 (bit 0: complete, bit 1: asks, bits 2-7: order) | entries 2, each:
           topic (text) | source (text) | log id 32 | flags 1 (bit 0: a reader is online here) | holders 1, each:
           name (text; empty: what the sender holds) | ranges 2, each: first 8, length 4
     ItemRequest: 2 | entries 2, each: topic (text) | source (text) | log id 32 | ranges 2, each: first 8, length 4
@@ -42,6 +42,9 @@ Ranges = tuple[tuple[int, int], ...]
 _RANGE = struct.Struct(">QI")
 _HAVE, _WANT = 1, 2
 _COMPLETE, _ASKS = 1, 2
+_ORDER_SHIFT = 2
+MAX_ORDER = 63
+"""`Have.order` goes from 1 to this, then from 1 again."""
 _READER_ONLINE = 1
 
 
@@ -71,11 +74,13 @@ class HaveEntry:
 @dataclass(frozen=True, slots=True)
 class Have:
     """`complete`: the sender holds nothing of logs that are not listed here or in the following messages. `asks`: it
-    has just met the receiver, whose own messages may have been lost before, and asks for all that it holds."""
+    has just met the receiver, whose own messages may have been lost before, and asks for all that it holds. `order`
+    counts the messages to this receiver, because they can overtake each other (0: the sender does not count them)."""
 
     entries: tuple[HaveEntry, ...]
     complete: bool = False
     asks: bool = False
+    order: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +96,8 @@ def encode_control(message: Have | ItemRequest) -> bytes:
         raise ValueError(f"entries: expected at most {MAX_ENTRIES}, found {len(message.entries)}")
     out = bytearray()
     match message:
-        case Have(entries, complete, asks):
-            flags = (_COMPLETE if complete else 0) | (_ASKS if asks else 0)
+        case Have(entries, complete, asks, order):
+            flags = (_COMPLETE if complete else 0) | (_ASKS if asks else 0) | order << _ORDER_SHIFT
             out += struct.pack(">BBH", _HAVE, flags, len(entries))
             for entry in entries:
                 holders = (Holder("", entry.held), *entry.readers[: MAX_HOLDERS - 1])
@@ -116,7 +121,7 @@ def decode_control(data: bytes | memoryview) -> Have | ItemRequest:
     if kind == _HAVE:
         flags = reader.integer(1, "flags")
         entries = tuple(_read_entry(reader) for _ in range(reader.at_most(2, MAX_ENTRIES, "entries")))
-        result: Have | ItemRequest = Have(entries, bool(flags & _COMPLETE), bool(flags & _ASKS))
+        result: Have | ItemRequest = Have(entries, bool(flags & _COMPLETE), bool(flags & _ASKS), flags >> _ORDER_SHIFT)
     elif kind == _WANT:
         count = reader.at_most(2, MAX_ENTRIES, "entries")
         result = ItemRequest(tuple((_read_log(reader), _read_ranges(reader)) for _ in range(count)))

@@ -14,7 +14,7 @@ from udp_mesh.core.logs.announcements import Announcements
 from udp_mesh.core.logs.conditions import LogConditions, conditions_of
 from udp_mesh.core.logs.delivery import Deliveries
 from udp_mesh.core.logs.item import FIRST_NUMBER, MAX_NUMBER, ItemId, LogItem, LogKey, decode_item, encode_item
-from udp_mesh.core.logs.knowledge import MAX_KEPT_RANGES, MAX_LOGS, LogState, PeerView, as_set, intersection
+from udp_mesh.core.logs.knowledge import MAX_LOGS, LogState, PeerView, as_set, intersection, limit_ranges
 from udp_mesh.core.logs.messages import CONTROL_TOPIC, Have, HaveEntry, ItemRequest, decode_control, encode_control
 from udp_mesh.core.logs.outcomes import Outcomes
 from udp_mesh.core.logs.policy import Policy
@@ -239,9 +239,7 @@ class Replicator:
 
     def _on_have(self, peer: str, view: PeerView, message: Have, now: float) -> None:
         view.silent = False
-        if message.complete:
-            view.held.clear()
-            view.reader_online.clear()
+        place = view.place(message)
         if message.asks:
             # What was requested before may not have reached it.
             view.needs_all = True
@@ -251,16 +249,17 @@ class Replicator:
             state = self._log(entry.log)
             if state is None:
                 continue
-            carried = tuple(view.set_held(entry).ranges())
-            readers = self.policy.readers(entry.log.topic)
+            new, readers = view.set_held(entry, place), self.policy.readers(entry.log.topic)
             read = state.add_readers(entry.readers, readers)
             if read:
                 self._announcements.note(entry.log, now, heard=True)
                 state.deferred_until = None
             if self._is_own_log(entry.log):
                 state.note_used(entry)
-                self._outcomes.report(entry.log, read, peer, carried, readers, now)
-            self._pulling.requests.keep_only(peer, entry.log, as_set(entry.held))
+                self._outcomes.report(entry.log, read, peer, tuple(new.ranges()) if new else (), readers, now)
+            if new is not None:
+                self._pulling.requests.keep_only(peer, entry.log, as_set(entry.held))
+            self._serving.peer_has(peer, entry.log, as_set([*entry.held, *dict(entry.readers).get(peer, ())]))
 
     def _on_request(self, peer: str, view: PeerView | None, key: LogKey, ranges: tuple[tuple[int, int], ...]) -> None:
         state = self.logs.get(key)
@@ -276,7 +275,7 @@ class Replicator:
             view.needs_all = True
 
     def on_item(self, peer: str, topic: str, payload: bytes, now: float) -> None:
-        """An item from a peer: verify, store, then announce and deliver it."""
+        """An item from a peer: verify, store, announce and deliver it, unless it was not asked for."""
         settings = self.policy.topics.get(topic)
         try:
             if settings is None:
@@ -288,14 +287,14 @@ class Replicator:
         self._pulling.requests.received(item.id, now)
         self._run_soon = True
         state = self._log(item.id.log)
-        if state is None or len(state.received) >= MAX_KEPT_RANGES:
+        wanted = self.policy.is_reader(topic)
+        if state is None or not (wanted or self.policy.copies(topic)):
             self.rejected_items += 1
             return
         number = item.id.number
         if number in state.received or number in state.storing:
             self.duplicate_items += 1
             return
-        wanted = self.policy.is_reader(topic)
         dropped = self.shelves[topic].make_room(len(payload), own=False, wanted=wanted)
         if dropped is None:
             self._pulling.refuse(item.id, now)
@@ -337,6 +336,7 @@ class Replicator:
             return
         state.held.add(number)
         state.received.add(number)
+        limit_ranges(state.received)
         self.shelves[key.topic].add(item.id, HeldItem(size_bytes, now, taken))
         if self.policy.is_reader(key.topic) and state.add_reader(self.policy.name, ((number, number),)):
             state.deferred_until = None

@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from udp_mesh.core.events import MessageId, Rejected, RejectReason
-from udp_mesh.core.logs.item import ItemId
+from udp_mesh.core.logs.item import ItemId, LogKey
 from udp_mesh.core.logs.messages import item_topic
 from udp_mesh.core.logs.store import LogStore
+from udp_mesh.core.ranges import RangeSet
 
 MAX_QUEUED = 256
 """Requested items waiting for one peer: it requests more once it has these."""
@@ -64,6 +65,12 @@ class Serving:
         service = self._peers.get(peer)
         if service is not None:
             service.queue.clear()
+
+    def peer_has(self, peer: str, log: LogKey, held: RangeSet) -> None:
+        """The peer has these items, perhaps from others: what still waits for it is not sent."""
+        service = self._peers.get(peer)
+        if service is not None and service.queue:
+            service.queue = deque(item for item in service.queue if item.log != log or item.number not in held)
 
     def run(self, now: float, lost: Callable[[ItemId, float], None]) -> None:
         """Read and send what may go now."""

@@ -31,6 +31,8 @@ def own_features(settings: Settings) -> int:
         features |= Feature.CONFIRM
     if any(topic.log is not None for topic in settings.topics):
         features |= Feature.LOGS
+    if settings.relay.hops > 1:
+        features |= Feature.RELAY
     return features
 
 

@@ -24,13 +24,15 @@ MAX_CHALLENGES = 8
 """Challenges remembered per peer: four addresses at a time, each with the current one."""
 
 
-def validate_path(state: State, session: Session, link: str, source: Address, now: float) -> None:
-    """Challenge this address and the current one."""
+def validate_path(
+    state: State, session: Session, link: str, source: Address, now: float, *, better: bool = False
+) -> None:
+    """Challenge this address and the current one, unless the new one is `better` even if both answer."""
     if session.peer is None or now < session.challenged_at + CHALLENGE_INTERVAL_S:
         return
     session.challenged_at = now
     path = session.path
-    migrating = path.link in state.links and (path.link, path.address) != (link, source)
+    migrating = path.link in state.links and (path.link, path.address) != (link, source) and not better
     if migrating:
         _send_challenge(state, session, Challenge(path.link, path.address, now, in_use=True))
     _send_challenge(state, session, Challenge(link, source, now, in_use=not migrating))

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from udp_mesh.core.logs.item import ItemId, LogItem, LogKey, decode_item, encode_item
-from udp_mesh.core.logs.messages import Have, HaveEntry, Holder, ItemRequest, decode_control, encode_control
+from udp_mesh.core.logs.messages import MAX_ORDER, Have, HaveEntry, Holder, ItemRequest, decode_control, encode_control
 from udp_mesh.crypto.signing import SigningKey
 from udp_mesh.wire.errors import DecodeError
 
@@ -68,6 +68,7 @@ messages = st.one_of(
         ).map(tuple),
         st.booleans(),
         st.booleans(),
+        st.integers(0, MAX_ORDER),
     ),
     st.builds(ItemRequest, st.lists(st.tuples(logs, ranges), max_size=4).map(tuple)),
 )

@@ -1,0 +1,1 @@
+"""In place of the ROS package tf2_msgs, of which no wheel exists."""

@@ -1,0 +1,95 @@
+"""Real daemons in a chain, each in a network namespace of its own: alice - relay - bob, and a second relay beside it.
+
+`python -m tests.udp_mesh.daemon.relay_namespaces` must run as root of a network namespace of its own (`unshare --net`).
+Anything that is not as it should be raises.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import tempfile
+from pathlib import Path
+
+from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
+from udp_mesh.cli.views import status_view
+
+LINKS = (("alice", "r1", "10.1.0"), ("r1", "bob", "10.2.0"), ("alice", "r2", "10.3.0"), ("r2", "bob", "10.4.0"))
+
+
+def _daemon(folder: Path, name: str) -> RunningDaemon:
+    relay = 'relay = ["bob"]\n' if name.startswith("r") else ""
+    configuration = f"""
+name = "{name}"
+key_file = "{folder}/key"
+{relay}
+[topics]
+status = {{ priority = 0 }}
+map = {{ priority = 7 }}
+{RATES}
+[daemon]
+socket = "{folder / name}.sock"
+state_directory = "{folder / name}"
+"""
+    daemon = RunningDaemon(folder, name, configuration)
+    daemon.prefix = ["unshare", "--net"]
+    return daemon
+
+
+def _ip(daemon: RunningDaemon, words: str) -> None:
+    assert daemon.process is not None
+    subprocess.run(["nsenter", "-t", str(daemon.process.pid), "-n", "ip", *words.split()], check=True)
+
+
+def _join(daemons: dict[str, RunningDaemon], left: str, right: str, network: str) -> None:
+    """A veth pair between two daemons, each end named after the other one."""
+    one, other = daemons[left].process, daemons[right].process
+    assert one is not None
+    assert other is not None
+    words = f"link add {right} netns {one.pid} type veth peer name {left} netns {other.pid}"
+    subprocess.run(["ip", *words.split()], check=True)
+    for place, (name, interface) in enumerate(((left, right), (right, left)), 1):
+        _ip(daemons[name], f"addr add {network}.{place}/24 brd + dev {interface}")
+        _ip(daemons[name], f"link set {interface} up")
+
+
+def _via(daemon: RunningDaemon, name: str) -> list[str]:
+    with daemon.client() as client:
+        routes = client.request("status")["relaying"]["routes"]
+    return next((route["via"] for route in routes if route["name"] == name and route["in_use"]), [])
+
+
+def main() -> None:
+    """They meet through a relay, exchange messages, and go on through the other one when the first is killed."""
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, contextlib.ExitStack() as stack:
+        folder = Path(path)
+        (folder / "key").write_text(KEY + "\n")
+        daemons = {name: stack.enter_context(_daemon(folder, name)) for name in ("alice", "bob", "r1", "r2")}
+        for left, right, network in LINKS:
+            _join(daemons, left, right, network)
+        alice, bob = daemons["alice"], daemons["bob"]
+        wait_online(alice, "bob")
+        wait_online(bob, "alice")
+        (relay,) = poll(lambda: _via(alice, "bob"), "a route to bob")
+        with alice.client() as sender, bob.client() as receiver:
+            receiver.subscribe("*")
+            for size in (5, 200_000):
+                sender.publish("map", bytes(size), to="bob", notify=True)
+                (message,) = collect(receiver, 1)
+                assert (message.source, len(message.payload)) == ("alice", size)
+            assert set(outcomes(sender, 2).values()) == {"delivered"}
+            process = daemons[relay].process
+            assert process is not None
+            process.kill()
+            sender.publish("map", bytes(100_000), to="bob", notify=True)
+            (message,) = collect(receiver, 1)
+            assert len(message.payload) == 100_000
+            assert set(outcomes(sender, 1).values()) == {"delivered"}
+            assert _via(alice, "bob") == [{"r1": "r2", "r2": "r1"}[relay]]
+            status = sender.request("status")
+            page = status_view(status)
+            assert "in use" in page
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Carried datagrams that wait for one neighbor: strictly by priority, origins of one level in turn, bounded per origin.
+
+`QueueBudget` counts over all neighbors what each origin, and each previous hop, has waiting here. Origins are what a
+previous hop states; a member that invents them is bounded by its share as a previous hop.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import NamedTuple
+
+from udp_mesh.wire.limits import PRIORITY_LEVELS
+from udp_mesh.wire.relay import Carry
+
+MAX_ORIGIN_BYTES = 256 << 10
+"""Waiting here from one origin: 0.2 s at 10 Mbit/s. A flood through a relay fills this, and no other's queue."""
+MAX_HOP_BYTES = 1 << 20
+"""Waiting here from one previous hop: a member that invents origins."""
+MAX_QUEUED_S = 2.0
+"""Older datagrams are dropped: their sender has sent them again."""
+
+
+class QueuedCarry(NamedTuple):
+    carry: Carry
+    previous: bytes
+    """Boot id of the neighbor it came from; our own if it began here."""
+    queued_at: float
+
+    @property
+    def size(self) -> int:
+        return len(self.carry.datagram)
+
+
+class QueueBudget:
+    """Bytes waiting by origin and by previous hop, over all queues of a node."""
+
+    __slots__ = ("_origins", "_previous", "own")
+
+    def __init__(self, own: bytes) -> None:
+        self.own = own
+        self._origins: dict[bytes, int] = {}
+        self._previous: dict[bytes, int] = {}
+
+    def has_room(self, item: QueuedCarry) -> bool:
+        if self._origins.get(item.carry.origin, 0) + item.size > MAX_ORIGIN_BYTES:
+            return False
+        return item.previous == self.own or self._previous.get(item.previous, 0) + item.size <= MAX_HOP_BYTES
+
+    def add(self, item: QueuedCarry) -> None:
+        _change(self._origins, item.carry.origin, item.size)
+        _change(self._previous, item.previous, item.size)
+
+    def remove(self, item: QueuedCarry) -> None:
+        _change(self._origins, item.carry.origin, -item.size)
+        _change(self._previous, item.previous, -item.size)
+
+    @property
+    def bytes(self) -> int:
+        return sum(self._origins.values())
+
+
+def _change(counts: dict[bytes, int], key: bytes, by: int) -> None:
+    count = counts.get(key, 0) + by
+    if count > 0:
+        counts[key] = count
+    else:
+        counts.pop(key, None)
+
+
+class HopQueue:
+    """`dropped` counts what found no room or waited too long, `bytes` is what waits."""
+
+    __slots__ = ("_budget", "_levels", "_waiting", "bytes", "dropped")
+
+    def __init__(self, budget: QueueBudget) -> None:
+        self._budget = budget
+        self._levels: list[dict[bytes, deque[QueuedCarry]]] = [{} for _ in range(PRIORITY_LEVELS)]
+        self._waiting = 0
+        """Mask of the levels with a datagram."""
+        self.dropped = 0
+        self.bytes = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    @property
+    def first_level(self) -> int:
+        """The most urgent level that waits."""
+        return (self._waiting & -self._waiting).bit_length() - 1
+
+    def push(self, item: QueuedCarry) -> None:
+        """Add a datagram; without room, the newest of its origin's least urgent ones goes, or this one."""
+        while not self._budget.has_room(item):
+            self.dropped += 1
+            if not self._evict(item.carry.origin, item.carry.priority):
+                return
+        self._budget.add(item)
+        self.bytes += item.size
+        level = self._levels[item.carry.priority]
+        level.setdefault(item.carry.origin, deque()).append(item)
+        self._waiting |= 1 << item.carry.priority
+
+    def _evict(self, origin: bytes, priority: int) -> bool:
+        """Drop the newest datagram of this origin that is less urgent; False if there is none."""
+        for level in range(PRIORITY_LEVELS - 1, priority, -1):
+            waiting = self._levels[level].get(origin)
+            if waiting:
+                self._removed(waiting.pop())
+                self._tidy(level, origin)
+                return True
+        return False
+
+    def pop(self, now: float) -> QueuedCarry | None:
+        """The most urgent datagram that is not too old; the next one of its level comes from the next origin."""
+        while self._waiting:
+            priority = self.first_level
+            level = self._levels[priority]
+            origin = next(iter(level))
+            item = level[origin].popleft()
+            level[origin] = level.pop(origin)
+            self._tidy(priority, origin)
+            self._removed(item)
+            if now - item.queued_at <= MAX_QUEUED_S:
+                return item
+            self.dropped += 1
+        return None
+
+    def _removed(self, item: QueuedCarry) -> None:
+        self._budget.remove(item)
+        self.bytes -= item.size
+
+    def _tidy(self, priority: int, origin: bytes) -> None:
+        level = self._levels[priority]
+        if not level[origin]:
+            del level[origin]
+        if not level:
+            self._waiting &= ~(1 << priority)

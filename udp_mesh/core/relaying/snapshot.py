@@ -1,0 +1,80 @@
+"""The conditions of the relay layer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from udp_mesh.core.relaying.conditions import RelayConditions, RelayNeighbour, RelayRoute
+from udp_mesh.core.relaying.hop_channel import membership_proof
+from udp_mesh.core.relaying.neighbours import LINK_COST, HopNeighbour
+from udp_mesh.core.relaying.routes import HopRoute
+from udp_mesh.core.state import State
+from udp_mesh.wire.limits import HEARD_TAG_BYTES
+from udp_mesh.wire.relay import VISITED_BYTES
+
+if TYPE_CHECKING:
+    from udp_mesh.core.relaying.relaying import Relaying
+
+
+def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
+    """See `Endpoint.relaying`."""
+    names = relaying.routes.names() | {boot_id: one.name for boot_id, one in relaying.neighbours.items()}
+    members = _members(state, relaying)
+    routes = [
+        _route(relaying, route, names, members) for route in relaying.routes.selected.values() if not route.direct
+    ]
+    return RelayConditions(
+        relaying.relays,
+        relaying.active(now),
+        tuple(sorted(_neighbours(state, relaying, now), key=lambda one: one.name)),
+        tuple(sorted(routes, key=lambda one: one.name)),
+        replace(relaying.counters),
+        relaying.queued_bytes,
+    )
+
+
+def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayNeighbour]:
+    for neighbour in relaying.neighbours.values():
+        link = neighbour.best_link(relaying.round, now)
+        yield RelayNeighbour(
+            neighbour.name,
+            None if link is None else link.name,
+            neighbour.relays,
+            _is_member(state, neighbour.boot_id, neighbour.proofs),
+            0.0 if link is None else min(1.0, LINK_COST / link.cost(neighbour.interval_s, now)),
+            neighbour.window.suspect,
+            neighbour.queue.bytes,
+            neighbour.window.packets,
+            neighbour.window.rtt,
+        )
+
+
+def _members(state: State, relaying: Relaying) -> set[bytes]:
+    """Boot ids of the nodes that hold one of our fleet keys."""
+    known: list[HopNeighbour | HopRoute] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
+    return {one.boot_id for one in known if _is_member(state, one.boot_id, one.proofs)}
+
+
+def _is_member(state: State, boot_id: bytes, proofs: tuple[bytes, ...]) -> bool:
+    return any(membership_proof(key, boot_id) in proofs for key in state.keys)
+
+
+def _route(relaying: Relaying, route: HopRoute, names: dict[bytes, str], members: set[bytes]) -> RelayRoute:
+    marks = {boot_id[:VISITED_BYTES]: boot_id for boot_id in names}
+    path = relaying.peers.paths.get(route.boot_id[:HEARD_TAG_BYTES], ())
+    if not path or path[0] != route.via[:VISITED_BYTES]:
+        # Heard the other way, or not yet: only the next hop is known.
+        path = (route.via[:VISITED_BYTES],)
+    relays = [marks.get(mark) for mark in path]
+    return RelayRoute(
+        route.name,
+        tuple(mark.hex() if boot_id is None else names[boot_id] for mark, boot_id in zip(path, relays, strict=True)),
+        route.hops,
+        route.cost / LINK_COST,
+        route.mtu,
+        relaying.peers.has_common_key(route),
+        tuple(names[boot_id] for boot_id in relays if boot_id in members and boot_id is not None),
+        relaying.peers.is_in_use(route.boot_id),
+    )
