@@ -23,7 +23,7 @@ else:
 AVAILABLE = zstd is not None
 
 LEVEL = 3
-"""zstd's default: as fast as zlib's level 1 and stronger than its level 6 on what robots send (docs/benchmarks.md)."""
+"""zstd's default."""
 
 STEP_BYTES = 1 << 16
 """Compressed per step: a millisecond at most, except that the first step also indexes the prefix (1 ms per MB)."""

@@ -111,13 +111,19 @@ class PeerVersions:
         size = len(accepted.payload) + (0 if base is None else len(base.payload))
         shared = self._node.shared(accepted, base)
         if shared is None and size > AT_ONCE_BYTES:
-            compression = accepted.channel.topic.compression
-            encoding = VersionEncoding(accepted.payload, base, compression=compression)
+            encoding = VersionEncoding(accepted.payload, base, compression=self._compresses(accepted))
             channel.current = message
             self._node.jobs.append((self, channel, message, base, encoding))
             return False
-        self.apply(channel, message, base, shared or self._node.encode(accepted, base))
+        self.apply(
+            channel, message, base, shared or self._node.encode(accepted, base, compression=self._compresses(accepted))
+        )
         return True
+
+    def _compresses(self, accepted: AcceptedMessage) -> bool:
+        """Whether a whole version is compressed: the first one always, because it is the largest of all."""
+        topic = accepted.channel
+        return topic.topic.compression or self._node.base(self, topic.number) is None
 
     def apply(self, channel: _Channel, message: OutgoingMessage, base: Version | None, encoded: Encoded) -> None:
         """Send the message like this, and learn from the gain."""
@@ -256,9 +262,9 @@ class SentVersions:
                 del self.blocked[versions, number]
         return freed
 
-    def encode(self, accepted: AcceptedMessage, base: Version | None) -> Encoded:
+    def encode(self, accepted: AcceptedMessage, base: Version | None, *, compression: bool) -> Encoded:
         """Encode a small message at once."""
-        encoded = encode(accepted.payload, base, compression=accepted.channel.topic.compression)
+        encoded = encode(accepted.payload, base, compression=compression)
         self._share(accepted, base, encoded)
         return encoded
 

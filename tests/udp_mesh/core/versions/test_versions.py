@@ -140,7 +140,7 @@ def test_a_sender_that_restarts_sends_the_whole() -> None:
 
 
 @pytest.mark.parametrize("size", [20_000, 600_000])
-def test_a_lost_base_is_reported_and_the_whole_follows(size: int) -> None:
+def test_a_lost_base_is_refused_and_the_whole_follows(size: int) -> None:
     made = world(MAP)
     maps = versions_of_a_map(4, size)
     send_all(made, maps[:2], every_s=3.0)
