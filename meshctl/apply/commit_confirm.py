@@ -24,7 +24,7 @@ from meshctl.apply.change_in_progress import (
     unlock,
 )
 from meshctl.apply.context import NodeContext
-from meshctl.apply.next_action import Action, rollback_reason
+from meshctl.apply.next_action import Action, flashed_by_others, rollback_reason
 from meshctl.device.errors import NodeRefused
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
@@ -148,7 +148,8 @@ def _act(change: ChangeInProgress, connection: SshConnection, *, is_proof: bool)
         case Action.WENT_BACK:
             unlock(change, connection)
             why = rollback_reason(change.status, change.unmet, change.login_refused, change.connect_error)
-            return Outcome(name, Result.ROLLED_BACK, f"{_flashed_by_others(change)}{why}")
+            flashed = flashed_by_others(change.ctx.before, change.last)
+            return Outcome(name, Result.ROLLED_BACK, f"{flashed}{why}")
         case Action.FOREIGN:
             status = change.status
             return Outcome(name, Result.REFUSED, f"{status.owner} has a change {status.state} on it")
@@ -178,14 +179,6 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
         unlock(change, connection)
         return Outcome(name, Result.REFUSED, str(refusal), hint=refusal.hint)
     return None
-
-
-def _flashed_by_others(change: ChangeInProgress) -> str:
-    """A clause if the node runs another build than before the change, whose reboot undid it; else empty."""
-    before, seen = change.ctx.before.release, change.last.release if change.last is not None else None
-    if before is None or seen is None or before.revision == seen.revision:
-        return ""
-    return f"someone else flashed it from {before.revision} to {seen.revision} meanwhile; "
 
 
 def _limit_s(change: ChangeInProgress) -> float:

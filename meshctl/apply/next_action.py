@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from meshctl.device.observation import ChangeStatus
+from meshctl.device.observation import ChangeStatus, Observation
 
 
 class Action(Enum):
@@ -105,3 +105,13 @@ def rollback_reason(
         reason += ", and the packages it installed could not be removed"
     details = login_refused or "; ".join(unmet) or (connect_error and f"it was unreachable: {connect_error}")
     return f"{reason}: {details}" if details else reason
+
+
+def flashed_by_others(before: Observation, last: Observation | None) -> str:
+    """A clause for a rollback if the node runs another build than before the change, whose reboot undid it; else empty.
+
+    Such a sysupgrade was started by someone else: meshctl itself never flashes a node with an unconfirmed change."""
+    seen = None if last is None else last.release
+    if before.release is None or seen is None or before.release.revision == seen.revision:
+        return ""
+    return f"someone else flashed it from {before.release.revision} to {seen.revision} meanwhile; "

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.apply.next_action import Action, applied_age_s, next_action, rollback_reason
-from meshctl.device.observation import ChangeStatus
+from meshctl.apply.next_action import Action, applied_age_s, flashed_by_others, next_action, rollback_reason
+from meshctl.device.observation import ChangeStatus, Observation, ReleaseInfo
 
 APPLIED = ChangeStatus("applied", "c1", owner="me", window_s=60, left_s=40.0, reload_status=0)
 STATES = ("idle", "staged", "armed", "waiting", "applied", "restoring", "absent")
@@ -93,6 +93,19 @@ def test_the_rollback_reason_is_human_readable() -> None:
     assert rollback_reason(status, ()) == "its power was cut, or it rebooted, before it was confirmed"
     late = replace(status, last_reason="timeout")
     assert rollback_reason(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
+
+
+def test_a_rollback_by_a_foreign_sysupgrade_names_both_builds() -> None:
+    def running(revision: str) -> Observation:
+        return Observation(0.0, 0.0, release=ReleaseInfo("OpenWrt", "24.10.7", revision, "ath79/generic"))
+
+    assert (
+        flashed_by_others(running("r29087"), running("r30000"))
+        == "someone else flashed it from r29087 to r30000 meanwhile; "
+    )
+    assert flashed_by_others(running("r29087"), running("r29087")) == ""
+    assert flashed_by_others(running("r29087"), None) == ""
+    assert flashed_by_others(Observation(0.0, 0.0), running("r30000")) == ""
 
 
 def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
