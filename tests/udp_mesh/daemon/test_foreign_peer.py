@@ -6,6 +6,7 @@ import random
 import socket
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -107,6 +108,10 @@ def test_a_foreign_node_receives_and_acknowledges_messages_of_any_size(
         assert packed.body.hex().startswith(ZSTD_MAGIC if foreign.features & ZSTD else ZLIB_MAGIC)
 
 
+def has_arrived(foreign: ForeignNode, count: int) -> bool:
+    return len(foreign.arrived) == count
+
+
 def grids(count: int) -> list[bytes]:
     """Random cells, of which each version changes some."""
     rng = random.Random(4)
@@ -127,7 +132,7 @@ def test_a_foreign_node_receives_versions_as_differences_if_it_announces_that(
     with daemon.client() as client:
         for number, payload in enumerate(sent, 1):
             client.publish("grid", payload, to=foreign.name, notify=True)
-            assert foreign.run(lambda count=number: len(foreign.arrived) == count, WAIT_S)
+            assert foreign.run(partial(has_arrived, foreign, number), WAIT_S)
             # The next one refers to this one only if it is known to have arrived.
             foreign.run(lambda: False, 0.1)
             assert set(outcomes(client, 1).values()) == {"delivered"}
@@ -159,7 +164,7 @@ def test_versions_from_a_foreign_node_are_decoded_and_those_without_a_base_refus
             (difference(third, first), packed, "delivered"),
         ):
             number = foreign.send(alice, "grid", body, flags=flags)
-            assert foreign.run(lambda sent=number: sent in alice.ends, WAIT_S)
+            assert foreign.run(partial(alice.ends.get, number), WAIT_S)
             assert alice.ends[number] == end
         assert [message.payload for message in collect(client, 3)] == [first, second, third]
 
