@@ -344,6 +344,7 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         repair=document.repair,
         log=_log(document.log) if document.log is not None else None,
         delta=document.delta,
+        delta_bytes=document.delta_bytes,
     )
 
 

@@ -107,7 +107,7 @@ def expected_value(error: ErrorDetails) -> str:
         return _KINDS[kind]
     if kind in _BOUNDS:
         words, key = _BOUNDS[kind]
-        return f"{words} {context[key]:g}"
+        return f"{words} {context[key]:.15g}"
     if kind == "string_pattern_mismatch":
         return f"text that matches {context['pattern']}"
     if "expected" in context:

@@ -33,6 +33,7 @@ from meshctl.lint.rules import (
     secrets,
     system,
     team,
+    topic_delivery,
     topics,
     traffic,
 )
@@ -60,6 +61,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Changes", rollout),
     ("The robots' computers", computers),
     ("Topics", topics),
+    ("Delivery of topics", topic_delivery),
     ("Load, ports and timers", traffic),
     ("Legacy robots", legacy),
     ("Firmware", firmware),

@@ -61,3 +61,4 @@ class Topic:
     repair: bool = False
     log: TopicLog | None = None
     delta: bool = False
+    delta_bytes: int = 16 << 20

@@ -222,6 +222,7 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
         yield "repair = true"
     if topic.delta:
         yield "delta = true"
+        yield f"delta_bytes = {topic.delta_bytes}"
 
 
 def _log(topic: Topic, log: TopicLog) -> Iterator[str]:

@@ -48,6 +48,9 @@ def _check_name(name: str, what: str, limit_bytes: int) -> None:
 
 
 def _written(value: object) -> object:
+    """A value as it is written in a configuration."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
     return value.value if isinstance(value, Enum) else value
 
 

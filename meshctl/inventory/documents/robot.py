@@ -184,5 +184,7 @@ class TopicDocument(Document):
     """Let receivers request lost broadcasts again."""
     delta: Flag = False
     """Send a message as the difference to the last one that its receiver has (maps, grids, images, states)."""
+    delta_bytes: Whole = Field(default=16_777_216, ge=1, le=1_073_741_824)
+    """Maximum size of a message for that; a larger one is sent whole."""
     log: TopicLogDocument = NOT_WRITTEN
     """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""

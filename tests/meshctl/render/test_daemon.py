@@ -50,6 +50,7 @@ MAPS = Topic(
     outbox_bytes=2_000_000,
     outbox_on_disk=True,
 )
+GRID = Topic("grid", 8, TopicClass.MAP, destinations=("base",), delta=True, delta_bytes=4_000_000)
 VIDEO = Topic("video", 9, TopicClass.VIDEO, reliable=False, destinations=("base",), repair=True)
 
 
@@ -70,7 +71,7 @@ def loaded(source: Fleet, robot: str, folder: Path) -> Configuration:
 
 
 def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:
-    found = loaded(fleet(ESTOP, MAPS, VIDEO, port=8701, heartbeat_s=0.5, metrics_port=9871), "uav", tmp_path)
+    found = loaded(fleet(ESTOP, MAPS, VIDEO, GRID, port=8701, heartbeat_s=0.5, metrics_port=9871), "uav", tmp_path)
     settings = found.settings
     assert (settings.name, settings.port, settings.window, settings.fragment_bytes) == ("uav", 8701, "adaptive", 1400)
     assert [key.secret for key in settings.keys] == [b"\x11" * 32, bytes(range(32))]
@@ -92,6 +93,14 @@ def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:
         outbox_on_disk=True,
     )
     assert topics["video"] == core.Topic("video", 9, reliable=False, destinations=("base",), repair=True)
+    assert topics["grid"] == core.Topic("grid", 8, destinations=("base",), delta=True, delta_bytes=4_000_000)
+
+
+def test_the_inventorys_default_and_bounds_of_delta_bytes_are_the_daemons(tmp_path: Path) -> None:
+    assert Topic("grid", 8).delta_bytes == core.Topic("grid", 8).delta_bytes
+    for size in (1, 1 << 30):
+        found = loaded(fleet(replace(GRID, delta_bytes=size)), "uav", tmp_path).settings.topics
+        assert {topic.delta_bytes for topic in found if topic.delta} == {size}
 
 
 def test_the_destinations_of_a_log_are_its_readers(tmp_path: Path) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import platform
+import shutil
+import subprocess
+import sys
 import zipfile
 from io import BytesIO
 from ipaddress import IPv4Address, IPv4Interface
@@ -28,7 +32,7 @@ from meshctl.robots.preconditions import (
     unmet_preconditions,
 )
 from meshctl.robots.wheel_tags import Target, is_compatible, parse_wheel, pip_options
-from meshctl.robots.wheels import own_wheel, stock_units
+from meshctl.robots.wheels import REQUIREMENTS, has_all, own_wheel, requirements, select_wheels, stock_units
 from tests.meshctl.render import fleets
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -74,6 +78,61 @@ def test_own_wheel_contains_only_udp_mesh_and_the_unit_starts_the_current_releas
     assert starts == ["ExecStart=/opt/udp-mesh/current/bin/udp-mesh run FILE"]
     with pytest.raises(ValueError, match="one ExecStart"):
         service_unit("[Service]\n", "x")
+
+
+@pytest.mark.parametrize(
+    ("target", "has_zstd"),
+    [
+        (BOOKWORM, True),
+        (PI, True),
+        (ALPINE, True),
+        # part of Python
+        (Target((3, 14), "x86_64", "glibc", (2, 41)), False),
+        # without a wheel of it, the robot gets plain messages
+        (Target((3, 11), "armv7l", "glibc", (2, 36)), False),
+    ],
+)
+def test_a_bundle_has_zstd_where_python_does_not(target: Target, has_zstd: bool, tmp_path: Path) -> None:
+    assert requirements(target) == (*REQUIREMENTS, *(["backports-zstd"] if has_zstd else []))
+    python, libc = "".join(map(str, target.python)), "manylinux" if target.libc == "glibc" else "musllinux"
+    tag = f"{libc}_{target.libc_version[0]}_{target.libc_version[1]}_{target.arch}"
+    for project in REQUIREMENTS:
+        zipfile.ZipFile(tmp_path / f"{project}-9.0-cp{python}-cp{python}-{tag}.whl", "w").close()
+    assert has_all(target, tmp_path) is not has_zstd
+    if has_zstd:
+        with pytest.raises(InputError, match=f"expected a wheel of backports-zstd for {target}, found none"):
+            select_wheels(target, tmp_path)
+        zipfile.ZipFile(tmp_path / f"backports_zstd-1.0-cp{python}-cp{python}-{tag}.whl", "w").close()
+    picked = [wheel.file.partition("-")[0] for wheel in select_wheels(target, tmp_path)]
+    assert picked == ["udp_mesh", *REQUIREMENTS, *(["backports_zstd"] if has_zstd else [])]
+
+
+def test_the_wheels_of_a_bundle_give_a_robot_differences_and_it_runs_without_them(wheels: Path, tmp_path: Path) -> None:
+    """In an interpreter that finds nothing but the unpacked wheels, as on a robot."""
+    libc, version = platform.libc_ver()
+    major, minor = version.split(".")[:2]
+    target = Target(sys.version_info[:2], platform.machine(), libc, (int(major), int(minor)))
+    for wheel in select_wheels(target, wheels):
+        with zipfile.ZipFile(BytesIO(wheel.content)) as archive:
+            archive.extractall(tmp_path)
+    code = """
+import sys
+sys.path.append(sys.argv[1])
+import udp_mesh.cli.main, udp_mesh.daemon.service
+from udp_mesh.core.peers.heartbeat import own_features
+from udp_mesh.core.settings import Settings
+from udp_mesh.wire.frames import Feature
+print(own_features(Settings("a", unkeyed=True)) & (Feature.ZSTD | Feature.VERSIONS))
+"""
+
+    def features() -> int:
+        words = [sys.executable, "-I", "-S", "-c", code, str(tmp_path)]
+        return int(subprocess.run(words, capture_output=True, check=True, timeout=60).stdout)
+
+    assert features() == 64 | 128
+    if sys.version_info < (3, 14):
+        shutil.rmtree(tmp_path / "backports")
+        assert features() == 0
 
 
 def test_a_bundle_id_depends_on_its_content_and_its_repr_hides_secrets() -> None:

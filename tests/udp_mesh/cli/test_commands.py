@@ -4,6 +4,7 @@ import argparse
 import errno
 import io
 import json
+import random
 import shlex
 import signal
 import socket
@@ -18,7 +19,7 @@ from typing import Any
 import pytest
 
 from tests.udp_mesh.cli.conftest import Pair, Run
-from tests.udp_mesh.daemon.processes import RunningDaemon, configuration
+from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, outcomes
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.cli import serve
 from udp_mesh.cli.inspect import screen_text
@@ -168,6 +169,37 @@ def test_set_and_drop_take_effect(run: Run) -> None:
     assert run("drop", "neighbour", "127.0.3.9")[0] == Exit.OK
     assert run("reload")[0] == Exit.OK
     assert run("reload")[1] == "no changes\n"
+
+
+def test_versions_of_a_topic_are_shown_as_text_json_and_metrics(pair: Pair, run: Run) -> None:
+    alice, bob = pair
+    grid = random.Random(2).randbytes(5000)
+    assert run("set", "topic", "grid", "delta=true", "delta_bytes=20000")[0] == Exit.OK
+    with alice.client() as client:
+        for number in range(3):
+            client.publish("grid", grid + bytes([number]) * 40, to="bob", notify=True)
+            assert set(outcomes(client, 1).values()) == {"delivered"}
+
+    def shown(daemon: RunningDaemon) -> dict[str, Any]:
+        with daemon.client() as client:
+            return next(topic for topic in client.request("topics")["topics"] if topic["name"] == "grid")
+
+    sent, received = shown(alice), shown(bob)["versions"]
+    assert (sent["delta"], sent["delta_bytes"]) == (True, 20_000)
+    assert (sent["versions"]["whole_sent"], sent["versions"]["differences_sent"]) == (1, 2)
+    assert sent["versions"]["payload_bytes_sent"] == 3 * 5040
+    assert sent["versions"]["body_bytes_sent"] < 5040 + 500
+    assert (received["whole_received"], received["differences_received"]) == (1, 2)
+    assert received["body_bytes_received"] == sent["versions"]["body_bytes_sent"]
+    topics = {topic["name"]: topic for topic in json.loads(run("topics", "--json")[1])["topics"]}
+    assert (topics["grid"]["versions"], topics["map"]["versions"]) == (sent["versions"], None)
+    lines = run("topics")[1].splitlines()
+    (head,) = (number for number, line in enumerate(lines) if line.startswith("versions of"))
+    assert lines[head + 1].split()[:3] == ["grid", "1", "2"]
+    metrics = run("metrics")[1].splitlines()
+    assert 'udp_mesh_version_whole_sent_total{topic="grid"} 1' in metrics
+    assert 'udp_mesh_version_differences_sent_total{topic="grid"} 2' in metrics
+    assert run("drop", "topic", "grid")[0] == Exit.OK
 
 
 def test_a_topic_limit_can_be_removed(run: Run) -> None:

@@ -1,15 +1,17 @@
 """The daemon's replies as text."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
 from tests.udp_mesh.core.pair import pair
 from udp_mesh.cli import output
 from udp_mesh.cli.inspect import screen_text
-from udp_mesh.cli.views import peers_view
-from udp_mesh.daemon.status import peer_json
+from udp_mesh.cli.views import peers_view, topics_view
+from udp_mesh.core.settings import Settings, Topic
+from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
+from udp_mesh.daemon.status import peer_json, topics_json
 
 
 @pytest.mark.parametrize(
@@ -31,6 +33,30 @@ def test_peers_view_shows_one_state_per_peer(
     line = peers_view([peer_json(peer, both.now)]).splitlines()[-1]
     assert f" {word} " in line
     assert ("14" in line) == (word == "NO ANSWER")
+
+
+def test_topics_view_shows_what_differences_saved() -> None:
+    counters = VersionCounters(
+        whole_sent=2,
+        differences_sent=7,
+        bases_lost=1,
+        payload_bytes_sent=9_000_000,
+        body_bytes_sent=2_200_000,
+        whole_received=3,
+        differences_received=4,
+        bases_missing=1,
+        damaged=1,
+    )
+    settings = Settings("a", unkeyed=True, topics=(Topic("map", 7, delta=True), Topic("status", 0)))
+    topics = topics_json(settings, {}, 0.0, (VersionConditions("map", counters), VersionConditions("old", counters)))
+    assert {topic["name"]: topic["versions"] for topic in topics} == {"map": asdict(counters), "status": None}
+    assert [(topic["delta"], topic["delta_bytes"]) for topic in topics] == [(False, 16 << 20), (True, 16 << 20)]
+    lines = topics_view({"topics": topics, "undeclared": None}).splitlines()
+    (head,) = (number for number, line in enumerate(lines) if line.startswith("versions of"))
+    assert lines[head + 1].split() == ["map", "2", "7", "9", "MB", "2.2", "MB", "3", "4", "3"]
+    assert lines[head + 2 :] == ["", "other topics are refused"]
+    without = topics_view({"topics": [{**topic, "versions": None} for topic in topics], "undeclared": None})
+    assert "versions of" not in without
 
 
 HOSTILE = "\x1b[2J\x1b]52;c;aGk=\x07\x9b2J\u202egnp.exe\nbob  online\x7f"

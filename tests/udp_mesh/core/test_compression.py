@@ -3,10 +3,12 @@
 import random
 import zlib
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import World, settings
+from udp_mesh.core import publish
 from udp_mesh.core.compression import (
     INFLATE_STEP_BYTES,
     STEP_BYTES,
@@ -14,9 +16,13 @@ from udp_mesh.core.compression import (
     Decompression,
     compress,
     decompress,
+    start_decompression,
 )
 from udp_mesh.core.events import ExpiryReason, MessageDelivered, MessageExpired, MessageReceived, Rejected
-from udp_mesh.core.settings import Limits, Topic
+from udp_mesh.core.peers import heartbeat
+from udp_mesh.core.receiver import receiver
+from udp_mesh.core.settings import Limits, Settings, Topic
+from udp_mesh.wire.frames import Feature
 
 TOPICS = (
     Topic("stop", priority=0),
@@ -49,6 +55,36 @@ def test_truncated_input_and_trailing_data_are_rejected(payload: bytes, cut: int
     packed = zlib.compress(payload * 50)
     assert decompress(packed[: min(cut, len(packed) - 1)], 1 << 20) is None
     assert decompress(packed + b"x", 1 << 20) is None
+
+
+@pytest.mark.parametrize("without", ["", "a", "b"])
+def test_zstd_is_on_the_wire_between_two_nodes_that_announce_it(without: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """zlib if one of them, `without`, has no zstd."""
+    own_features = heartbeat.own_features
+    bodies: list[str] = []
+
+    def features(config: Settings) -> int:
+        return own_features(config) & ~(Feature.ZSTD if config.name == without else 0)
+
+    def start(body: bytes, flags: int, limit_bytes: int) -> object:
+        bodies.append(bytes(body[:4]).hex())
+        return start_decompression(body, flags, limit_bytes)
+
+    monkeypatch.setattr(heartbeat, "own_features", features)
+    monkeypatch.setattr(publish, "own_features", features)
+    monkeypatch.setattr(receiver.__name__ + ".start_decompression", start)
+    made = world()
+    # Compressed at once, and in steps.
+    payloads = [b"again and " * 300, b"again and " * 30_000]
+    for payload in payloads:
+        made.send("a", "map", payload, "b")
+        made.run(2.0)
+    assert [event.payload for event in made.events_of("b", MessageReceived) if isinstance(event, MessageReceived)] == (
+        payloads
+    )
+    # RFC 8878, 3.1.1, and RFC 1950, 2.2.
+    starts = "78" if without else "28b52ffd"
+    assert [body[: len(starts)] for body in bodies] == [starts] * 2
 
 
 def test_compression_step_size_does_not_depend_on_message_size() -> None:

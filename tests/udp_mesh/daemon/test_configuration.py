@@ -160,6 +160,18 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
             'udp-mesh.toml:3: topics.map.outbox_on_disk: expected outbox = "last" or "all" as well, found true',
         ),
         (
+            "[topics]\nmap = { delta = 1 }",
+            "udp-mesh.toml:3: topics.map.delta: expected true or false, found 1",
+        ),
+        (
+            "[topics.map]\ndelta = true\ndelta_bytes = 0",
+            "udp-mesh.toml:4: topics.map.delta_bytes: expected an integer from 1 to 1073741824, found 0",
+        ),
+        (
+            "[topics.map]\nlog = {}\ndelta = true",
+            "udp-mesh.toml:2: topics.map: expected no delta for a log, found true",
+        ),
+        (
             '[[neighbours]]\naddress = "fe80::1"',
             'udp-mesh.toml:3: neighbours.0.address: expected link = "INTERFACE" with a link-local address, '
             'found "fe80::1"',

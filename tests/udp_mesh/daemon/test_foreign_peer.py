@@ -6,19 +6,41 @@ import random
 import socket
 import tempfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, collect, configuration, outcomes, wait_online
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from tests.udp_mesh.wire.foreign_peer import COMPRESSED, FLAG_TO_ALL, ZLIB, Channel, FleetKey, ForeignNode, Parser
+from tests.udp_mesh.wire.foreign_peer import (
+    COMPRESSED,
+    FLAG_TO_ALL,
+    FLAG_ZSTD,
+    RELIABLE,
+    VERSION,
+    VERSIONS,
+    ZLIB,
+    ZSTD,
+    Channel,
+    FleetKey,
+    ForeignNode,
+    Parser,
+    difference,
+    read_version,
+    version_hash,
+)
 from tests.udp_mesh.wire.make_vectors import FOLDER
 from udp_mesh.client import MeshClient
 
 pytestmark = pytest.mark.xdist_group("udp_mesh_daemons")
 
-TOPICS = "packed = { priority = 6, compression = true }\ncast = { priority = 4, repair = true }"
+TOPICS = """
+packed = { priority = 6, compression = true }
+cast = { priority = 4, repair = true }
+grid = { priority = 7, delta = true }
+"""
+ZSTD_MAGIC, ZLIB_MAGIC = "28b52ffd", "78"
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +51,7 @@ def daemon() -> Iterator[RunningDaemon]:
             yield one
 
 
-@pytest.fixture(params=[0, ZLIB])
+@pytest.fixture(params=[0, ZLIB, ZLIB | ZSTD | VERSIONS])
 def foreign(daemon: RunningDaemon, request: pytest.FixtureRequest) -> Iterator[ForeignNode]:
     """One that the daemon has met; it goes with a good-bye."""
     with daemon.client() as client:
@@ -59,6 +81,10 @@ def test_an_independent_implementation_matches_the_published_vectors() -> None:
         assert sealed.hex() == vector["datagram"]
     for vector in json.loads((FOLDER / "frames.json").read_text()).values():
         assert len(Parser(bytes.fromhex(vector["hex"])).frames()) == len(vector["frames"])
+    versions = json.loads((FOLDER / "versions.json").read_text())
+    for vector in versions["accepted"].values():
+        held = {version_hash(base)[:4]: base for base in [bytes.fromhex(vector["base"] or "")] if base}
+        assert read_version(bytes.fromhex(vector["body"]), vector["flags"], held).hex() == vector["payload"]
 
 
 def test_a_foreign_node_receives_and_acknowledges_messages_of_any_size(
@@ -74,9 +100,73 @@ def test_a_foreign_node_receives_and_acknowledges_messages_of_any_size(
         assert set(outcomes(client, len(payloads)).values()) == {"delivered"}
     assert {one.topic: one.payload for one in foreign.arrived} == payloads
     assert {one.type_name for one in foreign.arrived} == {"a/Type"}
-    # Compression is used only with peers that announce it.
+    # Compression is used only with peers that announce it, and zstd rather than zlib.
     packed = next(one for one in foreign.arrived if one.topic == "packed")
     assert bool(packed.flags & COMPRESSED) == bool(foreign.features & ZLIB)
+    assert bool(packed.flags & FLAG_ZSTD) == bool(foreign.features & ZSTD)
+    if packed.flags & COMPRESSED:
+        assert packed.body.hex().startswith(ZSTD_MAGIC if foreign.features & ZSTD else ZLIB_MAGIC)
+
+
+def has_arrived(foreign: ForeignNode, count: int) -> bool:
+    return len(foreign.arrived) == count
+
+
+def grids(count: int) -> list[bytes]:
+    """Random cells, of which each version changes some."""
+    rng = random.Random(4)
+    cells = bytearray(rng.randbytes(6000))
+    made = []
+    for _ in range(count):
+        at = rng.randrange(5000)
+        cells[at : at + 8] = rng.randbytes(8)
+        cells += rng.randbytes(20)
+        made.append(bytes(cells))
+    return made
+
+
+def test_a_foreign_node_receives_versions_as_differences_if_it_announces_that(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
+    sent = grids(3)
+    with daemon.client() as client:
+        for number, payload in enumerate(sent, 1):
+            client.publish("grid", payload, to=foreign.name, notify=True)
+            assert foreign.run(partial(has_arrived, foreign, number), WAIT_S)
+            # The next one refers to this one only if it is known to have arrived.
+            foreign.run(lambda: False, 0.1)
+            assert set(outcomes(client, 1).values()) == {"delivered"}
+    assert [one.payload for one in foreign.arrived] == sent
+    if not foreign.features & VERSIONS:
+        assert not any(one.flags & VERSION for one in foreign.arrived)
+        return
+    assert all(one.flags & VERSION for one in foreign.arrived)
+    bases = [bytes(4), *(version_hash(payload)[:4] for payload in sent)]
+    assert [one.body[:4] for one in foreign.arrived] == bases[:3]
+    for one in foreign.arrived[1:]:
+        assert one.body[12:].hex().startswith(ZSTD_MAGIC)
+        assert len(one.body) < 200
+
+
+def test_versions_from_a_foreign_node_are_decoded_and_those_without_a_base_refused(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
+    alice = foreign.peer("alice")
+    assert alice is not None
+    first, second, third, _ = grids(4)
+    packed = RELIABLE | COMPRESSED | FLAG_ZSTD | VERSION
+    with daemon.client() as client:
+        client.subscribe("grid")
+        for body, flags, end in (
+            (bytes(4) + version_hash(first) + first, RELIABLE | VERSION, "delivered"),
+            (difference(second, first), packed, "delivered"),
+            (difference(third, b"never sent" * 5), packed, "refused 4"),
+            (difference(third, first), packed, "delivered"),
+        ):
+            number = foreign.send(alice, "grid", body, flags=flags)
+            assert foreign.run(partial(alice.ends.get, number), WAIT_S)
+            assert alice.ends[number] == end
+        assert [message.payload for message in collect(client, 3)] == [first, second, third]
 
 
 def test_messages_from_a_foreign_node_arrive_once_and_are_acknowledged(

@@ -8,14 +8,17 @@ end in `_total` and are never negative.
 import asyncio
 import random
 import re
+from dataclasses import fields
 
 import pytest
 
 from tests.udp_mesh.core.pair import pair
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 from udp_mesh.core.conditions import PeerConditions
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event, MessageDelivered, MessageId, PeerOffline
 from udp_mesh.core.settings import Topic
+from udp_mesh.core.versions.conditions import VersionCounters
 from udp_mesh.daemon.interface import PING_TOPIC
 from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.metrics import render
@@ -76,6 +79,35 @@ def test_the_metrics_page_follows_the_prometheus_text_format() -> None:
         'topic="line\\nfeed"',
         'topic="map"',
     ]
+
+
+def test_versions_are_counted_by_topic_at_both_ends() -> None:
+    both = pair(Topic("map", delta=True), Topic("status"))
+    rng = random.Random(1)
+    grid = bytearray(rng.randbytes(5000))
+    for _ in range(3):
+        grid += rng.randbytes(50)
+        for topic in ("map", "status"):
+            both.a.send(topic, bytes(grid), destination="b", now=both.now)
+        both.roundtrip(50)
+
+    def page(node: Endpoint) -> dict[str, list[tuple[str, float]]]:
+        versions = node.versions()
+        text = render(node.conditions(both.now), {}, {}, versions=versions, about={}, uptime_s=1.0)
+        found = {name: samples for name, samples in families(text).items() if name.startswith("udp_mesh_version_")}
+        assert set(found) == {f"udp_mesh_version_{item.name}_total" for item in fields(VersionCounters)}
+        return found
+
+    sent, received = page(both.a), page(both.b)
+    for found in (sent, received):
+        assert {labels for samples in found.values() for labels, _ in samples} == {'topic="map"'}
+    assert sent["udp_mesh_version_whole_sent_total"] == [('topic="map"', 1)]
+    assert sent["udp_mesh_version_differences_sent_total"] == [('topic="map"', 2)]
+    assert sent["udp_mesh_version_payload_bytes_sent_total"] == [('topic="map"', 5050 + 5100 + 5150)]
+    assert 5050 < sent["udp_mesh_version_body_bytes_sent_total"][0][1] < 5400
+    for name in ("payload_bytes", "body_bytes", "whole", "differences"):
+        of_sender = sent[f"udp_mesh_version_{name}_sent_total"]
+        assert received[f"udp_mesh_version_{name}_received_total"] == of_sender
 
 
 def test_bytes_to_and_from_a_peer_grow_with_each_message() -> None:

@@ -1,4 +1,4 @@
-"""A node written from docs/wire-format.md alone: nothing of udp_mesh is imported, only an AEAD cipher.
+"""A node written from docs/wire-format.md alone: nothing of udp_mesh is imported, only an AEAD cipher and zstd.
 
 It does what that page requires of another implementation, in the simplest way: sends a hello, believes nodes that hear
 it, fragments and reassembles messages, acknowledges each datagram individually, and retransmits what is missing twice a
@@ -18,13 +18,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from backports import zstd
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 HELLO, BROADCAST, INTRODUCTION, DATA = range(4)
 TO_ALL = bytes(16)
-RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR = 1, 2, 4, 8
-ZLIB, REPAIRS = 1, 2
+RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR, FLAG_ZSTD, VERSION = 1, 2, 4, 8, 64, 128
+ZLIB, REPAIRS, ZSTD, VERSIONS = 1, 2, 64, 128
 FIRST_UNREPAIRED_NUMBER = 1 << 31
 COVER = bytes.fromhex("02ffffffffffff00000000")
 HELLO_S, RESEND_S, HEARD_FOR_S = 0.2, 0.5, 0.7
@@ -191,6 +192,40 @@ class Parser:
         return {"id": message_id, "position": 0, "head": head, "payload": payload, "cast": bool(kind & 16)}
 
 
+# Versions
+
+
+def version_hash(content: bytes) -> bytes:
+    return hashlib.blake2b(content, digest_size=8).digest()
+
+
+def unpack(body: bytes, flags: int, prefix: bytes = b"") -> bytes:
+    """The content of a message's body, or of a version's after its header."""
+    if not flags & COMPRESSED:
+        return body
+    if not flags & FLAG_ZSTD:
+        return zlib.decompress(body)
+    return zstd.decompress(body, zstd_dict=zstd.ZstdDict(prefix, is_raw=True).as_prefix if prefix else None)
+
+
+def read_version(body: bytes, flags: int, held: dict[bytes, bytes]) -> bytes:
+    """A version, decoded with those held by the first 4 bytes of their hashes; it is added to them."""
+    base, digest, content = body[:4], body[4:12], body[12:]
+    version = unpack(content, flags, held[base] if base != bytes(4) else b"")
+    if version_hash(version) != digest:
+        raise ValueError("a version has another hash")
+    held[digest[:4]] = version
+    return version
+
+
+def difference(version: bytes, base: bytes) -> bytes:
+    """The body of a version as the difference to another one."""
+    compressor = zstd.ZstdCompressor(zstd_dict=zstd.ZstdDict(base, is_raw=True).as_prefix)
+    compressor.set_pledged_input_size(len(version))
+    packed = compressor.compress(version, zstd.ZstdCompressor.FLUSH_FRAME)
+    return version_hash(base)[:4] + version_hash(version) + packed
+
+
 # The node
 
 
@@ -201,6 +236,8 @@ class ReceivedMessage:
     type_name: str
     payload: bytes
     flags: int
+    body: bytes
+    """As it was on the wire."""
 
 
 @dataclass
@@ -223,6 +260,8 @@ class Peer:
         self.topics: dict[int, tuple[str, str]] = {}
         self.partials: dict[tuple[bool, int], Partial] = {}
         self.finished: set[tuple[bool, int]] = set()
+        self.versions: dict[tuple[str, str], dict[bytes, bytes]] = {}
+        """By topic and type."""
         self.next_id = 0
         self.in_flight: dict[int, list[tuple[bytes, set[int]]]] = {}
         """Message id -> per fragment its frames and the packets that carried it."""
@@ -406,6 +445,10 @@ class ForeignNode:
         body = b"".join(partial.pieces[place] for place in range(head["fragments"]))
         if len(body) != head["size"]:
             raise ValueError(f"{len(body)} bytes arrived of a message of {head['size']}")
-        payload = zlib.decompress(body) if head["flags"] & COMPRESSED else body
         topic, type_name = peer.topics[head["topic"]]
-        self.arrived.append(ReceivedMessage(peer.name, topic, type_name, payload, head["flags"]))
+        flags = head["flags"]
+        if flags & VERSION:
+            payload = read_version(body, flags, peer.versions.setdefault((topic, type_name), {}))
+        else:
+            payload = unpack(body, flags)
+        self.arrived.append(ReceivedMessage(peer.name, topic, type_name, payload, flags, body))

@@ -1,7 +1,7 @@
 """Write the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with its output.
 
 Other implementations read `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with the
-keys and boot ids that open them, and datagrams and messages of the legacy format.
+keys and boot ids that open them, versions with their bases, and datagrams and messages of the legacy format.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from udp_mesh.crypto import Key, SendChannel
 from udp_mesh.wire.codec import encode
@@ -18,9 +19,11 @@ from udp_mesh.wire.frames import (
     Bye,
     Cancel,
     Delivered,
+    Feature,
     Fragment,
     Frame,
     Heartbeat,
+    MessageFlag,
     MessageHead,
     Nack,
     Ping,
@@ -41,8 +44,69 @@ from udp_mesh.wire.legacy import (
     encode_legacy,
     encode_mesh_data,
 )
+from udp_mesh.wire.version import NO_BASE, VersionHeader, base_of, encode_version, version_hash
 
 FOLDER = Path(__file__).parent / "vectors"
+
+VERSION, PACKED = MessageFlag.VERSION, MessageFlag.VERSION | MessageFlag.COMPRESSED | MessageFlag.ZSTD
+
+OLD_GRID = b"".join(b"%02d;" % (cell * 7 % 100) for cell in range(64))
+GRID = OLD_GRID.replace(b"35;", b"wall;") + b"99;"
+
+# Compressors differ, and so do versions of one: other bytes may decompress to the same content.
+PACKED_GRID = (
+    "28b52ffd20c0dd020002cc1509c03d204992100638275796b860c2d189df0df7d856b716ba66ce21537c30c0d38d97cb5d36eda889be19e6912d"
+    "6e2c7075f6e0749f0df6d4469796b964ca11137c1dfa70bb7b8b5d35eba0693e19e4890d2e2cbd381900"
+)
+GRID_DIFFERENCE = "28b52ffd20c58d00003877616c6c39393b0200aca25134ec0c10"
+# Made with the content size left out of the frame.
+GRID_WITHOUT_SIZE = (
+    "28b52ffd0058dd020002cc1509c03d204992100638275796b860c2d189df0df7d856b716ba66ce21537c30c0d38d97cb5d36eda889be19e6912d"
+    "6e2c7075f6e0749f0df6d4469796b964ca11137c1dfa70bb7b8b5d35eba0693e19e4890d2e2cbd381900"
+)
+
+
+class VersionVector(NamedTuple):
+    """A version, the one it is a difference to, and its bytes in the message."""
+
+    payload: bytes
+    base: bytes | None
+    flags: int
+    body: bytes
+
+
+def version(payload: bytes, base: bytes | None = None, packed: str = "") -> VersionVector:
+    """A version sent as it is, or as these compressed bytes (hexadecimal)."""
+    header = VersionHeader(NO_BASE if base is None else base_of(version_hash(base)), version_hash(payload))
+    body = encode_version(header, bytes.fromhex(packed) if packed else payload)
+    return VersionVector(payload, base, PACKED if packed else VERSION, body)
+
+
+VERSIONS: dict[str, VersionVector] = {
+    "empty version": version(b""),
+    "whole version": version(OLD_GRID),
+    "whole version, compressed": version(OLD_GRID, packed=PACKED_GRID),
+    "difference": version(GRID, OLD_GRID, GRID_DIFFERENCE),
+}
+
+REFUSED_VERSIONS: dict[str, tuple[VersionVector, RefuseReason]] = {
+    "shorter than its header": (VersionVector(b"", None, VERSION, bytes(11)), RefuseReason.CORRUPT),
+    "another hash": (VersionVector(b"", None, VERSION, version(b"").body + b"!"), RefuseReason.CORRUPT),
+    "compressed with zlib": (
+        version(OLD_GRID)._replace(flags=VERSION | MessageFlag.COMPRESSED),
+        RefuseReason.CORRUPT,
+    ),
+    "compressed without its size": (version(OLD_GRID, packed=GRID_WITHOUT_SIZE), RefuseReason.CORRUPT),
+    "difference to a version that the receiver does not have": (
+        version(GRID, GRID, GRID_DIFFERENCE)._replace(base=OLD_GRID),
+        RefuseReason.FORGOTTEN,
+    ),
+    "difference with another hash": (
+        version(OLD_GRID, OLD_GRID, GRID_DIFFERENCE),
+        RefuseReason.FORGOTTEN,
+    ),
+}
+"""The receiver has `base`, and answers REFUSED with the reason."""
 
 FRAMES: dict[str, list[Frame]] = {
     "heartbeat": [
@@ -76,6 +140,19 @@ FRAMES: dict[str, list[Frame]] = {
         Sent(0x01020304),
         Fragment(1, 0, b"hello", MessageHead(5, 1, 2, 0, 1, 40, 1500), ack_now=True),
     ],
+    "heartbeat of a node that keeps versions": [
+        Heartbeat("ugv1", 1, 1, Feature.ZLIB | Feature.ZSTD | Feature.VERSIONS, 1000, 0, 0, 9, 0)
+    ],
+    "difference in one fragment": [
+        TopicAnnounce(3, "grid", "nav_msgs/OccupancyGrid"),
+        Fragment(
+            13,
+            0,
+            VERSIONS["difference"].body,
+            MessageHead(len(VERSIONS["difference"].body), 1, 3, 7, MessageFlag.RELIABLE | PACKED),
+        ),
+    ],
+    "refused because its base is not held": [Refused(13, RefuseReason.FORGOTTEN)],
 }
 
 COMPACT_FRAMES: dict[str, list[Frame]] = {
@@ -160,6 +237,21 @@ def make_sealed() -> object:
     return vectors
 
 
+def make_versions() -> object:
+    return {
+        "accepted": {name: _version_json(vector) for name, vector in VERSIONS.items()},
+        "refused": {
+            name: {**_version_json(vector), "payload": None, "reason": int(reason)}
+            for name, (vector, reason) in REFUSED_VERSIONS.items()
+        },
+    }
+
+
+def _version_json(vector: VersionVector) -> dict[str, object]:
+    base = None if vector.base is None else vector.base.hex()
+    return {"payload": vector.payload.hex(), "base": base, "flags": int(vector.flags), "body": vector.body.hex()}
+
+
 def make_legacy() -> object:
     datagrams = {
         name: {"datagram": describe(value), "hex": encode_legacy(value).hex()} for name, value in LEGACY.items()
@@ -171,7 +263,12 @@ def make_legacy() -> object:
     }
 
 
-MAKERS = {"frames.json": make_frames, "sealed.json": make_sealed, "legacy.json": make_legacy}
+MAKERS = {
+    "frames.json": make_frames,
+    "sealed.json": make_sealed,
+    "versions.json": make_versions,
+    "legacy.json": make_legacy,
+}
 
 
 def main() -> None:

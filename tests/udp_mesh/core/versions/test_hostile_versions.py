@@ -6,32 +6,13 @@ from backports import zstd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.core.receiver.memory_limit import MemoryBudget
-from udp_mesh.core.settings import Limits
-from udp_mesh.core.versions.decoding import VersionDecoding
+from tests.udp_mesh.core.versions.receiving import TOPIC, receive, receiver
 from udp_mesh.core.versions.encoding import Version, encode
-from udp_mesh.core.versions.received import CounterTable, ReceivedVersions
 from udp_mesh.core.zstd import DECOMPRESS_STEP_BYTES, ZstdDecompression
 from udp_mesh.wire.frames import MessageFlag, RefuseReason
 from udp_mesh.wire.version import NO_BASE, VersionHeader, encode_version, version_hash
 
-TOPIC = ("map", "")
 PACKED = MessageFlag.VERSION | MessageFlag.COMPRESSED | MessageFlag.ZSTD
-
-
-def receiver(**limits: int) -> ReceivedVersions:
-    made = Limits(**limits)
-    return ReceivedVersions(made, MemoryBudget(made.version_bytes), CounterTable())
-
-
-def receive(versions: ReceivedVersions, body: bytes, flags: int) -> bytes | RefuseReason:
-    begun = versions.begin(TOPIC, body, flags)
-    if isinstance(begun, RefuseReason):
-        return begun
-    assert isinstance(begun, VersionDecoding)
-    while not begun.step():
-        pass
-    return versions.finish(TOPIC, begun, len(body))
 
 
 @given(st.binary(max_size=400), st.integers(0, 255))

@@ -1,0 +1,222 @@
+"""Topics: delivery, names, differences (MC712 to MC720)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.model import Fleet, Outbox, Topic, TopicClass
+from meshctl.resolve import has_routed_lans
+
+_ALL = "all"
+# at 5 % loss 0.95**32, one in five, of such best-effort messages arrive
+_BEST_EFFORT_FRAGMENTS = 32
+# ROS 1: package/Type; ROS 2: package/msg/Type
+_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/((msg|srv|action)/)?[A-Za-z][A-Za-z0-9_]*")
+_TOPIC = re.compile(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+# udp_mesh keeps no shorter message as the base of a difference
+_MIN_BASE_BYTES = 32
+# udp_mesh compares at most so many bytes of a topic per second, those of the bases included
+_COMPARED_BYTES_PER_S = 32 << 20
+# names and payload of a message that udp_mesh broadcasts in one datagram of 1500 bytes: less IPv6 and UDP (48), the
+# sealed header (23), announcement and head (30), and the legacy format's header (14)
+_BROADCAST_BYTES = 1385
+# their content is compressed already; ROS 2 writes msg/ in between
+_COMPRESSED_TYPES = frozenset(
+    {
+        "sensor_msgs/CompressedImage",
+        "theora_image_transport/Packet",
+        "ffmpeg_image_transport_msgs/FFMPEGPacket",
+        "point_cloud_interfaces/CompressedPointCloud2",
+    }
+)
+
+
+def _path(topic: Topic, *key: str) -> tuple[str, ...]:
+    return ("topics", topic.name, *key)
+
+
+@fleet_rule(
+    "MC712",
+    Severity.WARNING,
+    "Video is sent reliably",
+    why="""Retransmitting old frames delays new ones: on a bad link, reliable video falls minutes behind and fills the
+    queue with obsolete frames.""",
+    fix="Set `reliable: false` and `keep_last: 1`.",
+    failing="topics: {video: {reliable: true}}",
+    passing="topics: {video: {reliable: false}}",
+)
+def video_reliable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.topic_class is TopicClass.VIDEO and topic.reliable:
+            yield Finding(_path(topic, "reliable"), "old frames delay new ones", "false", "true")
+
+
+@fleet_rule(
+    "MC713",
+    Severity.WARNING,
+    "A best-effort message is too large to arrive",
+    why="""A message arrives only if every fragment does. At 5 % loss, a message of 32 fragments arrives one time in
+    five.""",
+    fix="Send smaller messages, or set `reliable: true` or `repair: true`.",
+    failing="topics: {video: {size_bytes: 200000}}",
+    passing="topics: {video: {size_bytes: 5000}}",
+)
+def best_effort_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        fragments = -(-topic.size_bytes // fleet.udp_mesh.fragment_bytes)
+        if not topic.reliable and not topic.repair and fragments > _BEST_EFFORT_FRAGMENTS:
+            expected = f"at most {_BEST_EFFORT_FRAGMENTS} fragments"
+            found = f"{fragments} fragments; {0.95**fragments:.0%} arrive at 5 % loss"
+            yield Finding(_path(topic, "size_bytes"), "lost if any fragment is lost", expected, found)
+
+
+@fleet_rule(
+    "MC714",
+    Severity.WARNING,
+    "An outbox keeps messages that will have expired",
+    why="""Messages wait for an offline peer, but their deadline passes before the peer counts as offline: the outbox is
+    always empty when the peer returns.""",
+    fix="Increase `deadline_s`, or remove the outbox.",
+    failing="topics: {commands: {outbox: last, deadline_s: 5}}",
+    passing="topics: {commands: {outbox: last, deadline_s: 600}}",
+)
+def outbox_expires(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    offline_s = fleet.udp_mesh.offline_after_s
+    for topic in fleet.topics:
+        if topic.outbox is not Outbox.NONE and topic.deadline_s is not None and topic.deadline_s <= offline_s:
+            expected = f"more than {offline_s:g} s (udp_mesh.offline_after_s)"
+            path = _path(topic, "deadline_s")
+            yield Finding(path, "expires before the peer returns", expected, f"{topic.deadline_s:g} s")
+
+
+@fleet_rule(
+    "MC715",
+    Severity.ERROR,
+    "An outbox is smaller than one message",
+    why="No message fits: it is dropped at once instead of being kept for an offline peer.",
+    fix="Increase `outbox_bytes` to several messages.",
+    failing="topics: {artifacts: {outbox: all, outbox_bytes: 10000, size_bytes: 60000}}",
+    passing="topics: {artifacts: {outbox: all, outbox_bytes: 6000000, size_bytes: 60000}}",
+)
+def outbox_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.outbox is not Outbox.NONE and topic.outbox_bytes < topic.size_bytes:
+            path = _path(topic, "outbox_bytes")
+            yield Finding(path, "no message fits", f"at least {topic.size_bytes}", str(topic.outbox_bytes))
+
+
+@fleet_rule(
+    "MC716",
+    Severity.WARNING,
+    "A best-effort topic has an outbox",
+    why="Best effort means now or never: kept messages would be sent once, without an acknowledgment.",
+    fix="Set `reliable: true`, or remove the outbox.",
+    failing="topics: {video: {outbox: all}}",
+    passing="topics: {video: {outbox: none}}",
+)
+def outbox_best_effort(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.outbox is not Outbox.NONE and not topic.reliable:
+            yield Finding(
+                _path(topic, "outbox"),
+                "kept, but not delivered reliably",
+                "none, or reliable: true",
+                topic.outbox.value,
+            )
+
+
+@fleet_rule(
+    "MC717",
+    Severity.WARNING,
+    "A topic's type is not a ROS type",
+    why="The bridge looks up the type by this name; without it, the bridge passes nothing.",
+    fix="Write `package/Type` (ROS 1) or `package/msg/Type` (ROS 2).",
+    failing="topics: {commands: {type: String}}",
+    passing="topics: {commands: {type: std_msgs/String}}",
+)
+def type_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.type_name and _TYPE.fullmatch(topic.type_name) is None:
+            expected = "package/Type or package/msg/Type"
+            yield Finding(_path(topic, "type"), "not a ROS type name", expected, topic.type_name)
+
+
+@fleet_rule(
+    "MC718",
+    Severity.ERROR,
+    "A topic's name is not a ROS name",
+    why="ROS rejects names with spaces, hyphens or a part that starts with a digit: the bridge does not start.",
+    fix="Use letters, digits and underscores, parts joined by slashes.",
+    failing="topics: {map-diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
+    passing="topics: {map_diffs: {priority: 8, class: map, type: std_msgs/String, rate_hz: 0.1, size_bytes: 1000}}",
+)
+def topic_name_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if _TOPIC.fullmatch(topic.name) is None:
+            expected = "letters, digits and underscores, parts joined by /"
+            yield Finding(_path(topic), "not a valid ROS name", expected, topic.name)
+
+
+@fleet_rule(
+    "MC719",
+    Severity.ERROR,
+    "A log has settings that contradict it",
+    why="""The items of a shared log wait in the log itself, for all their readers. The daemon refuses a topic that is a
+    log and also best effort, limited to its last messages, kept in an outbox, or sent as differences.""",
+    fix="Remove the other setting, or `log`.",
+    failing="topics: {artifacts: {log: {}, outbox: all}}",
+    passing="topics: {artifacts: {log: {}, outbox: none}}",
+)
+def log_contradicted(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        if topic.log is None:
+            continue
+        for key, found, is_set in (
+            ("reliable", "false", not topic.reliable),
+            ("keep_last", str(topic.keep_last), bool(topic.keep_last)),
+            ("deadline_s", f"{topic.deadline_s} s", topic.deadline_s is not None),
+            ("outbox", topic.outbox.value, topic.outbox is not Outbox.NONE),
+            ("repair", "true", topic.repair),
+            ("delta", "true", topic.delta),
+        ):
+            if is_set:
+                yield Finding(_path(topic, key), f"{topic.name} is a shared log", f"no {key} beside log", found)
+
+
+@fleet_rule(
+    "MC720",
+    Severity.WARNING,
+    "Differences save nothing on a topic",
+    why="""With `delta`, a message is sent as the difference to the last one that its receiver has. udp_mesh sends
+    messages below 32 bytes or above `delta_bytes` whole, as well as those to all that fit one datagram. It compares at
+    most 32 MiB of a topic per second, and finds nothing in common in data compressed already, such as JPEG.""",
+    fix="Remove `delta`, or change what the finding names: `delta_bytes`, the destinations, or the rate.",
+    failing="topics: {video: {type: sensor_msgs/CompressedImage, delta: true}}",
+    passing="topics: {map: {type: nav_msgs/OccupancyGrid, delta: true, keep_last: 1}}",
+)
+def delta_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    can_broadcast = fleet.udp_mesh.broadcast and not has_routed_lans(fleet)
+    for topic in fleet.topics:
+        # MC719 covers logs
+        if not topic.delta or topic.log is not None:
+            continue
+        if topic.type_name.replace("/msg/", "/") in _COMPRESSED_TYPES:
+            yield Finding(_path(topic, "delta"), "compressed already", "false for this type", topic.type_name)
+        size, names = topic.size_bytes, len((topic.name + topic.type_name).encode())
+        if 0 < size < _MIN_BASE_BYTES:
+            expected = f"messages of at least {_MIN_BASE_BYTES} bytes"
+            yield Finding(_path(topic, "delta"), "every message is sent whole", expected, f"{size} bytes")
+        elif size and can_broadcast and _ALL in topic.destinations and size + names <= _BROADCAST_BYTES:
+            expected, found = "named destinations, or false", f"{size} bytes to all"
+            yield Finding(_path(topic, "delta"), "broadcast whole, in one datagram", expected, found)
+        elif size > topic.delta_bytes:
+            path = _path(topic, "delta_bytes")
+            yield Finding(path, "every message is sent whole", f"at least {size} (size_bytes)", str(topic.delta_bytes))
+        elif 2 * size * topic.rate_hz > _COMPARED_BYTES_PER_S:
+            expected = f"at most {_COMPARED_BYTES_PER_S} bytes/s with their bases"
+            found = f"{topic.rate_hz:g} Hz x 2 x {size} bytes"
+            yield Finding(_path(topic, "delta"), "part of the messages is sent whole", expected, found)
