@@ -27,6 +27,9 @@ log = logging.getLogger(__name__)
 RETRY_S = 5.0
 """Until a message that neither the disk nor a program took is requested from its sender again."""
 
+LoggedItem = tuple[str, str, int]
+"""(source, topic, number) of an item of a log."""
+
 
 @dataclass(slots=True)
 class _Held:
@@ -36,8 +39,8 @@ class _Held:
     receipt: Receipt | None
     """Set until the sender is informed that the message is safe."""
     on_disk: bool
-    logged: bool = False
-    """It is an item of a log."""
+    item: LoggedItem | None = None
+    """Set for an item of a log."""
     reading: dict[Client, int | None] = field(default_factory=dict)
     """Programs that it was sent to: the position in the client's stream at which it is read, or None if the client is
     to acknowledge it."""
@@ -77,7 +80,12 @@ class Inbox:
         key = self._next_key
         self._next_key += 1
         if message.number is not None:
-            self._held[key] = _Held(message.topic, message.receipt, on_disk=False, logged=True)
+            self._held[key] = _Held(
+                message.topic,
+                message.receipt,
+                on_disk=False,
+                item=(message.source, message.topic, message.number),
+            )
             return key
         stored = StoredMessage(key, message.source, message.topic, message.type_name, message.payload, None)
         self._held[key] = _Held(message.topic, message.receipt, on_disk=self._store.put(stored))
@@ -86,13 +94,13 @@ class Inbox:
     def on_distributed(self, key: int) -> None:
         """The message was sent to all programs subscribed now."""
         held = self._held.get(key)
-        if held is not None and not held.on_disk and not held.logged and not held.reading:
+        if held is not None and not held.on_disk and held.item is None and not held.reading:
             self._drop(key, held)
         self.take_read()
 
     async def flush(self) -> None:
         """Wait until everything added so far is on disk, then confirm it."""
-        waiting = [key for key, held in self._held.items() if held.receipt is not None and not held.logged]
+        waiting = [key for key, held in self._held.items() if held.receipt is not None and held.item is None]
         await self._flusher.flush()
         for key in waiting:
             held = self._held.get(key)
@@ -127,15 +135,21 @@ class Inbox:
         held = self._held.get(key)
         return held is not None and not held.reading
 
-    def request_item(self, key: int) -> bool:
-        """If the message is an item of a log, have it read and delivered again. Returns whether it is one."""
+    def topic(self, key: int) -> str | None:
+        """The topic of a message that no program is reading; None if there is none any more."""
         held = self._held.get(key)
-        if held is None or not held.logged:
-            return False
-        del self._held[key]
+        return None if held is None or held.reading else held.topic
+
+    def item(self, key: int) -> LoggedItem | None:
+        """Which item of a log the message is; None if it is none."""
+        held = self._held.get(key)
+        return None if held is None else held.item
+
+    def request_item(self, key: int) -> None:
+        """Have an item of a log read and delivered again, as a message of its own."""
+        held = self._held.pop(key)
         if held.receipt is not None:
             self._request_again(held.receipt)
-        return True
 
     def read(self, key: int) -> StoredMessage | None:
         """The message from the disk. Blocks; None if it cannot be read."""
@@ -163,14 +177,14 @@ class Inbox:
         del self._held[key]
         if held.receipt is not None:
             self._confirm(held.receipt)
-        if not held.logged:
+        if held.item is None:
             self._store.remove(key)
 
     def client_gone(self, client: Client) -> None:
         """What the client has not taken goes to another one."""
         self.take_read()
         for key, held in list(self._held.items()):
-            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk and not held.logged:
+            if held.reading.pop(client, 0) != 0 and not held.reading and not held.on_disk and held.item is None:
                 self._drop(key, held)
 
     def topics(self) -> Iterator[str]:

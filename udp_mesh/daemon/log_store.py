@@ -281,7 +281,11 @@ class SqliteLogStore:
     def _report(self, calls: list[Callable[[], None]]) -> None:
         def report() -> None:
             for call in calls:
-                call()
+                try:
+                    call()
+                except Exception:
+                    # The others of the batch wait for their answers all the same.
+                    log.exception("log-callback-failed path=%s", self.path)
             self.on_done()
 
         assert self._loop is not None

@@ -9,12 +9,16 @@ from collections.abc import Callable, Coroutine, Iterator
 from udp_mesh.client.mesh_client import Header, encode_frame
 from udp_mesh.core.events import MessageReceived
 from udp_mesh.daemon.api import Client, RequestError
-from udp_mesh.daemon.inbox import Inbox
+from udp_mesh.daemon.inbox import Inbox, LoggedItem
 
 MAX_PATTERNS = 1024
 """Patterns per client: each is matched against each new topic."""
 MAX_ROUTES = 4096
 """Topics whose subscribers are remembered; a holder of the key could invent names without bound."""
+MAX_READS = 64
+"""Items of logs requested for programs and not delivered yet."""
+READ_TIMEOUT_S = 30.0
+"""An item that the log did not deliver for this long, such as one that it dropped meanwhile, no longer counts."""
 
 
 class Subscriptions:
@@ -34,6 +38,10 @@ class Subscriptions:
         """Clients that acknowledge messages with receipts."""
         self._routes: dict[str, list[Client]] = {}
         self._passing_on = False
+        self._full: set[Client] = set()
+        """Clients that did not take a held message: they get no more until they have read what was sent to them."""
+        self._reads: dict[LoggedItem, float] = {}
+        """Items of logs being read for programs, with the time of the request."""
 
     def add(self, client: Client, patterns: list[str], *, acknowledge: bool) -> None:
         """Raises RequestError for too many patterns."""
@@ -56,6 +64,7 @@ class Subscriptions:
     def remove_client(self, client: Client) -> None:
         self._patterns.pop(client, None)
         self._acknowledging.discard(client)
+        self._full.discard(client)
         self._routes.clear()
         self._inbox.client_gone(client)
         self.pass_on_held()
@@ -94,26 +103,46 @@ class Subscriptions:
         self._send_held(clients, key, header, message.payload)
         if self._inbox.needs_flush:
             self._spawn(self._inbox.flush())
+        if message.number is not None and self._reads:
+            self._reads.pop((message.source, message.topic, message.number), None)
+            if not self._reads:
+                self.pass_on_held()
 
     def _send_held(self, clients: list[Client], key: int, header: Header, payload: bytes) -> None:
         for client in clients:
             acknowledges = client in self._acknowledging
             if client.send_encoded(encode_frame({**header, "receipt": key} if acknowledges else header, payload)):
                 self._inbox.on_sent(key, client, acknowledges=acknowledges)
+            else:
+                self._full.add(client)
         self._inbox.on_distributed(key)
 
+    def _has_taker(self, topic: str) -> bool:
+        """Whether a program that is subscribed to the topic has room for a message."""
+        self._full = {client for client in self._full if client.backlog_bytes()}
+        return any(client not in self._full for client in self.clients(topic))
+
     def pass_on_held(self) -> None:
-        """Send messages that no program is reading to the programs subscribed now."""
-        if not self._passing_on and any(self.clients(topic) for topic in self._inbox.topics()):
+        """Send messages that no program is reading to the programs subscribed now, as far as these have room."""
+        if not self._passing_on and any(self._has_taker(topic) for topic in self._inbox.topics()):
             self._passing_on = True
             self._spawn(self._send_from_disk())
 
     async def _send_from_disk(self) -> None:
+        loop = asyncio.get_running_loop()
         try:
-            for key in self._inbox.waiting(lambda topic: bool(self.clients(topic))):
-                if self._inbox.request_item(key):
+            expired_at = loop.time() - READ_TIMEOUT_S
+            self._reads = {item: at for item, at in self._reads.items() if at > expired_at}
+            for key in self._inbox.waiting(self._has_taker):
+                topic = self._inbox.topic(key)
+                if topic is None or not self._has_taker(topic):
                     continue
-                held = await asyncio.get_running_loop().run_in_executor(None, self._inbox.read, key)
+                if (item := self._inbox.item(key)) is not None:
+                    if len(self._reads) < MAX_READS:
+                        self._reads[item] = loop.time()
+                        self._inbox.request_item(key)
+                    continue
+                held = await loop.run_in_executor(None, self._inbox.read, key)
                 if held is not None and self._inbox.is_waiting(key):
                     priority = self._priority(held.topic)
                     header = _header(held.peer, held.topic, held.type_name, priority, False, None)

@@ -154,3 +154,19 @@ def test_a_job_that_fails_in_any_way_does_not_end_the_thread(tmp_path: Path) -> 
         assert store.last_put.problem is None
 
     with_store(tmp_path / "items.db", use)
+
+
+def test_an_exception_in_one_callback_does_not_keep_the_results_of_others(tmp_path: Path) -> None:
+    async def use(store: Store, _: LogContents) -> None:
+        reported = asyncio.Event()
+        answers: list[str] = []
+        store.on_done = reported.set
+
+        def fail() -> None:
+            raise ValueError("in a callback")
+
+        store._report([fail, lambda: answers.append("second")])
+        await asyncio.wait_for(reported.wait(), 10)
+        assert answers == ["second"]
+
+    with_store(tmp_path / "items.db", use)
