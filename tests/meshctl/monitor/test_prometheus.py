@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from meshctl.device.observation import Sensors
+from meshctl.device.observation import MeshTableSizes, Sensors
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
 from meshctl.monitor.exposition import CONTENT_TYPE
@@ -43,6 +43,7 @@ def frame_with_everything(fleet: Fleet) -> Frame:
         HEALTHY["rover"],
         sensors=Sensors({"phy0": 101}, {"phy0": 61.5}),
         mesh_statistics={"bat0": {"tx_bytes": 5000, "forward_bytes": 70}},
+        mesh_tables={"bat0": MeshTableSizes(2, 1, 7, 0)},
         stations=tuple(
             replace(
                 one, tx_packets=1000, tx_retries=300, tx_failed=2, tx_mbit_s=65.0, rx_mbit_s=58.5, expected_mbit_s=30.0
@@ -120,6 +121,7 @@ def test_prometheus_scrapes_radios_and_daemons_and_knows_every_metric_of_dashboa
         }
         (labels,) = server.query('wifi_station_signal_dbm{node="b01",neighbor!="rover"}')
         assert json.loads(labels)["neighbor"] == HOSTILE
+        assert server.query('sum(batman_originator_count{node="rover"})') == {"{}": 3.0}
         assert min(server.query("udp_mesh_peer_delivered_bytes_total").values()) > 0
         assert list(server.query("node_boot_time_seconds").values()) == [NOW - 1 - 5000] * 3
         rules: Any = server.get("rules")
