@@ -215,3 +215,20 @@ def test_radios_with_an_exporter_are_targets(tmp_path: Path) -> None:
         "node": "b01",
         "role": "beacon",
     }
+
+
+def test_robots_daemons_are_scraped_at_the_addresses_that_their_ports_are_forwarded_to(tmp_path: Path) -> None:
+    port = free_tcp_port()
+    path = tmp_path / "fleet.yaml"
+    path.write_text(f"{INVENTORY}udp_mesh: {{metrics_port: {port}}}\n")
+    # as with `ssh -L 127.42.0.14:PORT:127.0.0.1:PORT rover`
+    with (
+        two_daemons(alice_more=f'metrics_address = "127.42.0.14:{port}"'),
+        running(tmp_path, {}, file_sd=file_sd(load_fleet(path))) as server,
+    ):
+        until(lambda: len(server.query("up")) == 3, "every target to be scraped")
+        until(lambda: server.query('udp_mesh_peer_online{instance="rover"}'), "the peers of rover's daemon")
+        (labels,) = server.query('udp_mesh_info{robot="rover"}')
+        up = {json.loads(one)["robot"]: value for one, value in server.query("up").items()}
+    assert json.loads(labels)["name"] == "alice"
+    assert up == {"station": 0.0, "rover": 1.0, "shelf": 0.0}
