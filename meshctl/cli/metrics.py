@@ -12,7 +12,7 @@ import typer
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab
 from meshctl.cli.fleet_view import CONNECT_S, NoRobots, Timeout, collect, open_fleet_view
 from meshctl.cli.monitor_history import HistoryFile
-from meshctl.cli.output import echo
+from meshctl.cli.output import echo, echo_error
 from meshctl.cli.robots_context import AskSudo
 from meshctl.errors import InputError
 
@@ -26,7 +26,8 @@ def metrics(
     ] = None,
     store: HistoryFile = None,
     file_sd: Annotated[
-        bool, typer.Option("--file-sd", help="Print the radios' exporters as targets for file_sd_configs.")
+        bool,
+        typer.Option("--file-sd", help="Print radios' exporters and robots' daemons as targets for file_sd_configs."),
     ] = False,
     rules: Annotated[bool, typer.Option("--rules", help="Print the alert rules for Prometheus.")] = False,
     dashboard: Annotated[bool, typer.Option("--dashboard", help="Print the dashboard for Grafana.")] = False,
@@ -56,7 +57,10 @@ def metrics(
     elif file_sd:
         from meshctl.inventory import load_fleet
 
-        text = prometheus.file_sd(load_fleet(inventory, environ=os.environ))
+        fleet = load_fleet(inventory, environ=os.environ)
+        text = prometheus.file_sd(fleet)
+        for problem in prometheus.daemon_targets(fleet)[1]:
+            echo_error(problem)
     elif store is not None:
         text = _of_history(store)
     else:

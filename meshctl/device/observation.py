@@ -202,6 +202,17 @@ class Originator:
 
 
 @dataclass(frozen=True, slots=True)
+class MeshTableSizes:
+    """Sizes of one batman-adv interface's tables; None: not known. Originators are counted by path, translations are
+    those of the global table by the type of the client's address."""
+
+    originators_selected: int | None = None
+    originators_other: int | None = None
+    tg_unicast: int | None = None
+    tg_multicast: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class HostKeyInfo:
     """A host key read on the node: `key_type` as in known_hosts, `fingerprint` `SHA256:...`."""
 
@@ -277,6 +288,8 @@ class Observation:
     originators: tuple[Originator, ...] | None = None
     mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
     """Interface of batman-adv -> its counters (`batctl statistics`)."""
+    mesh_tables: Mapping[str, MeshTableSizes] | None = None
+    """Interface of batman-adv -> the sizes of its tables."""
     package_tool: str | None = None
     packages: Mapping[str, str] | None = None
     """Installed package -> version."""

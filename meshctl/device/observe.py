@@ -22,6 +22,7 @@ from meshctl.device.observation import (
     FileInfo,
     MeshInfo,
     MeshNeighbour,
+    MeshTableSizes,
     Observation,
     Originator,
     ReleaseInfo,
@@ -116,7 +117,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
     board, release = _board(reader)
     space = reader.read("df", system.parse_df) or {}
     links, stations, surveys = _wireless(reader)
-    mesh, neighbours, originators = _mesh(reader)
+    mesh, neighbours, originators, tables = _mesh(reader)
     macs = reader.read("macs", system.parse_macs)
     indexes = reader.read("macs", system.parse_indexes, required=False) or {}
     has_tool = not reader.found_nothing("package_tool")
@@ -151,6 +152,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         neighbours=neighbours,
         originators=originators,
         mesh_statistics=_statistics(reader),
+        mesh_tables=tables,
         package_tool=reader.read("package_tool", packages.parse_package_tool, required=has_tool),
         packages=None if installed is None else MappingProxyType(installed),
         uci=_uci(reader),
@@ -210,16 +212,22 @@ def _wireless(
 
 def _mesh(
     reader: _OutputReader,
-) -> tuple[MeshInfo | None, tuple[MeshNeighbour, ...] | None, tuple[Originator, ...] | None]:
-    """Of all batman-adv interfaces together; (None, None, None) without any."""
+) -> tuple[
+    MeshInfo | None,
+    tuple[MeshNeighbour, ...] | None,
+    tuple[Originator, ...] | None,
+    Mapping[str, MeshTableSizes] | None,
+]:
+    """Of all batman-adv interfaces together, and the sizes of each one's tables; all None without any."""
     names = reader.names("batctl.originators_json")
     if not names:
-        return None, None, None
+        return None, None, None, None
     info: MeshInfo | None = None
     hard: list[str] = []
     known = reader.read("macs", system.parse_indexes, required=False) or {}
     neighbours: list[MeshNeighbour] | None = None
     originators: list[Originator] | None = None
+    tables: dict[str, MeshTableSizes] = {}
     for name in names:
         as_text = reader.status(f"batctl.originators {name}") is not None
         if as_text:
@@ -239,10 +247,25 @@ def _mesh(
         info = info or seen
         neighbours = (neighbours or []) + list(near) if near is not None else neighbours
         originators = (originators or []) + list(far) if far is not None else originators
+        tables[name] = _table_sizes(
+            far, reader.read(f"batctl.transglobal {name}", batctl.parse_transglobal, required=False)
+        )
     return (
         None if info is None else replace(info, hard_interfaces=tuple(dict.fromkeys(hard))),
         None if neighbours is None else tuple(neighbours),
         None if originators is None else tuple(originators),
+        MappingProxyType(tables),
+    )
+
+
+def _table_sizes(paths: tuple[Originator, ...] | None, translations: tuple[int, int] | None) -> MeshTableSizes:
+    selected = None if paths is None else sum(path.best for path in paths)
+    unicast, multicast = translations or (None, None)
+    return MeshTableSizes(
+        originators_selected=selected,
+        originators_other=None if paths is None or selected is None else len(paths) - selected,
+        tg_unicast=unicast,
+        tg_multicast=multicast,
     )
 
 

@@ -17,6 +17,8 @@ from meshctl.monitor.frame import Frame
 from meshctl.monitor.store import FrameStore
 
 _COUNTER = re.compile(r"[a-z][a-z0-9_]*")
+# Taken by the sizes of tables: a family may come once in a page.
+_TABLE_COUNTS = frozenset(("originator_count", "tg_count"))
 _OF_ONLINE_PEERS = frozenset(("round_trip_s", "loss", "capacity_bits_per_s"))
 # The device of alarms that concern the whole fleet: an empty label would be none.
 _FLEET = "fleet"
@@ -171,19 +173,28 @@ def _links(document: Document) -> Iterator[MetricFamily]:
 
 
 def _batman(nodes: Iterable[_Device]) -> Iterator[MetricFamily]:
-    """batman-adv's counters by the names of the kernel, as existing exporters have them: `batman_tx_bytes`."""
+    """batman-adv's counters by the names of the kernel, as existing exporters have them: `batman_tx_bytes`; and the
+    sizes of its tables by theirs."""
+    originators = MetricFamily("batman_originator_count", "gauge", "Paths to originators: those in use, and others.")
+    translations = MetricFamily("batman_tg_count", "gauge", "Entries of the global translation table by address type.")
     families: dict[str, MetricFamily] = {}
     for node in nodes:
+        for batdev, sizes in (node.get("mesh_tables") or {}).items():
+            labels = {"node": node.name, "batdev": batdev}
+            originators.add(sizes.get("originators_other"), **labels, selected="false")
+            originators.add(sizes.get("originators_selected"), **labels, selected="true")
+            translations.add(sizes.get("tg_multicast"), **labels, type="multicast")
+            translations.add(sizes.get("tg_unicast"), **labels, type="unicast")
         for batdev, counters in (node.get("mesh_statistics") or {}).items():
             for name, value in counters.items():
                 # a name from a device becomes one of a metric
-                if _COUNTER.fullmatch(name):
+                if _COUNTER.fullmatch(name) and name not in _TABLE_COUNTS:
                     metric = f"batman_{name}"
                     text = f"Counter {name} of batman-adv."
                     families.setdefault(name, MetricFamily(metric, "counter", text)).add(
                         value, node=node.name, batdev=batdev
                     )
-    yield from families.values()
+    yield from (originators, translations, *families.values())
 
 
 def _robots(status: Document) -> Iterator[MetricFamily]:

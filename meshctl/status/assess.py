@@ -186,6 +186,7 @@ def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
         radios=seen.radios,
         temperature_c=temperature_of(observed),
         mesh_statistics=observed.mesh_statistics,
+        mesh_tables=observed.mesh_tables,
         neighbors=seen.neighbors,
         is_path_known=seen.is_path_known,
         hops=seen.path.hops if seen.path else None,

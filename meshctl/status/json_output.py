@@ -6,6 +6,7 @@ Times are in seconds, shares 0 to 1; an unknown value is null, never 0.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import asdict
 from typing import Any
 
 from meshctl.robots.facts import RobotFacts
@@ -81,6 +82,9 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         "mesh_statistics": None
         if node.mesh_statistics is None
         else {name: dict(counters) for name, counters in node.mesh_statistics.items()},
+        "mesh_tables": None
+        if node.mesh_tables is None
+        else {name: asdict(sizes) for name, sizes in node.mesh_tables.items()},
         "bridge_ports": None if node.lan_ports is None else list(node.lan_ports),
         "neighbours": [_neighbor(neighbor) for neighbor in node.neighbors] if answers else None,
         "hops": node.hops,

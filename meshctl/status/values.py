@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
+from meshctl.device.observation import MeshTableSizes
 from meshctl.errors import ExitCode
 from meshctl.model import Node, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
@@ -136,6 +137,8 @@ class NodeStatus:
     """The highest that the board reports."""
     mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
     """batman-adv's counters by its interface."""
+    mesh_tables: Mapping[str, MeshTableSizes] | None = None
+    """The sizes of batman-adv's tables by its interface."""
     neighbors: tuple[Neighbor, ...] = ()
     is_path_known: bool = True
     """Whether enough nodes were queried to know its path; then `hops` None means that there is none."""

@@ -73,7 +73,7 @@ class PeerConditions:
     """What `sent_bits_per_s` is the rate of, since the peer was first sent to; the next two likewise."""
     delivered_bytes: int = 0
     received_bytes: int = 0
-    """Since its current boot was heard, without what it sent before it knew ours."""
+    """Since its current boot was heard, of authentic datagrams to this node alone, each counted once."""
 
 
 @dataclass(slots=True)

@@ -26,7 +26,6 @@ from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
 from udp_mesh.crypto import (
-    SHORT_OVERHEAD_BYTES,
     TO_ALL,
     Key,
     OpenError,
@@ -89,6 +88,7 @@ def receive_datagram(state: State, data: bytes | memoryview, link: str, source: 
             except OpenError:
                 continue
             if to_one:
+                session.received_bytes += size + IP_UDP_BYTES
                 _receive_data(state, session, number, frames, link, source, now)
             else:
                 _receive_broadcast(state, session, frames, link, source, now)
@@ -124,7 +124,6 @@ def _receive_data(
     """Process a datagram bound to our current boot: its sender is alive, or was when it was recorded."""
     path = session.path
     peer = session.peer
-    session.received_bytes += len(frames) + SHORT_OVERHEAD_BYTES + IP_UDP_BYTES
     if not frames:
         state.event_queue.counters.dropped_malformed += 1
         return
@@ -243,6 +242,8 @@ def _receive_long(
             # The session was forgotten, but its counters were restored: a replay.
             state.peer_table.forget(session)
             raise ReplayError(f"packet {number} was already seen or is too old")
+    if introduced:
+        session.received_bytes += len(data) + IP_UDP_BYTES
     if beat is not None and beat.name != session.name:
         state.event_queue.counters.dropped_malformed += 1
         return

@@ -39,7 +39,7 @@ _PEER_GAUGES = (
 # Base units and counters; the rates in bits per second above are kept for one release.
 _PEER_COUNTERS = {
     "sent_bytes": "Wire bytes of messages sent to the peer.",
-    "received_bytes": "Wire bytes received from the peer.",
+    "received_bytes": "Wire bytes of datagrams from the peer to this node alone.",
     "delivered_bytes": "Payload bytes the peer acknowledged.",
 }
 _BUILD_LABELS = ("version", "wire_version")

@@ -27,6 +27,12 @@ def parse_statistics(text: str) -> Mapping[str, int]:
     return MappingProxyType({match[1]: int(match[2]) for match in found if match})
 
 
+def parse_transglobal(text: str) -> tuple[int, int] | None:
+    """What observe.sh counts in `transglobal`: entries of unicast and of multicast addresses."""
+    found = re.fullmatch(r"unicast (\d{1,9})\nmulticast (\d{1,9})\n*", text)
+    return (int(found[1]), int(found[2])) if found else None
+
+
 def parse_mesh_json(text: str) -> MeshInfo | None:
     """`mesh_json`: version, algorithm and every setting as text."""
     data = mapping(parse_json(text))

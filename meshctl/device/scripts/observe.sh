@@ -84,6 +84,16 @@ authorized_keys() { [ ! -f /etc/dropbear/authorized_keys ] || cat /etc/dropbear/
 
 host_keys() { for key in /etc/dropbear/dropbear_*_host_key; do [ ! -f "$key" ] || dropbearkey -y -f "$key"; done; }
 
+# entries of the global translation table by type: counted here, since the table of a large mesh is long
+transglobal() { # meshif|-m INTERFACE
+	entries=$(batctl "$1" "$2" transglobal -H -n) || return
+	echo "$entries" | awk '
+		{ mac = $1 ~ /:/ ? $1 : $2 }
+		mac ~ /^[0-9a-f][13579bdf]:/ { multicast++ }
+		mac ~ /^[0-9a-f][02468ace]:/ { unicast++ }
+		END { printf "unicast %d\nmulticast %d\n", unicast, multicast }'
+}
+
 # batctl prints JSON from 2021.1 on; older ones print tables
 mesh() { # INTERFACE
 	section "batctl.mesh_json $1" batctl meshif "$1" mesh_json
@@ -92,9 +102,11 @@ mesh() { # INTERFACE
 	section "batctl.originators_json $1" batctl meshif "$1" originators_json
 	if [ $STATUS -eq 0 ]; then
 		section "batctl.statistics $1" batctl meshif "$1" statistics
+		section "batctl.transglobal $1" transglobal meshif "$1"
 		return
 	fi
 	section "batctl.statistics $1" batctl -m "$1" statistics
+	section "batctl.transglobal $1" transglobal -m "$1"
 	section "batctl.interface $1" batctl -m "$1" if
 	section "batctl.neighbors $1" batctl -m "$1" n
 	section "batctl.originators $1" batctl -m "$1" o

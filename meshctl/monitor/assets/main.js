@@ -1,31 +1,27 @@
-// The page: one state, shown by the map, the panels and the timeline. `state.at_s` null means live.
+// The page: one state, shown by the strip, the map, the panels and the timeline.
 
 import { byId, el, setText } from "./dom.js";
-import { clockTime, duration, isKnown, percent } from "./format.js";
+import { clockTime, isKnown } from "./format.js";
 import { differences, viewOf } from "./model.js";
 import { Layout } from "./layout.js";
-import { drawSample, MeshCanvas } from "./mesh.js";
+import { MeshCanvas } from "./mesh.js";
+import { showLegend } from "./legend.js";
 import { Charts } from "./charts.js";
 import { Timeline } from "./timeline.js";
 import { AlarmSound } from "./sound.js";
 import { openSilence } from "./actions.js";
-import { openSource } from "./source.js";
+import { interval_s, now_s, shown_s, source, state } from "./state.js";
+import { recalled, remember } from "./storage.js";
+import { count, notice, showClock, showStrip } from "./strip.js";
 import { alarmsAt, isQuiet, showAlarms, showChanges, showDetails, showRadios, showRobots } from "./panels.js";
 
 const TABS = ["robots", "alarms", "radios", "changes", "details"];
 const MAX_BUCKETS = 240;
 const CHARTS_EVERY_MS = 4000;
 const TIMELINE_EVERY_MS = 4000;
-// Data older than this many intervals is late.
-const LATE_INTERVALS = 3;
 const PLAY_EVERY_MS = 200;
 const REFERENCE_KEY = "meshctl-monitor-reference";
 
-const source = openSource();
-const state = {
-  meta: null, live: null, frame: null, view: null, at_s: null, selected: null, tab: "alarms", arrangement: "auto",
-  alarms: [], reference: null, link: "connecting", linkReason: "", lostAt_s: null, hasSnr: true, span: null, window_s: 3600, playing: 0, offset_s: 0,
-};
 const layout = new Layout();
 const sound = new AlarmSound();
 const mesh = new MeshCanvas(byId("mesh"), byId("tip"), (name) => select(name));
@@ -35,10 +31,6 @@ let wanted = null;
 let isFetching = false;
 let timelineAt = -Infinity;
 let chartsAt = -Infinity;
-
-const now_s = () => Date.now() / 1000 + state.offset_s;
-const interval_s = () => state.frame?.airtime?.interval_s ?? state.meta?.interval_s ?? 5;
-const shown_s = () => state.at_s ?? state.frame?.time_s ?? now_s();
 
 // ---- time
 
@@ -118,7 +110,7 @@ function render() {
   const hasSnr = view.links.some((link) => isKnown(link.snr_db)) || view.links.length === 0;
   if (hasSnr !== state.hasSnr) {
     state.hasSnr = hasSnr;
-    showLegend();
+    showLegend(mesh.colors);
   }
   if (isMetric) findLastPlaces(view);
   showStrip(view);
@@ -155,75 +147,6 @@ function isMetricView(view) {
   byId("by-metres").disabled = placed === 0;
   if (placed === 0) return false;
   return state.arrangement === "meters" || (state.arrangement === "auto" && placed * 2 >= view.shown.length);
-}
-
-function count(tab, items) {
-  const button = byId(tab);
-  let badge = button.querySelector(".count");
-  if (items.length === 0) { badge?.remove(); return; }
-  if (badge === null) { badge = el("span", { class: "count" }); button.append(badge); }
-  badge.dataset.level = items.some((item) => item.level === "error") ? "error" : items.some((item) => item.level === "warning") ? "warning" : "";
-  setText(badge, String(items.length));
-}
-
-function showStrip(view) {
-  const verdict = view.frame.verdict ?? { go: null, text: "NOT ASSESSED", reasons: [] };
-  const box = byId("verdict");
-  box.dataset.go = String(verdict.go);
-  const [word, rest] = splitVerdict(verdict);
-  setText(box.querySelector(".verdict-mark"), verdict.go === true ? "✓" : verdict.go === false ? "✕" : "?");
-  const text = box.querySelector(".verdict-text");
-  const signature = `${word}|${rest}`;
-  if (text.dataset.signature !== signature) {
-    text.dataset.signature = signature;
-    text.replaceChildren(word, ...(rest === "" ? [] : [" ", el("span", { class: "verdict-sub" }, rest)]));
-  }
-  setText(byId("fleet"), view.frame.fleet ?? state.meta.fleet);
-  const reasons = verdict.reasons ?? [];
-  setText(byId("reasons"), reasons.length > 0 ? reasons.join(" · ") : verdict.go === true ? "All checks pass." : "");
-  byId("reasons").title = reasons.join("\n");
-  const nodes = [...view.devices.values()].filter((device) => device.health !== "off" && device.health !== "unknown");
-  const answering = (list) => list.filter((one) => one.health === "ok" || one.health === "degraded").length;
-  const robots = view.robots.filter((robot) => robot.health !== "off");
-  const open = alarmsAt(state.alarms, shown_s()).open;
-  const level = (name) => open.filter((alarm) => alarm.level === name).length;
-  const total = (term, ...text) => el("div", {}, el("dt", {}, term), el("dd", {}, ...text));
-  const airtime = view.frame.airtime;
-  const totals = [
-    ["radios", `${answering(nodes)}`, `/${nodes.length}`], ["robots", robots.length === 0 ? "–" : `${answering(robots)}`, robots.length === 0 ? "" : `/${robots.length}`],
-    ["errors", `▲${level("error")}`, ""], ["warnings", `◆${level("warning")}`, ""],
-    ["watching", airtime && isKnown(airtime.share) ? percentOf(airtime.share) : "–", " air"],
-  ];
-  const key = JSON.stringify(totals);
-  if (byId("totals").dataset.signature !== key) {
-    byId("totals").dataset.signature = key;
-    byId("totals").replaceChildren(...totals.map(([term, large, small]) => total(term, large, el("small", {}, small))));
-  }
-  showClock();
-  document.title = `${verdict.text} · ${view.frame.fleet ?? "meshctl"}`;
-}
-
-const percentOf = (share) => (share < 0.0995 ? `${(share * 100).toFixed(1)} %` : percent(share));
-
-function splitVerdict(verdict) {
-  const found = /^([A-Z-]+(?: ASSESSED)?)\s*(.*)$/.exec(verdict.text ?? "");
-  return found === null ? [verdict.text ?? "?", ""] : [found[1], found[2]];
-}
-
-function showClock() {
-  if (state.frame === null) return;
-  const isLive = state.at_s === null;
-  const age_s = Math.max(0, now_s() - state.frame.time_s);
-  setText(byId("clock"), clockTime(isLive ? now_s() : state.at_s));
-  const isLate = isLive && age_s > LATE_INTERVALS * interval_s() + (state.frame.took_s ?? 0);
-  const back_s = state.at_s === null ? 0 : (state.span?.[1] ?? state.at_s) - state.at_s;
-  setText(byId("freshness"), isLive ? `data ${duration(age_s)} old${isLate ? ", late" : ""}` : `data of ${clockTime(state.frame.time_s)}${back_s < 0.05 ? "" : `, −${duration(back_s)}`}`);
-  byId("freshness").classList.toggle("is-late", isLate);
-  const mode = byId("mode");
-  const kind = state.link === "lost" || state.link === "refused" ? "lost" : state.meta.mode === "replay" ? "replay" : isLive ? "live" : "past";
-  mode.dataset.state = kind;
-  setText(mode, { live: "● live", past: "◀ past", replay: "▶ recording", lost: "✕ no connection" }[kind]);
-  byId("live").setAttribute("aria-pressed", String(isLive));
 }
 
 // ---- timeline, charts
@@ -292,15 +215,6 @@ function setReference(frame) {
   showTimeline(true);
 }
 
-// A page from a file may have no storage.
-function remember(key, value) {
-  try { if (value === null) localStorage.removeItem(key); else localStorage.setItem(key, value); } catch { return; }
-}
-
-function recalled(key) {
-  try { return JSON.parse(localStorage.getItem(key)); } catch { return null; }
-}
-
 const alarmHandlers = {
   jump: (alarm) => { stop(); goTo(alarm.first_s); if (alarm.device !== "") { state.selected = alarm.device.replace(/^robot:/, ""); mesh.select(state.selected); } },
   select: (name) => select(state.view.robots.find((robot) => robot.name === name)?.radio ?? name),
@@ -318,11 +232,6 @@ function receiveAlarms(alarms) {
   state.alarms = alarms;
   if (fresh.length > 0 && !isFirst) sound.play(fresh.some((alarm) => alarm.level === "error") ? "error" : "warning");
   render();
-}
-
-function notice(text) {
-  byId("notice").hidden = text === "";
-  setText(byId("notice"), text);
 }
 
 // ---- buttons and keys
@@ -362,21 +271,11 @@ function toggleTheme() {
 
 function recolor() {
   mesh.readColors();
-  showLegend();
+  showLegend(mesh.colors);
   charts?.clear();
   chartsAt = -Infinity;
   render();
   showTimeline(true);
-}
-
-function showLegend() {
-  const [good, fair, poor] = state.hasSnr ? ["> 20 dB", "10–20 dB", "< 10 dB"] : ["≥ 80 %", "50–80 %", "< 50 %"];
-  const entries = [["good", `good ${good}`], ["fair", `fair ${fair}`], ["poor", `poor ${poor}`], ["one-way", "one-way"], ["stale", "stale"], ["path", "path to base"], ["cut", "single point of failure"], ["base", "base"], ["robot", "robot"], ["beacon", "beacon"]];
-  byId("legend").replaceChildren(...entries.map(([kind, text]) => {
-    const sample = el("canvas", { "aria-hidden": "true" });
-    drawSample(sample, kind, mesh.colors);
-    return el("li", {}, sample, text);
-  }));
 }
 
 function onKey(event) {
@@ -458,7 +357,7 @@ async function start() {
   wire();
   document.documentElement.dataset.theme = recalled("meshctl-monitor-theme") ?? "dark";
   mesh.readColors();
-  showLegend();
+  showLegend(mesh.colors);
   openTab(matchMedia("(min-width: 1500px)").matches ? "alarms" : "robots");
   for (;;) {
     try {

@@ -1,13 +1,13 @@
-// The mesh on a canvas: links by class, paths, shapes by role, labels that do not overlap; pan, zoom, selection.
+// The mesh on a canvas: links by class, paths, shapes by role, labels; pan, zoom, selection.
 
-import { clockTime, duration, isKnown, percent, withUnit } from "./format.js";
+import { isKnown } from "./format.js";
+import { drawLabels } from "./labels.js";
 import { pathOf } from "./model.js";
+import { drawArrow, drawText, LINK, shape } from "./signs.js";
+import { summaryOf, tipOf } from "./words.js";
 
-const LINK = { good: { width: 4, color: "--good" }, fair: { width: 3, color: "--fair" }, poor: { width: 2.5, color: "--poor" }, stale: { width: 2, color: "--stale" }, unknown: { width: 2, color: "--muted" } };
 const MAX_RADIUS = 11;
 const MIN_RADIUS = 5;
-// Names of ordinary beacons in a large fleet appear from this zoom on.
-const CROWDED = 80;
 // Room for labels, the buttons above and the legend below.
 const MARGIN = { x: 90, top: 100, bottom: 84 };
 const HIT_PX = 22;
@@ -190,7 +190,7 @@ export class MeshCanvas {
     c.fillStyle = colors["--bg"];
     c.fillRect(0, 0, this.width, this.height);
     if (this.view === null || this.points.size === 0) {
-      this.#text("No device reported yet", this.width / 2, this.height / 2, { size: 20, color: colors["--muted"], align: "center" });
+      drawText(c, "No device reported yet", this.width / 2, this.height / 2, { size: 20, color: colors["--muted"], align: "center" });
       return;
     }
     if (this.camera === null) this.fit();
@@ -212,7 +212,7 @@ export class MeshCanvas {
     }
     this.#changes();
     for (const device of this.view.shown) this.#device(device);
-    this.#labels();
+    drawLabels(c, colors, { view: this.view, selected: this.selected, radius: this.radius, isMetric: this.isMetric, scale: this.camera.scale, screen: (name) => this.#screen(name) });
     if (share < 1) this.request();
   }
 
@@ -250,11 +250,11 @@ export class MeshCanvas {
     c.beginPath();
     c.moveTo(right - px, 26); c.lineTo(right - px, 34); c.lineTo(right, 34); c.lineTo(right, 26);
     c.stroke();
-    this.#text(`${step} m`, right - px / 2, 20, { size: 14, color: colors["--muted"], align: "center" });
+    drawText(c, `${step} m`, right - px / 2, 20, { size: 14, color: colors["--muted"], align: "center" });
   }
 
   #columns() {
-    const { colors } = this;
+    const { context: c, colors } = this;
     const places = new Map();
     for (const device of this.view.shown) {
       const at = this.#screen(device.name);
@@ -270,10 +270,10 @@ export class MeshCanvas {
       const label = hop === "none" ? "no path" : hop === 0 ? "base" : hop === 1 ? "1 hop" : `${hop} hops`;
       if (this.isPortrait) {
         if (along - last < 22) continue;
-        this.#text(label, this.width - 12, along, { size: 14, color: colors["--muted"], align: "right" });
+        drawText(c, label, this.width - 12, along, { size: 14, color: colors["--muted"], align: "right" });
       } else {
         if (along - last < 62) continue;
-        this.#text(label, along, 76, { size: 14, color: colors["--muted"], align: "center" });
+        drawText(c, label, along, 76, { size: 14, color: colors["--muted"], align: "center" });
       }
       last = along;
     }
@@ -316,22 +316,9 @@ export class MeshCanvas {
     c.moveTo(a.x, a.y); c.lineTo(b.x, b.y);
     c.stroke();
     c.setLineDash([]);
-    if (link.isOneWay) this.#arrow(link.forward !== null ? a : b, link.forward !== null ? b : a, colors[style.color]);
+    if (link.isOneWay) drawArrow(c, link.forward !== null ? a : b, link.forward !== null ? b : a, colors[style.color]);
     c.globalAlpha = 1;
     link.isLabeled = isNear || (!crowded && (isTree || link.isOneWay || link.class === "stale"));
-  }
-
-  #arrow(from, to, color) {
-    const { context: c } = this;
-    const angle = Math.atan2(to.y - from.y, to.x - from.x);
-    const x = from.x + (to.x - from.x) * 0.62;
-    const y = from.y + (to.y - from.y) * 0.62;
-    c.fillStyle = color;
-    c.beginPath();
-    c.moveTo(x + 10 * Math.cos(angle), y + 10 * Math.sin(angle));
-    c.lineTo(x + 8 * Math.cos(angle + 2.5), y + 8 * Math.sin(angle + 2.5));
-    c.lineTo(x + 8 * Math.cos(angle - 2.5), y + 8 * Math.sin(angle - 2.5));
-    c.fill();
   }
 
   #changes() {
@@ -349,7 +336,7 @@ export class MeshCanvas {
         c.beginPath(); c.moveTo(a.x, a.y); c.lineTo(b.x, b.y); c.stroke();
         c.setLineDash([]);
       }
-      this.#text(change.lost ? "✕" : "+", (a.x + b.x) / 2, (a.y + b.y) / 2, { size: 18, color: colors["--cut"], align: "center", isBold: true, halo: true });
+      drawText(c, change.lost ? "✕" : "+", (a.x + b.x) / 2, (a.y + b.y) / 2, { size: 18, color: colors["--cut"], align: "center", isBold: true, halo: colors["--bg"] });
     }
   }
 
@@ -378,119 +365,9 @@ export class MeshCanvas {
     if (this.drawn.get(device.name).isGuess) c.setLineDash([3, 3]);
     c.stroke();
     c.setLineDash([]);
-    if (device.health === "unreachable") this.#text("✕", at.x, at.y + 0.5, { size: isSmall ? 11 : 15, color: colors["--poor"], align: "center", isBold: true });
-    else if (device.health === "degraded") this.#text("!", at.x, at.y + 0.5, { size: isSmall ? 10 : 15, color: "#160800", align: "center", isBold: true });
-  }
-
-  // Names, the most important first; those that would overlap are left out, as are links' labels.
-  #labels() {
-    const { colors } = this;
-    const isCrowded = this.view.shown.length > CROWDED;
-    const taken = [];
-    const signs = this.view.shown.map((device) => {
-      const at = this.#screen(device.name);
-      const radius = this.radius * 0.8;
-      return { left: at.x - radius, right: at.x + radius, top: at.y - radius, bottom: at.y + radius };
-    });
-    const isClear = (box, boxes) => boxes.every((other) => box.right < other.left || box.left > other.right || box.bottom < other.top || box.top > other.bottom);
-    const free = (box, isImportant = false) => isClear(box, taken) && (isImportant || isClear(box, signs));
-    const rank = (device) => (device.name === this.selected ? 0 : device.health === "unreachable" ? 1 : device.role === "base" ? 2 : device.role === "robot" ? 3 : device.health === "degraded" ? 4 : device.isCut ? 5 : 6);
-    const size = isCrowded ? 14 : 16;
-    for (const device of [...this.view.shown].sort((x, y) => rank(x) - rank(y))) {
-      if (isCrowded && rank(device) > 5 && this.camera.scale < (this.isMetric ? 3 : 0.9)) continue;
-      const at = this.#screen(device.name);
-      const age = device.answers === true || !isKnown(device.age_s) ? "" : ` ${duration(device.age_s)}`;
-      const label = device.name.length > 22 ? `${device.name.slice(0, 21)}…` : device.name;
-      const width = (label.length + age.length) * size * 0.6;
-      for (const dy of [this.radius + size * 0.9, -this.radius - size * 0.8]) {
-        const box = { left: at.x - width / 2, right: at.x + width / 2, top: at.y + dy - size * 0.6, bottom: at.y + dy + size * 0.6 };
-        if (device.name !== this.selected && !free(box, isCrowded && rank(device) < 4)) continue;
-        taken.push(box);
-        this.#text(label + age, at.x, at.y + dy, { size, color: device.answers === false ? colors["--muted"] : colors["--text"], align: "center", isBold: rank(device) < 4, halo: true });
-        break;
-      }
-    }
-    for (const link of this.view.links) {
-      if (!link.isLabeled) continue;
-      const a = this.#screen(link.a);
-      const b = this.#screen(link.b);
-      const text = linkLabel(link);
-      if (a === null || b === null || text === "" || Math.hypot(a.x - b.x, a.y - b.y) < 70) continue;
-      const at = { x: (a.x + b.x) / 2, y: (a.y + b.y) / 2 };
-      const width = text.length * 8.4;
-      const box = { left: at.x - width / 2, right: at.x + width / 2, top: at.y - 9, bottom: at.y + 9 };
-      if (!free(box)) continue;
-      taken.push(box);
-      this.#text(text, at.x, at.y, { size: 14, color: colors["--text"], align: "center", halo: true });
-    }
-  }
-
-  #text(text, x, y, { size, color, align, isBold = false, halo = false }) {
-    const { context: c } = this;
-    c.font = `${isBold ? 700 : 500} ${size}px system-ui, "Noto Sans", "DejaVu Sans", sans-serif`;
-    c.textAlign = align;
-    c.textBaseline = "middle";
-    if (halo) {
-      c.lineWidth = 5;
-      c.lineJoin = "round";
-      c.strokeStyle = this.colors["--bg"];
-      c.strokeText(text, x, y);
-    }
-    c.fillStyle = color;
-    c.fillText(text, x, y);
+    if (device.health === "unreachable") drawText(c, "✕", at.x, at.y + 0.5, { size: isSmall ? 11 : 15, color: colors["--poor"], align: "center", isBold: true });
+    else if (device.health === "degraded") drawText(c, "!", at.x, at.y + 0.5, { size: isSmall ? 10 : 15, color: "#160800", align: "center", isBold: true });
   }
 }
 
 const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
-
-// Shapes besides color: base a square, robots circles, beacons diamonds, others triangles.
-export function shape(c, role, x, y, radius) {
-  c.beginPath();
-  if (role === "base") c.rect(x - radius, y - radius, 2 * radius, 2 * radius);
-  else if (role === "robot") c.arc(x, y, radius, 0, 2 * Math.PI);
-  else {
-    const corners = role === "unknown" ? 3 : 4;
-    for (let i = 0; i < corners; i += 1) {
-      const angle = -Math.PI / 2 + (2 * Math.PI * i) / corners;
-      c.lineTo(x + radius * 1.25 * Math.cos(angle), y + radius * 1.25 * Math.sin(angle));
-    }
-    c.closePath();
-  }
-}
-
-export function linkLabel(link) {
-  if (link.isStale) return duration(link.age_s);
-  if (isKnown(link.snr_db)) return `${Math.round(link.snr_db)} dB`;
-  return isKnown(link.quality) ? percent(link.quality) : "";
-}
-
-function tipOf(view, name) {
-  const device = view.devices.get(name);
-  const lines = [device.name, `${device.role}, ${device.health}${device.reason ? `: ${device.reason}` : ""}`];
-  if (isKnown(device.hops)) lines.push(device.hops === 0 ? "is the base" : `${device.hops} hops to base by ${device.via}, ${percent(device.quality)}`);
-  if (device.isCut) lines.push("single point of failure");
-  const near = [...view.linksOf.get(name)].sort((x, y) => (y.snr_db ?? y.quality ?? 0) - (x.snr_db ?? x.quality ?? 0));
-  for (const link of near.slice(0, 4)) lines.push(`${link.a === name ? link.b : link.a}: ${withUnit(isKnown(link.snr_db) ? Math.round(link.snr_db) : null, "dB SNR")}, ${percent(link.quality)}${link.isOneWay ? ", one-way" : ""}`);
-  return lines.join("\n");
-}
-
-function summaryOf(view) {
-  const bad = view.shown.filter((device) => device.health === "unreachable").map((device) => device.name);
-  const poor = view.links.filter((link) => link.class === "poor").length;
-  return `Mesh at ${clockTime(view.time_s)}: ${view.shown.length} devices, ${view.links.length} links, ${poor} of them poor. ${bad.length === 0 ? "All required devices answer." : `No answer: ${bad.join(", ")}.`} Arrow keys select a device, plus and minus zoom.`;
-}
-
-// A sample of each sign, drawn as on the map.
-export function drawSample(canvas, kind, colors) {
-  const c = canvas.getContext("2d");
-  const ratio = window.devicePixelRatio || 1;
-  canvas.width = 30 * ratio;
-  canvas.height = 16 * ratio;
-  c.setTransform(ratio, 0, 0, ratio, 0, 0);
-  const line = (color, width, dash = []) => { c.strokeStyle = color; c.lineWidth = width; c.setLineDash(dash); c.beginPath(); c.moveTo(0, 8); c.lineTo(30, 8); c.stroke(); };
-  if (kind in LINK) line(colors[LINK[kind].color], LINK[kind].width, kind === "stale" ? [2, 5] : []);
-  else if (kind === "one-way") line(colors["--text"], 3, [9, 5]);
-  else if (kind === "path") { c.globalAlpha = 0.35; line(colors["--path"], 11); }
-  else if (kind === "cut") { c.strokeStyle = colors["--cut"]; c.lineWidth = 2.5; c.beginPath(); c.arc(15, 8, 6.5, 0, 2 * Math.PI); c.stroke(); }
-  else { shape(c, kind, 15, 8, 5.5); c.fillStyle = colors["--text"]; c.fill(); }
-}

@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -35,11 +35,9 @@ def dashboard() -> str:
 
 
 def file_sd(fleet: Fleet) -> str:
-    """Targets for Prometheus' file_sd_configs: the managed radios that have OpenWrt's exporter among their packages.
-
-    The daemons of udp_mesh serve their metrics on loopback only, so they are no targets of another machine.
-    """
-    groups = [
+    """Targets for Prometheus' file_sd_configs: the managed radios that have OpenWrt's exporter among their packages,
+    and the robots' daemons if they serve metrics (`daemon_targets`)."""
+    radios = [
         {
             "targets": [host_and_port(str(node.address.ip), EXPORTER_PORT)],
             "labels": {"fleet": fleet.name, "node": node.name, "role": node.role.value, "robot": node.robot},
@@ -47,7 +45,40 @@ def file_sd(fleet: Fleet) -> str:
         for node in fleet.managed()
         if EXPORTER_PACKAGE in (*node.hardware.packages, *node.packages)
     ]
-    return json.dumps(groups, indent=2) + "\n"
+    daemons = [
+        {"targets": [target], "labels": {"fleet": fleet.name, "robot": robot, "instance": robot}}
+        for robot, target in daemon_targets(fleet)[0].items()
+    ]
+    return json.dumps([*radios, *daemons], indent=2) + "\n"
+
+
+def daemon_targets(fleet: Fleet) -> tuple[Mapping[str, str], Sequence[str]]:
+    """Robot -> where Prometheus finds the metrics of its daemon; and why robots have no such address, a line each.
+
+    Daemons serve their metrics on loopback alone, so these are addresses of Prometheus' own machine. The base station's
+    computer is taken for that machine. Of another robot's address the first byte is replaced by 127: its daemon's port
+    is to be forwarded there, and adding robots moves no other's target.
+    """
+    port = fleet.udp_mesh.metrics_port
+    if port is None:
+        return {}, ()
+    targets: dict[str, str] = {}
+    problems: list[str] = []
+    # the base station first: its address is fixed
+    for robot in sorted(fleet.robots.values(), key=lambda robot: not robot.is_base):
+        if robot.computer is None:
+            continue
+        address = str(robot.computer.address.ip)
+        if not robot.is_base and robot.computer.address.version == 6:
+            problems.append(f"{robot.name} is no target: its address {address} is IPv6, which has one loopback address")
+            continue
+        local = "127.0.0.1" if robot.is_base else "127." + address.split(".", 1)[1]
+        target = host_and_port(local, port)
+        if (other := next((name for name, taken in targets.items() if taken == target), None)) is not None:
+            problems.append(f"{robot.name} is no target: {target} is that of {other}")
+            continue
+        targets[robot.name] = target
+    return targets, problems
 
 
 class TextfileWriter:

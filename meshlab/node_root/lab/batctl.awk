@@ -42,6 +42,11 @@ END {
 		header()
 		print "IF             Neighbor              last-seen"
 		for (i = 1; i <= n; i++) printf " %10s\t  %s %4d.%03ds\n", n_face[i], neighbour[i], n_age[i] / 1000, n_age[i] % 1000
+	} else if (verb == "tg" || verb == "transglobal") {
+		if (arguments !~ / -H/) { header(); print "   Client             VID Flags Last ttvn     Via        ttvn  (CRC       )" }
+		# of each originator its own bat0, a unicast address
+		if (arguments !~ / -m/) for (i = 1; i <= o; i++) if (best[i]) \
+			printf " * fe%s   -1 [....] (  1) %s (  1) (0x00000000)\n", substr(origin[i], 3), origin[i]
 	} else if (verb == "statistics" || verb == "s") {
 		# one OGM a second of its own, and one of every originator
 		ogms = int(uptime)

@@ -117,3 +117,16 @@ def test_metrics_of_a_history_and_the_files_for_prometheus(
         capfd, "metrics", "--store", store, "--textfile", str(tmp_path / "no" / "x.prom"), code=2
     )
     assert "expected one of" in said(capfd, "metrics", "--rules", "--dashboard", code=2)
+
+
+def test_targets_name_the_robots_that_are_none_on_standard_error(
+    inventory: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    text = Path(inventory).read_text().replace("10.42.0.15/24", "172.42.0.14/24")
+    Path(inventory).write_text(f"{text}udp_mesh: {{metrics_port: 9871}}\n")
+    with pytest.raises(SystemExit) as ended:
+        main(["metrics", "--file-sd", "-i", inventory])
+    out, err = capfd.readouterr()
+    assert ended.value.code == 0
+    assert [group["labels"]["robot"] for group in json.loads(out)] == ["station", "rover"]
+    assert err == "shelf is no target: 127.42.0.14:9871 is that of rover\n"

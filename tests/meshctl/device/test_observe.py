@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from meshctl.device.observe import interpret, observation_script, observe
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
 from meshctl.device.parse.deadman import parse_answer, parse_status
 from meshctl.device.parse.sections import OutputSection, split_sections
+from meshctl.device.scripts import script
 from meshctl.device.ssh import SshConnection
 from meshctl.model import RELEASES
 from tests.meshctl.device.sandbox import Sandbox
@@ -118,6 +120,7 @@ PARSERS = [
     iw.parse_stations,
     iw.parse_survey,
     batctl.parse_statistics,
+    batctl.parse_transglobal,
     system.parse_sensors,
     batctl.parse_mesh_json,
     batctl.parse_mesh_header,
@@ -246,6 +249,32 @@ def test_an_apk_database_is_read_by_the_script(connection: SshConnection, node: 
     seen = observe(connection)
     assert seen.package_tool == "apk"
     assert seen.packages == {"batctl-full": "2025.4-r1", "iw": "6.17-r1"}
+
+
+TRANSGLOBAL = """\
+ * 66:0f:2c:9e:01:0c   -1 [....] (  3) 02:15:6d:00:00:21 (  3) (0x8b1d5a3f)
+   66:0f:2c:9e:01:0c    1 [.W..] (  3) 02:15:6d:00:00:22 (  3) (0x8b1d5a3f)
+ * 33:33:00:00:00:fb   -1 [....] (  1) 02:15:6d:00:00:22 (  2) (0x00000000)
+"""
+
+
+@pytest.mark.parametrize(
+    ("prints", "status", "counted"),
+    [(TRANSGLOBAL, 0, (2, 1)), ("", 0, (0, 0)), ("", 254, None), (TRANSGLOBAL, 1, None)],
+    ids=["entries", "empty", "failed", "failed midway"],
+)
+def test_the_translation_table_is_counted_on_the_node(
+    node: Sandbox, prints: str, status: int, counted: tuple[int, int] | None
+) -> None:
+    node.put("/harness/table", prints)
+    asked = 'echo "$*" >/harness/asked'
+    node.put("/usr/sbin/batctl", f"#!/bin/sh\n{asked}\ncat /harness/table\nexit {status}\n", 0o755)
+    function = re.search(r"^transglobal\(\) .*?^}$", script("observe.sh"), re.MULTILINE | re.DOTALL)
+    assert function is not None
+    done = node.run("sh", "-c", f"{function[0]}\ntransglobal meshif bat0")
+    assert node.text("/harness/asked") == "meshif bat0 transglobal -H -n\n"
+    assert (done.returncode == 0) == (counted is not None)
+    assert batctl.parse_transglobal(done.stdout) == counted
 
 
 def test_host_keys_are_fingerprinted_as_a_client_sees_them(connection: SshConnection, node: Sandbox) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.monitor.page import ASSETS, joined_modules, modules, single_file
+from tests.test_structure import MAX_LINES
 
 OWN = sorted(ASSETS.glob("*.js"))
 ROOT = Path(__file__).resolve().parents[3]
@@ -36,6 +37,11 @@ def test_every_module_is_reached_and_no_two_define_the_same_name() -> None:
     found = re.findall(r"^(?:export )?(?:async )?(?:function|const|let|class) (\w+)", joined_modules(), re.MULTILINE)
     assert [name for name, count in Counter(found).items() if count > 1] == []
     assert not re.search(r"^(?:import|export)\b", joined_modules(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("file", OWN, ids=lambda file: file.name)
+def test_modules_stay_short(file: Path) -> None:
+    assert len(file.read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
 def test_colors_of_classes_are_those_of_okabe_and_ito() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from meshctl.device.observation import Sensors
+from meshctl.device.observation import MeshTableSizes, Sensors
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
 from meshctl.monitor.exposition import CONTENT_TYPE
@@ -43,6 +43,7 @@ def frame_with_everything(fleet: Fleet) -> Frame:
         HEALTHY["rover"],
         sensors=Sensors({"phy0": 101}, {"phy0": 61.5}),
         mesh_statistics={"bat0": {"tx_bytes": 5000, "forward_bytes": 70}},
+        mesh_tables={"bat0": MeshTableSizes(2, 1, 7, 0)},
         stations=tuple(
             replace(
                 one, tx_packets=1000, tx_retries=300, tx_failed=2, tx_mbit_s=65.0, rx_mbit_s=58.5, expected_mbit_s=30.0
@@ -120,6 +121,7 @@ def test_prometheus_scrapes_radios_and_daemons_and_knows_every_metric_of_dashboa
         }
         (labels,) = server.query('wifi_station_signal_dbm{node="b01",neighbor!="rover"}')
         assert json.loads(labels)["neighbor"] == HOSTILE
+        assert server.query('sum(batman_originator_count{node="rover"})') == {"{}": 3.0}
         assert min(server.query("udp_mesh_peer_delivered_bytes_total").values()) > 0
         assert list(server.query("node_boot_time_seconds").values()) == [NOW - 1 - 5000] * 3
         rules: Any = server.get("rules")
@@ -213,3 +215,20 @@ def test_radios_with_an_exporter_are_targets(tmp_path: Path) -> None:
         "node": "b01",
         "role": "beacon",
     }
+
+
+def test_robots_daemons_are_scraped_at_the_addresses_that_their_ports_are_forwarded_to(tmp_path: Path) -> None:
+    port = free_tcp_port()
+    path = tmp_path / "fleet.yaml"
+    path.write_text(f"{INVENTORY}udp_mesh: {{metrics_port: {port}}}\n")
+    # as with `ssh -L 127.42.0.14:PORT:127.0.0.1:PORT rover`
+    with (
+        two_daemons(alice_more=f'metrics_address = "127.42.0.14:{port}"'),
+        running(tmp_path, {}, file_sd=file_sd(load_fleet(path))) as server,
+    ):
+        until(lambda: len(server.query("up")) == 3, "every target to be scraped")
+        until(lambda: server.query('udp_mesh_peer_online{instance="rover"}'), "the peers of rover's daemon")
+        (labels,) = server.query('udp_mesh_info{robot="rover"}')
+        up = {json.loads(one)["robot"]: value for one, value in server.query("up").items()}
+    assert json.loads(labels)["name"] == "alice"
+    assert up == {"station": 0.0, "rover": 1.0, "shelf": 0.0}

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 
-from tests.udp_mesh.core.pair import Pipe, World, settings
+from tests.udp_mesh.core.pair import IP_UDP_BYTES, Pipe, World, settings
 from udp_mesh.core.events import MessageDelivered, MessageReceived, PeerOnline
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.first_contact import MAX_HELD_DATAGRAMS
 from udp_mesh.core.peers.session import Session
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, clock_echo, clock_ms, echo_age_s
 from udp_mesh.core.settings import Topic
+from udp_mesh.wire.header import Kind
 
 ATTACKER = ("10.0.0.66", 8700)
 STOP = Topic("stop", priority=0)
@@ -112,6 +115,30 @@ def test_held_datagrams_are_bounded_and_every_message_arrives(monkeypatch: pytes
     assert held == MAX_HELD_DATAGRAMS
     world.run(30.0)
     assert len(world.events_of("b", MessageReceived)) == 5 * MAX_HELD_DATAGRAMS
+
+
+@pytest.mark.parametrize("echoes", [True, False])
+def test_bytes_received_from_a_peer_count_from_its_first_datagram_on_each_once(
+    echoes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Introductions carry payload, and without echoes they are held until a ping is answered."""
+    if not echoes:
+        without_echoes(monkeypatch)
+    world = world_of("a", "b")
+    world.pipes["b", "a"].delay_s = 0.3
+    b, to_b = world.nodes["b"], world.addresses["b"]
+    sent: list[Datagram] = []
+    world.tap = lambda name, datagram, now: sent.append(datagram) if datagram.destination == to_b else None
+    assert world.run(5.0, until=lambda: bool(world.events_of("a", PeerOnline)))
+    world.send("a", "stop", random.Random(1).randbytes(5000), "b")
+    world.run(5.0)
+    assert len(world.events_of("b", MessageReceived)) == 1
+    introductions = [datagram for datagram in sent if datagram.data[0] & 0x0F == Kind.INTRODUCTION]
+    assert sum(len(datagram.data) for datagram in introductions) > 5000
+    for copy in introductions:
+        b.receive(copy.data, "mesh", world.addresses["a"], world.now)
+    (peer,) = b.conditions(world.now).peers
+    assert peer.received_bytes == sum(len(datagram.data) + IP_UDP_BYTES for datagram in sent)
 
 
 @pytest.mark.parametrize("now", [5.0, 1e6, 4294967.296 + 3.0, 4294967.296 - 0.001])
