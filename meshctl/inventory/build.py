@@ -246,6 +246,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         lan=document.lan.network if document.lan is not None else None,
         computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
         position=fixed_position(document.position),
+        relay=document.relay,
     )
 
 
@@ -363,5 +364,6 @@ def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
         window=settings.window,
         broadcast=settings.broadcast,
         metrics_port=settings.metrics_port,
+        relay_hops=settings.relay_hops,
         etc_hosts=settings.etc_hosts,
     )

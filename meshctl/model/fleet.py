@@ -165,7 +165,7 @@ class Robot:
 
     `fielded` is the address of a robot that still runs the legacy udp_mesh, which meshctl does not manage. `lan` is the
     subnet of the robot's own LAN, which its radios route; None: they bridge the mesh to its switch. `computers` are the
-    others on its switch by name, which run no daemon.
+    others on its switch by name, which run no daemon. Its daemon passes datagrams on for the robots in `relay`.
     """
 
     name: str
@@ -177,6 +177,7 @@ class Robot:
     lan: IpNetwork | None = None
     computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
     position: FixedPosition | None = None
+    relay: tuple[str, ...] = ()
 
     @property
     def other_addresses(self) -> tuple[str, ...]:
@@ -226,7 +227,8 @@ class ApplyPolicy:
 
 @dataclass(frozen=True, slots=True)
 class UdpMesh:
-    """Transport settings of all robots; `keys` are the live fleet keys, of which the first encrypts."""
+    """Transport settings of all robots; `keys` are the live fleet keys, of which the first encrypts. `relay_hops` is
+    the greatest number of links between two robots with relays between them."""
 
     port: int = 8700
     keys: tuple[SecretRef, ...] = ()
@@ -236,6 +238,7 @@ class UdpMesh:
     window: int | None = None
     broadcast: bool = True
     metrics_port: int | None = None
+    relay_hops: int = 4
     etc_hosts: bool = False
 
 

@@ -30,12 +30,14 @@ _MAX_TOPIC_BYTES = 255
 _RESERVED_PREFIX = "~mesh/"
 _MAX_FRAGMENT_BYTES = 8192
 _MAX_WINDOW = 4096
+_MAX_RELAY_HOPS = 8
 _MAX_KEYS = 2
 _KEY_BYTES = 32
 # Maximum heartbeat interval of idle peers, unless offline_after_s requires a shorter one (udp_mesh's default).
 _MAX_SPARSE_HEARTBEAT_S = 3.0
 # Silence after which messages without an outbox count as lost (udp_mesh's default).
 _PEER_LOST_S = 60.0
+_PEER_NAME = f"a name of 1 to {_MAX_NAME_BYTES} bytes without space or slash"
 
 
 def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> bytes:
@@ -44,7 +46,12 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
     Raises InvalidInput for an unknown robot, one without a computer, and every value that the daemon would reject.
     """
     computer = _computer(fleet, robot)
-    problems = [*_check_robot(fleet, robot), *_check_transport(fleet), *_check_topics(fleet)]
+    problems = [
+        *_check_robot(fleet, robot),
+        *_check_relay(fleet, robot),
+        *_check_transport(fleet),
+        *_check_topics(fleet),
+    ]
     if problems:
         raise InvalidInput(problems)
     transport = fleet.udp_mesh
@@ -55,6 +62,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         f"key_file = {_text(key_name)}" if transport.keys else "unkeyed = true",
         f"window = {transport.window}" if transport.window is not None else 'window = "adaptive"',
         f"fragment_bytes = {transport.fragment_bytes}",
+        *_relay(fleet.robots[robot], transport),
         *_rates(transport),
         *_position(fleet, robot),
         *_links(fleet, robot, computer),
@@ -117,9 +125,24 @@ def _computer(fleet: Fleet, name: str) -> Computer:
 
 def _check_robot(fleet: Fleet, name: str) -> Iterator[Diagnostic]:
     """Check the peer name. Names are parts of topic names, so slashes are not allowed."""
-    if not _is_name(name, _MAX_NAME_BYTES) or "/" in name:
-        expected = f"a name of 1 to {_MAX_NAME_BYTES} bytes without space or slash"
-        yield _problem(fleet, ("robots", name), expected, repr(name))
+    if not _is_peer_name(name):
+        yield _problem(fleet, ("robots", name), _PEER_NAME, repr(name))
+
+
+def _check_relay(fleet: Fleet, robot: str) -> Iterator[Diagnostic]:
+    relay = fleet.robots[robot].relay
+    for index, name in enumerate(relay):
+        if not _is_peer_name(name):
+            yield _problem(fleet, ("robots", robot, "relay", str(index)), _PEER_NAME, repr(name))
+    hops = fleet.udp_mesh.relay_hops
+    if not 1 <= hops <= _MAX_RELAY_HOPS:
+        yield _problem(fleet, ("udp_mesh", "relay_hops"), f"1 to {_MAX_RELAY_HOPS}", str(hops))
+    elif relay and hops == 1:
+        yield _problem(fleet, ("udp_mesh", "relay_hops"), f"at least 2, because {robot} is a relay", "1")
+
+
+def _is_peer_name(text: str) -> bool:
+    return _is_name(text, _MAX_NAME_BYTES) and "/" not in text
 
 
 def _is_name(text: str, limit_bytes: int) -> bool:
@@ -167,6 +190,14 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
                 yield from _neighbor(peer.name, str(peer.computer.address.ip))
+
+
+def _relay(robot: Robot, transport: UdpMesh) -> Iterator[str]:
+    """Only what differs from the daemon's defaults: daemons of earlier versions reject unknown keys."""
+    if robot.relay:
+        yield f"relay = [{', '.join(map(_text, robot.relay))}]"
+    if transport.relay_hops != UdpMesh().relay_hops:
+        yield f"relay_hops = {transport.relay_hops}"
 
 
 def _position(fleet: Fleet, robot: str) -> Iterator[str]:

@@ -64,6 +64,8 @@ class RobotDocument(Document):
     lan: LanDocument = NOT_WRITTEN
     """Subnet of the robot's own LAN; its first radio in service routes it. Default: its radios bridge the mesh to its
     switch."""
+    relay: tuple[Text, ...] = ()
+    """Robots whose datagrams its daemon passes on, to and from them; `all` for all."""
     position: PositionDocument = NOT_WRITTEN
     """Where it stands, if it does not move, as a base station."""
 
@@ -130,6 +132,8 @@ class UdpMeshDocument(Document):
     """Discover peers and reach all of them by broadcast."""
     metrics_port: Whole = Field(default=NOT_WRITTEN, ge=1, le=65_535)
     """TCP port of Prometheus metrics. Default: no metrics."""
+    relay_hops: Whole = Field(default=4, ge=1, le=8)
+    """Maximum number of links between two robots with relays between them; 1 turns relays off."""
     etc_hosts: Flag = False
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
 

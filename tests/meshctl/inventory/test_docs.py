@@ -64,6 +64,14 @@ def test_the_robots_of_the_examples_load_with_their_lans_and_computers(tmp_path:
     assert list(fleet.robots["husky1"].computers) == ["jetson", "lidar"]
 
 
+def test_the_relays_of_the_example_load(tmp_path: Path) -> None:
+    (relays,) = (text for text in _examples() if text.startswith("udp_mesh:"))
+    fleet = load_text(tmp_path, HEAD + relays).fleet
+    assert fleet is not None
+    assert {robot.name: robot.relay for robot in fleet.robots.values()} == {"husky1": ("uav1",), "uav1": ()}
+    assert fleet.udp_mesh.relay_hops == 3
+
+
 @pytest.mark.parametrize("number", range(3))
 def test_each_documented_secret_reference_loads(number: int, tmp_path: Path) -> None:
     (example,) = (text for text in _examples() if text.startswith("key: "))

@@ -73,6 +73,8 @@ def test_the_main_file_requires_fleet_and_country(key: str, validator: Draft2020
         (("meshes", "main", "key"), "plain text"),
         (("topics", "fpv", "priority"), 16),
         (("udp_mesh", "window"), 0),
+        (("udp_mesh", "relay_hops"), 9),
+        (("robots", "husky1", "relay"), "uav1"),
         (("country",), "us"),
         (("meshctl",), 2),
         (("hardware", "rocket", "release"), "18.06"),

@@ -130,6 +130,70 @@ def test_a_fixed_position_is_the_daemons_and_a_robot_without_one_has_none(tmp_pa
     assert loaded(source, "uav", tmp_path).position is None
 
 
+def relaying(relay: tuple[str, ...], robot: str = "spot", **transport: Any) -> Fleet:
+    source = fleet(ESTOP, **transport)
+    return replace(source, robots={**source.robots, robot: replace(source.robots[robot], relay=relay)})
+
+
+@pytest.mark.parametrize(
+    ("relay", "hops", "expected"),
+    [
+        (("uav",), 4, core.RelaySettings(("uav",))),
+        (("uav", "base"), 2, core.RelaySettings(("uav", "base"), hops=2)),
+        (("all",), 8, core.RelaySettings(all=True, hops=8)),
+        (("all", "uav"), 4, core.RelaySettings(("uav",), all=True)),
+    ],
+)
+def test_a_relay_is_that_robots_alone_and_the_limit_of_links_is_everybodys(
+    relay: tuple[str, ...], hops: int, expected: core.RelaySettings, tmp_path: Path
+) -> None:
+    source = relaying(relay, relay_hops=hops)
+    assert loaded(source, "spot", tmp_path).settings.relay == expected
+    assert loaded(source, "uav", tmp_path).settings.relay == core.RelaySettings(hops=hops)
+
+
+def test_relays_may_be_turned_off_for_the_whole_fleet(tmp_path: Path) -> None:
+    assert loaded(fleet(ESTOP, relay_hops=1), "spot", tmp_path).settings.relay == core.RelaySettings(hops=1)
+
+
+def test_a_fleet_without_relays_has_the_daemons_defaults_and_no_key_that_earlier_daemons_reject(tmp_path: Path) -> None:
+    assert loaded(fleet(ESTOP), "spot", tmp_path).settings.relay == core.RelaySettings()
+    assert b"relay" not in daemon_config(fleet(ESTOP), "spot")
+
+
+@pytest.mark.parametrize(
+    ("relay", "hops", "path", "message"),
+    [
+        (("all",), 1, "udp_mesh.relay_hops", "expected at least 2, because spot is a relay, found 1"),
+        ((), 0, "udp_mesh.relay_hops", "expected 1 to 8, found 0"),
+        ((), 9, "udp_mesh.relay_hops", "expected 1 to 8, found 9"),
+        (("uav", "u av"), 4, "robots.spot.relay.1", "expected a name of 1 to 63 bytes without space or slash"),
+        (("a/b",), 4, "robots.spot.relay.0", "found 'a/b'"),
+        (("",), 4, "robots.spot.relay.0", "found ''"),
+    ],
+)
+def test_a_relay_the_daemon_would_reject_is_rejected(
+    relay: tuple[str, ...], hops: int, path: str, message: str
+) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        daemon_config(relaying(relay, relay_hops=hops), "spot")
+    (found,) = caught.value.diagnostics
+    assert (found.code, found.path) == ("RND030", path)
+    assert message in found.text
+
+
+@given(st.text(st.sampled_from("ab é\"\\'\x7f\n/~[].#=,中"), max_size=12))
+def test_any_name_of_a_relay_is_loaded_unchanged_or_rejected(
+    tmp_path_factory: pytest.TempPathFactory, name: str
+) -> None:
+    try:
+        found = loaded(relaying((name,)), "spot", tmp_path_factory.getbasetemp())
+    except InvalidInput as error:
+        assert {item.code for item in error.diagnostics} == {"RND030"}
+        return
+    assert found.settings.relay.names == (name,)
+
+
 def test_without_broadcast_all_other_robots_are_neighbors(tmp_path: Path) -> None:
     found = loaded(fleet(broadcast=False, window=3), "base", tmp_path)
     assert found.settings.window == 3

@@ -1,7 +1,8 @@
 """Write the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with its output.
 
 Other implementations read `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with the
-keys and boot ids that open them, versions with their bases, and datagrams and messages of the legacy format.
+keys and boot ids that open them, the same of relays, versions with their bases, and datagrams and messages of the
+legacy format.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from udp_mesh.core.relaying.hop_channel import HopChannels, hop_key, membership_proof
 from udp_mesh.crypto import Key, SendChannel
 from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import (
@@ -43,6 +45,18 @@ from udp_mesh.wire.legacy import (
     encapsulate,
     encode_legacy,
     encode_mesh_data,
+)
+from udp_mesh.wire.relay import (
+    UNREACHABLE,
+    Carry,
+    HeardHop,
+    HopAck,
+    RelayedNode,
+    RelayFrame,
+    RelayHello,
+    encode_carry,
+    encode_hello,
+    encode_hop_ack,
 )
 from udp_mesh.wire.version import NO_BASE, VersionHeader, base_of, encode_version, version_hash
 
@@ -166,6 +180,33 @@ COMPACT_FRAMES: dict[str, list[Frame]] = {
 }
 """For receivers that announce COMPACT."""
 
+FLEET_KEY, ALICE, RELAY, BOB = Key(bytes(range(32))), bytes(range(16)), bytes(range(50, 66)), bytes(range(100, 116))
+"""Boots of two nodes, and of the relay between them."""
+
+RELAY_FRAMES: dict[str, RelayFrame] = {
+    "hello of a node that hears a relay": RelayHello(
+        "alice", False, 1000, 7, (membership_proof(FLEET_KEY, ALICE),), (HeardHop(RELAY[:8], 41, 255, False),)
+    ),
+    "hello of a relay": RelayHello(
+        "husky1",
+        True,
+        1000,
+        42,
+        (membership_proof(FLEET_KEY, RELAY),),
+        (HeardHop(ALICE[:8], 7, 230, True), HeardHop(BOB[:8], 0xFFFFFFFF, 0, False)),
+        (
+            RelayedNode(BOB, 12, 18, 1, 1500, True, "uav1", (membership_proof(FLEET_KEY, BOB),)),
+            RelayedNode(bytes(range(150, 166)), 3, UNREACHABLE, 8, 576, False, "gone", ()),
+        ),
+    ),
+    "hello of a relay without the fleet key, which hears nobody": RelayHello("guest", True, 0xFFFF, 0, ()),
+    "carried datagram on its first hop": Carry(3, 4, ALICE[:8], BOB[:8], (), b"\x93 any datagram"),
+    "carried datagram that visited relays": Carry(
+        15, 8, ALICE[:8], BOB[:8], (RELAY[:4], b"more"), b"\x93 any datagram"
+    ),
+    "acknowledgement of a hop": HopAck(0x1_0000_0005, 8000),
+}
+
 LEGACY: dict[str, LegacyDatagram] = {
     "host": Host("ugv1", "10.10.0.1"),
     "payload": LegacyPayload(0x7FFF, 1, 3, b"data", wants_ack=True),
@@ -263,10 +304,56 @@ def make_legacy() -> object:
     }
 
 
+def encode_relay(frame: RelayFrame) -> bytes:
+    match frame:
+        case RelayHello():
+            return encode_hello(frame)
+        case Carry():
+            return encode_carry(frame)
+        case HopAck():
+            return encode_hop_ack(frame)
+
+
+def make_relay() -> object:
+    """Relay frames, and what a datagram from `ALICE` to `BOB` and its relay's answers look like on the first hop."""
+    frames = {
+        name: {"frame": describe(frame), "hex": encode_relay(frame).hex()} for name, frame in RELAY_FRAMES.items()
+    }
+    _, carried = SendChannel(FLEET_KEY, ALICE, BOB).seal(encode([Ping(7)]))
+    relay, alice = HopChannels((FLEET_KEY,), RELAY), HopChannels((FLEET_KEY,), ALICE)
+    hello = encode_relay(RELAY_FRAMES["hello of a relay"])
+    carry = encode_carry(Carry(3, 4, ALICE[:8], BOB[:8], (), carried))
+    ack = encode_hop_ack(HopAck(0, 8000))
+    datagrams = {
+        "hello": (RELAY, None, hello, relay.seal_hello(hello)),
+        "carried datagram": (ALICE, RELAY, carry, alice.seal(alice.add(RELAY), carry)[1]),
+        "acknowledgement": (RELAY, ALICE, ack, relay.seal(relay.add(ALICE), ack)[1]),
+    }
+    hop = hop_key(FLEET_KEY)
+    return {
+        "frames": frames,
+        "fleet_key": FLEET_KEY.secret.hex(),
+        "hop_key": hop.secret.hex(),
+        "hop_key_id": hop.key_id.hex(),
+        "proofs": {boot.hex(): membership_proof(FLEET_KEY, boot).hex() for boot in (ALICE, RELAY, BOB)},
+        "datagrams": {
+            title: {
+                "sender_boot": sender.hex(),
+                "receiver_boot": receiver.hex() if receiver else None,
+                "packet_number": 0,
+                "frame": frame.hex(),
+                "datagram": datagram.hex(),
+            }
+            for title, (sender, receiver, frame, datagram) in datagrams.items()
+        },
+    }
+
+
 MAKERS = {
     "frames.json": make_frames,
     "sealed.json": make_sealed,
     "versions.json": make_versions,
+    "relay.json": make_relay,
     "legacy.json": make_legacy,
 }
 

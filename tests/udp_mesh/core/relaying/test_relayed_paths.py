@@ -65,6 +65,40 @@ def test_a_relay_for_named_nodes_passes_on_only_what_is_to_or_from_them() -> Non
     assert not online(topology, "base", "stranger")
 
 
+def hidden_ends(relay: RelaySettings) -> Topology:
+    """One network on which `base` and `uav` hear `husky` alone."""
+    topology = Topology()
+    topology.network("mesh").losses = {("base", "uav"): 1.0, ("uav", "base"): 1.0}
+    for name in ("base", "uav"):
+        topology.add(node(name), ["mesh"])
+    topology.add(node("husky", relay), ["mesh"])
+    return topology
+
+
+def test_a_relay_with_one_link_joins_nodes_of_its_network_that_do_not_hear_each_other() -> None:
+    topology = hidden_ends(RelaySettings(("uav",)))
+    assert topology.run(10, lambda: online(topology, "base", "uav") and online(topology, "uav", "base"))
+    topology.send("base", "map", bytes(50_000), destination="uav")
+    topology.run(3)
+    assert via(topology, "base", "uav") == ("husky",)
+    assert len(reported(topology, "uav", MessageReceived)) == 1
+    assert len(reported(topology, "base", MessageDelivered)) == 1
+
+
+@pytest.mark.parametrize("off", [RelaySettings(), RelaySettings(hops=1)])
+def test_a_running_node_becomes_a_relay_and_none_again(off: RelaySettings) -> None:
+    topology = hidden_ends(off)
+    topology.run(10)
+    assert online(topology, "base", "husky")
+    assert not online(topology, "base", "uav")
+    husky = topology.nodes["husky"]
+    husky.apply(node("husky", RelaySettings(("uav",))), topology.now)
+    assert topology.run(15, lambda: online(topology, "base", "uav") and online(topology, "uav", "base"))
+    husky.apply(node("husky", off), topology.now)
+    assert topology.run(60, lambda: not online(topology, "base", "uav") and not online(topology, "uav", "base"))
+    assert online(topology, "base", "husky")
+
+
 def test_a_relay_that_dies_is_replaced_by_the_other_path_and_nothing_is_lost() -> None:
     topology = ring()
     topology.run(6)
