@@ -126,13 +126,21 @@ no_radio_is_lost() {
 	done
 }
 
+# stay_settled: looks again a second later. A change that reaches a radio while it is being set up is only noted; between
+# the end of that setup and the next one, the radio is up for a moment (25.12: wireless-device.uc, wdev_setup_cb).
+stay_settled() {
+	is_late || pause 1
+	until_s $NETIFD_LIMIT_S netifd_is_idle
+	until_s $RADIO_LIMIT_S no_radio_is_lost
+}
+
 # settle_radios: waits until the radios are set up. 25.12 keeps the interface of a disabled radio, and removes the one it
 # has just created when a radio changes from wpa_supplicant to an open cell (wifi-scripts: mac80211.sh, wdev.uc). Taking
 # the radios down first clears that state.
 settle_radios() {
 	until_s $NETIFD_LIMIT_S netifd_is_idle
 	configured_interfaces=$(radio_interfaces)
-	until_s $RADIO_LIMIT_S no_radio_is_lost && return
+	until_s $RADIO_LIMIT_S no_radio_is_lost && stay_settled && return
 	[ -x /sbin/wifi ] || return 0
 	/sbin/wifi down
 	/sbin/wifi up

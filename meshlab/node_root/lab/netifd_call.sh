@@ -14,3 +14,11 @@ is_call() {
 	*) return 1 ;;
 	esac
 }
+# await_taken: returns once the latest call has read its configuration. netifd is one process: whoever asks after a reload
+# has returned is answered after it, and sees the radios that it will set up as pending (netifd ubus.c, wireless-device.uc).
+await_taken() {
+	read -r latest 2>/dev/null </tmp/run/netifd.call || return 0
+	while read -r taken 2>/dev/null </tmp/run/netifd/taken || taken=; [ "$taken" != "$latest" ] && is_call "$latest"; do
+		/rom/lab/genuine/busybox usleep 10000
+	done
+}

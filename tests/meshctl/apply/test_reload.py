@@ -215,7 +215,17 @@ def test_a_dropbear_process_that_does_not_exit_is_a_failure(node: Node) -> None:
 def test_the_reload_waits_for_radios_that_netifd_is_setting_up(node: Node) -> None:
     (node.place / "pending").touch()
     assert node.reload("wireless") == (0, "")
-    assert node.slept_s() == 1
+    assert node.slept_s() == 2  # until they are up, and once more
+
+
+def test_an_interface_lost_in_a_second_setup_right_after_the_first_is_recreated(node: Node) -> None:
+    node.tool("wifi", 'echo "wifi $1" >>"$HERE/log"')
+    (node.place / "wireless").write_text(WIRELESS % 0)
+    (node.place / "net" / "mesh0").mkdir()
+    # up at the first look; the pause after it is when netifd handles the change that it had only noted
+    node.tool("sleep", 'echo "sleep $1" >>"$HERE/log"; rmdir "$HERE/net/mesh0" 2>/dev/null')
+    assert node.reload("wireless") == (0, "")
+    assert [line for line in node.log if line.startswith("wifi")] == ["wifi down", "wifi up"]
 
 
 WIRELESS = """wireless.radio0=wifi-device
