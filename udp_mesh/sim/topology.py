@@ -15,10 +15,10 @@ from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event, MessageId, Rejected
 from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import Address, LinkInfo, LinkKind, Settings
 from udp_mesh.sim.event_queue import SimEventQueue
 
-IP_UDP_BYTES = 28
 _MIN_STEP_S = 1e-6
 
 

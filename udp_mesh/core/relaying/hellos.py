@@ -42,7 +42,7 @@ def hello_datagrams(
 ) -> Iterator[Datagram]:
     """The hellos of one round, on every link. `passes` names the nodes for which every path is open (None: all)."""
     named = None if passes is None else frozenset(passes)
-    links = [link for link in state.links.values() if link.name != RELAY_LINK]
+    links = state.own_links()
     for link in links:
         here = [neighbour for neighbour in neighbours if link.name in neighbour.links]
         if not (here or state.settings.relay.keys or _is_understood(state, link.name)):

@@ -8,7 +8,7 @@ a relay that could read what it passes on is distinguished from one that cannot.
 from __future__ import annotations
 
 import hmac
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, SendChannel, check_long
@@ -30,6 +30,11 @@ def hop_key(key: Key) -> Key:
 def membership_proof(key: Key, boot_id: bytes) -> bytes:
     """Shows holders of this fleet key that the boot holds it, too."""
     return hmac.digest(key.prk, b"relay member" + boot_id, "sha256")[:PROOF_BYTES]
+
+
+def is_member(keys: Iterable[Key], boot_id: bytes, proofs: Sequence[bytes]) -> bool:
+    """Whether a boot that showed these proofs holds one of the fleet keys."""
+    return any(membership_proof(key, boot_id) in proofs for key in keys)
 
 
 class _Numbers(NamedTuple):

@@ -19,6 +19,9 @@ MAX_HOP_BYTES = 1 << 20
 MAX_QUEUED_S = 2.0
 """Older datagrams are dropped: their sender has sent them again."""
 
+_BEFORE_ALL = float("-inf")
+"""At this time nothing is too old."""
+
 
 class QueuedCarry(NamedTuple):
     carry: Carry
@@ -124,6 +127,13 @@ class HopQueue:
                 return item
             self.dropped += 1
         return None
+
+    def drain(self) -> list[QueuedCarry]:
+        """Everything that waits, whatever its age, in the order of `pop`."""
+        items = []
+        while (item := self.pop(_BEFORE_ALL)) is not None:
+            items.append(item)
+        return items
 
     def _removed(self, item: QueuedCarry) -> None:
         self._budget.remove(item)

@@ -54,10 +54,6 @@ class HopWindow:
         self._progress_at = 0.0
 
     @property
-    def outstanding(self) -> int:
-        return len(self._sent)
-
-    @property
     def suspect(self) -> bool:
         return self.timeouts >= SUSPECT_AFTER
 

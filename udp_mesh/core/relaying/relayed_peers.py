@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from udp_mesh.core.path_mtu import update_mtu
 from udp_mesh.core.peers.session import STALE_PATH_S
-from udp_mesh.core.relaying.hop_channel import membership_proof
+from udp_mesh.core.relaying.hop_channel import is_member
 from udp_mesh.core.relaying.routes import HopRoute
 from udp_mesh.core.sender.path import IP_UDP_BYTES, header_bytes
 from udp_mesh.core.settings import MIN_LINK_MTU, RELAY_LINK, Address, LinkInfo, LinkKind, Neighbour
@@ -51,14 +51,12 @@ class RelayedPeers:
 
     def has_common_key(self, route: HopRoute) -> bool:
         """Whether this node can be spoken to: it proved that it holds one of our fleet keys."""
-        return any(membership_proof(key, route.boot_id) in route.proofs for key in self._state.keys)
+        return is_member(self._state.keys, route.boot_id, route.proofs)
 
     def open_link(self) -> None:
         """Make `RELAY_LINK` available to the core, or fit it to changed links."""
         state = self._state
-        mtus = [
-            self._mtu(link.mtu, header_bytes(link.address)) for link in state.links.values() if link.name != RELAY_LINK
-        ]
+        mtus = [self._mtu(link.mtu, header_bytes(link.address)) for link in state.own_links()]
         if not mtus:
             return
         known = state.links.get(RELAY_LINK)
@@ -88,8 +86,8 @@ class RelayedPeers:
             session = state.peer_table.sessions.get(boot_id)
             if session is not None and session.path.link == RELAY_LINK:
                 mtu = self._mtu(route.mtu, IP_UDP_BYTES)
-                narrowed = session.peer is not None and session.peer.sender is not None
-                narrowed = narrowed and session.peer.sender.pmtu.narrowed_at is not None  # type: ignore[union-attr]
+                sender = None if session.peer is None else session.peer.sender
+                narrowed = sender is not None and sender.pmtu.narrowed_at is not None
                 if session.path.mtu > mtu or (session.path.mtu < mtu and not narrowed):
                     update_mtu(state, session, mtu)
             elif session is not None and now - session.path.heard_at < STALE_PATH_S and now - since < HOLD_S:

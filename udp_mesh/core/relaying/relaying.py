@@ -61,7 +61,7 @@ class Relaying:
         self.round = 0
         self._out: list[Datagram] = []
         self._relay_heard_at = float("-inf")
-        self._hello_at = now if self._relays else _NEVER
+        self._hello_at = now if self.relays else _NEVER
         self._hello_sent_at = float("-inf")
         self._maintenance_at = now + MAINTENANCE_S
 
@@ -69,7 +69,8 @@ class Relaying:
         return self._state.settings.relay.keys or self._state.keys
 
     @property
-    def _relays(self) -> bool:
+    def relays(self) -> bool:
+        """Whether this node passes datagrams on."""
         return self._state.settings.relay.enabled
 
     @property
@@ -83,7 +84,7 @@ class Relaying:
 
     def active(self, now: float) -> bool:
         """Whether this node relays, or hears a relay."""
-        return self.takes_part and (self._relays or now - self._relay_heard_at <= ACTIVE_FOR_S)
+        return self.takes_part and (self.relays or now - self._relay_heard_at <= ACTIVE_FOR_S)
 
     # Settings
 
@@ -92,7 +93,7 @@ class Relaying:
         self._channels.set_keys(self._hop_keys())
         for boot_id, neighbour in self.neighbours.items():
             neighbour.hop = self._channels.add(boot_id)
-        if self._relays:
+        if self.relays:
             self._hello_soon(now)
         if not self.takes_part:
             for boot_id in list(self.neighbours):
@@ -254,8 +255,7 @@ class Relaying:
 
     def _forget(self, boot_id: bytes) -> None:
         neighbour = self.neighbours.pop(boot_id)
-        while neighbour.queue.pop(float("-inf")) is not None:
-            self.counters.dropped_unreachable += 1
+        self.counters.dropped_unreachable += len(neighbour.queue.drain())
         self._channels.forget(boot_id)
         self.forwarding.ack_due.pop(boot_id, None)
         self.forwarding.queued.pop(boot_id, None)
@@ -275,10 +275,10 @@ class Relaying:
         self._hello_sent_at = now
         self._hello_at = now + interval_s * (1 - JITTER * state.rng.random())
         opened = None if relay.all else dict.fromkeys(relay.names, True)
-        nodes = self.routes.announce(relay.hops, opened) if self._relays else []
+        nodes = self.routes.announce(relay.hops, opened) if self.relays else []
         base = RelayHello(
             state.settings.name,
-            self._relays,
+            self.relays,
             min(65_535, int(interval_s * 1000)),
             self.round,
             tuple(membership_proof(key, self._own) for key in state.keys),
@@ -304,7 +304,7 @@ class Relaying:
                 self.forwarding.tags.pop(before.boot_id[:HEARD_TAG_BYTES], None)
             if after is not None:
                 self.forwarding.tags[after.boot_id[:HEARD_TAG_BYTES]] = after.boot_id
-        if changed and self._relays:
+        if changed and self.relays:
             self._hello_soon(now)
         self.peers.sync(boot_ids, self.routes.selected, self.active(now), now)
         for before, after in changed:
@@ -313,10 +313,7 @@ class Relaying:
     def _on_changed(self, before: HopRoute | None, after: HopRoute | None) -> None:
         old = self.neighbours.get(before.via) if before is not None else None
         if old is not None and old.queue:
-            waiting = []
-            while (item := old.queue.pop(float("-inf"))) is not None:
-                waiting.append(item)
-            for item in waiting:
+            for item in old.queue.drain():
                 self.forwarding.queue(item)
         if after is not None and not after.direct and self.peers.is_in_use(after.boot_id):
             via = self.neighbours[after.via].name
@@ -333,7 +330,3 @@ class Relaying:
     @property
     def queued_bytes(self) -> int:
         return self.forwarding.budget.bytes
-
-    @property
-    def relays(self) -> bool:
-        return self._relays

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from udp_mesh.core.relaying.conditions import RelayConditions, RelayNeighbour, RelayRoute
-from udp_mesh.core.relaying.hop_channel import membership_proof
+from udp_mesh.core.relaying.hop_channel import is_member
 from udp_mesh.core.relaying.neighbours import LINK_COST, HopNeighbour
 from udp_mesh.core.relaying.routes import HopRoute
 from udp_mesh.core.state import State
@@ -42,7 +42,7 @@ def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayN
             neighbour.name,
             None if link is None else link.name,
             neighbour.relays,
-            _is_member(state, neighbour.boot_id, neighbour.proofs),
+            is_member(state.keys, neighbour.boot_id, neighbour.proofs),
             0.0 if link is None else min(1.0, LINK_COST / link.cost(neighbour.interval_s, now)),
             neighbour.window.suspect,
             neighbour.queue.bytes,
@@ -54,11 +54,7 @@ def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayN
 def _members(state: State, relaying: Relaying) -> set[bytes]:
     """Boot ids of the nodes that hold one of our fleet keys."""
     known: list[HopNeighbour | HopRoute] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
-    return {one.boot_id for one in known if _is_member(state, one.boot_id, one.proofs)}
-
-
-def _is_member(state: State, boot_id: bytes, proofs: tuple[bytes, ...]) -> bool:
-    return any(membership_proof(key, boot_id) in proofs for key in state.keys)
+    return {one.boot_id for one in known if is_member(state.keys, one.boot_id, one.proofs)}
 
 
 def _route(relaying: Relaying, route: HopRoute, names: dict[bytes, str], members: set[bytes]) -> RelayRoute:
