@@ -8,20 +8,21 @@ BURST_S = 0.1
 
 
 class TokenBucket:
-    """One topic's bucket, shared by all destinations. It may go into debt by one datagram."""
+    """One topic's bucket, shared by all destinations. It may go into debt by one `consume`."""
 
-    __slots__ = ("_at", "_bytes", "bytes_per_s", "parked")
+    __slots__ = ("_at", "_burst_s", "_bytes", "bytes_per_s", "parked")
 
-    def __init__(self, bytes_per_s: int, now: float) -> None:
+    def __init__(self, bytes_per_s: int, now: float, *, burst_s: float = BURST_S) -> None:
         self.bytes_per_s = bytes_per_s
-        self._bytes = bytes_per_s * BURST_S
+        self._burst_s = burst_s
+        self._bytes = bytes_per_s * burst_s
         self._at = now
         self.parked: list[tuple[Sender, Run]] = []
         """What waits for tokens: messages, or single fragments to be retransmitted."""
 
     def has_tokens(self, now: float) -> bool:
         """Whether a datagram may be sent now."""
-        self._bytes = min(self.bytes_per_s * BURST_S, self._bytes + (now - self._at) * self.bytes_per_s)
+        self._bytes = min(self.bytes_per_s * self._burst_s, self._bytes + (now - self._at) * self.bytes_per_s)
         self._at = now
         return self._bytes > 0
 

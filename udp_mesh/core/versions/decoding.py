@@ -5,7 +5,7 @@ from __future__ import annotations
 from hashlib import blake2b
 
 from udp_mesh.core.versions.encoding import HASH_STEP_BYTES, Version
-from udp_mesh.core.zstd import DECOMPRESS_STEP_BYTES, ZstdDecompression
+from udp_mesh.core.zstd import ZstdDecompression
 from udp_mesh.wire.version import HASH_BYTES, VersionHeader
 
 
@@ -56,7 +56,3 @@ class VersionDecoding:
         if self._hash.digest() == self.header.digest:
             self.payload = self._result
         return True
-
-
-SMALL_BYTES = DECOMPRESS_STEP_BYTES
-"""A version of at most this size is decoded in one step."""

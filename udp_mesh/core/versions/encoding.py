@@ -24,11 +24,20 @@ MIN_BASE_BYTES = 32
 """Shorter versions are never a base: they save nothing, and zstd refuses a prefix below 8 bytes."""
 
 
+ENTRY_BYTES = 300
+"""Overhead of a version that is kept, so that limits cover tiny ones, too."""
+
+
 class Version(NamedTuple):
     """A version that a peer has."""
 
     digest: bytes
     payload: bytes
+
+    @property
+    def kept_bytes(self) -> int:
+        """What it takes to keep it."""
+        return len(self.payload) + ENTRY_BYTES
 
 
 class Encoded(NamedTuple):

@@ -15,9 +15,6 @@ from udp_mesh.wire.version import NO_BASE, base_of
 MAX_PER_TOPIC = 8
 """The sender refers to the newest version that it knows to have arrived: some more may be on their way meanwhile."""
 
-ENTRY_BYTES = 300
-"""Overhead of a version without its bytes, so that the limit covers tiny ones, too."""
-
 _Key = tuple[str, str]
 """Topic and type."""
 
@@ -47,7 +44,7 @@ class HeldVersions:
     def keep(self, topic: _Key, version: Version) -> None:
         """Keep a version just received, if there is room; older ones make room for it."""
         key = (topic, base_of(version.digest))
-        size = len(version.payload) + ENTRY_BYTES
+        size = version.kept_bytes
         self._drop(key)
         if key[1] == NO_BASE or len(version.payload) < MIN_BASE_BYTES or size > self.limit_bytes:
             return
@@ -76,4 +73,4 @@ class HeldVersions:
     def _drop(self, key: tuple[_Key, bytes]) -> None:
         version = self._versions.pop(key, None)
         if version is not None:
-            self._account.release(len(version.payload) + ENTRY_BYTES)
+            self._account.release(version.kept_bytes)

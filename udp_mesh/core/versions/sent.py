@@ -17,6 +17,7 @@ from collections import OrderedDict, deque
 from dataclasses import replace
 
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
+from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.core.versions.encoding import MIN_BASE_BYTES, Encoded, Version, VersionEncoding, encode
 from udp_mesh.core.versions.received import CounterTable
@@ -40,27 +41,7 @@ SHARED_ENCODINGS, SHARED_BYTES = 4, 16 << 20
 """Encodings kept, because other peers with the same base get the same message now. The newest is kept whatever its
 size."""
 
-ENTRY_BYTES = 300
-
 _COMPRESSION = MessageFlag.COMPRESSED | MessageFlag.ZSTD
-
-
-class _Budget:
-    """Bytes of one topic that may be compared now."""
-
-    __slots__ = ("_at", "_bytes")
-
-    def __init__(self, now: float) -> None:
-        self._bytes = float(MAX_BYTES_PER_S)
-        self._at = now
-
-    def take(self, size: int, now: float) -> bool:
-        self._bytes = min(float(MAX_BYTES_PER_S), self._bytes + (now - self._at) * MAX_BYTES_PER_S)
-        self._at = now
-        if self._bytes <= 0:
-            return False
-        self._bytes -= size
-        return True
 
 
 class _Channel:
@@ -215,7 +196,8 @@ class SentVersions:
         self._payloads: dict[bytes, Version] = {}
         self._shared: OrderedDict[tuple[int, bytes], Encoded] = OrderedDict()
         self._shared_bytes = 0
-        self._budgets: dict[str, _Budget] = {}
+        self._budgets: dict[str, TokenBucket] = {}
+        """Bytes of each topic that may be compared now; the first versions of a mission may take a second's worth."""
 
     def of(self, peer: str) -> PeerVersions:
         """The versions of a peer."""
@@ -286,8 +268,11 @@ class SentVersions:
         """Whether the topic may compare so many bytes now."""
         budget = self._budgets.get(topic)
         if budget is None:
-            budget = self._budgets[topic] = _Budget(now)
-        return budget.take(size, now)
+            budget = self._budgets[topic] = TokenBucket(MAX_BYTES_PER_S, now, burst_s=1.0)
+        has_tokens = budget.has_tokens(now)
+        if has_tokens:
+            budget.consume(size)
+        return has_tokens
 
     # Bases
 
@@ -304,7 +289,7 @@ class SentVersions:
         version = self._payloads.setdefault(version.digest, version)
         users = self._users.get(version.digest, 0)
         if not users:
-            self.bytes += len(version.payload) + ENTRY_BYTES
+            self.bytes += version.kept_bytes
         self._users[version.digest] = users + 1
         self._bases[peer, number] = version
         while self.bytes > self.limit_bytes and self._bases:
@@ -317,4 +302,4 @@ class SentVersions:
         self._users[version.digest] -= 1
         if not self._users[version.digest]:
             del self._users[version.digest], self._payloads[version.digest]
-            self.bytes -= len(version.payload) + ENTRY_BYTES
+            self.bytes -= version.kept_bytes
