@@ -12,7 +12,8 @@ from __future__ import annotations
 import struct
 import sys
 from array import array
-from typing import Any, Dict, List, NamedTuple, Optional
+from functools import lru_cache
+from typing import Any, Dict, List, NamedTuple, Optional, Tuple
 
 from udp_mesh.bridges.message_definition import HEADER, MAX_DEPTH, DefinitionError, Field, MessageDefinition
 
@@ -62,7 +63,7 @@ def numbers(type_name: str, values: List[Any]) -> Numbers:
 
 def decode(definition: MessageDefinition, data: bytes, ros_version: int) -> Message:
     """Bytes -> values. Raises CodecError."""
-    reader = _Reader(data, ros_version)
+    reader = MessageReader(data, ros_version)
     try:
         message = _read(reader, definition, definition.name, 0)
         reader.finish()
@@ -86,9 +87,18 @@ def converted(definition: MessageDefinition, data: bytes, from_version: int, to_
     return encode(definition, decode(definition, data, from_version), to_version)
 
 
-class _Reader:
+@lru_cache(maxsize=256)
+def _layout(text: str) -> Tuple[struct.Struct, int]:
+    """A format of `struct` with one kind of number, and the size of each."""
+    return struct.Struct(text), struct.calcsize("<" + text[-1])
+
+
+class MessageReader:
+    """The bytes of one message, read in the order of its fields. Raises struct.error, UnicodeDecodeError or CodecError
+    for bytes that are none."""
+
     def __init__(self, data: bytes, ros_version: int) -> None:
-        self.ros_version, self._at = ros_version, 0
+        self.ros_version, self._at, self._is_cdr = ros_version, 0, ros_version == 2
         self._data, self._order = memoryview(data), "<"
         if ros_version == 2:
             if data[:2] not in (b"\x00\x00", b"\x00\x01"):
@@ -97,12 +107,21 @@ class _Reader:
             self._data = self._data[4:]
 
     def number(self, form: str) -> Any:
-        size = struct.calcsize(form)
-        if self.ros_version == 2:
+        return self.values(form)[0]
+
+    def values(self, form: str) -> Tuple[Any, ...]:
+        """Consecutive fields of one type of number, such as `3d`."""
+        layout, size = _layout(self._order + form)
+        if self._is_cdr:
             self._at += -self._at % size
-        (value,) = struct.unpack_from(self._order + form, self._data, self._at)
-        self._at += size
-        return value
+        found = layout.unpack_from(self._data, self._at)
+        self._at += layout.size
+        return found
+
+    def time(self, type_name: str = "time") -> Tuple[int, int]:
+        """Seconds and nanoseconds."""
+        signs = _time_form(type_name, self.ros_version)
+        return self.number(signs[0]), self.number(signs[1])
 
     def take(self, size: int) -> bytes:
         raw = self._data[self._at : self._at + size]
@@ -135,7 +154,7 @@ def _swapped(form: str, raw: bytes) -> bytes:
     return values.tobytes()
 
 
-def _read(reader: _Reader, definition: MessageDefinition, name: str, depth: int) -> Message:
+def _read(reader: MessageReader, definition: MessageDefinition, name: str, depth: int) -> Message:
     if depth > MAX_DEPTH:
         raise CodecError("{}: nested too deeply".format(name))
     fields = definition.fields(name)
@@ -149,7 +168,7 @@ def _read(reader: _Reader, definition: MessageDefinition, name: str, depth: int)
     }
 
 
-def _read_field(reader: _Reader, definition: MessageDefinition, field: Field, depth: int) -> Any:
+def _read_field(reader: MessageReader, definition: MessageDefinition, field: Field, depth: int) -> Any:
     form = NUMBERS.get(field.type)
     if field.length is None:
         return _read_value(reader, definition, field.type, form, depth)
@@ -161,14 +180,15 @@ def _read_field(reader: _Reader, definition: MessageDefinition, field: Field, de
     return [_read_value(reader, definition, field.type, None, depth) for _ in range(count)]
 
 
-def _read_value(reader: _Reader, definition: MessageDefinition, type_name: str, form: Optional[str], depth: int) -> Any:
+def _read_value(
+    reader: MessageReader, definition: MessageDefinition, type_name: str, form: Optional[str], depth: int
+) -> Any:
     if form is not None:
         return reader.number(form)
     if type_name == "string":
         return reader.text()
     if type_name in ("time", "duration"):
-        signs = _time_form(type_name, reader.ros_version)
-        return (reader.number(signs[0]), reader.number(signs[1]))
+        return reader.time(type_name)
     return _read(reader, definition, type_name, depth + 1)
 
 

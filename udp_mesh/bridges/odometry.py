@@ -1,7 +1,7 @@
 """Positions out of ROS messages: `nav_msgs/Odometry` and `tf2_msgs/TFMessage` as bytes -> set-position. Pure.
 
-ROS 1 (http://wiki.ros.org/msg, "Serialization") and ROS 2 (CDR, with alignment) differ in the header's `seq` and in the
-padding. A tf chain is followed from the robot's frame to the map's.
+Only the fields that are needed are read; `message_codec` reads whole messages. A tf chain is followed from the robot's
+frame to the map's.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 import struct
 from typing import Dict, NamedTuple, Optional, Tuple
+
+from udp_mesh.bridges.message_codec import MessageReader
 
 PERIOD_S = 1.0
 """A position is set at most this often: the daemon sends it every two seconds."""
@@ -39,51 +41,25 @@ class Transform(NamedTuple):
     time_s: float
 
 
-class _Reader:
-    """Reads one message; raises struct.error, UnicodeDecodeError or ValueError for bytes that are none."""
+def _text(reader: MessageReader) -> str:
+    return reader.text().rstrip("\0")
 
-    def __init__(self, data: bytes, ros_version: int) -> None:
-        self._data, self._at, self._is_cdr = data, 0, ros_version == 2
-        if self._is_cdr:
-            # the encapsulation: big or little endian, plain CDR
-            if data[:2] not in (b"\x00\x00", b"\x00\x01"):
-                raise ValueError("not CDR")
-            self._order = "<" if data[1] else ">"
-            self._data = data[4:]
-        else:
-            self._order = "<"
 
-    def numbers(self, form: str, size: int) -> Tuple[float, ...]:
-        if self._is_cdr:
-            self._at += -self._at % size
-        layout = struct.Struct(self._order + form)
-        values = layout.unpack_from(self._data, self._at)
-        self._at += layout.size
-        return values
-
-    def text(self) -> str:
-        (length,) = self.numbers("I", 4)
-        raw = self._data[self._at : self._at + int(length)]
-        if len(raw) != length:
-            raise ValueError("cut off")
-        self._at += int(length)
-        return raw.rstrip(b"\0").decode()
-
-    def stamped(self) -> Tuple[float, str]:
-        """A std_msgs/Header: time and frame."""
-        if not self._is_cdr:
-            self.numbers("I", 4)
-        seconds, nanoseconds = self.numbers("iI" if self._is_cdr else "II", 4)
-        return seconds + nanoseconds / 1e9, self.text().lstrip("/")
+def _stamped(reader: MessageReader) -> Tuple[float, str]:
+    """A std_msgs/Header: time and frame."""
+    if reader.ros_version == 1:
+        reader.number("I")
+    seconds, nanoseconds = reader.time()
+    return seconds + nanoseconds / 1e9, _text(reader).lstrip("/")
 
 
 def odometry_pose(data: bytes, ros_version: int) -> Optional[Pose]:
     """The pose of a `nav_msgs/Odometry`; None for bytes that are none."""
     try:
-        reader = _Reader(data, ros_version)
-        time_s, frame = reader.stamped()
+        reader = MessageReader(data, ros_version)
+        time_s, frame = _stamped(reader)
         reader.text()
-        x_m, y_m, z_m = reader.numbers("3d", 8)
+        x_m, y_m, z_m = reader.values("3d")
     except (struct.error, ValueError):
         return None
     return Pose(frame, x_m, y_m, z_m, time_s) if all(map(math.isfinite, (x_m, y_m, z_m))) else None
@@ -93,12 +69,11 @@ def transforms(data: bytes, ros_version: int) -> Tuple[Transform, ...]:
     """The transforms of a `tf2_msgs/TFMessage`; none for bytes that are none."""
     found = []
     try:
-        reader = _Reader(data, ros_version)
-        (count,) = reader.numbers("I", 4)
-        for _ in range(min(int(count), MAX_TRANSFORMS)):
-            time_s, parent = reader.stamped()
-            child = reader.text().lstrip("/")
-            values = reader.numbers("7d", 8)
+        reader = MessageReader(data, ros_version)
+        for _ in range(min(reader.number("I"), MAX_TRANSFORMS)):
+            time_s, parent = _stamped(reader)
+            child = _text(reader).lstrip("/")
+            values = reader.values("7d")
             if all(map(math.isfinite, values)):
                 x, y, z, qx, qy, qz, qw = values
                 found.append(Transform(parent, child, (x, y, z), (qx, qy, qz, qw), time_s))
