@@ -13,13 +13,3 @@ IpNetwork: TypeAlias = IPv4Network | IPv6Network
 def host_and_port(host: str, port: int) -> str:
     """`host:port`, with brackets around an IPv6 address (RFC 3986, 3.2.2)."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-
-
-def sorting_key(network: IpNetwork) -> tuple[int, int, int]:
-    """Sorts networks of both families: by family, first address and width."""
-    return network.version, int(network.network_address), network.prefixlen
-
-
-def end_of(network: IpNetwork) -> tuple[int, int]:
-    """Sorts networks of both families by their last addresses."""
-    return network.version, int(network.broadcast_address)

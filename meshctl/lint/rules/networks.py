@@ -7,11 +7,11 @@ from ipaddress import ip_network
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key
+from meshctl.lint.grouping import group_by_key, overlaps
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import meshes_of, networks, stations
 from meshctl.model import Backend, Fleet, Mesh
-from meshctl.model.ip import IpAddress, IpNetwork, end_of, sorting_key
+from meshctl.model.ip import IpAddress, IpNetwork
 
 # RFC 1918, RFC 6598 (carrier-grade NAT), and RFC 4193 (unique local IPv6)
 _PRIVATE = tuple(
@@ -49,14 +49,10 @@ _UNUSABLE = tuple(
     """,
 )
 def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # sorted by first address: a network overlaps either the widest network before it or none
-    widest: Mesh | None = None
-    for mesh in sorted(fleet.meshes.values(), key=lambda mesh: sorting_key(mesh.network)):
-        if widest is not None and mesh.network.overlaps(widest.network) and not _routed_as_one(mesh, widest):
-            message = f"overlaps {widest.network} of mesh {widest.name}"
-            yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(mesh.network))
-        if widest is None or end_of(mesh.network) > end_of(widest.network):
-            widest = mesh
+    for (mesh, network), (other, of_other) in overlaps((mesh, mesh.network) for mesh in fleet.meshes.values()):
+        if not _routed_as_one(mesh, other):
+            message = f"overlaps {of_other} of mesh {other.name}"
+            yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(network))
 
 
 def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:

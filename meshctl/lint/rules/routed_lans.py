@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
+from meshctl.lint.grouping import join_limited, overlaps
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.addresses import lan_address_path, meshes_of, networks
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Robot
-from meshctl.model.ip import IpNetwork, end_of, sorting_key
+from meshctl.model.ip import IpNetwork
 
 # the robot of the examples with a LAN of its own
 _ROUTED = """
@@ -36,15 +36,12 @@ def _routed(fleet: Fleet) -> Iterator[tuple[Robot, IpNetwork]]:
     passing=_ROUTED,
 )
 def lan_overlaps(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    # sorted by first address: a network overlaps either the widest network before it or none
-    widest: tuple[tuple[str, ...], IpNetwork] | None = None
-    for path, network in sorted(networks(fleet), key=lambda item: sorting_key(item[1])):
-        if widest is not None and network.overlaps(widest[1]) and "robots" in (path[0], widest[0][0]):
-            lan, other = ((path, network), widest) if path[0] == "robots" else (widest, (path, network))
-            owner = f"mesh {other[0][1]}" if other[0][0] == "meshes" else f"the LAN of {other[0][1]}"
-            yield Finding(lan[0], f"overlaps {other[1]} of {owner}", "a separate network", str(lan[1]))
-        if widest is None or end_of(network) > end_of(widest[1]):
-            widest = path, network
+    for entry, before in overlaps(networks(fleet)):
+        if "robots" not in (entry[0][0], before[0][0]):
+            continue
+        (path, network), (path_of_other, other) = (entry, before) if entry[0][0] == "robots" else (before, entry)
+        owner = f"mesh {path_of_other[1]}" if path_of_other[0] == "meshes" else f"the LAN of {path_of_other[1]}"
+        yield Finding(path, f"overlaps {other} of {owner}", "a separate network", str(network))
 
 
 @fleet_rule(
