@@ -91,11 +91,12 @@ class SqliteFile:
             try:
                 version = self._version()
                 self._check_owner()
-            except (sqlite3.Error, MeshctlError) as failed:
+            except MeshctlError:
+                self._database.close()
+                raise
+            except sqlite3.Error as failed:
                 error = failed
                 self._database.close()
-                if isinstance(failed, MeshctlError):
-                    raise
                 continue
             if version == self._schema.version:
                 return

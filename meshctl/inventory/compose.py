@@ -61,7 +61,7 @@ def _composed(source: Source, loader: type[yaml.SafeLoader]) -> _Composer:
     """Raises _LibyamlTooDeep."""
     composer = _Composer(source.file)
     try:
-        for event in yaml.parse(source.text, Loader=loader):
+        for event in yaml_events(source.text, loader):
             if not composer.handle(event):
                 break
     except yaml.MarkedYAMLError as reason:
@@ -73,9 +73,9 @@ def _composed(source: Source, loader: type[yaml.SafeLoader]) -> _Composer:
     return composer
 
 
-def yaml_events(text: str) -> Iterator[yaml.Event]:
+def yaml_events(text: str, loader: type[yaml.SafeLoader] = LOADER) -> Iterator[yaml.Event]:
     """Parse with libyaml if there is one. Raises YAMLError."""
-    events: Iterator[yaml.Event] = yaml.parse(text, Loader=LOADER)
+    events: Iterator[yaml.Event] = yaml.parse(text, Loader=loader)
     return events
 
 

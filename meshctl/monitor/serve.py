@@ -15,6 +15,7 @@ import uvicorn
 from starlette.applications import Starlette
 
 from meshctl.errors import InputError
+from meshctl.model.ip import host_and_port
 from meshctl.monitor.feed import Feed
 
 # Streams end at once when the server stops; a download gets this long.
@@ -68,8 +69,7 @@ def address_of(listening: socket.socket, token: str, *, is_tls: bool) -> str:
     host, port = listening.getsockname()[:2]
     if ipaddress.ip_address(host).is_unspecified:
         host = socket.gethostname()
-    shown = f"[{host}]" if ":" in host else host
-    return f"{'https' if is_tls else 'http'}://{shown}:{port}/{f'#token={token}' if token else ''}"
+    return f"{'https' if is_tls else 'http'}://{host_and_port(host, port)}/{f'#token={token}' if token else ''}"
 
 
 class _Server(uvicorn.Server):
