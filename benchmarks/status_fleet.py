@@ -104,7 +104,7 @@ class Devices:
         return ("base", *(f"n{number:03}" for number in range(1, self.radios)))
 
     @property
-    def crew(self) -> tuple[str, ...]:
+    def team(self) -> tuple[str, ...]:
         return tuple(f"robot{number:02}" for number in range(1, self.robots + 1))
 
     def address(self, number: int) -> str:
@@ -130,7 +130,7 @@ class Devices:
         self._write_computers()
         trust = TrustStore(self.directory / "known_hosts")
         host_key = parse_key((self.directory / "host_key.pub").read_text())
-        for name in (*self.names, *(f"robot.{robot}" for robot in self.crew)):
+        for name in (*self.names, *(f"robot.{robot}" for robot in self.team)):
             trust.replace(name, host_key)
         self._listen()
 
@@ -153,7 +153,7 @@ class Devices:
         )
         robots = "".join(
             f"  {robot}: {{computer: {{address: {COMPUTERS}.{number}/16, ssh: {{user: root, key_files: [key]}}}}}}\n"
-            for number, robot in enumerate(self.crew, 1)
+            for number, robot in enumerate(self.team, 1)
         )
         topics = "".join(f"  {name}: {text}\n" for name, text in TOPICS.items())
         key = (self.directory / "key.pub").read_text().strip()
@@ -186,7 +186,7 @@ class Devices:
         for path, text in programs.items():
             path.write_text(text)
             path.chmod(0o755)
-        for number, robot in enumerate(self.crew, 1):
+        for number, robot in enumerate(self.team, 1):
             for word, reply in (("status", self._status(robot)), ("topics", {"topics": self._topics()})):
                 (root / "opt/stand-in" / f"{COMPUTERS}.{number}.{word}.json").write_text(json.dumps(reply))
 
@@ -201,7 +201,7 @@ class Devices:
                 "window_packets": 8.0, "in_flight_packets": 1, "retransmitted_packets": 12, "queues": queues,
                 "outbox_messages": 0, "outbox_bytes": 0,
             }
-            for number, other in enumerate(self.crew, 1)
+            for number, other in enumerate(self.team, 1)
             if other != robot
         ]  # fmt: skip
         return {

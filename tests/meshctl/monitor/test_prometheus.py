@@ -25,7 +25,7 @@ from meshctl.monitor.prometheus import alert_rules, dashboard, file_sd
 from meshctl.status import preflight
 from meshctl.status.json_output import as_json
 from tests.meshctl.monitor.prometheus_program import Prometheus, free_tcp_port, promtool, running
-from tests.meshctl.status.fleets import CREW, HEALTHY, INVENTORY, NOW, peer, queue, robot_facts, status_of, trio
+from tests.meshctl.status.fleets import HEALTHY, INVENTORY, NOW, TEAM, peer, queue, robot_facts, status_of, trio
 from tests.udp_mesh.daemon.processes import two_daemons
 from tests.waiting import until
 
@@ -53,7 +53,7 @@ def frame_with_everything(fleet: Fleet) -> Frame:
     )
     station = peer("station", outbox_messages=3, capacity_bits_per_s=4e6)
     facts = robot_facts("rover", station, queues=(queue(0, 2, 5.5), queue(5, 9, 1.0)))
-    status = as_json(status_of(fleet, {**HEALTHY, "rover": rover}, {**CREW, "rover": facts}))
+    status = as_json(status_of(fleet, {**HEALTHY, "rover": rover}, {**TEAM, "rover": facts}))
     status["nodes"][1]["neighbours"][0]["name"] = HOSTILE
     checks = preflight(fleet, status_of(fleet))
     return frame_of(status, time_s=NOW, checks=checks, airtime=Airtime(900.0, 0.01, 0.03, 5.0))

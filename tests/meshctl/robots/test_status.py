@@ -39,9 +39,9 @@ def test_a_deployed_team_is_healthy_and_a_stopped_daemon_is_reported(fleet: Robo
     before = document(fleet, "status", "--role", "computer")
     assert [serious(robot) for robot in before["robots"]] == [["not-installed"]] * 2
     fleet.deploy()
-    crew = document(fleet, "status", "--role", "computer")
-    assert crew["exit"] == 0, crew
-    alpha = crew["robots"][0]
+    team = document(fleet, "status", "--role", "computer")
+    assert team["exit"] == 0, team
+    alpha = team["robots"][0]
     assert alpha["daemon"]["drift"] == []
     assert [peer["name"] for peer in alpha["peers"] if peer["online"]] == ["bravo"]
     assert [topic["name"] for topic in alpha["topics"]] == ["estop", "status"]

@@ -148,7 +148,7 @@ def robot_facts(robot: str, *peers: PeerFacts, **other: Any) -> RobotFacts:
     return replace(made, **other)
 
 
-CREW = {"station": robot_facts("station", peer("rover")), "rover": robot_facts("rover", peer("station"))}
+TEAM = {"station": robot_facts("station", peer("rover")), "rover": robot_facts("rover", peer("station"))}
 
 
 def queue(priority: int, messages: int, oldest_s: float, size: int = 1000) -> QueueFacts:
@@ -158,7 +158,7 @@ def queue(priority: int, messages: int, oldest_s: float, size: int = 1000) -> Qu
 def look_of(
     fleet: Fleet,
     observations: Mapping[str, Observation] = HEALTHY,
-    robots: Mapping[str, RobotFacts] = CREW,
+    robots: Mapping[str, RobotFacts] = TEAM,
     *,
     plans: Mapping[str, NodePlan] | None = None,
     known: Mapping[str, LastKnown] | None = None,
@@ -185,7 +185,7 @@ def look_of(
 def status_of(
     fleet: Fleet,
     observations: Mapping[str, Observation] = HEALTHY,
-    robots: Mapping[str, RobotFacts] = CREW,
+    robots: Mapping[str, RobotFacts] = TEAM,
     **other: Any,
 ) -> FleetStatus:
     """The status of the whole fleet."""

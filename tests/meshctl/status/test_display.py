@@ -27,7 +27,7 @@ from meshctl.status.rows import COLUMNS, TableCell
 from meshctl.status.table import layout, table_lines
 from meshctl.status.text import preflight_text, summary_lines, text, topic_lines
 from meshctl.status.values import NoAnswer
-from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, look_of, status_of
+from tests.meshctl.status.fleets import HEALTHY, NOW, TEAM, look_of, status_of
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = (ROOT / "docs/status.md").read_text()
@@ -36,11 +36,11 @@ PAGE = (ROOT / "docs/status.md").read_text()
 def broken(fleet: Fleet) -> FleetStatus:
     """Some of everything."""
     plan = NodePlan("b01", Verdict.CHANGE, files=(FileChange("etc/config/wireless", "changed", ""),))
-    rover = replace(CREW["rover"], peers=(), drift=("differs from the inventory: etc/udp-mesh.toml",))
+    rover = replace(TEAM["rover"], peers=(), drift=("differs from the inventory: etc/udp-mesh.toml",))
     return status_of(
         fleet,
         {name: HEALTHY[name] for name in ("base", "b01")},
-        {"rover": rover, "station": CREW["station"]},
+        {"rover": rover, "station": TEAM["station"]},
         plans={"b01": plan},
         known={
             "rover": LastKnown("rover", NOW - 600, {"version": "23.05.5", "hops": "2", "via": "b01", "heard": "b01"})

@@ -17,14 +17,14 @@ from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
 from meshctl.status.values import Alarm, Level
-from tests.meshctl.status.fleets import CREW, HEALTHY, NOW, robot_facts, seen, status_of
+from tests.meshctl.status.fleets import HEALTHY, NOW, TEAM, robot_facts, seen, status_of
 
 KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
 DELIVERED = Pings({("station", "rover"): 0.01, ("rover", "station"): 0.02})
 
 
 def checks(
-    fleet: Fleet, robots: Mapping[str, RobotFacts] = CREW, pings: Pings | None = DELIVERED, **other: Any
+    fleet: Fleet, robots: Mapping[str, RobotFacts] = TEAM, pings: Pings | None = DELIVERED, **other: Any
 ) -> dict[str, Check]:
     status = status_of(fleet, robots=robots, **{"known": KNOWN, **other})
     return {check.name: check for check in preflight(fleet, status, pings)}
@@ -70,8 +70,8 @@ def test_a_robot_whose_radio_is_silent_is_a_no_go(fleet: Fleet) -> None:
 
 
 def test_a_robot_whose_daemon_is_down_is_a_no_go_with_the_reason(fleet: Fleet) -> None:
-    rover = replace(CREW["rover"], service=ServiceFacts("failed", "enabled", 0, "exit-code"), status={}, peers=())
-    found = checks(fleet, {**CREW, "rover": rover}, Pings())
+    rover = replace(TEAM["rover"], service=ServiceFacts("failed", "enabled", 0, "exit-code"), status={}, peers=())
+    found = checks(fleet, {**TEAM, "rover": rover}, Pings())
     assert "rover: its daemon is failed (exit-code)" in found["daemons"].reason
     assert {"daemons", "delivery"} <= set(stopped(found))
 
@@ -92,7 +92,7 @@ def test_a_radio_with_no_path_or_a_zero_quality_path_is_a_no_go(fleet: Fleet) ->
 
 
 def test_robots_that_do_not_hear_each_other_are_a_no_go(fleet: Fleet) -> None:
-    found = checks(fleet, {**CREW, "station": robot_facts("station")})
+    found = checks(fleet, {**TEAM, "station": robot_facts("station")})
     assert found["peers"].reason == "station does not hear rover"
 
 
@@ -103,7 +103,7 @@ def test_an_undelivered_test_message_is_a_no_go(fleet: Fleet) -> None:
 
 
 def test_an_urgent_topic_that_is_not_declared_is_a_no_go(fleet: Fleet) -> None:
-    found = checks(fleet, {**CREW, "rover": replace(CREW["rover"], topics=CREW["rover"].topics[1:])})
+    found = checks(fleet, {**TEAM, "rover": replace(TEAM["rover"], topics=TEAM["rover"].topics[1:])})
     assert found["urgent topics"].reason == "rover: estop is not declared"
 
 
@@ -127,9 +127,9 @@ def test_a_check_with_partial_answers_shows_their_number(fleet: Fleet) -> None:
 
 
 def test_a_busy_computer_is_a_note_and_does_not_block(fleet: Fleet) -> None:
-    rover = CREW["rover"]
+    rover = TEAM["rover"]
     busy = replace(rover, computer=replace(rover.computer, load=(40.0, 9.0, 3.0)))
-    assert stopped(checks(fleet, {**CREW, "rover": busy})) == []
+    assert stopped(checks(fleet, {**TEAM, "rover": busy})) == []
 
 
 def test_unqueried_robots_are_shown_as_not_checked(fleet: Fleet) -> None:
@@ -167,7 +167,7 @@ def test_pings_are_parsed_by_line_and_missing_results_are_failures() -> None:
 
 def selected(fleet: Fleet, *words: str) -> tuple[Check, ...]:
     """The checks of what `words` select, while rover is unreachable and b02 was never seen."""
-    whole = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, CREW, known={})
+    whole = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, TEAM, known={})
     chosen = select_devices(fleet, words, lambda path: path).devices_of(whole)
     left_out = [one.name for one in whole if one not in tuple(chosen)]
     return preflight(fleet, chosen, DELIVERED, left_out)

@@ -19,14 +19,14 @@ from meshctl.status.last_known import facts_to_record, merge_by_device
 from meshctl.status.text import text
 from meshctl.status.topics import limit_s
 from meshctl.status.values import NoAnswer
-from tests.meshctl.status.fleets import CREW, NOW, alarms, peer, queue, robot_facts, robot_health, status_of
+from tests.meshctl.status.fleets import NOW, TEAM, alarms, peer, queue, robot_facts, robot_health, status_of
 
 DOWN = NoAnswer("no answer to connect within 5 s")
-COMPUTER = CREW["rover"].computer
+COMPUTER = TEAM["rover"].computer
 
 
 def with_rover(**change: Any) -> dict[str, RobotFacts]:
-    return {**CREW, "rover": replace(CREW["rover"], **change)}
+    return {**TEAM, "rover": replace(TEAM["rover"], **change)}
 
 
 def test_a_healthy_team_is_ok_and_a_shelved_robot_is_off(fleet: Fleet) -> None:
@@ -36,7 +36,7 @@ def test_a_healthy_team_is_ok_and_a_shelved_robot_is_off(fleet: Fleet) -> None:
 
 
 def test_an_unreachable_robot_heard_by_its_peers_is_reported_as_such(fleet: Fleet) -> None:
-    status = status_of(fleet, robots={"station": CREW["station"]}, silent_robots={"rover": DOWN})
+    status = status_of(fleet, robots={"station": TEAM["station"]}, silent_robots={"rover": DOWN})
     assert robot_health(status)["rover"] is Health.UNREACHABLE
     assert (
         "station hears it (0.5 s ago): its daemon is heard" in alarms(status, "rover", robot=True)["unreachable"].text
@@ -94,10 +94,10 @@ def test_normal_or_unreported_values_raise_no_alarm(fleet: Fleet, change: dict[s
 
 
 def test_the_most_common_version_is_the_expected_one(fleet: Fleet) -> None:
-    crew = {
+    team = {
         name: robot_facts(name, version=version) for name, version in (("station", "2"), ("rover", "2"), ("shelf", "1"))
     }
-    status = status_of(fleet, robots=crew)
+    status = status_of(fleet, robots=team)
     assert "version" not in alarms(status, "rover", robot=True)
     assert "most others 2" in alarms(status, "shelf", robot=True)["version"].text
 
@@ -124,9 +124,9 @@ def test_restarts_count_since_the_last_look(fleet: Fleet) -> None:
 
 
 def topics(robot: str, **change: TopicFacts) -> dict[str, RobotFacts]:
-    """The crew, with one robot's topics changed by name."""
-    mine = tuple(change.get(topic.name, topic) for topic in CREW[robot].topics if topic.name not in change)
-    return {**CREW, robot: replace(CREW[robot], topics=(*mine, *change.values()))}
+    """The team, with one robot's topics changed by name."""
+    mine = tuple(change.get(topic.name, topic) for topic in TEAM[robot].topics if topic.name not in change)
+    return {**TEAM, robot: replace(TEAM[robot], topics=(*mine, *change.values()))}
 
 
 def test_the_silence_limit_of_a_topic_depends_on_its_rate_and_deadline(fleet: Fleet) -> None:
@@ -135,35 +135,35 @@ def test_the_silence_limit_of_a_topic_depends_on_its_rate_and_deadline(fleet: Fl
 
 
 def test_a_topic_not_sent_for_too_long_is_reported_as_silent(fleet: Fleet) -> None:
-    crew = topics("rover", telemetry=TopicFacts("telemetry", 3, 10, 10, 40.0, 0.3))
-    alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-silent"]
+    team = topics("rover", telemetry=TopicFacts("telemetry", 3, 10, 10, 40.0, 0.3))
+    alarm = alarms(status_of(fleet, robots=team), "rover", robot=True)["topic-silent"]
     assert alarm.text == "telemetry: nothing sent for 40 s"
 
 
 def test_a_topic_that_does_not_arrive_is_reported_with_its_senders(fleet: Fleet) -> None:
-    crew = topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 90.0))
-    alarm = alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-not-arriving"]
+    team = topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 90.0))
+    alarm = alarms(status_of(fleet, robots=team), "rover", robot=True)["topic-not-arriving"]
     assert (alarm.level, alarm.text) == (Level.ERROR, "estop: nothing received for 90 s, although station sends")
 
 
 def test_receivers_are_not_reported_while_the_source_is_silent(fleet: Fleet) -> None:
-    crew = topics("station", estop=TopicFacts("estop", 0, 10, 0, 300.0, None))
-    crew = {**crew, "rover": topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 300.0))["rover"]}
-    status = status_of(fleet, robots=crew)
+    team = topics("station", estop=TopicFacts("estop", 0, 10, 0, 300.0, None))
+    team = {**team, "rover": topics("rover", estop=TopicFacts("estop", 0, 0, 10, None, 300.0))["rover"]}
+    status = status_of(fleet, robots=team)
     assert "topic-silent" in alarms(status, "station", robot=True)
     assert alarms(status, "rover", robot=True) == {}
 
 
 def test_a_recently_started_daemon_is_not_yet_silent(fleet: Fleet) -> None:
-    crew = with_rover(
+    team = with_rover(
         daemon_uptime_s=4.0, topics=(TopicFacts("estop", 0), TopicFacts("commands", 1), TopicFacts("telemetry", 3))
     )
-    assert alarms(status_of(fleet, robots=crew), "rover", robot=True) == {}
+    assert alarms(status_of(fleet, robots=team), "rover", robot=True) == {}
 
 
 def test_an_urgent_topic_missing_from_a_daemon_is_an_error(fleet: Fleet) -> None:
-    crew = with_rover(topics=CREW["rover"].topics[1:])
-    assert alarms(status_of(fleet, robots=crew), "rover", robot=True)["topic-undeclared"].level is Level.ERROR
+    team = with_rover(topics=TEAM["rover"].topics[1:])
+    assert alarms(status_of(fleet, robots=team), "rover", robot=True)["topic-undeclared"].level is Level.ERROR
     other = topics("rover", telemetry=TopicFacts("telemetry", 7, 10, 10, 0.1, 0.1))
     alarm = alarms(status_of(fleet, robots=other), "rover", robot=True)["topic-undeclared"]
     assert (alarm.level, alarm.text) == (Level.WARNING, "telemetry: expected priority 3, found 7")

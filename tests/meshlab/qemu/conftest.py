@@ -1,5 +1,5 @@
 """One QEMU machine for the tests of this folder, provisioned from factory state to a working mesh once; the tests of
-`crew` have their own, which is stopped before this one starts.
+`team` have their own, which is stopped before this one starts.
 
 Tests that change the fleet leave it in the state of its inventory. scripts/setup-lab installs QEMU when it is missing:
 no test is skipped.

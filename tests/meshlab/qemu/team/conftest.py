@@ -16,7 +16,7 @@ KEYS = {"main": "a word that all of them know", "fast": "and another one for fiv
 
 
 @dataclass(frozen=True, slots=True)
-class Crew(Lab):
+class Team(Lab):
     """The running fleet; `spare` stays on the bench, factory-fresh."""
 
     NODES = FIELDED
@@ -41,7 +41,7 @@ class Crew(Lab):
 
 
 @pytest.fixture(scope="package")
-def crew(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Crew]:
+def team(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Team]:
     """The nodes of the field, bootstrapped on the bench and unplugged: they are reached only over the mesh."""
-    with field_lab(Crew, INVENTORY, tmp_path_factory.mktemp("crew"), before=Crew.write_keys) as made:
+    with field_lab(Team, INVENTORY, tmp_path_factory.mktemp("team"), before=Team.write_keys) as made:
         yield made

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.meshlab.qemu.conftest import until
-from tests.meshlab.qemu.crew.conftest import FIELDED, Crew
-from tests.meshlab.qemu.crew.test_encrypted import all_authorized, keys
+from tests.meshlab.qemu.team.conftest import FIELDED, Team
+from tests.meshlab.qemu.team.test_encrypted import all_authorized, keys
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
@@ -28,106 +28,106 @@ RATE_OF_MAIN = """\
     # no robot"""
 
 
-def cells(crew: Crew) -> set[str]:
+def cells(team: Team) -> set[str]:
     """The cells of the main mesh that the kernels' radios are in: frequency and BSSID."""
     command = "iw dev mesh0 link | sed -n -e 's/^Joined IBSS \\([^ ]*\\).*/\\1/p' -e 's/^.freq: //p'"
-    return {" ".join(crew.on(name, command).split()) for name in FIELDED}
+    return {" ".join(team.on(name, command).split()) for name in FIELDED}
 
 
-def test_channel_bssid_and_key_of_a_mesh_change_over_the_mesh_itself(crew: Crew) -> None:
-    assert cells(crew) == {"02:ca:fe:00:00:21 2437"}
-    crew.edit("channel: 6\n", "channel: 11\n")
-    crew.edit("02:ca:fe:00:00:21", "02:ca:fe:00:00:31")
-    crew.write_keys(main="the word for another channel")
-    last = crew.provision(*FIELDED)[-1]
+def test_channel_bssid_and_key_of_a_mesh_change_over_the_mesh_itself(team: Team) -> None:
+    assert cells(team) == {"02:ca:fe:00:00:21 2437"}
+    team.edit("channel: 6\n", "channel: 11\n")
+    team.edit("02:ca:fe:00:00:21", "02:ca:fe:00:00:31")
+    team.write_keys(main="the word for another channel")
+    last = team.provision(*FIELDED)[-1]
     assert {event["outcome"]["result"] for event in last if event["event"] == "finished"} == {"done"}
-    assert cells(crew) == {"02:ca:fe:00:00:31 2462"}
-    assert keys(crew)["main"] == {"the word for another channel"}
-    crew.settle()
-    until(lambda: all_authorized(crew), "every neighbor to be authorized with the new key")
+    assert cells(team) == {"02:ca:fe:00:00:31 2462"}
+    assert keys(team)["main"] == {"the word for another channel"}
+    team.settle()
+    until(lambda: all_authorized(team), "every neighbor to be authorized with the new key")
 
 
-def test_the_whole_mesh_rolls_back_when_some_nodes_do_not_come_back(crew: Crew) -> None:
-    before = cells(crew)
-    crew.edit("channel: 11\n", "channel: 1\n")
-    crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
+def test_the_whole_mesh_rolls_back_when_some_nodes_do_not_come_back(team: Team) -> None:
+    before = cells(team)
+    team.edit("channel: 11\n", "channel: 1\n")
+    team.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORT_WINDOW_S}")
     # at the moment of the change b02 loses its links, and with it the Husky behind it
-    crew.fleet.inject_fault("b02", "sever@reload_config")
+    team.fleet.inject_fault("b02", "sever@reload_config")
 
     def let_it_be_heard() -> None:
-        crew.fleet.repair("b02")
-        crew.node("b02").plug(False)
+        team.fleet.repair("b02")
+        team.node("b02").plug(False)
 
     on_line = ("rolling back", let_it_be_heard)
-    done = crew.meshctl("provision", "--yes", "--json", *FIELDED, expect=1, on_line=on_line)
+    done = team.meshctl("provision", "--yes", "--json", *FIELDED, expect=1, on_line=on_line)
     results = {event["node"]: event["outcome"]["result"] for event in done.events if event["event"] == "finished"}
     assert results.keys() == set(FIELDED)
     # on a starved host a node may be seen too late, although it is back
     assert set(results.values()) <= {"rolled back", "uncertain"}
-    until(lambda: cells(crew) == before, "every node to be in the old cell again")
-    crew.edit("channel: 1\n", "channel: 11\n")
-    crew.edit(f"confirm_window_s: &window {SHORT_WINDOW_S}", "confirm_window_s: &window 600")
-    crew.settle()
-    until(lambda: all_authorized(crew), "every neighbor to be authorized again")
-    until(lambda: crew.meshctl("provision", *FIELDED, "--check", expect=None).status == 0, "every node to be as it was")
+    until(lambda: cells(team) == before, "every node to be in the old cell again")
+    team.edit("channel: 1\n", "channel: 11\n")
+    team.edit(f"confirm_window_s: &window {SHORT_WINDOW_S}", "confirm_window_s: &window 600")
+    team.settle()
+    until(lambda: all_authorized(team), "every neighbor to be authorized again")
+    until(lambda: team.meshctl("provision", *FIELDED, "--check", expect=None).status == 0, "every node to be as it was")
 
 
-def test_farthest_nodes_are_provisioned_first_and_restarted_radios_are_heard_again(crew: Crew) -> None:
+def test_farthest_nodes_are_provisioned_first_and_restarted_radios_are_heard_again(team: Team) -> None:
     # the broadcast rate restarts a radio on every release; transmit power does not
-    crew.edit(RATE_OF_MAIN.format(12000), RATE_OF_MAIN.format(6000))
-    far_first = sorted(FIELDED, key=lambda name: -crew.hops()[name])
+    team.edit(RATE_OF_MAIN.format(12000), RATE_OF_MAIN.format(6000))
+    far_first = sorted(FIELDED, key=lambda name: -team.hops()[name])
     assert far_first == ["husky", "b02", "b01", "base"]
-    first, *_ = crew.provision(*FIELDED)
+    first, *_ = team.provision(*FIELDED)
     begun = [event["node"] for event in first if event["event"] == "started"]
     assert begun == far_first[: len(begun)]
     steps = [event["text"] for event in first if event["event"] == "step" and event["node"] == "b02"]
     assert steps.index("watch neighbor station entries") < steps.index("apply")
-    assert {crew.on(name, "uci get wireless.mesh0.mcast_rate").strip() for name in FIELDED} == {"6000"}
-    crew.settle()
+    assert {team.on(name, "uci get wireless.mesh0.mcast_rate").strip() for name in FIELDED} == {"6000"}
+    team.settle()
     # without other traffic: unicast frames from a node to each of its neighbors are accepted
     for name, addresses in (("b01", ("10.42.0.1", "10.42.0.102")), ("b02", ("10.42.0.101", "10.42.0.11"))):
         for address in addresses:
-            until(lambda: is_answered(crew, name, address), f"an answer from {address} to {name}")  # noqa: B023
-    until(lambda: not _unanswered_by_old_entries(crew, "b02"), "every neighbor to have deleted a stale entry")
+            until(lambda: is_answered(team, name, address), f"an answer from {address} to {name}")  # noqa: B023
+    until(lambda: not _unanswered_by_old_entries(team, "b02"), "every neighbor to have deleted a stale entry")
 
 
-def is_answered(crew: Crew, node: str, address: str) -> bool:
-    return "1 packets received" in crew.on(node, f"ping -c 1 -W 5 {address} || true")
+def is_answered(team: Team, node: str, address: str) -> bool:
+    return "1 packets received" in team.on(node, f"ping -c 1 -W 5 {address} || true")
 
 
-def _unanswered_by_old_entries(crew: Crew, name: str) -> list[str]:
+def _unanswered_by_old_entries(team: Team, name: str) -> list[str]:
     """The neighbors whose entry of the node's radio is older than the node's own entries, and that get no echo reply.
 
     An old entry that drops nothing is kept on purpose: without block acknowledgement it has no window to be outside of,
     and to delete it could cut off the other direction.
     """
-    mac = next(mac for mac, node in crew.names().items() if node == name)
+    mac = next(mac for mac, node in team.names().items() if node == name)
     command = "iw dev mesh0 station {what} | sed -n 's/.*connected time:[^0-9]*\\([0-9]*\\).*/\\1/p'"
-    own = max(int(age) for age in crew.on(name, command.format(what="dump")).split())
-    ages = {other: crew.on(other, command.format(what=f"get {mac}")).split() for other in crew.neighbors(name)}
+    own = max(int(age) for age in team.on(name, command.format(what="dump")).split())
+    ages = {other: team.on(other, command.format(what=f"get {mac}")).split() for other in team.neighbors(name)}
     old = [other for other, age in ages.items() if not age or int(age[0]) > own + SLACK_S]
     return [
         other
         for other in old
-        if " bytes from " not in crew.on(other, f"batctl meshif bat0 ping -c 3 -t 1 {mac} || true")
+        if " bytes from " not in team.on(other, f"batctl meshif bat0 ping -c 3 -t 1 {mac} || true")
     ]
 
 
-def test_a_node_rolls_back_a_configuration_that_isolates_it(crew: Crew, tmp_path: Path) -> None:
-    before = cells(crew)
-    crew.meshctl("backup", "b01", "--out", str(tmp_path))
+def test_a_node_rolls_back_a_configuration_that_isolates_it(team: Team, tmp_path: Path) -> None:
+    before = cells(team)
+    team.meshctl("backup", "b01", "--out", str(tmp_path))
     (kept,) = tmp_path.glob("b01-*.tgz")
     bad = tmp_path / "bad.tgz"
     bad.write_bytes(with_other_channel(kept.read_bytes(), 1))
-    crew.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORTER_WINDOW_S}")
-    done = crew.meshctl("restore", "b01", str(bad), "--yes", expect=1)
-    crew.edit(f"confirm_window_s: &window {SHORTER_WINDOW_S}", "confirm_window_s: &window 600")
+    team.edit("confirm_window_s: &window 600", f"confirm_window_s: &window {SHORTER_WINDOW_S}")
+    done = team.meshctl("restore", "b01", str(bad), "--yes", expect=1)
+    team.edit(f"confirm_window_s: &window {SHORTER_WINDOW_S}", "confirm_window_s: &window 600")
     # on a starved host it may not be seen in time, although it is back
     assert "rolled back" in done.text + done.errors or "uncertain" in done.text + done.errors
-    until(lambda: cells(crew) == before, "the node to be in its cell again")
-    status = crew.on("b01", "meshctl-deadman status")
+    until(lambda: cells(team) == before, "the node to be in its cell again")
+    status = team.on("b01", "meshctl-deadman status")
     assert "last_outcome=restored last_reason=timeout" in status
-    crew.settle()
+    team.settle()
 
 
 def with_other_channel(archive: bytes, channel: int) -> bytes:
@@ -148,16 +148,16 @@ def with_other_channel(archive: bytes, channel: int) -> bytes:
     return out.getvalue()
 
 
-def test_a_power_cut_inside_the_window_leaves_the_old_configuration(crew: Crew) -> None:
+def test_a_power_cut_inside_the_window_leaves_the_old_configuration(team: Team) -> None:
     power = "uci get wireless.radio0.txpower"
-    before = crew.on("husky", power)
-    boot = crew.node("husky").boot_id
+    before = team.on("husky", power)
+    boot = team.node("husky").boot_id
     plain, changed = "husky: {groups: [twins],", "husky: {radios: {radio0: {tx_power_dbm: 15}}, groups: [twins],"
-    crew.edit(plain, changed)
-    crew.fleet.inject_fault("husky", "power-cut@reload_config")
-    crew.meshctl("provision", "--yes", "husky", expect=1)
-    crew.edit(changed, plain)
-    until(lambda: crew.node("husky").is_up() and crew.node("husky").boot_id != boot, "the node to boot")
-    until(lambda: crew.on("husky", power) == before, "its old configuration")
-    until(lambda: crew.neighbors("husky") == {"b02"}, "its radios to be in the mesh again")
-    crew.settle()
+    team.edit(plain, changed)
+    team.fleet.inject_fault("husky", "power-cut@reload_config")
+    team.meshctl("provision", "--yes", "husky", expect=1)
+    team.edit(changed, plain)
+    until(lambda: team.node("husky").is_up() and team.node("husky").boot_id != boot, "the node to boot")
+    until(lambda: team.on("husky", power) == before, "its old configuration")
+    until(lambda: team.neighbors("husky") == {"b02"}, "its radios to be in the mesh again")
+    team.settle()
