@@ -28,6 +28,8 @@ export class MeshCanvas {
     this.difference = null;
     this.pointers = new Map();
     this.isMetric = false;
+    // the ways of robots in a recording: [{name, points: [[time_s, x_m, y_m, is_online]]}]
+    this.tracks = [];
     this.pending = 0;
     this.frames = 0;
     this.readColors();
@@ -90,8 +92,9 @@ export class MeshCanvas {
   fit() {
     this.isFitted = true;
     if (this.points.size === 0 || !this.width) return;
-    const xs = [...this.points.values()].map((point) => point.x);
-    const ys = [...this.points.values()].map((point) => point.y);
+    const ways = this.isMetric ? this.tracks.flatMap((track) => track.points) : [];
+    const xs = [...this.points.values()].map((point) => point.x).concat(ways.map((at) => at[1]));
+    const ys = [...this.points.values()].map((point) => point.y).concat(ways.map((at) => -at[2]));
     const [left, right, top, bottom] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
     const room = this.room;
     const most = this.isMetric ? 40 : 1.25;
@@ -203,7 +206,7 @@ export class MeshCanvas {
       this.drawn.set(name, { x: from.x + (to.x - from.x) * eased, y: from.y + (to.y - from.y) * eased, isGuess: to.isGuess });
     }
     this.radius = this.#radius();
-    if (this.isMetric) this.#grid(); else this.#columns();
+    if (this.isMetric) { this.#grid(); this.#ways(); } else this.#columns();
     const path = this.selected === null ? [] : pathOf(this.view, this.selected);
     const onPath = new Set(path);
     this.#paths(onPath);
@@ -251,6 +254,28 @@ export class MeshCanvas {
     c.moveTo(right - px, 26); c.lineTo(right - px, 34); c.lineTo(right, 34); c.lineTo(right, 26);
     c.stroke();
     drawText(c, `${step} m`, right - px / 2, 20, { size: 14, color: colors["--muted"], align: "center" });
+  }
+
+  // Where robots have been up to the shown moment: a line where they were online, dotted where they were not.
+  #ways() {
+    const { context: c, colors, camera } = this;
+    c.globalAlpha = 0.6;
+    for (const { points } of this.tracks) {
+      for (const isOnline of [false, true]) {
+        c.strokeStyle = isOnline ? colors["--accent"] : colors["--stale"];
+        c.lineWidth = isOnline ? 3 : 2;
+        c.setLineDash(isOnline ? [] : [2, 5]);
+        c.beginPath();
+        for (let i = 1; i < points.length && points[i][0] <= this.view.time_s; i += 1) {
+          if (points[i][3] !== isOnline) continue;
+          c.moveTo(points[i - 1][1] * camera.scale + camera.x, -points[i - 1][2] * camera.scale + camera.y);
+          c.lineTo(points[i][1] * camera.scale + camera.x, -points[i][2] * camera.scale + camera.y);
+        }
+        c.stroke();
+      }
+    }
+    c.setLineDash([]);
+    c.globalAlpha = 1;
   }
 
   #columns() {

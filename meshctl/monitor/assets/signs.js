@@ -54,6 +54,8 @@ export function drawSample(canvas, kind, colors) {
   const line = (color, width, dash = []) => { c.strokeStyle = color; c.lineWidth = width; c.setLineDash(dash); c.beginPath(); c.moveTo(0, 8); c.lineTo(30, 8); c.stroke(); };
   if (kind in LINK) line(colors[LINK[kind].color], LINK[kind].width, kind === "stale" ? [2, 5] : []);
   else if (kind === "one-way") line(colors["--text"], 3, [9, 5]);
+  else if (kind === "track") line(colors["--accent"], 3);
+  else if (kind === "lost-track") line(colors["--stale"], 2, [2, 4]);
   else if (kind === "path") { c.globalAlpha = 0.35; line(colors["--path"], 11); }
   else if (kind === "cut") { c.strokeStyle = colors["--cut"]; c.lineWidth = 2.5; c.beginPath(); c.arc(15, 8, 6.5, 0, 2 * Math.PI); c.stroke(); }
   else { shape(c, kind, 15, 8, 5.5); c.fillStyle = colors["--text"]; c.fill(); }
