@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from meshctl.monitor.frame import Frame, links_of
@@ -18,8 +18,11 @@ def frames_of(robots: Sequence[RecordedRobot], fleet: str = "recording", limit: 
     """Frames of recordings alone. Robots are drawn as devices, with the peers that they hear as links; a robot that
     others saw alone is one, too."""
     known = joined_by_name(robots)
-    for name in sorted({name for robot in robots for name in robot.peer_names} - set(known)):
+    peers = {name for robot in robots for name in robot.peer_names}
+    for name in sorted(peers - set(known)):
         known[name] = RecordedRobot(name)
+    # what has places and runs no daemon
+    beacons = frozenset(name for name, robot in known.items() if not robot.times_s and name not in peers)
     sampled_s = [time_s for robot in known.values() for time_s in robot.times_s]
     step_s = STEP_S
     if sampled_s:
@@ -31,13 +34,14 @@ def frames_of(robots: Sequence[RecordedRobot], fleet: str = "recording", limit: 
         places = {
             name: place for name, robot in known.items() if (place := robot.place_at(time_s + step_s / 2)) is not None
         }
-        yield _frame(time_s, fleet, list(known), documents, places)
+        yield _frame(time_s, fleet, list(known), beacons, documents, places)
 
 
 def _frame(
     time_s: float,
     fleet: str,
     names: Sequence[str],
+    beacons: Collection[str],
     documents: Mapping[str, Mapping[str, Any]],
     places: Mapping[str, Mapping[str, Any]],
 ) -> Frame:
@@ -49,12 +53,19 @@ def _frame(
         "taken_s": time_s,
         "entry": base,
         "alarms": [],
-        "nodes": [_node(name, base, documents, unrecorded.get(name)) for name in names],
+        "nodes": [
+            _node(
+                name, "base" if name == base else "beacon" if name in beacons else "robot", base, documents, unrecorded
+            )
+            for name in names
+            if name not in beacons or name in places
+        ],
         "robots": [
             {**documents[name], "health": "ok", "answers": True, "age_s": 0.0}
             if name in documents
             else {"name": name, "radios": [name], "alarms": [], **unrecorded[name]}
             for name in names
+            if name not in beacons
         ],
     }
     return Frame.of(
@@ -85,7 +96,11 @@ def _unrecorded(name: str, documents: Mapping[str, Mapping[str, Any]]) -> dict[s
 
 
 def _node(
-    name: str, base: str | None, documents: Mapping[str, Mapping[str, Any]], unrecorded: Mapping[str, Any] | None
+    name: str,
+    role: str,
+    base: str | None,
+    documents: Mapping[str, Mapping[str, Any]],
+    unrecorded: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     peers = [] if name not in documents else [peer for peer in documents[name]["peers"] if peer["online"]]
     of_base = () if base is None else documents[base]["peers"]
@@ -96,11 +111,11 @@ def _node(
     hops = 0 if name == base else None if near is None else 1 if stated is None else int(stated)
     return {
         "name": name,
-        "role": "base" if name == base else "robot",
-        "robot": name,
+        "role": role,
+        "robot": None if role == "beacon" else name,
         "state": "deployed",
         "alarms": [],
-        **(unrecorded or {"health": "ok", "answers": True, "age_s": 0.0}),
+        **unrecorded.get(name, {"health": "ok", "answers": True, "age_s": 0.0}),
         "hops": hops,
         "via": base if hops == 1 else None,
         "quality": _quality(near) if hops == 1 and near is not None else None,

@@ -69,7 +69,7 @@ def _notes(recording: Recording) -> list[str]:
     total_mb = sum(item.size for item in recording.arrivals) / 1e6
     notes = [f"{recording.end_s:.0f} s, {len(recording.arrivals)} messages received, {total_mb:.1f} MB."]
     if recording.problems:
-        notes.append(f"{len(recording.problems)} lines are invalid and were ignored.")
+        notes.append(f"Invalid lines, which were ignored: {len(recording.problems)}.")
     if recording.missing_lines:
         notes.append(
             f"The disk did not keep up with the recording: {recording.missing_lines} lines are missing and not counted."

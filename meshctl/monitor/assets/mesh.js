@@ -3,13 +3,14 @@
 import { isKnown } from "./format.js";
 import { drawLabels } from "./labels.js";
 import { pathOf } from "./model.js";
-import { drawArrow, drawText, LINK, shape } from "./signs.js";
+import { drawArrow, drawText, HOLLOW, LINK, shape } from "./signs.js";
+import { drawTracks } from "./tracks.js";
 import { summaryOf, tipOf } from "./words.js";
 
 const MAX_RADIUS = 11;
 const MIN_RADIUS = 5;
-// Room for labels, the buttons above and the legend below.
-const MARGIN = { x: 90, top: 100, bottom: 84 };
+// Room for labels, and the buttons above.
+const MARGIN = { x: 90, top: 100 };
 const HIT_PX = 22;
 const MOVE_MS = 350;
 
@@ -28,7 +29,7 @@ export class MeshCanvas {
     this.difference = null;
     this.pointers = new Map();
     this.isMetric = false;
-    // the ways of robots in a recording: [{name, points: [[time_s, x_m, y_m, is_online]]}]
+    // of a recording: [{name, points: [[time_s, x_m, y_m, is_online]]}]
     this.tracks = [];
     this.pending = 0;
     this.frames = 0;
@@ -49,7 +50,10 @@ export class MeshCanvas {
     this.request();
   }
 
-  get room() { return { x: Math.max(50, this.width - 2 * MARGIN.x), y: Math.max(50, this.height - MARGIN.top - MARGIN.bottom) }; }
+  get room() { return { x: Math.max(50, this.width - 2 * MARGIN.x), y: Math.max(50, this.height - MARGIN.top - this.bottom) }; }
+
+  // Room for labels and the legend.
+  get bottom() { return (this.canvas.parentElement.querySelector(".legend")?.offsetHeight ?? 0) + 44; }
 
   get isPortrait() { return this.height > this.width * 1.1; }
 
@@ -206,7 +210,7 @@ export class MeshCanvas {
       this.drawn.set(name, { x: from.x + (to.x - from.x) * eased, y: from.y + (to.y - from.y) * eased, isGuess: to.isGuess });
     }
     this.radius = this.#radius();
-    if (this.isMetric) { this.#grid(); this.#ways(); } else this.#columns();
+    if (this.isMetric) { this.#grid(); drawTracks(c, colors, this.camera, this.tracks, this.view.time_s); } else this.#columns();
     const path = this.selected === null ? [] : pathOf(this.view, this.selected);
     const onPath = new Set(path);
     this.#paths(onPath);
@@ -254,28 +258,6 @@ export class MeshCanvas {
     c.moveTo(right - px, 26); c.lineTo(right - px, 34); c.lineTo(right, 34); c.lineTo(right, 26);
     c.stroke();
     drawText(c, `${step} m`, right - px / 2, 20, { size: 14, color: colors["--muted"], align: "center" });
-  }
-
-  // Where robots have been up to the shown moment: a line where they were online, dotted where they were not.
-  #ways() {
-    const { context: c, colors, camera } = this;
-    c.globalAlpha = 0.6;
-    for (const { points } of this.tracks) {
-      for (const isOnline of [false, true]) {
-        c.strokeStyle = isOnline ? colors["--accent"] : colors["--stale"];
-        c.lineWidth = isOnline ? 3 : 2;
-        c.setLineDash(isOnline ? [] : [2, 5]);
-        c.beginPath();
-        for (let i = 1; i < points.length && points[i][0] <= this.view.time_s; i += 1) {
-          if (points[i][3] !== isOnline) continue;
-          c.moveTo(points[i - 1][1] * camera.scale + camera.x, -points[i - 1][2] * camera.scale + camera.y);
-          c.lineTo(points[i][1] * camera.scale + camera.x, -points[i][2] * camera.scale + camera.y);
-        }
-        c.stroke();
-      }
-    }
-    c.setLineDash([]);
-    c.globalAlpha = 1;
   }
 
   #columns() {
@@ -340,6 +322,12 @@ export class MeshCanvas {
     c.beginPath();
     c.moveTo(a.x, a.y); c.lineTo(b.x, b.y);
     c.stroke();
+    if (style.isHollow && c.lineWidth >= 3) {
+      c.globalAlpha = 1;
+      c.strokeStyle = colors["--bg"];
+      c.lineWidth *= HOLLOW;
+      c.stroke();
+    }
     c.setLineDash([]);
     if (link.isOneWay) drawArrow(c, link.forward !== null ? a : b, link.forward !== null ? b : a, colors[style.color]);
     c.globalAlpha = 1;

@@ -2,7 +2,7 @@
 
 import { axisOf, Charts, paletteOf, spansChart } from "./charts.js";
 import { el } from "./dom.js";
-import { clockTime, duration, isKnown, shortNumber } from "./format.js";
+import { clockTime, isKnown, shortNumber } from "./format.js";
 
 const HISTOGRAM_HEIGHT = 150;
 // As in transport_recording.py: recordings alone do not say which node is the base.
@@ -56,7 +56,7 @@ const nameOf = (one) => (one.node === "" ? "an unnamed node" : one.node);
 // Charts and tables are of every line; the map has fewer moments.
 function momentsOf(meta) {
   const thinned = isKnown(meta.frames) && meta.frames < meta.recorded_frames ? `${meta.frames} of ${meta.recorded_frames} moments are in this file. ` : "";
-  return `${thinned}Map and robots show about one moment per ${duration(meta.interval_s)}; tables and charts count every line of the recording.`;
+  return `${thinned}Map and robots show about one moment per ${Math.max(1, Math.round(meta.interval_s))} s; tables and charts count every line of the recording.`;
 }
 
 function tableOf(table) {

@@ -118,10 +118,11 @@ def test_a_simulation_records_each_peer_in_a_line_of_its_own(tmp_path: Path) -> 
         {"t": 2.0, "kind": "conditions", "at": "base", "peers": [{"name": "spot1", "loss": 0.25, "hops": 2}]},
         {"t": 2.0, "kind": "conditions", "at": "base", "peers": [{"name": "spot2"}]},
         {"t": 2.0, "kind": "place", "at": "spot1", "x": 7.0, "y": 1.0},
+        {"t": 2.5, "kind": "place", "at": "beacon1", "x": 9.0, "y": 1.0},
         {"t": 4.0, "kind": "conditions", "at": "base", "peers": []},
     ]
-    second = next(
-        one for one in frames_of(tmp_path, written(tmp_path / "r.jsonl", head, *lines)) if one.time_s == 102.0
+    second, last = (
+        one for one in frames_of(tmp_path, written(tmp_path / "r.jsonl", head, *lines)) if one.time_s > 101.0
     )
     base = second.status["robots"][0]
     assert [(peer["name"], peer["online"]) for peer in base["peers"]] == [("spot1", True), ("spot2", False)]
@@ -133,6 +134,10 @@ def test_a_simulation_records_each_peer_in_a_line_of_its_own(tmp_path: Path) -> 
     (link,) = second.document["links"]
     assert (link["from"], link["quality"], link["age_s"]) == ("spot1", 0.75, None)
     assert second.document["positions"]["spot1"]["x_m"] == 7.0
+    # what has only a place is no robot
+    assert [(node["name"], node["role"]) for node in last.status["nodes"]][-1] == ("spot2", "robot")
+    assert ("beacon1", "beacon") in [(node["name"], node["role"]) for node in last.status["nodes"]]
+    assert "beacon1" not in [robot["name"] for robot in last.status["robots"]]
 
 
 def test_recordings_without_conditions_show_what_they_have(tmp_path: Path) -> None:

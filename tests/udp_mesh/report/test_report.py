@@ -80,7 +80,7 @@ def test_a_truncated_line_is_ignored_and_reported() -> None:
 def test_a_damaged_line_is_ignored_and_reported_with_the_reason(raw: str, problem: str) -> None:
     recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
     assert recording.problems == [f"r:2: {problem}"]
-    assert "1 lines are invalid" in text_of(document_of(recording))
+    assert "Invalid lines, which were ignored: 1." in text_of(document_of(recording))
 
 
 def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
