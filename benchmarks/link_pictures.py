@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from udp_mesh.report.charts import HEIGHT, WIDTH, color, over_time
+from benchmarks.line_chart import HEIGHT, WIDTH, color, over_time
 from udp_mesh.sim.links.trial import Result
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images" / "links"

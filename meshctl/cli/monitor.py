@@ -38,7 +38,8 @@ from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
 from meshctl.monitor.page import recording_of, single_file
 from meshctl.monitor.prometheus import TextfileWriter
-from meshctl.monitor.replay import open_recordings
+from meshctl.monitor.recording_page import documents_of
+from meshctl.monitor.replay import is_history, open_recordings
 from meshctl.monitor.sampler import FrameSampler
 from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
@@ -324,13 +325,18 @@ def _serve(
 def _replay(files: list[Path], out: Path | None, web: WebOptions, *, as_json: bool) -> None:
     """Serve recordings, or write them as one page."""
     with TemporaryDirectory(prefix="meshctl-replay.") as directory, open_recordings(files, Path(directory)) as opened:
-        settings = PageSettings(opened.fleet, __version__, "replay", opened.interval_s, opened.topic_classes)
+        for problem in opened.problems:
+            echo(f"warning: {problem}", err=True)
+        report = documents_of(file for file in files if not is_history(file))
+        settings = PageSettings(
+            opened.fleet, __version__, "replay", opened.interval_s, opened.topic_classes, has_report=bool(report)
+        )
         if out is not None:
-            page = single_file(recording_of(opened.store, settings.as_json())).encode()
+            page = single_file(recording_of(opened.store, settings.as_json(), report)).encode()
             write_file(out, page)
             size = f"{len(page) / 1e6:.1f} MB"
             say({"event": "written", "file": str(out), "bytes": len(page)}, f"wrote {out} ({size})", as_json=as_json)
             return
         feed = Feed()
-        app = MonitorServer(opened.store, feed, settings, web.rules).app()
+        app = MonitorServer(opened.store, feed, settings, web.rules, report=report).app()
         raise typer.Exit(_serve(app, web, feed, as_json=as_json))

@@ -2,8 +2,9 @@
 
 The page is hand-written ES modules without a build step. For the single file they are joined in the order of their
 imports: each module imports by name, from files of its own directory, and no two define the same name (a test checks
-both). The recording is JSON, packed, in an element that no browser executes; the policy in the file allows exactly its
-own scripts and styles, by hash, and no network.
+both). The recording is JSON, packed, in elements that no browser executes: one with all but the frames, and the frames
+in parts that the page unpacks as it needs them, so that hours of a large team stay usable. The policy in the file
+allows exactly its own scripts and styles, by hash, and no network.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from meshctl.monitor.store import FrameStore
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 _MAIN = "main.js"
+_JSON: dict[str, Any] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./([a-z]+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MULTILINE)
 _TAG = re.compile(
@@ -32,6 +34,10 @@ _TAG = re.compile(
 MAX_FRAMES = 3600
 MAX_CHART_FRAMES = 600
 TIMELINE_BUCKETS = 480
+# Of all frames; packed they are about a tenth of it.
+MAX_FRAME_CHARACTERS = 256 << 20
+# The browser unpacks so much at once.
+PART_CHARACTERS = 1 << 20
 
 
 def modules(main: str = _MAIN) -> list[str]:
@@ -54,22 +60,39 @@ def joined_modules() -> str:
     return "\n".join(f"// {name}\n{_EXPORT.sub('', _IMPORT.sub('', _read(name)))}" for name in modules())
 
 
-def recording_of(store: FrameStore, settings: Mapping[str, Any], limit: int = MAX_FRAMES) -> dict[str, Any]:
-    """What the page shows of a history, as one document. Raises ValueError for an empty history."""
+def recording_of(
+    store: FrameStore,
+    settings: Mapping[str, Any],
+    report: Sequence[Mapping[str, Any]] = (),
+    limit: int = MAX_FRAMES,
+) -> dict[str, Any]:
+    """What the page shows of a history, as one document; `frames` are JSON texts, evenly thinned to `limit` and to
+    `MAX_FRAME_CHARACTERS`. `report` are the documents of udp-mesh's recordings. Raises ValueError for an empty history.
+    """
     span = store.span()
     if span is None:
         raise ValueError("the history has no frame")
-    frames = store.between(*span, limit)
     charted = store.between(*span, MAX_CHART_FRAMES)
+    typical = max(1, sum(len(frame.json_text) for frame in charted) // len(charted))
+    frames = store.between(*span, max(2, min(limit, MAX_FRAME_CHARACTERS // typical)))
     return {
         "meta": {
-            **settings, "mode": "replay", "span": span, "now_s": span[1], "actions": False, "can_acknowledge": False
+            **settings,
+            "mode": "replay",
+            "span": span,
+            "now_s": span[1],
+            "actions": False,
+            "can_acknowledge": False,
+            "frames": len(frames),
+            "recorded_frames": store.count(),
         },
-        "frames": [frame.document for frame in frames],
+        "times_s": [frame.time_s for frame in frames],
+        "frames": [frame.json_text for frame in frames],
         "alarms": [alarm.as_json() for alarm in store.alarms(active_only=False, now_s=span[1])],
         "timeline": {"buckets": [asdict(one) for one in store.timeline(span[0], span[1] + 0.001, TIMELINE_BUCKETS)]},
         "series": {device: {"charts": charts_of(charted, device)} for device in devices_of(charted)},
-    }  # fmt: skip
+        "report": list(report),
+    }
 
 
 def single_file(recording: Mapping[str, Any]) -> str:
@@ -97,13 +120,36 @@ def single_file(recording: Mapping[str, Any]) -> str:
         " base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'"
     )
     head = f'<meta charset="utf-8">\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
-    data = f'<script type="application/json" id="recording">{_packed(recording)}</script>'
+    frames = recording.get("frames", ())
+    parts = _parts(frames)
+    rest = {**recording, "frames": [len(part) for part in parts]}
+    data = "\n".join(
+        [
+            f'<script type="application/json" id="recording">{_packed(json.dumps(rest, **_JSON))}</script>',
+            *(
+                f'<script type="application/json" class="frames">{_packed("[" + ",".join(part) + "]")}</script>'
+                for part in parts
+            ),
+        ]
+    )
     return html.replace('<meta charset="utf-8">', head, 1).replace("<body>", f"<body>\n{data}", 1)
 
 
-def _packed(recording: Mapping[str, Any]) -> str:
+def _parts(frames: Sequence[str]) -> list[list[str]]:
+    """Consecutive frames together, up to `PART_CHARACTERS`."""
+    parts: list[list[str]] = []
+    characters = PART_CHARACTERS
+    for frame in frames:
+        if characters + len(frame) > PART_CHARACTERS:
+            parts.append([])
+            characters = 0
+        parts[-1].append(frame)
+        characters += len(frame)
+    return parts
+
+
+def _packed(text: str) -> str:
     """gzip in base64, which no text of a device can leave."""
-    text = json.dumps(recording, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
 

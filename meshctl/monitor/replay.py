@@ -5,13 +5,14 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
 from meshctl.errors import InputError
+from meshctl.monitor.recorded_frames import frames_of, with_recorded
 from meshctl.monitor.store import FrameStore
-from meshctl.monitor.transport_recording import frames_of, read_recording, with_recorded
+from meshctl.monitor.transport_recording import joined_by_name, read_recording
 
 _SQLITE = b"SQLite format 3\x00"
 # The distances of so many frames tell how far apart they usually are.
@@ -22,23 +23,26 @@ _NO_LIMIT_BYTES = 1 << 40
 
 @dataclass(frozen=True, slots=True)
 class OpenedRecording:
-    """`interval_s` is the usual time between two frames."""
+    """`interval_s` is the usual time between two frames; `problems` says which lines were ignored."""
 
     store: FrameStore
     fleet: str
     interval_s: float
     topic_classes: Mapping[str, str] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
 
 
 @contextmanager
-def open_recordings(files: Sequence[Path], directory: Path) -> Iterator[OpenedRecording]:
+def open_recordings(files: Sequence[Path], directory: Path, fleet: str = "recording") -> Iterator[OpenedRecording]:
     """Open recordings for reading: one history, recordings of udp-mesh, or a history with recordings that add what its
-    robots recorded while out of reach. `directory` is for temporary files. Raises InputError with the file's name.
+    robots recorded while out of reach. `directory` is for temporary files; `fleet` names recordings without a history.
+    Raises InputError with the file's name.
     """
     histories = [file for file in files if is_history(file)]
     if len(histories) > 1:
         raise InputError(f"expected one history, found {len(histories)}: {', '.join(map(str, histories))}")
-    robots = [robot for file in files if file not in histories for robot in read_recording(file)]
+    problems: list[str] = []
+    robots = [robot for file in files if file not in histories for robot in read_recording(file, problems.append)]
     if histories and not robots:
         with FrameStore.open_recording(histories[0]) as store:
             yield _opened(store, str(histories[0]))
@@ -47,12 +51,13 @@ def open_recordings(files: Sequence[Path], directory: Path) -> Iterator[OpenedRe
     with FrameStore.open(directory / "merged.sqlite", _FOREVER_S, _NO_LIMIT_BYTES) as merged:
         if histories:
             with FrameStore.open_recording(histories[0]) as store:
+                known = joined_by_name(robots)
                 for frame in store.after(0.0):
-                    merged.append(with_recorded(frame, robots))
+                    merged.append(with_recorded(frame, known))
         else:
-            for frame in frames_of(robots):
+            for frame in frames_of(robots, fleet):
                 merged.append(frame)
-        yield _opened(merged, ", ".join(map(str, files)))
+        yield replace(_opened(merged, ", ".join(map(str, files))), problems=tuple(problems))
 
 
 def is_history(file: Path) -> bool:

@@ -10,7 +10,7 @@ import getpass
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -46,13 +46,15 @@ MAX_SILENCE_S = 366 * 86400.0
 
 @dataclass(frozen=True, slots=True)
 class PageSettings:
-    """What the page asks for once. `topic_classes` maps topic names to their classes in the inventory."""
+    """What the page asks for once. `topic_classes` maps topic names to their classes in the inventory; `has_report`:
+    there are tables and charts of udp-mesh's recordings."""
 
     fleet: str
     version: str
     mode: str = "live"
     interval_s: float = 5.0
     topic_classes: Mapping[str, str] = field(default_factory=dict)
+    has_report: bool = False
 
     def as_json(self) -> dict[str, Any]:
         return {**asdict(self), "topic_classes": dict(self.topic_classes)}
@@ -64,7 +66,8 @@ class BadRequest(Exception):
 
 @dataclass(frozen=True, slots=True)
 class MonitorServer:
-    """The routes over one history. `metrics` renders /metrics; `clock` is Unix time."""
+    """The routes over one history. `metrics` renders /metrics; `clock` is Unix time; `report` are the documents of
+    udp-mesh's recordings."""
 
     store: FrameStore
     feed: Feed
@@ -73,6 +76,7 @@ class MonitorServer:
     actions: Actions | None = None
     metrics: Callable[[Frame | None, FrameStore, float], str] | None = None
     clock: Callable[[], float] = time.time
+    report: Sequence[Mapping[str, Any]] = ()
     streams: EventStreams = field(init=False)
 
     def __post_init__(self) -> None:
@@ -89,6 +93,7 @@ class MonitorServer:
             Route("/api/timeline", self._timeline),
             Route("/api/series", self._series),
             Route("/api/events", self._events),
+            Route("/api/report", self._report),
             Route("/api/alarms", self._alarms),
             Route("/api/alarms/ack", self._acknowledge, methods=["POST"]),
             Route("/api/alarms/silence", self._silence, methods=["POST"]),
@@ -162,6 +167,9 @@ class MonitorServer:
             lambda: charts_of(self.store.between(start_s, end_s, CHART_POINTS), device) if device else []
         )
         return _json({"device": device, "charts": charts})
+
+    async def _report(self, request: Request) -> Response:
+        return _json(list(self.report))
 
     async def _range(self, request: Request) -> tuple[float, float]:
         """`from` and `to`, by default all that was recorded."""

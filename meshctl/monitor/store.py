@@ -278,6 +278,11 @@ class FrameStore:
             return None if unwritten is None else (unwritten.time_s, unwritten.time_s)
         return first / 1000, max(last / 1000, 0.0 if unwritten is None else unwritten.time_s)
 
+    def count(self) -> int:
+        """The number of frames."""
+        ((count,),) = self._reader.read("SELECT count(*) FROM frames", ())
+        return int(count)
+
     def timeline(self, start_s: float, end_s: float, buckets: int) -> tuple[TimelineBucket, ...]:
         """`buckets` equal stretches from `start_s` to `end_s`, from indexed columns alone."""
         start, end = milliseconds(start_s), milliseconds(end_s)

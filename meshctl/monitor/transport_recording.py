@@ -1,47 +1,80 @@
-"""Recordings of udp-mesh (docs/recording-format.md) as robots of frames: what a robot recorded itself, also while
-out of reach.
+"""Recordings of udp-mesh (docs/recording-format.md): what a robot recorded itself, also while out of reach.
 
-`read_recording` parses one file; `frames_of` makes frames of recordings alone; `with_recorded` adds to a frame of a
-history what robots recorded that did not answer then. Lines of an unknown kind are skipped, as is a truncated last one.
+`read_recording` parses one file into `RecordedRobot`s. Damaged lines and lines of an unknown kind are skipped;
+`recorded_frames` makes frames of the robots.
 """
 
 from __future__ import annotations
 
 import json
+import statistics
+import zlib
 from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import InputError
-from meshctl.monitor.frame import Frame, links_of
 
 FORMAT = 1
-# A sample says nothing about a moment that is this much later: `conditions_period_s` is seconds.
+# A sample says nothing about a moment that is this much later, or 2.5 of the recording's periods if that is more.
 MAX_AGE_S = 15.0
-# Frames of recordings alone are at least this far apart.
-STEP_S = 1.0
-_BASE_NAMES = ("base", "base-station", "basestation")
-_PEER_KEYS = ("name", "online", "heard_ago_s", "round_trip_s", "loss", "outbox_messages", "capacity_bits_per_s")
+PERIODS = 2.5
+# Without conditions, events and messages are samples, at most one in this time.
+SAMPLE_S = 1.0
+MAX_PLACE_M = 1e7
+BASE_NAMES = ("base", "base-station", "basestation")
+_PEER_KEYS = (
+    *("name", "online", "heard_ago_s", "round_trip_s", "loss", "outbox_messages", "capacity_bits_per_s", "hops"),
+)
 
 
 @dataclass(slots=True)
 class RecordedRobot:
-    """One robot's samples in ascending order: times, and its part of a status document at each."""
+    """One robot's samples in ascending order: times, and its part of a status document at each, packed, since hours of
+    a large team would not fit into memory. A robot that others saw alone has places and no samples."""
 
     name: str
     times_s: list[float] = field(default_factory=list)
-    documents: list[dict[str, Any]] = field(default_factory=list)
     places: list[tuple[float, float, float]] = field(default_factory=list)
+    peer_names: set[str] = field(default_factory=set)
+    _packed: list[bytes] = field(default_factory=list)
+    _max_age_s: float = MAX_AGE_S
+
+    def add(self, time_s: float, document: Mapping[str, Any]) -> None:
+        self.times_s.append(time_s)
+        self._packed.append(zlib.compress(json.dumps(document, separators=(",", ":")).encode(), 1))
+        self.peer_names.update(peer["name"] for peer in document["peers"])
+
+    def finish(self) -> None:
+        """After the last sample."""
+        if len(self.times_s) > 1:
+            period_s = statistics.median(later - earlier for earlier, later in pairwise(self.times_s))
+            self._max_age_s = max(MAX_AGE_S, PERIODS * period_s)
+
+    def joined(self, other: RecordedRobot) -> RecordedRobot:
+        """Both recordings of one robot."""
+        samples = sorted(
+            zip([*self.times_s, *other.times_s], [*self._packed, *other._packed], strict=True), key=lambda one: one[0]
+        )
+        return RecordedRobot(
+            self.name,
+            [time_s for time_s, _ in samples],
+            sorted([*self.places, *other.places]),
+            self.peer_names | other.peer_names,
+            [packed for _, packed in samples],
+            max(self._max_age_s, other._max_age_s),
+        )
 
     def at(self, time_s: float) -> tuple[float, dict[str, Any]] | None:
         """The newest sample that is not after `time_s` and still says something, with its time."""
         index = bisect_right(self.times_s, time_s) - 1
-        if index < 0 or time_s - self.times_s[index] > MAX_AGE_S:
+        if index < 0 or time_s - self.times_s[index] > self._max_age_s:
             return None
-        return self.times_s[index], self.documents[index]
+        return self.times_s[index], json.loads(zlib.decompress(self._packed[index]))
 
     def place_at(self, time_s: float) -> dict[str, Any] | None:
         index = bisect_right(self.places, (time_s, float("inf"), float("inf"))) - 1
@@ -60,7 +93,7 @@ class _Topics:
     def note(self, entry: Mapping[str, Any], key: str, time_s: float) -> None:
         topic = entry.get("topic")
         if isinstance(topic, str):
-            self._last.setdefault(topic, {"priority": entry.get("priority")})[key] = time_s
+            self._last.setdefault(topic, {"priority": number_of(entry.get("priority"))})[key] = time_s
 
     def at(self, time_s: float) -> list[dict[str, Any]]:
         def ago_s(seen: Mapping[str, Any], key: str) -> float | None:
@@ -75,61 +108,123 @@ class _Topics:
                 "limit_s": None,
                 "trouble": None,
             }
-            for name, seen in sorted(self._last.items(), key=lambda item: (_number(item[1]["priority"]) or 0, item[0]))
+            for name, seen in sorted(self._last.items(), key=lambda item: (item[1]["priority"] or 0, item[0]))
         ]
 
 
-def read_recording(file: Path) -> list[RecordedRobot]:
-    """The robots of one recording; a simulation's has several. Raises InputError with file and line."""
-    robots: dict[str, RecordedRobot] = {}
-    topics: dict[str, _Topics] = defaultdict(_Topics)
+class _Reader:
+    """The lines of one robot, in ascending order -> its samples."""
+
+    def __init__(self, name: str) -> None:
+        self.robot = RecordedRobot(name)
+        self._topics = _Topics()
+        self._online: dict[str, bool] = {}
+        self._open: tuple[float, list[dict[str, Any]], list[dict[str, Any]]] | None = None
+        self._has_conditions = False
+        # samples of a recording without conditions
+        self._events: list[tuple[float, dict[str, Any]]] = []
+
+    def line(self, entry: Mapping[str, Any], time_s: float) -> None:
+        match entry.get("kind"):
+            case "conditions":
+                self._conditions(entry, time_s)
+                return
+            case "place":
+                x_m, y_m = number_of(entry.get("x")), number_of(entry.get("y"))
+                if x_m is not None and y_m is not None and max(abs(x_m), abs(y_m)) <= MAX_PLACE_M:
+                    self.robot.places.append((time_s, x_m, y_m))
+                return
+            case "sent" | "received" as kind:
+                self._topics.note(entry, kind, time_s)
+            case "peer-online" | "peer-offline" as kind:
+                if isinstance(peer := entry.get("peer"), str):
+                    self._online[peer] = kind == "peer-online"
+        events = self._events
+        if not self._has_conditions and (not events or time_s - events[-1][0] >= SAMPLE_S):
+            peers = [{"name": name, "online": is_online} for name, is_online in sorted(self._online.items())]
+            events.append((time_s, _document(self.robot.name, peers, self._topics.at(time_s))))
+
+    def end(self) -> RecordedRobot:
+        self._close()
+        if not self._has_conditions:
+            for time_s, document in self._events:
+                self.robot.add(time_s, document)
+        self.robot.finish()
+        return self.robot
+
+    def _conditions(self, entry: Mapping[str, Any], time_s: float) -> None:
+        """A simulation writes a line for each peer, all of the same time."""
+        self._has_conditions = True
+        found = entry.get("peers")
+        peers = [peer for peer in found if _is_peer(peer)] if isinstance(found, list) else []
+        for peer in peers:
+            peer["online"] = (
+                self._online.setdefault(peer["name"], False) if "online" not in peer else bool(peer["online"])
+            )
+            self._online[peer["name"]] = peer["online"]
+        if self._open is not None and self._open[0] == time_s:
+            self._open[1].extend(peers)
+            return
+        self._close()
+        self._open = (time_s, peers, self._topics.at(time_s))
+
+    def _close(self) -> None:
+        if self._open is not None:
+            time_s, peers, topics = self._open
+            self.robot.add(time_s, _document(self.robot.name, peers, topics))
+            self._open = None
+
+
+def _is_peer(value: object) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("name"), str)
+
+
+def read_recording(file: Path, on_problem: Callable[[str], None] = lambda text: None) -> list[RecordedRobot]:
+    """The robots of one recording; a simulation's has several. `on_problem` gets one text about all damaged lines.
+
+    Raises InputError with file and line if it is no recording.
+    """
+    readers: dict[str, _Reader] = {}
+    problems: list[int] = []
     try:
         with file.open(encoding="utf-8", errors="replace") as lines:
             node, started_s = _header(file, lines.readline())
-            for entry in _entries(file, lines):
-                elapsed_s = _number(entry.get("t"))
-                if elapsed_s is None:
+            for entry in _entries(lines, problems):
+                elapsed_s = number_of(entry.get("t"))
+                if elapsed_s is None or elapsed_s < 0:
                     continue
-                time_s, name = started_s + elapsed_s, str(entry.get("at", node))
-                robot = robots.setdefault(name, RecordedRobot(name))
-                match entry.get("kind"):
-                    case "sent" | "received" as kind:
-                        topics[name].note(entry, kind, time_s)
-                    case "conditions":
-                        robot.times_s.append(time_s)
-                        robot.documents.append(_robot(name, entry, topics[name].at(time_s)))
-                    case "place":
-                        x_m, y_m = _number(entry.get("x")), _number(entry.get("y"))
-                        if x_m is not None and y_m is not None:
-                            robot.places.append((time_s, x_m, y_m))
+                name = str(entry.get("at", node))
+                readers.setdefault(name, _Reader(name)).line(entry, started_s + elapsed_s)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from error
-    found = [robot for robot in robots.values() if robot.times_s]
-    if not found:
-        raise InputError(f"{file}: expected lines of kind conditions, found none")
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        on_problem(f"{file}: line {problems[0]}{more}: expected a JSON object; ignored")
+    found = [reader.end() for reader in readers.values()]
+    if not any(robot.times_s for robot in found):
+        # nothing happened, and that is shown
+        empty = RecordedRobot(node)
+        empty.add(started_s, _document(node, [], []))
+        found = [robot for robot in found if robot.name != node] + [empty]
     return found
 
 
 def _header(file: Path, line: str) -> tuple[str, float]:
     try:
         header = json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         header = None
     hint = "expected a history of `meshctl monitor`, or a recording of `udp-mesh record start`"
     if not isinstance(header, dict) or header.get("recording") != FORMAT:
         raise InputError(f"{file}: line 1: expected the header of a recording of version {FORMAT}", hint=hint)
-    started_s = _number(header.get("started"))
+    started_s = number_of(header.get("started"))
     if not isinstance(header.get("node"), str) or started_s is None:
         raise InputError(f"{file}: line 1: expected node and started", hint=hint)
     return header["node"], started_s
 
 
-def _entries(file: Path, lines: Iterable[str]) -> Iterator[Mapping[str, Any]]:
-    broken = 0
+def _entries(lines: Iterable[str], problems: list[int]) -> Iterator[Mapping[str, Any]]:
     for number, line in enumerate(lines, 2):
-        # only the last line may be truncated
-        if broken:
-            raise InputError(f"{file}: line {broken}: expected a JSON object")
         try:
             entry = json.loads(line)
         except (ValueError, RecursionError):
@@ -137,124 +232,52 @@ def _entries(file: Path, lines: Iterable[str]) -> Iterator[Mapping[str, Any]]:
         if isinstance(entry, dict):
             yield entry
         elif line.strip():
-            broken = number
+            problems.append(number)
 
 
-def _robot(name: str, entry: Mapping[str, Any], topics: list[dict[str, Any]]) -> dict[str, Any]:
-    peers = [peer for peer in entry.get("peers") or () if isinstance(peer, dict)]
+def _document(name: str, peers: list[dict[str, Any]], topics: list[dict[str, Any]]) -> dict[str, Any]:
     queues: dict[int, dict[str, Any]] = {}
     for peer in peers:
-        for queue in peer.get("queues") or ():
+        found = peer.get("queues")
+        for queue in found if isinstance(found, list) else ():
             if not isinstance(queue, dict) or not isinstance(queue.get("priority"), int):
                 continue
             priority = queue["priority"]
             total = queues.setdefault(priority, {"priority": priority, "messages": 0, "bytes": 0, "oldest_s": 0.0})
-            total["messages"] += int(_number(queue.get("messages")) or 0)
-            total["bytes"] += int(_number(queue.get("bytes")) or 0)
-            total["oldest_s"] = max(total["oldest_s"], _number(queue.get("oldest_s")) or 0.0)
+            total["messages"] += int(number_of(queue.get("messages")) or 0)
+            total["bytes"] += int(number_of(queue.get("bytes")) or 0)
+            total["oldest_s"] = max(total["oldest_s"], number_of(queue.get("oldest_s")) or 0.0)
+    has_queues = any("queues" in peer for peer in peers)
     return {
         "name": name,
-        "is_base": name in _BASE_NAMES,
+        "is_base": name in BASE_NAMES,
         "radios": [name],
         "alarms": [],
-        "peers": [{key: peer.get(key) for key in _PEER_KEYS} for peer in peers],
-        "queues": [queues[priority] for priority in sorted(queues)],
+        "peers": [
+            {key: peer.get(key) if key in ("name", "online") else number_of(peer.get(key)) for key in _PEER_KEYS}
+            for peer in peers
+        ],
+        "queues": [queues[priority] for priority in sorted(queues)] if has_queues or not peers else None,
         "topics": topics,
         "recorded": True,
     }
 
 
-def frames_of(robots: Sequence[RecordedRobot]) -> Iterator[Frame]:
-    """Frames of recordings alone. Robots are drawn as devices, with the peers that they hear as links."""
-    times = sorted({round(time_s / STEP_S) * STEP_S for robot in robots for time_s in robot.times_s})
-    for time_s in times:
-        sampled = {robot.name: robot.at(time_s + STEP_S / 2) for robot in robots}
-        documents = {name: found[1] for name, found in sampled.items() if found is not None}
-        base = next((name for name, document in documents.items() if document["is_base"]), None)
-        nodes = [_node(robot.name, documents.get(robot.name), base) for robot in robots]
-        status = {
-            "version": 1,
-            "fleet": "recording",
-            "taken_s": time_s,
-            "entry": base,
-            "alarms": [],
-            "nodes": nodes,
-            "robots": [
-                {**documents[robot.name], "health": "ok", "answers": True, "age_s": 0.0}
-                if robot.name in documents
-                else {"name": robot.name, "health": "unreachable", "answers": False, "alarms": []}
-                for robot in robots
-            ],
-        }
-        places = {robot.name: robot.place_at(time_s) for robot in robots}
-        yield Frame.of(
-            {
-                "schema": 1,
-                "time_s": time_s,
-                "fleet": "recording",
-                "verdict": None,
-                "status": status,
-                "links": links_of(status),
-                "radios": {},
-                "positions": {name: place for name, place in places.items() if place is not None},
-                "airtime": None,
-            }
-        )
+def joined_by_name(robots: Iterable[RecordedRobot]) -> dict[str, RecordedRobot]:
+    """Robots by name; several recordings of one robot, or its places in those of others, become one."""
+    found: dict[str, RecordedRobot] = {}
+    by_name: dict[str, list[RecordedRobot]] = defaultdict(list)
+    for robot in robots:
+        by_name[robot.name].append(robot)
+    for name, same in by_name.items():
+        one = same[0]
+        for other in same[1:]:
+            one = one.joined(other)
+        found[name] = one
+    return found
 
 
-def _node(name: str, document: Mapping[str, Any] | None, base: str | None) -> dict[str, Any]:
-    peers = () if document is None else [peer for peer in document["peers"] if peer.get("online")]
-    hears_base = any(peer["name"] == base for peer in peers)
-    return {
-        "name": name,
-        "role": "base" if name == base else "robot",
-        "robot": name,
-        "state": "deployed",
-        "health": "unreachable" if document is None else "ok",
-        "answers": document is not None,
-        "alarms": [],
-        "age_s": None if document is None else 0.0,
-        "hops": 0 if name == base else 1 if hears_base else None,
-        "via": base if hears_base else None,
-        "neighbours": [
-            {
-                "name": peer["name"],
-                "age_s": _number(peer.get("heard_ago_s")) or 0.0,
-                "quality": None if (loss := _number(peer.get("loss"))) is None else round(1 - loss, 3),
-                "signal_dbm": None,
-            }
-            for peer in peers
-        ],
-    }
-
-
-def with_recorded(frame: Frame, robots: Sequence[RecordedRobot]) -> Frame:
-    """The frame with what robots recorded that did not answer then, each marked `recorded`."""
-    known = {robot.name: robot for robot in robots}
-    changed = False
-    merged: list[Any] = []
-    for one in frame.status.get("robots") or ():
-        recorded = known.get(str(one.get("name"))) if isinstance(one, dict) and one.get("answers") is False else None
-        found = None if recorded is None else recorded.at(frame.time_s)
-        if found is None:
-            merged.append(one)
-            continue
-        changed = True
-        seen_s, document = found
-        facts = {key: document[key] for key in ("peers", "queues", "topics", "recorded")}
-        merged.append({**one, **facts, "age_s": round(frame.time_s - seen_s, 3)})
-    places = {
-        robot.name: place
-        for robot in robots
-        if (place := robot.place_at(frame.time_s)) is not None and robot.name not in frame.document.get("positions", {})
-    }
-    if not changed and not places:
-        return frame
-    positions = {**frame.document.get("positions", {}), **places}
-    return Frame.of({**frame.document, "status": {**frame.status, "robots": merged}, "positions": positions})
-
-
-def _number(value: object) -> float | None:
+def number_of(value: object) -> float | None:
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     return float(value) if abs(value) < 1e15 else None

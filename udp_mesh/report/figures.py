@@ -6,11 +6,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from udp_mesh.report.recording import Recording, Sample
+from udp_mesh.report.recording import Recording
 
 # A periodic topic has enough messages, and a median interval that most of them keep to.
 _MIN_MESSAGES = 20
@@ -94,9 +93,10 @@ def connections(recording: Recording) -> list[Connection]:
     return found
 
 
-def throughput(recording: Recording, bins: int = 120) -> tuple[float, list[Throughput]]:
-    """(bin width in seconds, throughput of every topic, most urgent first)."""
-    width_s = max(recording.end_s / bins, 1e-9)
+def throughput(recording: Recording, bins: int = 120, width_s: float | None = None) -> tuple[float, list[Throughput]]:
+    """(bin width in seconds, throughput of every topic, most urgent first). Without `width_s` the bins end with the
+    recording."""
+    width_s = width_s or max(recording.end_s / bins, 1e-9)
     filled: dict[str, list[float]] = defaultdict(lambda: [0.0] * bins)
     totals: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0])
     for item in recording.arrivals:
@@ -156,22 +156,6 @@ def sent_topics(recording: Recording) -> list[SentTopic]:
         )
         for topic in sorted({*counts, *ends}, key=lambda topic: (priorities.get(topic, 99), topic))
     ]
-
-
-def time_series(
-    recording: Recording, read: Callable[[Sample], float | None], bins: int = 240
-) -> dict[str, list[tuple[float, float]]]:
-    """A value of the samples over time, per peer: the mean of each equal bin that has samples, at the bin's middle."""
-    width_s = max(recording.end_s / bins, 1e-9)
-    gathered: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for sample in recording.samples:
-        value = read(sample)
-        if value is not None:
-            gathered[sample.peer][min(bins - 1, int(sample.t / width_s))].append(value)
-    return {
-        peer: [((place + 0.5) * width_s, sum(values) / len(values)) for place, values in sorted(found.items())]
-        for peer, found in sorted(gathered.items())
-    }
 
 
 def summary(recording: Recording) -> dict[str, Any]:

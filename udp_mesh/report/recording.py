@@ -6,12 +6,12 @@ start), `kind`, and `at` (the node whose view it is) unless that is the node of 
 - `received`, `sent`: `topic`, `priority`, `bytes`, and for `received` also `source`,
 - `message-delivered` (`latency_s`), `message-expired`, `message-peer-lost`: `peer`, `topic`,
 - `peer-online`, `peer-offline`: `peer`,
-- `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`, `hops` (all but the
-  name are optional),
+- `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`,
+  `capacity_bits_per_s`, `outbox_messages`, `hops` (all but the name are optional),
 - `place`: `x`, `y` in meters (simulated runs),
 - `gap`: `lines`, the number of lines dropped here during recording.
 
-Other kinds (further events) are ignored.
+Every other kind is an event, with its fields as text.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ MAX_T_S = 1e9
 MAX_PLACE_M = 1e7
 MAX_BYTES = 1 << 50
 MAX_SAMPLE = 1e15
-_SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops")
+_SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops", "outbox_messages", "capacity_bits_per_s")
+MAX_EVENT_TEXT = 200
 
 
 class RecordingError(ValueError):
@@ -64,6 +65,8 @@ class Sample:
     loss: float | None = None
     received_bits_per_s: float | None = None
     hops: int | None = None
+    outbox_messages: int | None = None
+    capacity_bits_per_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +96,14 @@ class SentOutcome:
     latency_s: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class RecordedEvent:
+    t: float
+    at: str
+    kind: str
+    text: str
+
+
 @dataclass(slots=True)
 class Recording:
     """The contents of one recording, in order. `problems` are the invalid lines and why; `missing_lines` counts lines
@@ -106,6 +117,7 @@ class Recording:
     places: list[Place] = field(default_factory=list)
     sent: list[SentMessage] = field(default_factory=list)
     outcomes: list[SentOutcome] = field(default_factory=list)
+    events: list[RecordedEvent] = field(default_factory=list)
     missing_lines: int = 0
     end_s: float = 0.0
     """The latest time of a line."""
@@ -221,6 +233,7 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
             peer = _text(entry, "peer")
             online[peer] = kind == "peer-online"
             recording.presences.append(Presence(t, at, peer, online[peer]))
+            recording.events.append(RecordedEvent(t, at, kind, peer))
         case "conditions":
             for peer_entry in _peers(entry):
                 _sample(recording, t, at, peer_entry, online)
@@ -229,9 +242,10 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
             recording.places.append(Place(t, at, x, y))
         case "gap":
             recording.missing_lines += _integer(entry, "lines")
+        case str():
+            recording.events.append(RecordedEvent(t, at, _text(entry, "kind"), _fields(entry)))
         case _:
-            # Another kind, which no chart shows.
-            return
+            raise _UnreadableError("a string as kind", kind)
 
 
 def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], online: dict[str, bool]) -> None:
@@ -251,6 +265,13 @@ def _peers(entry: dict[str, Any]) -> list[dict[str, Any]]:
     if not isinstance(peers, list) or not all(isinstance(peer, dict) for peer in peers):
         raise _UnreadableError("a list of objects as peers", peers)
     return peers
+
+
+def _fields(entry: dict[str, Any]) -> str:
+    """The fields of an event in words; nested values are left out."""
+    known = ((key, value) for key, value in entry.items() if key not in ("t", "kind", "at"))
+    shown = ", ".join(f"{key} {value}" for key, value in known if isinstance(value, str | int | float))
+    return shown[:MAX_EVENT_TEXT].encode(errors="replace").decode()
 
 
 def _text(entry: dict[str, Any], key: str) -> str:

@@ -10,7 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from udp_mesh.report.page import write_page
+from udp_mesh.report.document import document_of
+from udp_mesh.report.page import page_writer
 from udp_mesh.report.recording import parse
 from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import MAX_DURATION_S, Scenario, ScenarioError, load
@@ -33,7 +34,9 @@ def run_command(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "--duration", type=_duration_s, metavar="SECONDS", help="override the scenario's duration (virtual time)"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write recording.jsonl, summary.json and report.html")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write recording.jsonl, summary.json and, with meshctl, report.html"
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     options = parser.parse_args(list(arguments))
     if options.list or options.scenario is None:
@@ -109,8 +112,9 @@ def write(result: RunResult, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     (directory / "recording.jsonl").write_text("\n".join(result.lines) + "\n", "utf-8")
     (directory / "summary.json").write_text(json.dumps(result.summary(), indent=2) + "\n", "utf-8")
-    recorded = parse((line.encode() for line in result.lines), "recording.jsonl")
-    write_page([recorded], directory / "report.html", title=result.scenario.name)
+    if (write_page := page_writer()) is not None:
+        document = document_of(parse((line.encode() for line in result.lines), "recording.jsonl"))
+        write_page([directory / "recording.jsonl"], [document], directory / "report.html", result.scenario.name)
 
 
 def _progress(scenario: Scenario) -> Callable[[float], None]:

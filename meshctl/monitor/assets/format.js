@@ -34,4 +34,7 @@ export function clockTime(time_s) {
   return [date.getHours(), date.getMinutes(), date.getSeconds()].map((part) => String(part).padStart(2, "0")).join(":");
 }
 
+// Three digits, as a chart can show.
+export const shortNumber = (value) => (Math.abs(value) >= 100 ? String(Math.round(value)) : String(Number(value.toPrecision(3))));
+
 export const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;

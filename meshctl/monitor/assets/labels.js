@@ -27,11 +27,16 @@ export function drawLabels(c, colors, { view, selected, radius, isMetric, scale,
     const age = device.answers === true || !isKnown(device.age_s) ? "" : ` ${duration(device.age_s)}`;
     const label = device.name.length > 22 ? `${device.name.slice(0, 21)}…` : device.name;
     const width = (label.length + age.length) * size * 0.6;
-    for (const dy of [radius + size * 0.9, -radius - size * 0.8]) {
-      const box = { left: at.x - width / 2, right: at.x + width / 2, top: at.y + dy - size * 0.6, bottom: at.y + dy + size * 0.6 };
-      if (device.name !== selected && !free(box, isCrowded && rank(device) < 4)) continue;
+    // below, above, and for important devices beside; in the end over the sign of another, rather than not at all
+    const below = radius + size * 0.9;
+    const beside = radius + width / 2 + 4;
+    const sides = [[0, below, false], [0, -radius - size * 0.8, false]];
+    if (rank(device) < 4) sides.push([-beside, 0, false], [beside, 0, false], [0, below, true], [0, -radius - size * 0.8, true]);
+    for (const [dx, dy, isImportant] of sides) {
+      const box = { left: at.x + dx - width / 2, right: at.x + dx + width / 2, top: at.y + dy - size * 0.6, bottom: at.y + dy + size * 0.6 };
+      if (!free(box, isImportant) && !(isImportant && device.name === selected)) continue;
       taken.push(box);
-      drawText(c, label + age, at.x, at.y + dy, { size, color: device.answers === false ? colors["--muted"] : colors["--text"], align: "center", isBold: rank(device) < 4, halo: colors["--bg"] });
+      drawText(c, label + age, at.x + dx, at.y + dy, { size, color: device.answers === false ? colors["--muted"] : colors["--text"], align: "center", isBold: rank(device) < 4, halo: colors["--bg"] });
       break;
     }
   }

@@ -7,6 +7,7 @@ import { Layout } from "./layout.js";
 import { MeshCanvas } from "./mesh.js";
 import { showLegend } from "./legend.js";
 import { Charts } from "./charts.js";
+import { markersOf, showReport, tracksOf } from "./report.js";
 import { Timeline } from "./timeline.js";
 import { AlarmSound } from "./sound.js";
 import { openSilence } from "./actions.js";
@@ -15,7 +16,7 @@ import { recalled, remember } from "./storage.js";
 import { count, notice, showClock, showStrip } from "./strip.js";
 import { alarmsAt, isQuiet, showAlarms, showChanges, showDetails, showRadios, showRobots } from "./panels.js";
 
-const TABS = ["robots", "alarms", "radios", "changes", "details"];
+const TABS = ["robots", "alarms", "radios", "changes", "details", "report"];
 const MAX_BUCKETS = 240;
 const CHARTS_EVERY_MS = 4000;
 const TIMELINE_EVERY_MS = 4000;
@@ -124,6 +125,7 @@ function render() {
     showDetails(byId("details"), view, state.selected, { meta: state.meta, source });
     refreshCharts();
   }
+  if (isVisible("report")) showReport(byId("report"), state.report, state.meta, mesh.colors, shown_s(), goTo);
   document.documentElement.dataset.shown = String(state.frame.time_s);
   showTimeline();
 }
@@ -166,7 +168,7 @@ async function showTimeline(isForced = false) {
     // wider than the time between frames, or there would be gaps
     const buckets = Math.max(1, Math.min(MAX_BUCKETS, Math.floor((last - start_s) / (1.6 * interval_s()))));
     const found = await source.timeline(start_s, last, buckets);
-    const markers = state.alarms.filter((alarm) => alarm.level !== "note").map((alarm) => ({ time_s: alarm.first_s, level: alarm.level }));
+    const markers = state.alarms.filter((alarm) => alarm.level !== "note").map((alarm) => ({ time_s: alarm.first_s, level: alarm.level })).concat(markersOf(state.report));
     timeline.show(found.buckets, markers, mesh.colors);
   } catch (error) {
     notice(`Cannot load the history: ${error.message}`);
@@ -196,7 +198,9 @@ function select(name) {
 }
 
 function openTab(name) {
+  if (byId(`tab-${name}`).hidden) return;
   state.tab = name;
+  document.documentElement.dataset.tab = name;
   for (const tab of TABS) {
     const isOpen = tab === name;
     byId(tab).hidden = !isOpen;
@@ -209,7 +213,7 @@ function openTab(name) {
 function setReference(frame) {
   state.reference = frame === null ? null : viewOf(frame, state.meta);
   byId("reference").setAttribute("aria-pressed", String(frame !== null));
-  byId("reference").title = frame === null ? "Mark this state as the reference (R)" : `Reference: ${clockTime(frame.time_s)} (R forgets it)`;
+  byId("reference").title = frame === null ? "Mark this state (R)" : `Reference: ${clockTime(frame.time_s)} (R forgets it)`;
   remember(REFERENCE_KEY, frame === null ? null : JSON.stringify({ fleet: frame.fleet, time_s: frame.time_s }));
   if (frame !== null) openTab("changes"); else render();
   showTimeline(true);
@@ -234,12 +238,10 @@ function receiveAlarms(alarms) {
   render();
 }
 
-// ---- buttons and keys
-
 const KEYS = [
   ["L", "back to live", () => goLive()], ["Space", "play or pause", () => play()], ["← →", "one step in time (Shift: ten)", null],
   ["R", "mark or forget the reference", () => setReference(state.reference === null ? state.frame : null)], ["M", "meters or hops", () => arrange(mesh.isMetric ? "hops" : "meters")],
-  ["F", "fit the map", () => mesh.fit()], ["1 – 5", "panels", null], ["N", "next open alarm", () => nextAlarm()], ["S", "sound", () => toggleSound()], ["T", "dark or light", () => toggleTheme()],
+  ["F", "fit the map", () => mesh.fit()], ["1 – 6", "panels", null], ["N", "next open alarm", () => nextAlarm()], ["S", "sound", () => toggleSound()], ["T", "dark or light", () => toggleTheme()],
   ["arrows on the map", "select a device in that direction", null], ["?", "this list", () => byId("keys").showModal()],
 ];
 
@@ -285,7 +287,7 @@ function onKey(event) {
     if (target.getAttribute?.("role") === "tab") return;
     stop();
     step((event.key === "ArrowLeft" ? -1 : 1) * (event.shiftKey ? 10 : 1));
-  } else if (/^[1-5]$/.test(event.key)) openTab(TABS[Number(event.key) - 1]);
+  } else if (/^[1-6]$/.test(event.key)) openTab(TABS[Number(event.key) - 1]);
   else if (event.key === "Escape") select(null);
   else {
     if (event.key === " " && target instanceof HTMLButtonElement) return;
@@ -353,11 +355,18 @@ const events = {
   },
 };
 
+async function loadReport() {
+  state.report = await source.report();
+  state.tracks = tracksOf(state.report);
+  mesh.tracks = state.tracks;
+  byId("tab-report").hidden = state.report.length === 0;
+  openTab("report");
+}
+
 async function start() {
   wire();
   document.documentElement.dataset.theme = recalled("meshctl-monitor-theme") ?? "dark";
   mesh.readColors();
-  showLegend(mesh.colors);
   openTab(matchMedia("(min-width: 1500px)").matches ? "alarms" : "robots");
   for (;;) {
     try {
@@ -377,6 +386,8 @@ async function start() {
     byId("window").value = "0";
     byId("live").textContent = "END";
   }
+  if (state.meta.has_report) await loadReport();
+  showLegend(mesh.colors);
   receiveAlarms(await source.alarms());
   const reference = recalled(REFERENCE_KEY);
   if (reference !== null && reference.fleet === state.meta.fleet && state.span !== null && reference.time_s >= state.span[0]) {

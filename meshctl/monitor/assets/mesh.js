@@ -3,13 +3,14 @@
 import { isKnown } from "./format.js";
 import { drawLabels } from "./labels.js";
 import { pathOf } from "./model.js";
-import { drawArrow, drawText, LINK, shape } from "./signs.js";
+import { drawArrow, drawText, HOLLOW, LINK, shape } from "./signs.js";
+import { drawTracks } from "./tracks.js";
 import { summaryOf, tipOf } from "./words.js";
 
 const MAX_RADIUS = 11;
 const MIN_RADIUS = 5;
-// Room for labels, the buttons above and the legend below.
-const MARGIN = { x: 90, top: 100, bottom: 84 };
+// Room for labels, and the buttons above.
+const MARGIN = { x: 90, top: 100 };
 const HIT_PX = 22;
 const MOVE_MS = 350;
 
@@ -28,6 +29,8 @@ export class MeshCanvas {
     this.difference = null;
     this.pointers = new Map();
     this.isMetric = false;
+    // of a recording: [{name, points: [[time_s, x_m, y_m, is_online]]}]
+    this.tracks = [];
     this.pending = 0;
     this.frames = 0;
     this.readColors();
@@ -47,7 +50,10 @@ export class MeshCanvas {
     this.request();
   }
 
-  get room() { return { x: Math.max(50, this.width - 2 * MARGIN.x), y: Math.max(50, this.height - MARGIN.top - MARGIN.bottom) }; }
+  get room() { return { x: Math.max(50, this.width - 2 * MARGIN.x), y: Math.max(50, this.height - MARGIN.top - this.bottom) }; }
+
+  // Room for labels and the legend.
+  get bottom() { return (this.canvas.parentElement.querySelector(".legend")?.offsetHeight ?? 0) + 44; }
 
   get isPortrait() { return this.height > this.width * 1.1; }
 
@@ -90,8 +96,9 @@ export class MeshCanvas {
   fit() {
     this.isFitted = true;
     if (this.points.size === 0 || !this.width) return;
-    const xs = [...this.points.values()].map((point) => point.x);
-    const ys = [...this.points.values()].map((point) => point.y);
+    const ways = this.isMetric ? this.tracks.flatMap((track) => track.points) : [];
+    const xs = [...this.points.values()].map((point) => point.x).concat(ways.map((at) => at[1]));
+    const ys = [...this.points.values()].map((point) => point.y).concat(ways.map((at) => -at[2]));
     const [left, right, top, bottom] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
     const room = this.room;
     const most = this.isMetric ? 40 : 1.25;
@@ -203,7 +210,7 @@ export class MeshCanvas {
       this.drawn.set(name, { x: from.x + (to.x - from.x) * eased, y: from.y + (to.y - from.y) * eased, isGuess: to.isGuess });
     }
     this.radius = this.#radius();
-    if (this.isMetric) this.#grid(); else this.#columns();
+    if (this.isMetric) { this.#grid(); drawTracks(c, colors, this.camera, this.tracks, this.view.time_s); } else this.#columns();
     const path = this.selected === null ? [] : pathOf(this.view, this.selected);
     const onPath = new Set(path);
     this.#paths(onPath);
@@ -315,6 +322,12 @@ export class MeshCanvas {
     c.beginPath();
     c.moveTo(a.x, a.y); c.lineTo(b.x, b.y);
     c.stroke();
+    if (style.isHollow && c.lineWidth >= 3) {
+      c.globalAlpha = 1;
+      c.strokeStyle = colors["--bg"];
+      c.lineWidth *= HOLLOW;
+      c.stroke();
+    }
     c.setLineDash([]);
     if (link.isOneWay) drawArrow(c, link.forward !== null ? a : b, link.forward !== null ? b : a, colors[style.color]);
     c.globalAlpha = 1;

@@ -130,6 +130,8 @@ function robotOf(robot, status, devices, meta, meters) {
   // what an offline peer had last is not what it has now
   const toBase = (robot.peers ?? []).find((peer) => peer.name === baseName && peer.online) ?? null;
   const radios = (robot.radios ?? []).map((name) => devices.get(name)).filter((device) => device !== undefined && device.role !== "beacon");
+  // a robot that told nothing itself: as the base sees it
+  const fromBase = ((status.robots ?? []).find((one) => one.is_base)?.peers ?? []).find((peer) => peer.name === robot.name && peer.online) ?? null;
   const best = radios.filter((device) => isKnown(device.hops)).sort((x, y) => x.hops - y.hops || (y.quality ?? 0) - (x.quality ?? 0))[0] ?? null;
   const beacons = [...devices.values()].filter((device) => device.role === "beacon" && device.robot === robot.name);
   const peers = robot.peers;
@@ -139,7 +141,7 @@ function robotOf(robot, status, devices, meta, meters) {
     alarms: robot.alarms ?? [], reason: robot.silent_because, raw: robot,
     hops: best?.hops ?? null, pathQuality: best?.quality ?? null, radio: best?.name ?? radios[0]?.name ?? null,
     queues: robot.queues ?? null, meter: meters?.[robot.name] ?? null,
-    roundTrip_s: toBase?.round_trip_s ?? null, loss: toBase?.loss ?? null,
+    roundTrip_s: toBase?.round_trip_s ?? fromBase?.round_trip_s ?? null, loss: toBase?.loss ?? null,
     capacity: toBase?.capacity_bits_per_s ?? null,
     outbox: peers === null || peers === undefined ? null : peers.every((peer) => isKnown(peer.outbox_messages)) ? sum(peers.map((peer) => peer.outbox_messages)) : null,
     peersOnline: peers === null || peers === undefined ? null : peers.filter((peer) => peer.online).length,

@@ -14,7 +14,7 @@ const MAX_FULL_CARDS = 6;
 const healthMark = (health) => HEALTH_MARKS[health] ?? `? ${health}`;
 
 function fact(term, text, isBad = false) {
-  const classes = [text === MISSING ? "is-missing" : "", isBad ? "is-bad" : "", /^[\d–-]/.test(text) && text.length < 9 ? "" : "is-text"].join(" ").trim();
+  const classes = [text === MISSING ? "is-missing" : "", isBad ? "is-bad" : "", /^[\d–-]/.test(text) && text.length < 9 ? "" : text.length > 8 ? "is-text is-long" : "is-text"].join(" ").trim();
   // the unit after the last space is small
   const at = /^[\d.,–-]+ \S/.test(text) ? text.indexOf(" ") : -1;
   const parts = at < 0 ? [text] : [text.slice(0, at), el("small", {}, text.slice(at))];
@@ -205,7 +205,7 @@ export function showChanges(panel, changes, reference_s, onSelect, onReference) 
   }
   const rows = changes.map((change) => el("p", { class: "change", "data-kind": change.kind }, el("b", {}, change.kind === "worse" ? "▼" : change.kind === "better" ? "▲" : "•"), change.text));
   panel.replaceChildren(
-    el("h2", {}, `${plural(changes.length, "difference")} from ${clockTime(reference_s)}`),
+    el("h2", {}, `${plural(changes.length, "difference")} from ${clockTime(reference_s)}, ${changes.filter((change) => change.kind === "worse").length} worse`),
     ...(rows.length === 0 ? [el("p", { class: "empty" }, "Nothing changed.")] : rows),
     el("div", { class: "actions" }, el("button", { type: "button", onclick: () => onReference(null) }, "Forget the reference")),
   );

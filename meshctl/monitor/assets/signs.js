@@ -1,6 +1,10 @@
 // Signs of the map: links' colors, devices' shapes, arrows, texts, and samples of them for the legend.
 
-export const LINK = { good: { width: 4, color: "--good" }, fair: { width: 3, color: "--fair" }, poor: { width: 2.5, color: "--poor" }, stale: { width: 2, color: "--stale" }, unknown: { width: 2, color: "--muted" } };
+// Good thick, fair thinner, poor hollow: to tell without color, and a poor link of a path is seen from afar.
+export const LINK = { good: { width: 4.5, color: "--good" }, fair: { width: 3, color: "--fair" }, poor: { width: 5, color: "--poor", isHollow: true }, stale: { width: 2, color: "--stale" }, unknown: { width: 2, color: "--muted" } };
+
+// The part of a hollow line's width that is empty.
+export const HOLLOW = 0.42;
 
 // Shapes besides color: base a square, robots circles, beacons diamonds, others triangles.
 export function shape(c, role, x, y, radius) {
@@ -52,8 +56,13 @@ export function drawSample(canvas, kind, colors) {
   canvas.height = 16 * ratio;
   c.setTransform(ratio, 0, 0, ratio, 0, 0);
   const line = (color, width, dash = []) => { c.strokeStyle = color; c.lineWidth = width; c.setLineDash(dash); c.beginPath(); c.moveTo(0, 8); c.lineTo(30, 8); c.stroke(); };
-  if (kind in LINK) line(colors[LINK[kind].color], LINK[kind].width, kind === "stale" ? [2, 5] : []);
+  if (kind in LINK) {
+    line(colors[LINK[kind].color], LINK[kind].width, kind === "stale" ? [2, 5] : []);
+    if (LINK[kind].isHollow) line(colors["--bg"], LINK[kind].width * HOLLOW);
+  }
   else if (kind === "one-way") line(colors["--text"], 3, [9, 5]);
+  else if (kind === "track") line(colors["--accent"], 3);
+  else if (kind === "lost-track") line(colors["--stale"], 2, [2, 4]);
   else if (kind === "path") { c.globalAlpha = 0.35; line(colors["--path"], 11); }
   else if (kind === "cut") { c.strokeStyle = colors["--cut"]; c.lineWidth = 2.5; c.beginPath(); c.arc(15, 8, 6.5, 0, 2 * Math.PI); c.stroke(); }
   else { shape(c, kind, 15, 8, 5.5); c.fillStyle = colors["--text"]; c.fill(); }

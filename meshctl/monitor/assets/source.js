@@ -2,6 +2,8 @@
 
 const QUIET_MS = 15_000;
 const MAX_BACKOFF_MS = 8_000;
+// Parts of a recording whose frames are kept.
+const MAX_UNPACKED = 8;
 
 export function openSource() {
   const embedded = document.getElementById("recording");
@@ -47,6 +49,7 @@ class LiveSource {
   timeline(from_s, to_s, buckets) { return this.#json(`api/timeline?from=${from_s}&to=${to_s}&buckets=${buckets}`); }
   series(device, from_s, to_s) { return this.#json(`api/series?device=${encodeURIComponent(device)}&from=${from_s}&to=${to_s}`); }
   alarms() { return this.#json("api/alarms"); }
+  report() { return this.#json("api/report"); }
   post(path, body) {
     return this.#json(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
   }
@@ -103,19 +106,32 @@ class RecordedSource {
   constructor(element) {
     this.isRecorded = true;
     this.loaded = unpack(element.textContent).then((text) => JSON.parse(text));
+    this.parts = [...document.querySelectorAll("script.frames")];
+    this.unpacked = new Map();
+  }
+
+  // The frames of one part of the file; the newest few are kept.
+  #part(index) {
+    const found = this.unpacked.get(index) ?? unpack(this.parts[index].textContent).then((text) => JSON.parse(text));
+    this.unpacked.delete(index);
+    this.unpacked.set(index, found);
+    if (this.unpacked.size > MAX_UNPACKED) this.unpacked.delete(this.unpacked.keys().next().value);
+    return found;
   }
 
   async meta() { return (await this.loaded).meta; }
 
   async frame(at_s) {
-    const { frames } = await this.loaded;
-    if (at_s === null) return frames.at(-1);
-    let [low, high] = [0, frames.length - 1];
+    const { times_s, frames } = await this.loaded;
+    let [low, high] = [0, times_s.length - 1];
+    if (at_s === null) low = high;
     while (low < high) {
       const middle = (low + high + 1) >> 1;
-      if (frames[middle].time_s <= at_s) low = middle; else high = middle - 1;
+      if (times_s[middle] <= at_s) low = middle; else high = middle - 1;
     }
-    return frames[low];
+    let part = 0;
+    while (low >= frames[part]) { low -= frames[part]; part += 1; }
+    return (await this.#part(part))[low];
   }
 
   async timeline(from_s, to_s) {
@@ -133,6 +149,7 @@ class RecordedSource {
   }
 
   async alarms() { return (await this.loaded).alarms; }
+  async report() { return (await this.loaded).report; }
   async post() { throw new RequestError(405, "a recording cannot be changed"); }
   async listen(on) { on.state("replay", ""); }
 }

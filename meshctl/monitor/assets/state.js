@@ -5,7 +5,7 @@ import { openSource } from "./source.js";
 export const source = openSource();
 export const state = {
   meta: null, live: null, frame: null, view: null, at_s: null, selected: null, tab: "alarms", arrangement: "auto",
-  alarms: [], reference: null, link: "connecting", linkReason: "", lostAt_s: null, hasSnr: true, span: null, window_s: 3600, playing: 0, offset_s: 0,
+  alarms: [], reference: null, link: "connecting", linkReason: "", lostAt_s: null, report: [], tracks: [], hasSnr: true, span: null, window_s: 3600, playing: 0, offset_s: 0,
 };
 
 export const now_s = () => Date.now() / 1000 + state.offset_s;

@@ -43,7 +43,8 @@ export function showStrip(view) {
   const totals = [
     ["radios", `${answering(nodes)}`, `/${nodes.length}`], ["robots", robots.length === 0 ? "–" : `${answering(robots)}`, robots.length === 0 ? "" : `/${robots.length}`],
     ["errors", `▲${level("error")}`, ""], ["warnings", `◆${level("warning")}`, ""],
-    ["watching", airtime && isKnown(airtime.share) ? percentOf(airtime.share) : "–", " air"],
+    // recordings of robots alone had no monitor that watched
+    ...(state.meta.mode === "replay" && !airtime ? [] : [["watching", airtime && isKnown(airtime.share) ? percentOf(airtime.share) : "–", " air"]]),
   ];
   const key = JSON.stringify(totals);
   if (byId("totals").dataset.signature !== key) {

@@ -6,7 +6,7 @@ import json
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -61,9 +61,19 @@ class Served:
 
 
 @contextmanager
-def served(store: FrameStore, settings: PageSettings = SETTINGS, *, port: int = 0, **parts: Any) -> Iterator[Served]:
+def served(
+    store: FrameStore,
+    settings: PageSettings = SETTINGS,
+    *,
+    port: int = 0,
+    meters: Callable[[], dict[str, Mapping[str, Any]]] | None = None,
+    **parts: Any,
+) -> Iterator[Served]:
     feed = Feed()
-    app = MonitorServer(store, feed, settings, **parts).app()
+    page = MonitorServer(store, feed, settings, **parts)
+    if meters is not None:
+        page.streams.meters = meters
+    app = page.app()
     listening = listen("127.0.0.1", port)
     server = uvicorn.Server(uvicorn.Config(app, log_config=None, access_log=False, timeout_graceful_shutdown=1))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)

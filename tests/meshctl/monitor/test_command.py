@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
+import re
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -18,6 +21,7 @@ from meshctl.cli.monitor_web import WebOptions
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
 from tests.meshctl.monitor.documents import frame
+from tests.meshctl.monitor.recordings import write_recording
 from tests.meshctl.status.fleets import trio
 from tests.meshctl.status.line_fleet import Bench, line_of_three
 
@@ -97,6 +101,22 @@ def history(tmp_path: Path) -> Path:
     with FrameStore.open(path, 1e9, MIN_BYTES) as store:
         store.append(frame(1000.0))
     return path
+
+
+def test_recordings_of_robots_are_part_of_the_debriefing(history: Path) -> None:
+    recording = write_recording(history.parent / "spot1.jsonl", "spot1")
+    with recording.open("a", encoding="utf-8") as file:
+        file.write("cut o")
+    page = history.parent / "run.html"
+    code, output = run("--replay", str(history), "--replay", str(recording), "--out", str(page))
+    assert code == 0
+    assert f"warning: {recording}: line " in output
+    (packed,) = re.findall(r'id="recording">([^<]*)<', page.read_text(encoding="utf-8"))
+    document = json.loads(gzip.decompress(base64.b64decode(packed)))
+    assert document["meta"]["fleet"] == "lab"
+    (report,) = document["report"]
+    assert report["node"] == "spot1"
+    assert "Invalid lines, which were ignored: 1." in report["notes"]
 
 
 @pytest.mark.parametrize(

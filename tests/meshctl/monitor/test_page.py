@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,9 @@ from meshctl.monitor.page import recording_of, single_file
 from meshctl.monitor.server import PageSettings
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
+from tests.meshctl.monitor.recordings import OFFLINE_S, write_recording
 from tests.meshctl.monitor.served import served
+from udp_mesh.report import main as report
 
 pytestmark = pytest.mark.xdist_group("browser")
 
@@ -134,6 +136,29 @@ def test_readings_of_the_placement_meter_are_shown_live_and_in_the_past(
         expect(meter).to_contain_text("DROP SOON")
         expect(meter.locator("b")).to_have_text(["12", "–"])
         expect(meter).to_contain_text("weak next hop")
+
+
+def test_readings_of_a_running_placement_meter_arrive_between_frames_and_go_when_it_ends(
+    browser: Browser, store: FrameStore, frames: list[Frame]
+) -> None:
+    readings: dict[str, Mapping[str, Any]] = {}
+    store.append(frames[0])
+    with (
+        served(store, SETTINGS, meters=lambda: dict(readings)) as server,
+        opened(browser, server.url, width=1600) as page,
+    ):
+        meter = page.locator("#robots .meter")
+        for advice, left in (("GO", 31.4), ("DROP NOW", 0.9), ("TURN BACK", None)):
+            readings["spot1"] = {"advice": advice, "meters_left": left, "margin_db": 6.2, "reason": HOSTILE}
+            server.feed.notify()
+            expect(meter).to_have_attribute("data-advice", advice)
+            expect(meter.locator("b")).to_have_text(["–" if left is None else str(int(left)), "6"])
+        assert page.locator("img").count() == 0
+        # no frame came meanwhile
+        assert shown_s(page) == frames[0].time_s
+        readings.clear()
+        server.feed.notify()
+        expect(meter).to_have_count(0)
 
 
 def test_the_slider_shows_any_moment_and_alarms_lead_to_theirs(
@@ -266,3 +291,58 @@ def test_a_recording_is_one_file_that_needs_no_server(
         page.click("#live")
         page.wait_for_selector(f'html[data-shown="{frames[-1].time_s:.0f}"]', state="attached")
         assert page.get_by_role("button", name="Acknowledge").count() == 0
+        # the frames are in several parts, and nothing of udp-mesh is there to report
+        assert page.locator("script.frames").count() > 1
+        expect(page.locator("#tab-report")).to_be_hidden()
+
+
+def left_edge(chart: Locator) -> str:
+    """The time at the left edge of a chart, from its legend."""
+    chart.locator(".u-over").hover(position={"x": 2, "y": 40})
+    expect(chart.locator(".u-legend")).to_contain_text(re.compile(r"\d\d:\d\d:\d\d"))
+    return chart.locator(".u-legend .u-value").first.text_content() or ""
+
+
+def test_the_report_of_recordings_is_the_same_page(
+    browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [write_recording(tmp_path / f"{node}.jsonl", node, HOSTILE) for node in ("base", "spot1")]
+    out = tmp_path / "run.html"
+    assert report([*map(str, files), "--out", str(out), "--title", HOSTILE]) == 0
+    assert capsys.readouterr().err == ""
+    with opened(browser, file_url(out), width=1600) as page:
+        expect(page.locator("#fleet")).to_have_text(HOSTILE)
+        expect(page.locator("#mode")).to_contain_text("recording")
+        panel = page.locator("#report")
+        for title in ("Throughput by topic", "Throughput by priority", "Latency", "Round-trip", "Outbox", "Online"):
+            expect(panel.locator(".chart h3", has_text=title).first).to_be_visible()
+        expect(panel.locator("table").first).to_contain_text(f"map{HOSTILE}")
+        expect(panel).to_contain_text("tables and charts count every line")
+        expect(page.locator("#legend")).to_contain_text("track, online")
+        # hover shows the values of that time
+        chart = panel.locator(".chart", has_text="Throughput by topic")
+        whole = left_edge(chart)
+        area = chart.locator(".u-over")
+        area.drag_to(area, source_position={"x": 150, "y": 40}, target_position={"x": 250, "y": 40})
+        assert left_edge(chart) > whole
+        # all charts are zoomed together
+        assert left_edge(panel.locator(".chart", has_text="Loss to the peer")) > whole
+        area.dblclick()
+        assert left_edge(chart) == whole
+        # an event leads to its moment, and the slider to any other
+        event = panel.locator("li", has_text="peer-offline").first
+        event.locator("button").click()
+        page.wait_for_selector(f'html[data-shown="{OFFLINE_S:.0f}"]', state="attached")
+        page.locator("#slider").fill(str(OFFLINE_S - 10))
+        page.wait_for_selector(f'html[data-shown="{OFFLINE_S - 10:.0f}"]', state="attached")
+        card = page.locator("#robots article", has_text="spot1")
+        expect(card).to_contain_text("ok")
+        # the other recording
+        panel.locator("select").select_option(label="recorded by spot1")
+        expect(panel.locator(".chart").first).to_be_visible()
+        page.keyboard.press("Escape")
+        page.keyboard.press("3")
+        page.keyboard.press("6")
+        expect(panel).to_be_visible()
+        assert page.locator("img, iframe, object").count() == 0
+        assert "owned" not in page.title().replace(HOSTILE, "")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 from collections import Counter
@@ -56,6 +58,19 @@ def test_a_recording_cannot_leave_its_element() -> None:
     assert text.count("<script") == text.count("</script>") == 7
     assert "default-src 'none'" in text
     assert "src=" not in re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+
+
+def test_frames_are_in_parts_which_hold_them_all() -> None:
+    frames = [json.dumps({"time_s": number, "padding": "x" * 400_000}) for number in range(7)]
+    text = single_file({"meta": {}, "times_s": list(range(7)), "frames": frames})
+    parts = [json.loads(unpacked(one)) for one in re.findall(r'class="frames">([^<]*)<', text)]
+    assert [frame["time_s"] for part in parts for frame in part] == list(range(7))
+    (rest,) = re.findall(r'id="recording">([^<]*)<', text)
+    assert json.loads(unpacked(rest))["frames"] == [len(part) for part in parts] == [2, 2, 2, 1]
+
+
+def unpacked(text: str) -> bytes:
+    return gzip.decompress(base64.b64decode(text))
 
 
 def test_files_of_others_are_pinned_by_version_and_hash() -> None:

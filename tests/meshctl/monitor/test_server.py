@@ -57,6 +57,13 @@ def test_frames_timeline_series_and_alarms(server: Served) -> None:
     )
 
 
+def test_the_report_of_recordings_is_served_as_it_was_made(store: FrameStore) -> None:
+    report = [{"node": "spot1", "notes": ["</script>"]}]
+    with served(store, PageSettings("lab", "0", "replay", has_report=True), report=report) as server:
+        assert server.ask("api/report").body == report
+        assert server.ask("api/meta").body["has_report"] is True
+
+
 @pytest.mark.parametrize(
     ("path", "expected"),
     [

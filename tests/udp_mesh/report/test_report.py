@@ -1,12 +1,9 @@
-"""A recording survives a round trip, with truncated and foreign lines; the page shows its contents."""
+"""A recording survives a round trip, with truncated and foreign lines; figures and commands show its contents."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 from hypothesis import given
@@ -14,9 +11,8 @@ from hypothesis import strategies as st
 
 from udp_mesh.report import main
 from udp_mesh.report import recording as report_recording
-from udp_mesh.report.charts import density, over_time, paths, spans, stacked, ticks
-from udp_mesh.report.figures import connections, histogram, intervals, sent_topics, summary, throughput, time_series
-from udp_mesh.report.page import page
+from udp_mesh.report.document import document_of
+from udp_mesh.report.figures import connections, histogram, intervals, sent_topics, summary, throughput
 from udp_mesh.report.recording import (
     Place,
     Presence,
@@ -29,6 +25,7 @@ from udp_mesh.report.recording import (
     parse,
     read,
 )
+from udp_mesh.report.text import text_of
 
 ITEMS = (
     Presence(1.0, "base", "spot1", True),
@@ -83,7 +80,7 @@ def test_a_truncated_line_is_ignored_and_reported() -> None:
 def test_a_damaged_line_is_ignored_and_reported_with_the_reason(raw: str, problem: str) -> None:
     recording = parse([header("base", 0.0).encode(), raw.encode()], "r")
     assert recording.problems == [f"r:2: {problem}"]
-    assert "1 lines are invalid" in page([recording], "any")
+    assert "Invalid lines, which were ignored: 1." in text_of(document_of(recording))
 
 
 def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
@@ -99,7 +96,7 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
     (spot,) = connections(recording)
     assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
     # Values of an offline peer are old.
-    assert [t for t, _ in time_series(recording, lambda sample: sample.loss, bins=5)["spot1"]] == [0.5, 2.5]
+    assert [sample.t for sample in recording.samples if sample.loss is not None] == [0.0, 2.0]
 
 
 def test_outcomes_of_sent_messages_are_counted_per_topic() -> None:
@@ -115,12 +112,13 @@ def test_outcomes_of_sent_messages_are_counted_per_topic() -> None:
     estop, bulk = sent_topics(recording)
     assert (estop.topic, estop.messages, estop.delivered, estop.latency_s(0.5)) == ("estop", 1, 2, 0.04)
     assert (bulk.total_bytes, bulk.expired, bulk.peer_lost, bulk.latency_s(0.5)) == (500, 1, 1, None)
-    assert "<td>estop</td><td>1</td><td>0.00</td><td>2</td><td>0</td><td>0</td><td>40.0</td>" in page([recording], "")
+    (table,) = (one for one in document_of(recording)["tables"] if one["title"] == "Sent")
+    assert table["rows"][0] == ["estop", "1", "0.00", "2", "0", "0", "40.0", "40.0"]
 
 
 def test_lines_that_were_never_written_are_reported() -> None:
     recording = parse([header("a", 0.0).encode(), b'{"t": 1, "kind": "gap", "lines": 40}'], "r")
-    assert "40 lines are missing" in page([recording], "any")
+    assert "40 lines are missing" in text_of(document_of(recording))
     assert summary(recording)["lines_left_out"] == 40
 
 
@@ -175,17 +173,6 @@ def test_topics_are_sorted_by_message_count_and_show_punctuality() -> None:
     assert second.punctual == 1.0
 
 
-def test_a_track_is_split_into_online_and_offline_paths() -> None:
-    track = [(float(x), 0.0, x < 50 or x > 80) for x in range(100)]
-    assert paths({"spot1": track}, {}).count("stroke-linejoin") == 3
-
-
-def test_a_long_name_is_shortened_and_shown_in_full_in_a_tooltip() -> None:
-    picture = spans({"operator-base-station": [(0.0, 1.0)]}, 2.0, "s")
-    assert ">operator…</text>" in picture
-    assert "<title>operator-base-station</title>" in picture
-
-
 def test_messages_that_all_come_at_once_are_not_periodic() -> None:
     burst = [RecordedArrival(5.0, "base", "spot1", "map", 7, 100) for _ in range(30)]
     assert intervals(parse(lines(*burst), "r")) == []
@@ -204,7 +191,7 @@ def test_an_invalid_recording_is_an_error_with_its_line(tmp_path: Path) -> None:
 def test_any_lines_give_a_recording_or_a_recording_error(raw: list[bytes]) -> None:
     for start in ([], [header("x", 0.0).encode()]):
         try:
-            page([parse([*start, *raw], "r")], "any")
+            text_of(document_of(parse([*start, *raw], "r")))
         except RecordingError as error:
             assert str(error).startswith("r:1:")
 
@@ -217,7 +204,7 @@ def test_any_lines_give_a_recording_or_a_recording_error(raw: list[bytes]) -> No
 def test_arbitrary_json_values_of_a_known_kind_are_handled(value: object) -> None:
     for kind in ("received", "peer-online", "conditions", "place"):
         entry = {"t": value, "kind": kind, "peer": value, "peers": value, "x": value, "y": 1, "source": value}
-        parse([header("x", 0.0).encode(), json.dumps(entry).encode()], "r")
+        document_of(parse([header("x", 0.0).encode(), json.dumps(entry).encode()], "r"))
 
 
 def periodic(jitter: float) -> Recording:
@@ -252,55 +239,39 @@ def test_a_histogram_is_a_density(values: list[float]) -> None:
     assert sum(histogram(tuple(values), 0.0, 2.0, 8)) * 0.25 == pytest.approx(inside / len(values))
 
 
-@given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6))
-def test_axis_ticks_are_few_and_within_range(low: float, span: float) -> None:
-    found = ticks(low, low + span)
-    assert 1 <= len(found) <= 11
-    assert all(low - 1e-6 * span <= value <= low + span * (1 + 1e-6) for value in found)
-
-
-def test_pictures_are_well_formed_and_escape_names() -> None:
-    for picture in (
-        density([0.1, 2.0], 0.0, 1.0, (0.5, 0.1), "s"),
-        spans({"<a>&": [(0.0, 1.0)]}, 2.0, "s"),
-        stacked({"<b>": [1.0, 2.0], "c": [0.0, 1.0]}, 2.0, "s", "Mbit/s"),
-        over_time({"<d>": [(0.0, 1.0), (1.0, 2.0), (9.0, 1.0)], "e": []}, 9.0, "s", "ms"),
-        paths({"d": [(0, 0, True), (5, 5, False)]}, {"<e>": (1, 1)}),
-    ):
-        ElementTree.fromstring(picture)
-
-
-def test_the_page_shows_every_topic_and_peer(tmp_path: Path) -> None:
+def test_without_meshctl_the_report_is_text_and_a_page_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "base.jsonl"
-    path.write_bytes(b"\n".join(lines(*ITEMS)) + b"\n")
-    out = tmp_path / "page.html"
-    assert main([str(path), "--out", str(out)]) == 0
-    text = out.read_text()
-    for expected in (
-        "telemetry",
-        "spot1",
-        "Throughput by topic",
-        "Online",
-        "Round-trip time",
-        "Loss",
-        "Where the robots were online",
-    ):
-        assert expected in text
+    path.write_bytes(b"\n".join(lines(*ITEMS)))
+    assert main([str(path), "--text"]) == 0
+    text = capsys.readouterr().out
+    # as in a robot's bundle, which has udp_mesh alone
+    monkeypatch.setattr("udp_mesh.report.page.GROUP", "udp_mesh.none")
+    monkeypatch.chdir(tmp_path)
+    assert main([str(path)]) == 0
+    assert capsys.readouterr().out == text
+    assert "telemetry" in text
+    assert "spot1" in text
+    assert main([str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["page"] is None
+    assert main([str(path), "--out", "run.html"]) == 2
+    assert "the page needs meshctl" in capsys.readouterr().err
+    assert [kept.name for kept in tmp_path.iterdir()] == ["base.jsonl"]
 
 
-def test_a_failed_write_keeps_the_previous_page_and_leaves_no_partial_file(tmp_path: Path) -> None:
-    path = tmp_path / "run.html"
-    path.write_text("the page before")
-    # a limit on files' sizes fails a write in its middle, as a full disk does
-    script = f"""
-import resource
-from pathlib import Path
-from udp_mesh.report.page import write_page
-from udp_mesh.report.recording import Recording
-resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
-write_page([Recording("base")], Path({str(path)!r}), "x" * 1000)
-"""
-    ended = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
-    assert f"File too large: '{path}'" in ended.stderr
-    assert [kept.name for kept in tmp_path.iterdir()] == ["run.html"]
-    assert path.read_text() == "the page before"
+def test_a_page_never_replaces_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "base.jsonl"
+    path.write_bytes(b"\n".join(lines(*ITEMS)))
+    before = path.read_bytes()
+    assert main([str(path), "--out", str(path)]) == 2
+    assert "expected another file" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+def test_text_has_no_control_characters_of_names() -> None:
+    hostile = RecordedArrival(1.0, "base", "\x1b[2Jspot", "to\npic\x1b]0;x\x07", 3, 10)
+    text = text_of(document_of(parse(lines(hostile), "r")))
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert "to␊pic" in text
