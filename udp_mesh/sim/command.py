@@ -20,11 +20,16 @@ SHIPPED = Path(__file__).with_name("scenarios")
 
 def run_command(arguments: Sequence[str]) -> int:
     """Exit codes: 0 success, 2 the scenario is invalid or the results cannot be written, 130 interrupted."""
+    if arguments[:1] == ["sweep"]:
+        from udp_mesh.sim.sweep import run_sweep
+
+        return run_sweep(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="udp-mesh sim",
         description="Simulate a team in virtual time: the transport's core on a simulated radio channel.",
         epilog="exit codes: 0 success, 2 invalid scenario or results not writable, 130 interrupted\n\n"
-        "example: udp-mesh sim final-run --out /tmp/final-run",
+        "example: udp-mesh sim final-run --out /tmp/final-run\n\n"
+        "`udp-mesh sim sweep --help`: many seeds and settings, compared with confidence intervals",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scenario", nargs="?", help="scenario file (YAML), or name of a shipped scenario")
