@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -175,7 +175,7 @@ def _parse(text: str, ground: str | None, file: str, settings: Settings) -> Scen
         raise SweepError("\n".join(f"{_problem(one, lines)} ({words})" for one in error.diagnostics)) from None
 
 
-def _problem(one: Diagnostic, lines: dict[str, Callable[[int], int]]) -> str:
+def _problem(one: Diagnostic, lines: Mapping[str, Callable[[int], int]]) -> str:
     place = one.position
-    line = lines.get(place.file, lambda number: number)(place.line)
+    line = lines[place.file](place.line) if place.file in lines else place.line
     return f"{place.file}:{line}: {one.text}"

@@ -12,7 +12,7 @@ from mesh_sweep.errors import SweepError
 from mesh_sweep.page import page
 from mesh_sweep.results import Identity, Result
 
-LATENCY = {"0": [1.0, 5.0, 9.0], "10": [1.1, 5.2, 9.0], "9": [2.0, 6.0, None]}
+LATENCY: dict[str, list[float | None]] = {"0": [1.0, 5.0, 9.0], "10": [1.1, 5.2, 9.0], "9": [2.0, 6.0, None]}
 RESULTS = [
     *(
         Result(Case((("loss", loss),), seed), {"latency_s": value, "arrived": 1.0})

@@ -1,4 +1,4 @@
-"""Whoever kills workers is found; nobody else is blamed, and everybody else runs."""
+"""A case that kills workers is found; no other one is blamed, and all others run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ def play(count: int, width: int, killers: set[int], order: list[int]) -> tuple[s
     """A pool that breaks whenever a killer runs: (done, given up, times that it broke)."""
     dispatch = Dispatch(Case((), seed) for seed in range(count))
     running: list[Case] = []
-    done, given_up, broken = set(), set(), 0
+    done: set[int] = set()
+    given_up: set[int] = set()
+    broken = 0
     while not dispatch.is_finished:
         running += dispatch.take(width)
         assert running

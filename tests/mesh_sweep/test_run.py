@@ -1,4 +1,4 @@
-"""Cases on real executors: a dead worker loses nothing, and whoever killed it is named."""
+"""Cases on real executors: a dead worker loses nothing, and a case that kills workers is named."""
 
 from __future__ import annotations
 

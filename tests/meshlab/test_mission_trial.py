@@ -68,7 +68,7 @@ def test_without_fading_the_losses_are_those_of_the_links() -> None:
     environment = replace(now.environment, links=(LinkSpec("base", "rover", loss=0.25, loss_back=0.5),))
     now = replace(now, environment=environment)
     found = losses_of(now, FadingField(random.Random(1), 0.0, 10.0))
-    expected = {}
+    expected: dict[tuple[str, str], float] = {}
     for link in links_of(environment):
         expected |= {(a, b): link.loss_to(b) for a, b in ((link.a, link.b), (link.b, link.a)) if link.loss_to(b) < 1.0}
     assert found == expected

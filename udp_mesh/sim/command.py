@@ -20,10 +20,6 @@ SHIPPED = Path(__file__).with_name("scenarios")
 
 def run_command(arguments: Sequence[str]) -> int:
     """Exit codes: 0 success, 2 the scenario is invalid or the results cannot be written, 130 interrupted."""
-    if arguments[:1] == ["sweep"]:
-        from udp_mesh.sim.sweep import run_sweep
-
-        return run_sweep(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="udp-mesh sim",
         description="Simulate a team in virtual time: the transport's core on a simulated radio channel.",

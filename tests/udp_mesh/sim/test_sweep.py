@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from udp_mesh.sim import main
 from udp_mesh.sim.sweep import run_sweep
 
 SCENARIO = """\
@@ -75,8 +76,6 @@ def test_settings_are_compared_and_a_second_run_computes_nothing(
 
 
 def test_one_seed_is_the_run_that_sim_makes(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from udp_mesh.sim import main
-
     assert run_sweep([str(scenario), "--seeds", "7-7", *INLINE]) == 0
     assert main([str(scenario), "--seed", "7", "--json"]) == 0
     printed = capsys.readouterr().out
@@ -109,6 +108,16 @@ def test_what_is_wrong_is_reported_with_its_place(
 ) -> None:
     assert run_sweep([str(scenario), *words]) == 2
     assert problem.format(file=scenario) in capsys.readouterr().err
+
+
+def test_a_robot_without_the_engine_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("mesh_sweep") or name == "udp_mesh.sim.sweep"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "mesh_sweep", None)
+    assert main(["sweep", "final-run"]) == 2
+    assert "install meshctl-fleet" in capsys.readouterr().err
 
 
 def test_results_of_another_scenario_are_refused(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
