@@ -72,8 +72,10 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
     out = options.out or Path(f"{study.identity.scenario}-sweep.jsonl")
     if options.report is not None:
         # before hours of work
-        with options.report.open("ab"):
-            pass
+        with options.report.open("ab") as opened:
+            is_new = opened.tell() == 0
+        if is_new:
+            options.report.unlink()
     with ResultsFile(out, study.identity) as file:
         if file.repaired_bytes:
             _note(f"{out}: cut off an incomplete last line of {file.repaired_bytes} bytes; its case runs again")

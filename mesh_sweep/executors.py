@@ -6,9 +6,11 @@ A `Workers` opens executors; `run` opens another one after a pool broke. Dask is
 from __future__ import annotations
 
 import importlib
+import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
@@ -17,6 +19,7 @@ from typing import Any, Protocol
 
 from mesh_sweep.errors import SweepError
 
+CONTINUE = "the results so far are kept, and the same command continues"
 _CONNECT_S = 15
 
 
@@ -107,12 +110,19 @@ class DaskWorkers:
             raise SweepError(
                 f"--dask: expected a Dask scheduler at {self.address}, found none: {str(error).splitlines()[0]}"
             ) from None
+        # lost connections are reported by the sweep, without a traceback
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        if not self._client.nthreads():
+            sys.stderr.write(f"{self.address} has no workers yet: waiting for the first one\n")
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     def width(self) -> int:
         # workers may come and go; two each, and a few for those that join
-        return 2 * max(2, sum(int(count) for count in self._client.nthreads().values()))
+        try:
+            return 2 * max(2, sum(int(count) for count in self._client.nthreads().values()))
+        except (OSError, RuntimeError, ValueError) as error:
+            raise SweepError(f"lost the Dask scheduler at {self.address}: {error}; {CONTINUE}") from error
 
     def is_death(self, error: BaseException) -> bool:
         from distributed import KilledWorker

@@ -8,13 +8,15 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, 
 from mesh_sweep.cases import Case
 from mesh_sweep.dispatch import MAX_LONE_DEATHS, Dispatch
 from mesh_sweep.errors import SweepError
-from mesh_sweep.executors import Workers
+from mesh_sweep.executors import CONTINUE, Workers
 from mesh_sweep.results import Figures, Result
 
 RunCase = Callable[[Case], Figures]
 """Simulates one case; picklable, because it runs on a worker."""
 _MAX_REASON = 300
 _TICK_S = 1.0
+_MAX_BROKEN = 8
+"""Pools that broke before any case ended: the fault is not a case's."""
 
 
 def run_cases(
@@ -31,6 +33,7 @@ def run_cases(
     executor = workers.open()
     running: dict[Future[Figures], Case] = {}
     is_complete = False
+    broken = ended = 0
     try:
         while not dispatch.is_finished:
             is_broken = not _submit(dispatch, run, executor, workers, running)
@@ -50,13 +53,21 @@ def run_cases(
                         dead.append(case)
                         continue
                     dispatch.done(case)
+                    ended += 1
                     yield Result(case, failed=_reason(error))
                 else:
                     dispatch.done(case)
+                    ended += 1
                     yield Result(case, figures)
             for case in dispatch.died(dead) if dead else ():
+                ended += 1
                 yield Result(case, failed=f"killed its worker {MAX_LONE_DEATHS} times while nothing else ran")
             if is_broken:
+                broken += 1
+                if broken >= _MAX_BROKEN and not ended:
+                    raise SweepError(
+                        f"workers died {broken} times before any case ended; run one case alone to see why"
+                    )
                 workers.close(executor, now=True)
                 executor = workers.open()
         is_complete = True
@@ -87,5 +98,5 @@ def _reason(error: BaseException) -> str:
             f"workers cannot import what they need ({error}): install the same version of meshctl-fleet on each of them"
         ) from error
     if isinstance(error, CancelledError):
-        raise SweepError("the executor canceled a case: is its scheduler still running?") from error
+        raise SweepError(f"the executor canceled a case: is its scheduler still running? {CONTINUE}") from error
     return f"{type(error).__name__}: {error}"[:_MAX_REASON]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from concurrent.futures import Executor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,13 @@ def other_revision(case: Case) -> dict[str, float | None]:
 
 def not_installed(case: Case) -> dict[str, float | None]:
     raise ModuleNotFoundError("No module named 'udp_mesh'")
+
+
+class DeadExecutor(Executor):
+    """A pool whose workers never start."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        raise BrokenExecutor("a process was terminated abruptly")
 
 
 class InlineExecutor(Executor):

@@ -52,6 +52,12 @@ def test_a_sweep_that_is_stopped_leaves_no_worker() -> None:
     assert multiprocessing.active_children() == []
 
 
+def test_workers_that_never_start_stop_the_sweep() -> None:
+    dead = OtherWorkers("tests.mesh_sweep.sample:DeadExecutor", 64)
+    with pytest.raises(SweepError, match="workers died 8 times before any case ended"):
+        list(run_cases([Case((), seed) for seed in range(1000)], sample.double, dead))
+
+
 @pytest.mark.parametrize(
     ("run", "problem"),
     [(sample.other_revision, "expected workers with revision a, found one with b"), (sample.not_installed, "install")],
