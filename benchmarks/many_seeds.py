@@ -70,14 +70,14 @@ def measure(case: Case) -> dict[str, float | None]:
 
 
 def tables(results: Sequence[Result]) -> str:
-    """One table per set, with a row per cell."""
+    """One table per set, with a row per cell; the columns of a cell's settings are in the order of their names."""
     by_cell: dict[Settings, list[Result]] = {}
     for result in sorted(results, key=lambda one: settings_order(one.case.settings)):
         if not result.failed:
             by_cell.setdefault(result.case.settings, []).append(result)
     parts = []
     for name, heads, columns in (
-        ("hops", ("three hops, loss of each", "bulk besides"), (("arrived", 100, "arrived, %"),
+        ("hops", ("bulk besides", "three hops, loss of each"), (("arrived", 100, "arrived, %"),
          ("deviation_s", 1e3, "standard deviation, ms"), ("longest_s", 1, "longest interval, s"))),
         ("teams", ("loss", "radio", "robots"), (("of_ceiling", 1, "of the ack-free ceiling"),
          ("fairness", 1, "fairness"), ("urgent_p99_s", 1e3, "urgent p99 of the worst, ms"))),
@@ -150,7 +150,8 @@ def main() -> None:
             except KeyboardInterrupt:
                 sys.exit(130)
             file.finish(results.values())
-    text = tables(decode(arguments.results.read_bytes(), str(arguments.results)).results)
+    stored = decode(arguments.results.read_bytes(), str(arguments.results))
+    text = f"udp_mesh {stored.identity.revision}\n\n{tables(stored.results)}"
     print(text)
     if arguments.fill:
         fill("many seeds", text)
