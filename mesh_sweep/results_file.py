@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
-from collections.abc import Iterable
+import stat
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -42,6 +44,10 @@ class ResultsFile:
         while True:
             descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666)
             try:
+                if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                    # a device may never end
+                    os.close(descriptor)
+                    raise SweepError(f"{self.path}: expected a regular file for the results, found none")
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # a sweep that ends replaces the file: the lock may be on the old one
                 if os.path.samestat(os.fstat(descriptor), os.stat(self.path)):
@@ -56,22 +62,34 @@ class ResultsFile:
             os.close(descriptor)
 
     def append(self, result: Result) -> None:
-        """Store one result now, with a single write."""
+        """Store one result now, with a single write. Raises OSError with the file's name."""
         line = encode(self.identity, result)
-        while line:
-            line = line[os.write(self._descriptor, line) :]
+        with self._named_errors():
+            while line:
+                line = line[os.write(self._descriptor, line) :]
 
     def finish(self, results: Iterable[Result]) -> None:
-        """Replace the file by all results, sorted; at every moment the old or the new content is there."""
+        """Replace the file by all results, sorted; at every moment the old or the new content is there.
+
+        Raises OSError with the file's name.
+        """
         new = self.path.with_name(f".{self.path.name}.new")
         try:
-            with new.open("wb") as file:
+            with self._named_errors(), new.open("wb") as file:
                 file.write(encode_all(self.identity, results))
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(new, self.path)
         finally:
             new.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _named_errors(self) -> Iterator[None]:
+        """Errors of a full disk do not name a file by themselves."""
+        try:
+            yield
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -105,7 +105,7 @@ def sweep(
     except SweepError as error:
         raise InputError(str(error)) from error
     except OSError as error:
-        raise InputError(f"{error.filename}: {error.strerror}") from error
+        raise InputError(f"{error.filename}: {error.strerror}" if error.filename else str(error)) from error
     raise typer.Exit(code)
 
 

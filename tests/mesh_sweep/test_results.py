@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import pytest
@@ -101,3 +102,25 @@ def test_a_refused_file_keeps_its_content(tmp_path: Path) -> None:
     with pytest.raises(SweepError), ResultsFile(path, OURS):
         pass
     assert path.read_bytes() == b"notes without an end"
+
+
+def test_a_full_disk_is_reported_with_the_file_and_tears_at_most_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "r.jsonl"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with ResultsFile(path, OURS) as file:
+        file.append(ONE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 20, limits[1]))
+        try:
+            with pytest.raises(OSError) as raised:
+                file.append(TWO)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert raised.value.filename == str(path)
+    with ResultsFile(path, OURS) as file:
+        assert file.stored.results == (ONE,)
+        assert file.repaired_bytes == 20
+
+
+def test_a_device_is_no_results_file() -> None:
+    with pytest.raises(SweepError, match="expected a regular file"), ResultsFile(Path("/dev/zero"), OURS):
+        pass

@@ -118,7 +118,7 @@ def run_sweep(arguments: Sequence[str]) -> int:
     except (SweepError, ScenarioError) as error:
         sys.stderr.write("".join(f"udp-mesh: {problem}\n" for problem in str(error).splitlines()))
     except OSError as error:
-        sys.stderr.write(f"udp-mesh: {error.filename}: {error.strerror}\n")
+        sys.stderr.write(f"udp-mesh: {f'{error.filename}: {error.strerror}' if error.filename else error}\n")
     return 2
 
 
