@@ -16,7 +16,7 @@ demo: setup
 # The tests start the programs hundreds of times; with PYTHONDONTWRITEBYTECODE each start would compile them.
 # Three workers on two cores: tests of virtual fleets wait for about half of their time.
 test: setup
-	$(BIN)/python -m compileall -q meshctl meshlab udp_mesh
+	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
 	$(BIN)/pytest -n 3 --dist loadgroup
 
 check: setup

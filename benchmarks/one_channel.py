@@ -162,8 +162,9 @@ def rank(values: Sequence[float], share: float) -> float:
     return ordered[min(len(ordered) - 1, int(len(ordered) * share))] if ordered else float("inf")
 
 
-def team(senders: int, loss: float, *, access_categories: bool) -> dict[str, Any]:
-    one = OneChannel(senders, channel=channel(access_categories=access_categories), loss=loss, seed=senders)
+def team(senders: int, loss: float, *, access_categories: bool, seed: int | None = None) -> dict[str, Any]:
+    used = channel(access_categories=access_categories)
+    one = OneChannel(senders, channel=used, loss=loss, seed=senders if seed is None else seed)
     one.run()
     bulk = one.bulk_bits_per_s()
     seen = list(one.seen.values())
@@ -183,8 +184,8 @@ def team(senders: int, loss: float, *, access_categories: bool) -> dict[str, Any
     }
 
 
-def guest(senders: int, loss: float) -> dict[str, Any]:
-    one = OneChannel(senders, 1, channel=channel(), loss=loss, seed=senders)
+def guest(senders: int, loss: float, *, seed: int | None = None) -> dict[str, Any]:
+    one = OneChannel(senders, 1, channel=channel(), loss=loss, seed=senders if seed is None else seed)
     one.run()
     latencies_s = one.seen["guest1"].latencies_s
     return {
@@ -198,7 +199,7 @@ def guest(senders: int, loss: float) -> dict[str, Any]:
     }
 
 
-def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
+def hops(loss: float, *, bulk: bool, seed: int = 1) -> dict[str, Any]:
     """A rover three hops from the base; each hop loses frames, and the radio makes only four attempts per frame."""
     row = ("base", "relay1", "relay2", "rover")
     place = {name: number for number, name in enumerate(row)}
@@ -225,7 +226,7 @@ def hops(loss: float, *, bulk: bool) -> dict[str, Any]:
         made.event_queue.after(1.0, report)
 
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in ("base", "rover")}
-    made = Team(settings, relays=row[1:3], channel=RadioChannel(attempts=4), loss=lost, seed=1, on_event=note)
+    made = Team(settings, relays=row[1:3], channel=RadioChannel(attempts=4), loss=lost, seed=seed, on_event=note)
     made.event_queue.at(MET_OVER_HOPS_S, report)
     if bulk:
         for _ in range(WAITING_BULKS):

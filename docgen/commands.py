@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, NoReturn
@@ -125,9 +125,13 @@ def _typer_option(parameter: Any) -> Option:
 def udp_mesh() -> Command:
     """The commands that argparse builds; `report` and `sim` have parsers of their own."""
     from udp_mesh.cli.main import FORWARDED, build_parser
+    from udp_mesh.sim.sweep import parser as sweep_parser
 
     own = {name: _parser_of(package) for name, package in FORWARDED.items()}
-    return _from_argparse(build_parser(), "udp-mesh", "", own)
+    root = _from_argparse(build_parser(), "udp-mesh", "", own)
+    # beside `udp-mesh sim`, which has options of its own
+    sweep = _from_argparse(sweep_parser(), "udp-mesh sim sweep", "compare settings of a scenario over many seeds", {})
+    return replace(root, commands=(*root.commands, sweep))
 
 
 class _Parsing(Exception):

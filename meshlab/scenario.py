@@ -58,6 +58,17 @@ class PowerEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class TrialSettings:
+    """What `mission_trial` needs besides: each robot reports every `report_s`, routes are chosen every `route_s`, slow
+    fading has this standard deviation and decorrelates over `shadow_m`."""
+
+    report_s: float = 1.0
+    route_s: float = 1.0
+    shadow_db: float = 3.0
+    shadow_m: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario:
     """`robots` move and `beacons` are deployed, by node name; the others stay where `environment` has them.
 
@@ -72,6 +83,7 @@ class Scenario:
     robots: Mapping[str, Trajectory] = field(default_factory=lambda: MappingProxyType({}))
     beacons: Mapping[str, Deployment] = field(default_factory=lambda: MappingProxyType({}))
     power_events: tuple[PowerEvent, ...] = ()
+    trial: TrialSettings = TrialSettings()
 
     @property
     def names(self) -> tuple[str, ...]:

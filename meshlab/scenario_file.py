@@ -9,6 +9,7 @@
       b01: {carried_by: rover1, drop_s: 40}
     incidents:
       - {at_s: 200, what: "off", who: b01}
+    trial: {report_s: 1, route_s: 1, shadow_db: 3, shadow_m: 10}      # for `meshctl lab sweep`
 
 docs/lab-ground.md describes the format.
 """
@@ -21,10 +22,21 @@ from pathlib import Path
 from meshctl.inventory.yaml_entries import YamlEntry, parse_text, read
 from meshlab import propagation_file
 from meshlab.propagation import RadioEnvironment
-from meshlab.scenario import Deployment, PowerEvent, Scenario, Trajectory, trajectory
+from meshlab.scenario import Deployment, PowerEvent, Scenario, Trajectory, TrialSettings, trajectory
 
 _ENVIRONMENT_KEYS = ("nodes", "walls", "air", "links")
-_KEYS = ("name", "base", "ground", *_ENVIRONMENT_KEYS, "duration_s", "step_s", "robots", "beacons", "incidents")
+_KEYS = (
+    "name",
+    "base",
+    "ground",
+    *_ENVIRONMENT_KEYS,
+    "duration_s",
+    "step_s",
+    "robots",
+    "beacons",
+    "incidents",
+    "trial",
+)
 # one day; a longer scenario is most likely a typo
 _MAX_DURATION_S = 86_400.0
 
@@ -34,14 +46,21 @@ def load(path: Path) -> Scenario:
     return _scenario(read(path), path)
 
 
-def parse(text: str, path: Path) -> Scenario:
-    """Like `load`, from the file's text; `path` is the file name in problems, and `ground` is relative to it."""
-    return _scenario(parse_text(text, str(path)), path)
+def parse(text: str, path: Path, ground: str | None = None) -> Scenario:
+    """Like `load`, from the file's text; `path` is the file name in problems, and `ground` is relative to it, unless
+    its text is given."""
+    return _scenario(parse_text(text, str(path)), path, ground)
 
 
-def _scenario(root: YamlEntry, path: Path) -> Scenario:
+def ground_path(text: str, path: Path) -> Path | None:
+    """The file that `ground` of a valid scenario names."""
+    entry = parse_text(text, str(path)).mapping().get("ground")
+    return path.parent / entry.text() if entry is not None and entry.is_present else None
+
+
+def _scenario(root: YamlEntry, path: Path, ground: str | None = None) -> Scenario:
     keys = root.mapping(_KEYS, required=("duration_s", "robots"))
-    environment = _environment(keys, path)
+    environment = _environment(keys, path, ground)
     robots = {name: _trajectory(entry) for name, entry in keys["robots"].mapping().items()}
     stationary = {name for name in environment.positions if name not in robots}
     beacons = {
@@ -64,17 +83,19 @@ def _scenario(root: YamlEntry, path: Path) -> Scenario:
         robots=robots,
         beacons=beacons,
         power_events=tuple(_power_events(keys["incidents"], names)),
+        trial=_trial(keys["trial"]),
     )
     root.finish()
     return scenario
 
 
-def _environment(keys: dict[str, YamlEntry], path: Path) -> RadioEnvironment:
+def _environment(keys: dict[str, YamlEntry], path: Path, ground: str | None) -> RadioEnvironment:
     """The file that `ground` names, extended and overridden by this file's nodes, walls, air and links."""
     own = propagation_file.environment_in(keys)
     if not keys["ground"].is_present:
         return own
-    other = propagation_file.load(path.parent / keys["ground"].text())
+    place = path.parent / keys["ground"].text()
+    other = propagation_file.load(place) if ground is None else propagation_file.parse(ground, str(place))
     ends = {link.ends for link in own.links}
     return replace(
         other,
@@ -96,6 +117,16 @@ def _trajectory(entry: YamlEntry) -> Trajectory:
         if keys["path"].is_present and all(rows):
             keys["path"].problem("[[seconds, x, y], ...] with increasing times", str(error))
         return Trajectory((0.0,), ((0.0, 0.0),))
+
+
+def _trial(entry: YamlEntry) -> TrialSettings:
+    keys, standard = entry.mapping(("report_s", "route_s", "shadow_db", "shadow_m")), TrialSettings()
+    return TrialSettings(
+        report_s=keys["report_s"].number(standard.report_s, 0.1, _MAX_DURATION_S),
+        route_s=keys["route_s"].number(standard.route_s, 0.1, _MAX_DURATION_S),
+        shadow_db=keys["shadow_db"].number(standard.shadow_db, 0.0, 30.0),
+        shadow_m=keys["shadow_m"].number(standard.shadow_m, 0.1, 10_000.0),
+    )
 
 
 def _deployment(name: str, entry: YamlEntry, carriers: tuple[str, ...]) -> Deployment | None:

@@ -12,7 +12,7 @@ import pytest
 from tests.plain_english import bad_page_words, bad_words
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("meshctl", "meshlab", "udp_mesh")
+PACKAGES = ("meshctl", "meshlab", "mesh_sweep", "udp_mesh")
 # records of what others wrote, and of releases that are out
 RECORDS = ("docs/facts/",)
 

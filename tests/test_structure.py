@@ -12,7 +12,7 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("meshctl", "meshlab", "udp_mesh")
+PACKAGES = ("meshctl", "meshlab", "mesh_sweep", "udp_mesh")
 # ROS 1, ROS 2 and Zenoh each have one, in a process of its own
 SHARED = {"Bridge"}
 

@@ -58,6 +58,7 @@ def test_the_wheel_carries_templates_examples_pages_scripts_and_scenarios(wheel:
         "meshctl/monitor/prometheus/alerts.yml",
         "meshctl/monitor/prometheus/dashboard.json",
         "meshlab/node_root/",
+        "mesh_sweep/command.py",
         "udp_mesh/sim/scenarios/final-run.yaml",
         "udp_mesh/daemon/units/",
     ):

@@ -14,7 +14,7 @@ from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.errors import InputError
 from meshctl.model import Release
 from meshctl.resources import shipped
-from meshlab.cli import links
+from meshlab.cli import links, sweep
 from meshlab.console import run_shell
 from meshlab.errors import LabError
 from meshlab.faults import FAULTS, describe, parse
@@ -154,6 +154,7 @@ def mend(
 
 
 links.register(app)
+sweep.register(app)
 
 
 @app.command("plug")
