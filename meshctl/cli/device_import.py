@@ -285,7 +285,7 @@ def _secret_files(target: ImportTarget, made: DeviceImport) -> dict[Path, Secret
 
 
 def _write(target: ImportTarget, text: str, edits: tuple[FileEdit, ...], files: Mapping[Path, Secret]) -> None:
-    """Write the secrets, then the inventory; a failure removes what was written. Raises InputError."""
+    """Write the secrets, then the inventory; a failure or Ctrl-C removes the secrets. Raises InputError."""
     written: list[Path] = []
     try:
         for path, secret in files.items():
@@ -297,12 +297,12 @@ def _write(target: ImportTarget, text: str, edits: tuple[FileEdit, ...], files: 
             _create(target.file, text, 0o666)
         else:
             save(edits)
-    except (OSError, InputError) as error:
+    except BaseException as error:
         for path in written:
             path.unlink(missing_ok=True)
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{error.filename or target.file} cannot be written: {error.strerror}") from error
+        if isinstance(error, OSError):
+            raise InputError(f"{error.filename or target.file} cannot be written: {error.strerror}") from error
+        raise
 
 
 def _create(path: Path, text: str, mode: int) -> None:

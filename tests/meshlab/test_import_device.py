@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -97,7 +98,8 @@ def test_the_guide_brings_an_existing_mesh_under_meshctl(
 ) -> None:
     """The commands of docs/how-to/import-existing.md up to the plan, on a mesh that was set up by hand."""
     page = (ROOT / "docs" / "how-to" / "import-existing.md").read_text(encoding="utf-8")
-    commands = [line.split()[1:] for line in page.splitlines() if line.startswith("    meshctl ")]
+    blocks = re.findall(r"^    ```sh\n(.*?)^    ```", page, re.DOTALL | re.MULTILINE)
+    commands = [line.split()[1:] for block in blocks for line in block.splitlines()]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MESHCTL_LAB", str(mesh.directory))
     ran = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from meshctl.cli.main import build
 from meshctl.errors import InputError
 from meshctl.interchange.device import observed_device, release_of
 from meshctl.interchange.device_differences import Fate, compare
+from meshctl.interchange.new_inventory import load_text, new_text
 from meshctl.inventory import load_fleet
 from meshctl.model import MASK, Encryption, Fleet, MeshMode, Release
 from meshctl.render import render_node
@@ -237,3 +239,22 @@ def test_the_operators_own_key_logs_in_to_a_device_without_one(tmp_path: Path) -
     made = new_inventory(exported("foreign"), tmp_path, operator_key=SSH_KEY)
     assert made.fleet.operators.ssh_keys == (SSH_KEY,)
     assert not made.fleet.operators.password_login
+
+
+def test_a_line_break_in_the_boards_name_cannot_add_to_the_inventory(tmp_path: Path) -> None:
+    device = replace(exported("foreign"), board="evil,box\nnodes: {evil: {}}")
+    made = new_inventory(device, tmp_path)
+    text = new_text(made.values, "a device\nrobots: {}", made.assumed)
+    assert list(load_text(tmp_path / "fleet.yaml", text).nodes) == ["Roof-West"]
+
+
+def test_a_failed_write_leaves_no_key_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(path: Path, text: str, mode: int) -> None:
+        if path.name == "fleet.yaml":
+            raise KeyboardInterrupt
+        path.write_text(text)
+
+    monkeypatch.setattr("meshctl.cli.device_import._create", fail)
+    done = run("uci", str(EXPORTS / "foreign.uci"), "--new", str(tmp_path / "valley"), *BOARD)
+    assert done.exit_code == 130
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
