@@ -10,10 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
+from meshctl.cli.command_group import ImportGroup
 from meshctl.cli.context import AsJson, InventoryPath
 from meshctl.cli.export import export
-from meshctl.cli.inventory_import import import_nodes
+from meshctl.cli.inventory_import import app as import_app
 from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.public_key import own_public_key
 from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import ExplainedValue, explain
@@ -25,10 +27,7 @@ from meshctl.model import Fleet, Node, NodeState, Role
 
 app = typer.Typer(help="Show and edit the inventory.", no_args_is_help=True)
 app.command("export")(export)
-app.command("import")(import_nodes)
-
-# ssh-keygen's default files; ed25519 first, which every release but 19.07 supports.
-_PUBLIC_KEYS = ("id_ed25519.pub", "id_ecdsa.pub", "id_rsa.pub")
+app.add_typer(import_app, name="import", cls=ImportGroup, no_args_is_help=True)
 
 
 def init(
@@ -42,7 +41,7 @@ def init(
 
     Example: meshctl init my-fleet && meshctl lint my-fleet
     """
-    key = _public_key(ssh_key)
+    key = own_public_key(ssh_key)
     files = write_starter(directory, key)
     for file in files:
         echo(f"wrote {file}")
@@ -131,22 +130,6 @@ def change_state(
         echo(change.diff(), nl=False)
     if not dry_run:
         save(changes)
-
-
-def _public_key(path: Path | None) -> str:
-    """The text of `path`, or of the first default public key; empty if there is none."""
-    candidates = [path] if path is not None else [Path("~/.ssh", name).expanduser() for name in _PUBLIC_KEYS]
-    for candidate in candidates:
-        if path is None and not candidate.is_file():
-            continue
-        try:
-            text = candidate.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as reason:
-            raise InputError(f"cannot read public key {candidate}: {reason}") from reason
-        if "PRIVATE KEY" in text or len(text.splitlines()) != 1 or not text.startswith(("ssh-", "ecdsa-", "sk-")):
-            raise InputError(f"{candidate} is not an SSH public key", hint="give the file that ends in .pub")
-        return text
-    return ""
 
 
 def _node(fleet: Fleet, name: str) -> Node:

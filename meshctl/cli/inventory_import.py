@@ -1,27 +1,33 @@
-"""`meshctl inventory import`: node attributes from a CSV table into the inventory."""
+"""`meshctl inventory import`: nodes from a CSV table, existing devices, recorded configurations and NetBox."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, DryRun, InventoryPath
+from meshctl.cli.device_import import import_device, import_export
 from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.inventory.csv_table import COLUMNS, NodeEdit, edits, read
+from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, checked, edits, read
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.source import MAX_FILE_BYTES, Source, read_source
 from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Fleet
+
+app = typer.Typer(help="Import nodes from a CSV table (the default), an existing device, its `uci export`, or NetBox.")
 
 
-def import_nodes(
+@app.command("csv")
+def import_table(
     table: Annotated[str, typer.Argument(metavar="FILE", help="CSV file with a header; - for standard input.")],
     inventory: InventoryPath = Path(),
     add: Annotated[bool, typer.Option("--add", help="Add nodes that the inventory does not have.")] = False,
@@ -40,13 +46,63 @@ def import_nodes(
     Columns: node, label, serial, mac, role, state, hardware, release, address, robot. A row names its node in `node`,
     or else by its label. Empty cells change nothing; the inventory's comments and layout stay.
 
-    Example: meshctl inventory import boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
+    Example: meshctl inventory import csv boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
     """
     fleet = load_fleet(inventory, environ=os.environ)
     source = _source(table)
     rows = read(source.text, source.file, headings=_headings(column or ()), ignored=ignore or ())
-    found = edits(rows, fleet, source.file, add=add)
-    changes = _changes(inventory, found, source.file)
+    _take_over(inventory, fleet, rows, source.file, add=add, dry_run=dry_run, as_json=as_json)
+
+
+@app.command("netbox")
+def import_netbox(
+    url: Annotated[str, typer.Argument(metavar="URL", help="Address of NetBox, e.g. https://netbox.example.org.")],
+    inventory: InventoryPath = Path(),
+    query: Annotated[
+        list[str] | None,
+        typer.Option("--filter", metavar="KEY=VALUE", help="Only devices that match, e.g. site=lab; repeatable."),
+    ] = None,
+    add: Annotated[bool, typer.Option("--add", help="Add nodes that the inventory does not have.")] = False,
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+) -> None:
+    """Take over names, asset tags, serial numbers, MAC and primary addresses of NetBox's devices.
+
+    The API token is in $NETBOX_TOKEN. Needs pynetbox, the extra `netbox`.
+
+    Example: NETBOX_TOKEN=... meshctl inventory import netbox https://netbox.example.org --filter site=mine --add
+    """
+    from meshctl.cli.netbox_client import fetch
+    from meshctl.interchange.netbox import rows as netbox_rows
+
+    fleet = load_fleet(inventory, environ=os.environ)
+    devices, interfaces = fetch(url, os.environ.get("NETBOX_TOKEN", ""), _filters(query or ()))
+    place = f"{url.rstrip('/')}/dcim/devices"
+    found = checked(netbox_rows(devices, interfaces, fleet), place)
+    _take_over(inventory, fleet, found, place, add=add, dry_run=dry_run, as_json=as_json)
+
+
+def _filters(words: Sequence[str]) -> dict[str, list[str]]:
+    """The query's parameters, each with all its values."""
+    filters: dict[str, list[str]] = {}
+    for word in words:
+        key, separator, value = word.partition("=")
+        if not separator or not key or not value:
+            raise InputError(f"--filter {word}: expected KEY=VALUE, such as site=lab")
+        filters.setdefault(key, []).append(value)
+    return filters
+
+
+app.command("device")(import_device)
+app.command("uci")(import_export)
+
+
+def _take_over(
+    inventory: Path, fleet: Fleet, rows: tuple[Row, ...], file: str, *, add: bool, dry_run: bool, as_json: bool
+) -> None:
+    """Show and write what the rows change in the inventory."""
+    found = edits(rows, fleet, file, add=add)
+    changes = _changes(inventory, found, file)
     if as_json:
         nodes = [{"node": each.node, "line": each.line, "new": each.is_new, "values": each.values} for each in found]
         echo_json(json.dumps({"fleet": fleet.name, "rows": len(rows), "nodes": nodes}, indent=2))

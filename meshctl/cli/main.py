@@ -19,6 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from meshctl import __version__
+from meshctl.cli.command_group import CommandGroup
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
 from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
@@ -108,15 +109,6 @@ def build(requested: str) -> typer.Typer:
     return app
 
 
-class _CommandGroup(TyperGroup):
-    """Lists commands with their whole summaries, which click would cut at the end of the line."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        summaries = [(name, command.get_short_help_str(sys.maxsize)) for name, command in self.commands.items()]
-        with formatter.section("Commands"):
-            formatter.write_dl(summaries)
-
-
 class _RootGroup(TyperGroup):
     """Lists the commands under the headings of their table, in its order."""
 
@@ -151,7 +143,7 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
     target = getattr(importlib.import_module(entry.module), entry.attribute) if entry.module else load(name)
     if isinstance(target, typer.Typer):
         _prepare_group(target)
-        app.add_typer(target, name=name, cls=_CommandGroup, help=entry.summary, no_args_is_help=True)
+        app.add_typer(target, name=name, cls=CommandGroup, help=entry.summary, no_args_is_help=True)
     else:
         # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
         app.command(name)(_guarded(target))
@@ -168,7 +160,8 @@ def _prepare_group(group: typer.Typer) -> None:
         if command.callback is not None:
             command.callback = _guarded(command.callback)
     for inner in group.registered_groups:
-        inner.cls = _CommandGroup
+        if not (isinstance(inner.cls, type) and issubclass(inner.cls, CommandGroup)):
+            inner.cls = CommandGroup
         if inner.typer_instance is not None:
             _prepare_group(inner.typer_instance)
 

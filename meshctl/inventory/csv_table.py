@@ -99,6 +99,16 @@ def read(
     return tuple(rows)
 
 
+def checked(rows: Iterable[Row], file: str) -> tuple[Row, ...]:
+    """Rows from elsewhere, whose values are those that the inventory allows. Raises InvalidInput with all errors."""
+    found = tuple(rows)
+    errors = [error for row in found for error in _errors_of(row.values, Position(file, row.line))]
+    errors += _repeated(found, file)
+    if errors:
+        raise InvalidInput(errors[: codes.MAX_DIAGNOSTICS])
+    return found
+
+
 def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) -> tuple[NodeEdit, ...]:
     """What to set on each node, where it differs from the inventory. A row names its node by `node`, else by `label`.
 

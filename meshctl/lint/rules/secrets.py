@@ -1,4 +1,4 @@
-"""Secrets: not in the inventory or the repository, and strong enough (MC441 to MC453)."""
+"""Secrets: not in the inventory or the repository, and strong enough (MC441 to MC454)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
 from meshctl.model import Fleet, Secret, SecretKind, SecretRef, SshSettings
 from meshctl.render.daemon import key_bytes, key_text
+from meshctl.uci import is_secret_option
 
 # as in udp_mesh/crypto/keys.py
 _KEY_BYTES = 32
@@ -329,3 +330,22 @@ def _is_pattern(raw: bytes) -> bool:
     """Few distinct bytes (32 random bytes have about 30, in practice never below 16), or an arithmetic sequence."""
     distances = {(second - first) % 256 for first, second in pairwise(raw)}
     return len(set(raw)) < _MIN_DISTINCT_BYTES or len(distances) == 1
+
+
+@fleet_rule(
+    "MC454",
+    Severity.ERROR,
+    "An extra UCI option is a secret",
+    why="""`extra_uci` has its values in plain text: the key or password is in the inventory, in git and in every copy,
+    and so public, even after its removal.""",
+    fix="""Remove it, and generate a new key. A mesh's key belongs into `key` of the mesh, as a reference; other secrets
+    cannot be in `extra_uci`.""",
+    failing="nodes: {b01: {extra_uci: {wireless.mesh0.sae_password: 'correct horse battery'}}}",
+    passing="nodes: {b01: {extra_uci: {wireless.mesh0.mesh_rssi_threshold: '-80'}}}",
+)
+def secret_extra_uci(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        for key, value in node.extra_uci.items():
+            if value and key.count(".") > 1 and is_secret_option(key.rpartition(".")[2]):
+                path = ("nodes", node.name, "extra_uci", key)
+                yield Finding(path, "the inventory contains a secret", "an option that is not secret", key)

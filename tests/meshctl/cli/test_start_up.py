@@ -15,6 +15,7 @@ ENTRANCE = frozenset(
     {
         "meshctl",
         "meshctl.cli",
+        "meshctl.cli.command_group",
         "meshctl.cli.commands",
         "meshctl.cli.extensions",
         "meshctl.cli.main",

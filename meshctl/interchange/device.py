@@ -1,0 +1,141 @@
+"""An existing device's configuration and the facts that an inventory needs about it, from an observation or from the
+text of `uci export`. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from meshctl.device.observation import Observation, WirelessLink
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
+from meshctl.errors import InputError
+from meshctl.model import RELEASES, Release
+from meshctl.render import DeviceFacts, with_switch
+from meshctl.render.rendered import MARKER_PATH
+from meshctl.uci import Package, Section, parse, parse_export
+
+MARKER = f"/{MARKER_PATH}"
+EMPTY_EXPORT = "IMP001"
+
+
+@dataclass(frozen=True, slots=True)
+class ExistingDevice:
+    """One device. Empty text and None mean that it was not reported; `marker` is meshctl's own file on the node."""
+
+    packages: Mapping[str, Package] = field(repr=False)
+    release: Release
+    board: str
+    target: str = ""
+    lan_ports: tuple[str, ...] = ()
+    switch_vlans: tuple[tuple[str, str, str], ...] = ()
+    label_mac: str = ""
+    memory_mib: int | None = None
+    authorized_keys: tuple[str, ...] = ()
+    links: tuple[WirelessLink, ...] = ()
+    marker: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+    def package(self, name: str) -> Package:
+        """The package, empty if the device has none."""
+        return self.packages.get(name, Package(name))
+
+    @property
+    def facts(self) -> DeviceFacts:
+        """What provisioning keeps of the device (`meshctl.render.facts`)."""
+        versions = (section.get("compat_version") for section in self.package("system").of_type("system"))
+        packages = dict(self.packages)
+        if "network" in packages and any("." in port for port in self.lan_ports):
+            packages["network"] = with_switch(packages["network"], self.switch_vlans)
+        return DeviceFacts(next(filter(None, versions), ""), packages)
+
+    @property
+    def hostname(self) -> str:
+        return next((section.get("hostname") for section in self.package("system").of_type("system")), "")
+
+    def link(self, section: Section) -> WirelessLink | None:
+        """The running interface of a wifi-iface section, if its name is known."""
+        names = {section.get("ifname"), section.name} - {"", None}
+        return next((link for link in self.links if link.ifname in names), None)
+
+
+def observed_device(seen: Observation) -> ExistingDevice:
+    """The device of an observation that includes the file MARKER.
+
+    Raises InputError if it reported no release, board or configuration, InvalidInput for a package that is not UCI.
+    """
+    if seen.release is None or seen.board is None or seen.uci is None:
+        missing = [
+            word
+            for word, fact in (("release", seen.release), ("board", seen.board), ("/etc/config", seen.uci))
+            if fact is None
+        ]
+        raise InputError(
+            f"the device reports no {' and no '.join(missing)}", hint="it must run OpenWrt 19.07 or later, as root"
+        )
+    packages = {}
+    problems: list[Diagnostic] = []
+    for name, text in seen.uci.items():
+        try:
+            packages[name] = parse(text, f"/etc/config/{name}", name=name)
+        except InvalidInput as reason:
+            problems += reason.diagnostics
+    if problems:
+        raise InvalidInput(problems)
+    marker = seen.files.get(MARKER)
+    return ExistingDevice(
+        packages=packages,
+        release=release_of(seen.release.version),
+        board=seen.board.board_name,
+        target=seen.release.target,
+        lan_ports=seen.board.lan_ports,
+        switch_vlans=seen.board.switch_vlans,
+        label_mac=seen.board.label_mac.lower(),
+        memory_mib=None if seen.memory is None else _memory_mib(seen.memory.total),
+        authorized_keys=seen.authorized_keys or (),
+        links=seen.links or (),
+        marker=MappingProxyType(parse_marker("" if marker is None else marker.text or "")),
+    )
+
+
+def exported_device(text: str, file: str, *, release: Release, board: str, target: str) -> ExistingDevice:
+    """The device of a recorded `uci export`, which names neither board nor release. Raises InvalidInput."""
+    packages = {package.name: package for package in parse_export(text, file)}
+    if not packages:
+        expected = "the output of `uci export`, which starts with `package NAME`"
+        raise InvalidInput(
+            [Diagnostic(EMPTY_EXPORT, Severity.ERROR, Position(file, 1), "", expected=expected, found="no package")]
+        )
+    return ExistingDevice(packages, release, board, target)
+
+
+def release_of(version: str) -> Release:
+    """The release series of a version such as 24.10.2. Raises InputError for one that meshctl does not render."""
+    found = re.match(r"\d\d\.\d\d", version)
+    release = next((each for each in RELEASES if found is not None and each.value == found[0]), None)
+    if release is None:
+        known = ", ".join(each.value for each in RELEASES)
+        raise InputError(
+            f"OpenWrt {version or '(no version)'}: expected a release of {known}",
+            hint="for a snapshot or a derived firmware, name the nearest release with --release",
+        )
+    return release
+
+
+def parse_marker(text: str) -> dict[str, str]:
+    """The lines `key=value` of the marker file."""
+    pairs = (line.partition("=") for line in text.splitlines())
+    return {key: value for key, separator, value in pairs if separator}
+
+
+def device_macs(seen: Observation) -> Iterable[str]:
+    """All MAC addresses of the device, lower case."""
+    return {mac.lower() for mac in (seen.macs or {}).values()}
+
+
+def _memory_mib(total_bytes: int) -> int:
+    """The RAM's size: the kernel reports less, and sizes are powers of two."""
+    size = 8
+    while size * 1024 * 1024 < total_bytes:
+        size *= 2
+    return size
