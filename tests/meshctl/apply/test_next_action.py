@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshctl.apply.health_checks import RELOADING
 from meshctl.apply.next_action import Action, applied_age_s, flashed_by_others, next_action, rollback_reason
 from meshctl.device.observation import ChangeStatus, Observation, ReleaseInfo
 
@@ -119,3 +120,6 @@ def test_the_connection_error_is_reported_only_if_no_check_was_unmet() -> None:
     reason = rollback_reason(late, (), "", "cannot connect: Connection refused")
     assert reason == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
     assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")
+    # it was still reloading when it was last reached
+    assert rollback_reason(late, (RELOADING,), "", "cannot connect") == reason.replace(": Connection refused", "")
+    assert rollback_reason(late, (RELOADING,)) == f"it was not confirmed in time: {RELOADING}"
