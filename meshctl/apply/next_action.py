@@ -98,14 +98,18 @@ def rollback_reason(
     status: ChangeStatus, unmet: Sequence[str], login_refused: str = "", connect_error: str = ""
 ) -> str:
     """One sentence for an outcome. `unmet` are the checks that failed in the latest observation of the applied change.
-    `login_refused` and `connect_error`: since then, a login was refused, or the node was unreachable."""
+    `login_refused` and `connect_error`: since then, a login was refused, or the node was unreachable.
+
+    An abort is sent because of `unmet`, and what a login says later is its effect: the restored keys are not ours."""
     word, _, rest = status.last_reason.partition("+")
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and the packages it installed could not be removed"
     # a node whose network has reloaded halfway says no more than that
     seen = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
-    details = login_refused or "; ".join(seen) or (connect_error and f"it was unreachable: {connect_error}")
+    failed = "; ".join(seen)
+    first, second = (failed, login_refused) if word == "abort" else (login_refused, failed)
+    details = first or second or (connect_error and f"it was unreachable: {connect_error}")
     return f"{reason}: {details}" if details else reason
 
 
