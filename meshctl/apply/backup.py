@@ -14,13 +14,14 @@ import re
 import tarfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
+from meshctl.apply.health_checks import heard_neighbors
 from meshctl.archive import TarMember, tar_of
 from meshctl.device import deadman, openwrt
 from meshctl.device.connection import OwnKey
@@ -31,10 +32,11 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node
 from meshctl.model.ip import IpAddress
+from meshctl.plan.cell import cells, partitions
 from meshctl.plan.lockout import lockout
 from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
-from meshctl.plan.seen import WIRELESS, management_address, packages_seen, parsed
+from meshctl.plan.seen import CONFIG, WIRELESS, management_address, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
@@ -46,6 +48,8 @@ _OWN = (
     *("/etc/meshctl/change", "/etc/meshctl/last", *deadman.installed_files()),
     *("/tmp/", "/var/", "/dev/", "/proc/", "/sys/"),
 )
+# What a cell is read from.
+_CELL_PATHS = (WIRELESS, f"{CONFIG}network")
 # From 24.10 on sysupgrade adds a script to every archive that disables, at the next boot, the services that were
 # disabled when it was taken (base-files, sbin/sysupgrade). A rollback would not undo that, and the script may name the
 # boot hook of the dead-man's switch. So files in this directory are not restored; the services are only reported.
@@ -230,6 +234,33 @@ def incompatibility(backup: Backup, node: str, seen: Observation) -> str:
     if backup.node and backup.node != node:
         return f"the backup is of node {backup.node}, not {node}"
     return ""
+
+
+def without_wireless(backup: Backup) -> Backup:
+    """The backup without /etc/config/wireless, so that the node's radios stay as they are."""
+    return replace(backup, files={path: new for path, new in backup.files.items() if path != f"/{WIRELESS}"})
+
+
+def departure(backup: Backup, node: str, seen: Observation) -> str:
+    """Why a backup from before a change of the cell would take the node out of the mesh that it is in; empty otherwise.
+
+    A node that hears no mesh neighbor has nothing to leave: it may return to the cell that its mesh still has.
+    """
+    neighbors = len(heard_neighbors(seen))
+    if not neighbors:
+        return ""
+    before = packages_seen(_CELL_PATHS, seen)
+    after = before | {
+        name: parsed(new.content.decode("utf-8", "replace"), name)
+        for path in _CELL_PATHS
+        if (new := backup.files.get(f"/{path}")) is not None and (name := path.removeprefix(CONFIG))
+    }
+    left = partitions(cells(before["wireless"], before["network"]), cells(after["wireless"], after["network"]))
+    if not left:
+        return ""
+    text = "; ".join(f"{radio}: {', '.join(changes)}" for radio, changes in left.items())
+    heard = "the mesh neighbor it hears" if neighbors == 1 else f"the {neighbors} mesh neighbors it hears"
+    return f"the backup has another cell ({text}): {node} would leave {heard}"
 
 
 def uninstalled_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:

@@ -259,7 +259,9 @@ def observe_and_decide(
     if age_s is not None:
         change.login_refused = change.connect_error = ""
         change.listener.observed()
-    change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
+    # what is missing after the rollback is not why the node rolled back
+    if change.status.state == "applied":
+        change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
     if change.extra_s and age_s is not None and age_s < PACKAGES_SETTLE_S:
         change.unmet = (*change.unmet, "its services may still be reloading")
     return next_action(

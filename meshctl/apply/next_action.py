@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
+from meshctl.apply.health_checks import RELOADING
 from meshctl.device.observation import ChangeStatus, Observation
 
 
@@ -96,14 +97,19 @@ REASONS = {
 def rollback_reason(
     status: ChangeStatus, unmet: Sequence[str], login_refused: str = "", connect_error: str = ""
 ) -> str:
-    """One sentence for an outcome. `login_refused` is a login refused while the change was applied; it takes
-    precedence, because `unmet` was then observed only after the rollback. `connect_error` is why the node was
-    unreachable."""
+    """One sentence for an outcome. `unmet` are the checks that failed in the latest observation of the applied change.
+    `login_refused` and `connect_error`: since then, a login was refused, or the node was unreachable.
+
+    An abort is sent because of `unmet`, and what a login says later is its effect: the restored keys are not ours."""
     word, _, rest = status.last_reason.partition("+")
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and the packages it installed could not be removed"
-    details = login_refused or "; ".join(unmet) or (connect_error and f"it was unreachable: {connect_error}")
+    # a node whose network has reloaded halfway says no more than that
+    seen = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
+    failed = "; ".join(seen)
+    first, second = (failed, login_refused) if word == "abort" else (login_refused, failed)
+    details = first or second or (connect_error and f"it was unreachable: {connect_error}")
     return f"{reason}: {details}" if details else reason
 
 

@@ -13,6 +13,7 @@ import typer
 
 from meshctl.apply.backup import (
     Backup,
+    departure,
     differing_files,
     fetch,
     incompatibility,
@@ -20,6 +21,7 @@ from meshctl.apply.backup import (
     read_backup,
     restore_backup,
     uninstalled_packages,
+    without_wireless,
 )
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
@@ -51,6 +53,10 @@ from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, observe_cleared
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
+
+_TO_ANOTHER_CELL = (
+    "restore the rest with `--keep-radios`; a whole mesh changes its cell by the inventory and `meshctl provision`"
+)
 
 
 def backup(
@@ -114,6 +120,9 @@ def restore(
     node: Annotated[str, typer.Argument(help="Node to restore.")],
     file: Annotated[Path, typer.Argument(help="Backup written by `meshctl backup`.")],
     inventory: InventoryPath = Path(),
+    keep_radios: Annotated[
+        bool, typer.Option("--keep-radios", help="Leave /etc/config/wireless as it is: the node stays in its mesh.")
+    ] = False,
     dry_run: DryRun = False,
     yes: Yes = False,
     as_json: AsJson = False,
@@ -128,6 +137,8 @@ def restore(
         saved = read_backup(file.read_bytes(), str(file))
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from error
+    if keep_radios:
+        saved = without_wireless(saved)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         there = selected_node(opened.fleet, node)
         if dry_run:
@@ -159,9 +170,11 @@ def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) 
 
 
 def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observation) -> None:
-    """Raises PlanRefused for a backup of another device, or one that would lock us out."""
+    """Raises PlanRefused for a backup of another device, or one that would lock us out or leave the mesh."""
     if problem := incompatibility(saved, node.name, seen):
         raise PlanRefused(problem)
+    if problem := departure(saved, node.name, seen):
+        raise PlanRefused(problem, hint=_TO_ANOTHER_CELL)
     lockout = lockout_by(saved, node, opened.access.own_keys(node))
     if lockout is not None:
         raise PlanRefused(lockout.reason, hint=lockout.hint)

@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=8
+VERSION=9
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -336,10 +336,15 @@ end_abandoned() { # the lock is ours to judge by: whoever has it now, it is not 
 	read_marker
 }
 
+# Each boot unpacks the archive that sysupgrade kept or was given (preinit), until one of them gets to its last init script
+# (S95 done), which deletes it. Logins work much earlier, and a power cut before that would undo even a confirmed change.
+is_first_boot() { [ -e /sysupgrade.tgz ]; }
+
 stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_staged` needs no more writing
 	need_lock "$1"
 	word "$2"
 	in_flash || refuse no-flash "/ is in RAM: wait until its flash is ready, some minutes after the first boot; an initramfs image has none"
+	! is_first_boot || refuse no-flash "its first boot after a flash has not ended, and the next boot would unpack /sysupgrade.tgz over the change: try again in a minute"
 	tidy
 	end_abandoned
 	case $MARKER in armed | restoring) refuse busy "change $ID of $OWNER is $MARKER" ;; esac

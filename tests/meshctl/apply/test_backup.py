@@ -13,10 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.apply.backup import Backup, incompatibility, lockout_by, read_backup, uninstalled_packages, with_info
+from meshctl.apply.backup import (
+    Backup,
+    departure,
+    incompatibility,
+    lockout_by,
+    read_backup,
+    uninstalled_packages,
+    with_info,
+    without_wireless,
+)
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import NewFile
-from meshctl.device.observation import BoardInfo
+from meshctl.device.observation import BoardInfo, Observation
 from meshctl.errors import InputError
 from tests.meshctl.plan.support import fleet, running
 
@@ -104,3 +113,31 @@ def test_a_backup_whose_authorized_keys_lock_us_out_is_rejected() -> None:
     refused = lockout_by(replace(saved(), files=keys), node, ())
     assert refused is not None
     assert f"it gets the keys {ours.fingerprint} (alice)" in refused.reason
+
+
+def _backup_of(seen: Observation) -> Backup:
+    return saved(*((f"etc/config/{package}", text.encode()) for package, text in (seen.uci or {}).items()))
+
+
+def test_a_backup_from_before_a_change_of_the_cell_is_restored_without_its_radios_only() -> None:
+    backup, seen = _backup_of(running(fleet(channel=6), "b01")), running(fleet(channel=11), "b01")
+    refused = departure(backup, "b01", seen)
+    assert refused == (
+        "the backup has another cell (radio0: channel 11 -> 6): b01 would leave the mesh neighbor it hears"
+    )
+    assert departure(without_wireless(backup), "b01", seen) == ""
+    assert "/etc/config/network" in without_wireless(backup).files
+    # in the backup's cell, or out of reach of any other node
+    assert departure(backup, "b01", running(fleet(channel=6), "b01")) == ""
+    assert departure(backup, "b01", replace(seen, neighbours=())) == ""
+
+
+def test_a_backup_from_before_a_change_of_the_key_is_not_restored() -> None:
+    backup = _backup_of(running(fleet(), "b01"))
+    wireless = backup.files["/etc/config/wireless"]
+    other = NewFile(wireless.content.replace(b"correct horse", b"another horse"), wireless.mode)
+    refused = departure(
+        replace(backup, files={**backup.files, "/etc/config/wireless": other}), "b01", running(fleet(), "b01")
+    )
+    assert "(radio0: key changes)" in refused
+    assert "horse" not in refused

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshctl.apply.health_checks import RELOADING
 from meshctl.apply.next_action import Action, applied_age_s, flashed_by_others, next_action, rollback_reason
 from meshctl.device.observation import ChangeStatus, Observation, ReleaseInfo
 
@@ -114,8 +115,18 @@ def test_a_refused_login_takes_precedence_over_unmet_checks() -> None:
     assert reason == "it was not confirmed in time: b01: login refused for root; tried: key a"
 
 
+def test_the_checks_that_caused_an_abort_take_precedence_over_a_login_refused_after_it() -> None:
+    aborted = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="abort")
+    reloading = "reloading its services failed with exit status 1"
+    assert rollback_reason(aborted, (reloading,), "login refused for root") == f"it was aborted: {reloading}"
+    assert rollback_reason(aborted, (), "login refused for root") == "it was aborted: login refused for root"
+
+
 def test_the_connection_error_is_reported_only_if_no_check_was_unmet() -> None:
     late = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     reason = rollback_reason(late, (), "", "cannot connect: Connection refused")
     assert reason == "it was not confirmed in time: it was unreachable: cannot connect: Connection refused"
     assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")
+    # it was still reloading when it was last reached
+    assert rollback_reason(late, (RELOADING,), "", "cannot connect") == reason.replace(": Connection refused", "")
+    assert rollback_reason(late, (RELOADING,)) == f"it was not confirmed in time: {RELOADING}"

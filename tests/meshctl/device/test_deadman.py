@@ -370,6 +370,18 @@ def test_staging_is_rejected_on_an_initramfs_image(node: Sandbox, reported: str)
     assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("refused no-flash ")
 
 
+def test_staging_is_rejected_until_the_first_boot_after_a_flash_has_ended(node: Sandbox) -> None:
+    """Until the end of that boot, the next one would unpack sysupgrade's archive over a confirmed change."""
+    prepare(node)
+    node.put("/sysupgrade.tgz", "the configuration that the flash kept")
+    node.deadman("lock", OWNER, LONG)
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("refused no-flash its first boot after a flash ")
+    assert not node.path("/etc/meshctl/change").exists()
+    # base-files, etc/init.d/done
+    node.run("/bin/sh", "-c", "rm -f /sysupgrade.tgz")
+    assert node.deadman("stage", OWNER, "c1", BUNDLE).startswith("ok state=staged ")
+
+
 def test_the_node_reboots_if_reloading_the_restored_state_fails(node: Sandbox) -> None:
     applied(node, window_s="1", wanted=change(reload="exit 1"))
     eventually(lambda: node.text("/harness/reboots") == "reboot\n")

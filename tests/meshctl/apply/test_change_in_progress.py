@@ -1,0 +1,67 @@
+"""A change in progress: what each look at the node leaves behind for the outcome."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from meshctl.apply import change_in_progress
+from meshctl.apply.change_in_progress import ChangeInProgress, observe_and_decide
+from meshctl.apply.context import NodeContext
+from meshctl.apply.health_checks import Expectation
+from meshctl.apply.next_action import Action
+from meshctl.device.connection import Endpoint
+from meshctl.device.deadman import Change
+from meshctl.device.observation import ChangeStatus, NetInterface, Observation
+from meshctl.device.ssh import SshConnection
+from meshctl.model import Secret
+from meshctl.uci import parse
+
+NETWORK = """
+config interface 'lan'
+	option device 'br-lan'
+	option ipaddr '10.42.0.101'
+"""
+HERE = Endpoint("10.42.0.101")
+CONNECTION = cast("SshConnection", SimpleNamespace(endpoint=HERE))
+
+
+def a_change() -> ChangeInProgress:
+    listener = SimpleNamespace(observed=lambda: None)
+    run = SimpleNamespace(
+        new_listener=lambda *_: listener,
+        current_base_macs=frozenset,
+        interrupt=SimpleNamespace(leaving=False),
+    )
+    ctx = SimpleNamespace(run=run, expected=Expectation(network=parse(NETWORK, "network")))
+    return ChangeInProgress(
+        cast("NodeContext", ctx), Change("c1", {}, "exit 0\n"), Secret("nonce"), 60, HERE, (HERE,), is_reloaded=True
+    )
+
+
+def looked_at(change: ChangeInProgress, monkeypatch: pytest.MonkeyPatch, status: ChangeStatus, address: str) -> Action:
+    lan = NetInterface("lan", up=True, pending=False, proto="static", addresses=(address,))
+    seen = Observation(0.0, 0.1, interfaces=(lan,), bridges=(), change=status)
+    monkeypatch.setattr(change_in_progress, "observe", lambda _: seen)
+    return observe_and_decide(change, CONNECTION, is_opened_after_reload=True)
+
+
+def test_what_a_node_lacks_after_its_rollback_is_not_given_as_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    restored = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
+    never_seen = a_change()
+    assert looked_at(never_seen, monkeypatch, restored, "192.168.1.1/24") is Action.WENT_BACK
+    assert never_seen.unmet == ()
+    seen = a_change()
+    applied = ChangeStatus("applied", "c1", window_s=60, left_s=20.0, reload_status=0)
+    assert looked_at(seen, monkeypatch, applied, "10.42.0.99/24") is Action.WAIT
+    assert looked_at(seen, monkeypatch, restored, "192.168.1.1/24") is Action.WENT_BACK
+    assert seen.unmet == ("its LAN has 10.42.0.99/24, not 10.42.0.101",)
+
+
+def test_an_applied_change_is_checked_even_if_its_age_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    change = a_change()
+    unknown = ChangeStatus("applied", "c1", reload_status=0)
+    assert looked_at(change, monkeypatch, unknown, "192.168.1.1/24") is Action.WAIT
+    assert change.unmet == ("its LAN has 192.168.1.1/24, not 10.42.0.101",)
