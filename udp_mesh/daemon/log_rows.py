@@ -1,6 +1,6 @@
 """The rows of the database of shared logs -> what the store held, checked.
 
-SQLite takes any value in any column, and a file may have been written by anybody. A row that makes no sense is left
+SQLite takes any value in any column, and a file may have been changed by hand. A row that makes no sense is left
 out and reported; all others are kept. What a row says about numbers is never taken for less than it may have been: if
 the numbers that this node used are in doubt, its logs get a new identity, as after the loss of a disk.
 """

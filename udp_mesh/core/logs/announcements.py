@@ -32,7 +32,7 @@ _NEVER = float("inf")
 
 @dataclass(slots=True)
 class _Pending:
-    """What one peer has not been told yet."""
+    """What was not announced to one peer yet."""
 
     logs: dict[LogKey, None] = field(default_factory=dict)
     due_at: float = _NEVER

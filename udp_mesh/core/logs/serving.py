@@ -1,7 +1,7 @@
 """Requested items out: a queue per peer -> the store -> messages, a few at a time.
 
 Only a few items per peer are read ahead, so that memory holds little and more urgent topics are not delayed by reading.
-An item that is already on its way to a peer is not sent twice, and one that nobody needs any more is withdrawn, even
+An item that is already on its way to a peer is not sent twice, and one that is not needed any more is withdrawn, even
 halfway.
 """
 

@@ -38,7 +38,7 @@ class Announcer:
         self.announcements.run([KEY], self.peers, until_s)
 
 
-def test_news_is_told_soon_to_those_who_can_act_on_it_and_later_to_others() -> None:
+def test_news_is_announced_soon_to_those_who_can_act_on_it_and_later_to_others() -> None:
     team = Announcer()
     team.announcements.note(KEY, 10.0)
     team.run(20.0)

@@ -37,7 +37,7 @@ def test_a_carrier_that_becomes_a_reader_delivers_what_it_carried_once(restarts:
     assert team.read("husky") == []
     make_reader(team, "husky", restarts=restarts)
     assert sorted(team.read("husky")) == [("spot", 1, b"one"), ("spot", 2, b"two")]
-    # It is told to the source, and not repeated by a change back and forth or a restart.
+    # The source learns of it, and it is not repeated by a change back and forth or a restart.
     team.meet("spot", "husky", seconds=4)
     delivered = [event for event in team.events_of("spot", MessageDelivered) if isinstance(event, MessageDelivered)]
     assert (message, "husky") in [(event.message_id, event.peer) for event in delivered]

@@ -1,4 +1,4 @@
-"""Sends that nobody needs any more stop halfway."""
+"""Sends that are not needed any more stop halfway."""
 
 from __future__ import annotations
 
