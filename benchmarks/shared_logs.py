@@ -5,8 +5,8 @@
 Robots walk between random points of a square and rarely meet; the base stays in a corner. Each robot publishes an
 artifact now and then; the last part of a run has no new ones, so that what can still arrive does. `direct`: an
 outbox for the base. `flooding`: each robot sends what it hears for the first time to all others, with an outbox for
-each. Prints one JSON line per run and a table; all in virtual time, so that a seed gives the same figures anywhere. With
-`--results`, runs are appended to a file, and those that it contains are not repeated: interrupt and continue at will.
+each. Prints one JSON line per run and a table; all in virtual time, so that a seed gives the same figures anywhere.
+With `--results`, runs are appended to a file, and those that it contains are not repeated.
 """
 
 from __future__ import annotations
