@@ -55,7 +55,8 @@ def _section(recording: Recording, named: bool) -> str:
             f"<p>The disk did not keep up with the recording: {recording.missing_lines} lines are missing and not "
             "counted.</p>"
         )
-    parts += [_totals(recording), _sent_topics(recording), _throughput(recording), _connectivity(recording)]
+    parts += [_totals(recording), _sent_topics(recording)]
+    parts += [_differences(recording), _logs(recording), _throughput(recording), _connectivity(recording)]
     parts += [_links(recording), _map(recording)]
     parts += [_intervals(each) for each in figures.intervals(recording)[:_SHOWN_INTERVALS]]
     return "".join(parts)
@@ -92,6 +93,41 @@ def _sent_topics(recording: Recording) -> str:
         "<th>delivered</th><th>expired</th><th>peer lost</th><th>p50 ms</th><th>p99 ms</th></tr>"
         f"{rows}</table><p>Outcomes count destinations; a single-datagram broadcast has none. Latency is measured from "
         "sending to the acknowledgment.</p>"
+    )
+
+
+def _differences(recording: Recording) -> str:
+    sent = figures.differences(recording)
+    if not sent:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(topic)}</td><td>{totals.whole}</td><td>{totals.differences}</td>"
+        f"<td>{totals.payload_bytes / 1e6:.2f}</td><td>{totals.body_bytes / 1e6:.2f}</td>"
+        f"<td>{_saved(totals.payload_bytes, totals.body_bytes)}</td></tr>"
+        for topic, totals in sent
+    )
+    return (
+        "<h3>Differences sent by this node</h3><table><tr><th>topic</th><th>whole</th><th>differences</th>"
+        f"<th>MB</th><th>MB on the wire</th><th>saved</th></tr>{rows}</table>"
+        "<p>On the wire: without headers and retransmissions, once for each destination.</p>"
+    )
+
+
+def _saved(payload_bytes: int, body_bytes: int) -> str:
+    return "-" if payload_bytes <= 0 else f"{1 - body_bytes / payload_bytes:.0%}"
+
+
+def _logs(recording: Recording) -> str:
+    if not recording.logs:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(topic)}</td><td>{escape(source)}</td><td>{log.received_items} of {log.known_items}</td>"
+        f"<td>{log.held_bytes / 1e6:.2f}</td></tr>"
+        for (topic, source), log in sorted(recording.logs.items())
+    )
+    return (
+        "<h3>Shared logs at the end</h3><table><tr><th>log</th><th>source</th><th>items received</th>"
+        f"<th>MB on disk</th></tr>{rows}</table>"
     )
 
 
