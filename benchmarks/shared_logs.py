@@ -1,11 +1,12 @@
 """Ten robots at random: artifacts to the base by a shared log, by direct delivery alone, and by flooding.
 
-    python -m benchmarks.shared_logs [--seeds N] [--seconds S]
+    python -m benchmarks.shared_logs [--seeds N] [--seconds S] [--results FILE]
 
 Robots walk between random points of a square and rarely meet; the base stays in a corner. Each robot publishes an
 artifact now and then; the last part of a run has no new ones, so that what can still arrive does. `direct`: an
 outbox for the base. `flooding`: each robot sends what it hears for the first time to all others, with an outbox for
 each. Prints one JSON line per run and a table; all in virtual time, so that a seed gives the same figures anywhere.
+With `--results`, runs are appended to a file, and those that it contains are not repeated.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import random
 import statistics
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from udp_mesh.core.events import Event, MessageReceived
@@ -107,6 +109,7 @@ def play(way: str, seed: int, seconds: float) -> dict[str, Any]:
     return {
         "way": way,
         "seed": seed,
+        "seconds": seconds,
         "published": len(published),
         "arrived": len(delays),
         "twice": twice,
@@ -116,16 +119,32 @@ def play(way: str, seed: int, seconds: float) -> dict[str, Any]:
     }
 
 
+def read_results(path: Path | None) -> list[dict[str, Any]]:
+    """The runs in a file of JSON lines; none if it does not exist."""
+    if path is None or not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=1800.0)
+    parser.add_argument("--results", type=Path, help="JSON lines")
     arguments = parser.parse_args()
-    runs = []
+    runs = read_results(arguments.results)
+    done = {(run["way"], run["seed"], run["seconds"]) for run in runs}
     for seed in range(1, arguments.seeds + 1):
         for way in WAYS:
-            runs.append(play(way, seed, arguments.seconds))
-            print(json.dumps(runs[-1]), flush=True)
+            if (way, seed, arguments.seconds) in done:
+                continue
+            run = play(way, seed, arguments.seconds)
+            runs.append(run)
+            print(json.dumps(run), flush=True)
+            if arguments.results is not None:
+                with arguments.results.open("a", encoding="utf-8") as file:
+                    file.write(f"{json.dumps(run)}\n")
+    runs = [run for run in runs if run["seconds"] == arguments.seconds and run["seed"] <= arguments.seeds]
     print("| way | arrived | twice | median delay (s) | airtime per artifact published (ms) |")
     print("| --- | --- | --- | --- | --- |")
     for way in WAYS:

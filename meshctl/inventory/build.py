@@ -37,6 +37,7 @@ from meshctl.model import (
     ApplyPolicy,
     Batman,
     Computer,
+    ComputerLink,
     Firmware,
     Fleet,
     HardwareProfile,
@@ -321,6 +322,10 @@ def _computer(document: ComputerDocument) -> Computer:
         arch=document.arch,
         ros=document.ros,
         gateway=document.gateway,
+        links=tuple(
+            ComputerLink(link.interface, link.address, MappingProxyType(dict(link.neighbors)), link.mtu)
+            for link in document.links
+        ),
     )
 
 
@@ -353,11 +358,15 @@ def _log(document: TopicLogDocument) -> TopicLog:
     return TopicLog(document.max_items, document.max_bytes, document.max_age_s, document.copies)
 
 
+def _transport_keys(documents: tuple[SecretDocument, ...], key: str, root: MappingNode) -> tuple[SecretRef, ...]:
+    return tuple(_secret(item, _base(root, "udp_mesh", key, number)) for number, item in enumerate(documents))
+
+
 def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
     settings = document.udp_mesh
     return UdpMesh(
         port=settings.port,
-        keys=tuple(_secret(key, _base(root, "udp_mesh", "keys", number)) for number, key in enumerate(settings.keys)),
+        keys=_transport_keys(settings.keys, "keys", root),
         heartbeat_s=settings.heartbeat_s,
         offline_after_s=settings.offline_after_s,
         fragment_bytes=settings.fragment_bytes,
@@ -365,5 +374,6 @@ def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
         broadcast=settings.broadcast,
         metrics_port=settings.metrics_port,
         relay_hops=settings.relay_hops,
+        relay_keys=_transport_keys(settings.relay_keys, "relay_keys", root),
         etc_hosts=settings.etc_hosts,
     )

@@ -7,6 +7,7 @@ value.
 from meshctl.model.fleet import (
     ApplyPolicy,
     Computer,
+    ComputerLink,
     FixedPosition,
     Fleet,
     MissingOrigin,
@@ -36,6 +37,7 @@ __all__ = [
     "Band",
     "Batman",
     "Computer",
+    "ComputerLink",
     "Encryption",
     "Firmware",
     "FixedPosition",

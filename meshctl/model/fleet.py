@@ -147,9 +147,20 @@ class Node:
 
 
 @dataclass(frozen=True, slots=True)
+class ComputerLink:
+    """A further link of a robot's daemon: an interface (a name or a pattern) or the computer's address there.
+    `neighbors` are the addresses of robots that no broadcast reaches."""
+
+    interface: str = ""
+    address: IpAddress | None = None
+    neighbors: Mapping[str, IpAddress] = field(default_factory=lambda: MappingProxyType({}))
+    mtu: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Computer:
     """A robot's computer, where the udp_mesh daemon runs. `gateway` is its next hop to other networks, by default the
-    robot's radio."""
+    robot's radio. `links` are those of the daemon beside the one with `address`."""
 
     address: IpInterface
     ssh: SshSettings = SshSettings()
@@ -157,6 +168,7 @@ class Computer:
     arch: str = "x86_64"
     ros: str = ""
     gateway: IpAddress | None = None
+    links: tuple[ComputerLink, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +240,7 @@ class ApplyPolicy:
 @dataclass(frozen=True, slots=True)
 class UdpMesh:
     """Transport settings of all robots; `keys` are the live fleet keys, of which the first encrypts. `relay_hops` is
-    the greatest number of links between two robots with relays between them."""
+    the greatest number of links between two robots with relays between them, `relay_keys` those of the hops."""
 
     port: int = 8700
     keys: tuple[SecretRef, ...] = ()
@@ -239,6 +251,7 @@ class UdpMesh:
     broadcast: bool = True
     metrics_port: int | None = None
     relay_hops: int = 4
+    relay_keys: tuple[SecretRef, ...] = ()
     etc_hosts: bool = False
 
 

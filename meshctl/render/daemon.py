@@ -15,7 +15,19 @@ from collections.abc import Callable, Iterator
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.errors import InputError
-from meshctl.model import Computer, Fleet, MissingOrigin, Outbox, Robot, Secret, SecretRef, Topic, TopicLog, UdpMesh
+from meshctl.model import (
+    Computer,
+    ComputerLink,
+    Fleet,
+    MissingOrigin,
+    Outbox,
+    Robot,
+    Secret,
+    SecretRef,
+    Topic,
+    TopicLog,
+    UdpMesh,
+)
 from meshctl.resolve import has_routed_lans
 
 # Values that the daemon would reject (docs/render.md).
@@ -23,6 +35,7 @@ DAEMON = "RND030"
 
 CONFIG_NAME = "udp-mesh.toml"
 KEY_NAME = "fleet.key"
+RELAY_KEY_NAME = "relay.key"
 
 # Limits of the wire format and the daemon's reader.
 _MAX_NAME_BYTES = 63
@@ -49,6 +62,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
     problems = [
         *_check_robot(fleet, robot),
         *_check_relay(fleet, robot),
+        *_check_links(fleet, robot, computer),
         *_check_transport(fleet),
         *_check_topics(fleet),
     ]
@@ -80,10 +94,21 @@ def daemon_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes |
 
     Raises InvalidInput for an invalid key, without showing the key.
     """
+    return _key_file(fleet, "keys", fleet.udp_mesh.keys, secrets)
+
+
+def relay_keys(fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> bytes | None:
+    """The file of the hops' keys (`RELAY_KEY_NAME`), as `daemon_keys`."""
+    return _key_file(fleet, "relay_keys", fleet.udp_mesh.relay_keys, secrets)
+
+
+def _key_file(
+    fleet: Fleet, key: str, refs: tuple[SecretRef, ...], secrets: Callable[[SecretRef], Secret]
+) -> bytes | None:
     lines = []
     problems = []
-    for index, ref in enumerate(fleet.udp_mesh.keys):
-        path = ("udp_mesh", "keys", str(index))
+    for index, ref in enumerate(refs):
+        path = ("udp_mesh", key, str(index))
         try:
             text = key_text(secrets(ref))
         except InputError as error:
@@ -141,6 +166,25 @@ def _check_relay(fleet: Fleet, robot: str) -> Iterator[Diagnostic]:
         yield _problem(fleet, ("udp_mesh", "relay_hops"), f"at least 2, because {robot} is a relay", "1")
 
 
+def _check_links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[Diagnostic]:
+    selectors = {str(computer.address.ip)}
+    for index, link in enumerate(computer.links):
+        path = ("robots", robot, "computer", "links", str(index))
+        if bool(link.interface) is (link.address is not None):
+            found = "both" if link.interface else "neither"
+            yield _problem(fleet, path, "an interface or an address", found)
+            continue
+        selector = link_selector(link)
+        if selector in selectors:
+            yield _problem(fleet, path, "another link than those before", selector)
+        selectors.add(selector)
+
+
+def link_selector(link: ComputerLink) -> str:
+    """The interface or address that selects a link; empty if neither is set."""
+    return str(link.address) if link.address is not None else link.interface
+
+
 def _is_peer_name(text: str) -> bool:
     return _is_name(text, _MAX_NAME_BYTES) and "/" not in text
 
@@ -158,9 +202,9 @@ def _check_transport(fleet: Fleet) -> Iterator[Diagnostic]:
     if transport.window is not None and not 1 <= transport.window <= _MAX_WINDOW:
         expected = f"adaptive, or 1 to {_MAX_WINDOW} fragments"
         yield _problem(fleet, ("udp_mesh", "window"), expected, str(transport.window))
-    if len(transport.keys) > _MAX_KEYS:
-        expected = f"at most {_MAX_KEYS} live keys"
-        yield _problem(fleet, ("udp_mesh", "keys"), expected, str(len(transport.keys)))
+    for name, keys in (("keys", transport.keys), ("relay_keys", transport.relay_keys)):
+        if len(keys) > _MAX_KEYS:
+            yield _problem(fleet, ("udp_mesh", name), f"at most {_MAX_KEYS} live keys", str(len(keys)))
 
 
 def _check_topics(fleet: Fleet) -> Iterator[Diagnostic]:
@@ -190,6 +234,19 @@ def _links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[str]:
         for peer in _others(fleet, robot):
             if peer.computer is not None:
                 yield from _neighbor(peer.name, str(peer.computer.address.ip))
+    for link in computer.links:
+        yield from _further_link(link)
+
+
+def _further_link(link: ComputerLink) -> Iterator[str]:
+    """Its neighbors need no names: the first link may already name the same robots."""
+    selector = _text(link_selector(link))
+    yield from ("", "[[links]]", f"{'interface' if link.address is None else 'address'} = {selector}")
+    yield f'kind = "{"neighbours" if link.neighbors else "broadcast"}"'
+    if link.mtu is not None:
+        yield f"mtu = {link.mtu}"
+    for address in link.neighbors.values():
+        yield from ("", "[[neighbours]]", f'address = "{address}"', f"link = {selector}")
 
 
 def _relay(robot: Robot, transport: UdpMesh) -> Iterator[str]:
@@ -198,6 +255,8 @@ def _relay(robot: Robot, transport: UdpMesh) -> Iterator[str]:
         yield f"relay = [{', '.join(map(_text, robot.relay))}]"
     if transport.relay_hops != UdpMesh().relay_hops:
         yield f"relay_hops = {transport.relay_hops}"
+    if transport.relay_keys:
+        yield f"relay_key_file = {_text(RELAY_KEY_NAME)}"
 
 
 def _position(fleet: Fleet, robot: str) -> Iterator[str]:

@@ -15,7 +15,7 @@ from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1, ROS_2, ROS_TOO_OLD
-from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, daemon_config, daemon_keys
+from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, RELAY_KEY_NAME, daemon_config, daemon_keys, relay_keys
 from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
 
@@ -134,9 +134,9 @@ def configuration(
         File("topics", topics),
         File(UNIT_NAME, service_unit(units[UNIT_NAME], start).encode()),
     ]
-    keys = daemon_keys(fleet, secrets)
-    if keys is not None:
-        files.append(File(f"etc/{KEY_NAME}", keys, _SECRET_MODE))
+    for name, keys in ((KEY_NAME, daemon_keys(fleet, secrets)), (RELAY_KEY_NAME, relay_keys(fleet, secrets))):
+        if keys is not None:
+            files.append(File(f"etc/{name}", keys, _SECRET_MODE))
     if fleet.udp_mesh.etc_hosts:
         hosts = f"{_CURRENT}/bin/udp-mesh hosts --write /etc/hosts"
         files.append(File(HOSTS_UNIT_NAME, service_unit(units[HOSTS_UNIT_NAME], hosts).encode()))

@@ -65,6 +65,8 @@ class PeerFacts:
     capacity_bits_per_s: float | None = None
     """The link's estimated capacity for payload; None if too little was sent to measure it."""
     delivered_bits_per_s: float | None = None
+    via: tuple[str, ...] = ()
+    """The relays on the way to it, the nearest first; empty if it is reached directly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,12 @@ class RobotFacts:
         return tuple(peer.name for peer in self.peers if peer.online)
 
     @property
+    def reached_through(self) -> tuple[str, ...]:
+        """Whom it reaches through whom, one text per online peer behind relays: `uav1 through husky1`."""
+        relayed = (peer for peer in self.peers if peer.online and peer.via)
+        return tuple(f"{peer.name} through {' and '.join(peer.via)}" for peer in relayed)
+
+    @property
     def is_healthy(self) -> bool:
         """Whether all expected services run and are proven; drift does not count."""
         others = (service for service in (self.bridge, self.hosts) if service is not None)
@@ -204,6 +212,8 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
     release, others = (_values(sections.get(name, ())) for name in ("release", "others"))
     status = _object(sections.get("status", ()))
     peers = tuple(_objects(_within(status, "conditions").get("peers")))
+    routes = _objects(_within(status, "relaying").get("routes"))
+    relayed = {str(route.get("name", "")): route for route in routes if route.get("in_use") is True}
 
     def optional(unit: str) -> ServiceFacts | None:
         found = services.get(unit, ServiceFacts())
@@ -223,7 +233,7 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
         daemon_uptime_s=_float(status.get("uptime_s")),
         keys=tuple(str(key) for key in status.get("keys", ()) or ()),
         unkeyed=bool(status.get("unkeyed")),
-        peers=tuple(_peer(peer) for peer in peers),
+        peers=tuple(_peer(peer, relayed) for peer in peers),
         positions=positions_in(status),
         queues=_queues(peers),
         topics=tuple(_topic(topic) for topic in _objects(_object(sections.get("topics", ())).get("topics"))),
@@ -265,6 +275,7 @@ def facts_object(facts: RobotFacts) -> dict[str, Any]:
         "answers": facts.answers,
         "online": list(facts.online),
         "remark": facts.remark,
+        "reached_through": list(facts.reached_through),
     }
 
 
@@ -338,7 +349,8 @@ def _float(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _peer(peer: Mapping[str, Any]) -> PeerFacts:
+def _peer(peer: Mapping[str, Any], relayed: Mapping[str, Mapping[str, Any]]) -> PeerFacts:
+    via = relayed.get(str(peer.get("name", "")), {}).get("via")
     return PeerFacts(
         str(peer.get("name", "")),
         bool(peer.get("online")),
@@ -349,6 +361,7 @@ def _peer(peer: Mapping[str, Any]) -> PeerFacts:
         int(_float(peer.get("outbox_bytes")) or 0),
         _float(peer.get("capacity_bits_per_s")),
         _float(peer.get("delivered_bits_per_s")),
+        tuple(str(relay) for relay in via) if isinstance(via, list) else (),
     )
 
 

@@ -41,6 +41,9 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
             drawn += textwrap.wrap(
                 f"{one.robot}: {one.error or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
             )
+        if one.reached_through:
+            relayed = f"{one.robot}: reaches {', '.join(one.reached_through)}"
+            drawn += textwrap.wrap(relayed, width or sys.maxsize, subsequent_indent=_GAP)
     if len(shown) < len(_HEADINGS):
         left_out = ", ".join(name for name in _HEADINGS if name not in shown)
         drawn += textwrap.wrap(f"columns not shown: {left_out} (use --json)", width or sys.maxsize)

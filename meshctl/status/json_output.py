@@ -207,6 +207,7 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
                 "outbox_bytes": peer.outbox_bytes,
                 "capacity_bits_per_s": _rounded(peer.capacity_bits_per_s, 0),
                 "delivered_bits_per_s": _rounded(peer.delivered_bits_per_s, 0),
+                "via": list(peer.via),
             }
             for peer in facts.peers
         ],

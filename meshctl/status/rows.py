@@ -182,8 +182,9 @@ def _robot_row(robot: RobotStatus) -> dict[str, TableCell]:
     messages = sum(queue.messages for queue in waiting)
     bad = sum(bool(topic.problem) for topic in robot.topics)
     peers = f"{len(facts.online)} of {len(facts.peers)}"
+    relayed = f", {len(facts.reached_through)} relayed" if facts.reached_through else ""
     return cells | {
-        "hears": TableCell(f"{peers} daemons", peers),
+        "hears": TableCell(f"{peers} daemons{relayed}", peers),
         "path": TableCell("" if robot.base_round_trip_s is None else f"{robot.base_round_trip_s * 1000:.0f} ms"),
         "waits": TableCell(by_priority or "0", str(messages)),
         "topics": TableCell(f"{bad} of {len(robot.topics)} bad" if bad else "ok" if robot.topics else ""),

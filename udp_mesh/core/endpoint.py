@@ -185,7 +185,7 @@ class Endpoint:
         self._relaying.apply(now)
         self._start_logs(settings, now)
         if self._logs is not None:
-            self._logs.apply(settings)
+            self._logs.apply(settings, now)
         return [line for line in lines if not line.startswith(f"topic {LOG_PREFIX}")]
 
     def logs(self) -> tuple[LogConditions, ...]:

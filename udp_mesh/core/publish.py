@@ -328,6 +328,20 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
         state.maintenance_at = min(state.maintenance_at, now + RELEASE_INTERVAL_S)
 
 
+def withdraw(state: State, name: str, message_id: MessageId, now: float) -> None:
+    """Send no more of a message to a peer that does not need it: it ends as superseded, unless it has ended already."""
+    peer = state.peer_table.peers.get(name)
+    if peer is None or peer.sender is None:
+        return
+    for message in peer.sender.pending:
+        if message.accepted.message_id == message_id:
+            peer.sender.finish(message, ExpiryReason.SUPERSEDED)
+            break
+    report_ended(state, peer, now)
+    state.ready[peer] = None
+    state.arm(peer)
+
+
 def report_ended(state: State, peer: Peer, now: float) -> None:
     """Turn the outcomes of messages to one peer into events."""
     sender = peer.sender

@@ -1,6 +1,6 @@
 """A set of integers stored as ranges: the finished messages of a peer, in little memory however many there were."""
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 
 
 class RangeSet:
@@ -65,6 +65,18 @@ class RangeSet:
         kept = [(begin, end) for begin, end in ((first, number - 1), (number + 1, last)) if begin <= end]
         firsts[place : place + 1] = [begin for begin, _ in kept]
         lasts[place : place + 1] = [end for _, end in kept]
+
+    def remove_range(self, first: int, last: int) -> None:
+        """Take every number from `first` to `last` out."""
+        firsts, lasts = self._firsts, self._lasts
+        begin = bisect_left(lasts, first)
+        end = bisect_right(firsts, last)
+        if begin >= end:
+            return
+        kept = [(firsts[begin], first - 1), (last + 1, lasts[end - 1])]
+        kept = [(low, high) for low, high in kept if low <= high]
+        firsts[begin:end] = [low for low, _ in kept]
+        lasts[begin:end] = [high for _, high in kept]
 
     def gaps(self, first: int, last: int) -> list[tuple[int, int]]:
         """The ranges from `first` to `last` that are not contained, ascending. Looks at no range outside of these."""

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from udp_mesh.core import publish
 from udp_mesh.core.event_queue import EventQueue
@@ -55,13 +56,19 @@ class SharedLogs:
         self._plain: dict[MessageId, MessageId] = {}
         """Copies of items sent as ordinary messages: their id -> the item's."""
         self.replicator = Replicator(
-            settings, store, send=self._send, emit=self._events.emit, next_message_id=self._next_message_id, now=now
+            settings,
+            store,
+            send=self._send,
+            withdraw=partial(publish.withdraw, state),
+            emit=self._events.emit,
+            next_message_id=self._next_message_id,
+            now=now,
         )
 
-    def apply(self, settings: Settings) -> None:
+    def apply(self, settings: Settings, now: float) -> None:
         """Take over changed settings."""
         self._events.set_limit(settings.limits.events)
-        self.replicator.apply(settings)
+        self.replicator.apply(settings, now)
 
     def is_log(self, topic: str) -> bool:
         return topic in self.replicator.policy.topics
@@ -90,13 +97,13 @@ class SharedLogs:
     def confirm(self, receipt: Receipt) -> bool:
         """Whether the receipt was one of an item."""
         if receipt.boot_id == LOG_RECEIPT:
-            self.replicator.confirm(receipt)
+            self.replicator.holdings.confirm(receipt)
         return receipt.boot_id == LOG_RECEIPT
 
     def request_again(self, receipt: Receipt) -> bool:
         """Whether the receipt was one of an item."""
         if receipt.boot_id == LOG_RECEIPT:
-            self.replicator.request_again(receipt)
+            self.replicator.holdings.request_again(receipt)
         return receipt.boot_id == LOG_RECEIPT
 
     @property

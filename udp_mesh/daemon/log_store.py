@@ -3,7 +3,7 @@
 `put`, `get`, `take` and `drop` queue a job; the thread does all that wait in one transaction (WAL, `synchronous=FULL`:
 what is reported as stored survives a power cut), then reports the results on the event loop. However slow the disk, the
 loop never waits for it. A damaged database is renamed and a new one begun, with a new identity: the secret of this
-node's logs is in the database, so that no number is ever used twice.
+node's logs is in the database, so that no number is ever used twice. Rows that make no sense are left out (`log_rows`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pathlib import Path
 
 from udp_mesh.core.logs.item import ItemId, LogKey
 from udp_mesh.core.logs.messages import Ranges
-from udp_mesh.core.logs.store import LogContents, StoredItem
-from udp_mesh.crypto.signing import SEED_BYTES
+from udp_mesh.core.logs.store import ItemUse, LogContents, RememberedLog
+from udp_mesh.daemon.log_rows import SCHEMA, load_rows
 
 log = logging.getLogger(__name__)
 
@@ -35,19 +35,7 @@ MAX_BATCH = 256
 """Jobs in one transaction: a long one delays the answers."""
 LOG_AGAIN_S = 60.0
 """Minimum interval between two log lines about a failing disk."""
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS meta (name TEXT PRIMARY KEY, value BLOB NOT NULL);
-CREATE TABLE IF NOT EXISTS logs (
-    id INTEGER PRIMARY KEY, topic TEXT NOT NULL, source TEXT NOT NULL, log_id BLOB NOT NULL,
-    dropped TEXT NOT NULL DEFAULT '[]', UNIQUE (topic, source, log_id));
-CREATE TABLE IF NOT EXISTS items (
-    position INTEGER PRIMARY KEY AUTOINCREMENT, log INTEGER NOT NULL REFERENCES logs (id), number INTEGER NOT NULL,
-    data BLOB NOT NULL, stored_s REAL NOT NULL, taken INTEGER NOT NULL, UNIQUE (log, number));
-"""
 _VERSION = 1
-
-FIRST_PLAUSIBLE_S = 1_704_067_200.0
-"""2024-01-01: a computer without a battery-backed clock starts long before, until it is set."""
 
 Job = Callable[[sqlite3.Connection], Callable[[], None] | None]
 """Runs in the thread, within a transaction; returns what to call on the loop once it is committed."""
@@ -140,44 +128,37 @@ class SqliteLogStore:
             version = connection.execute("PRAGMA user_version").fetchone()[0]
             if version > _VERSION:
                 raise OSError(f"expected a log of version {_VERSION} or earlier, found {version}")
-            connection.executescript(_SCHEMA)
+            connection.executescript(SCHEMA)
             connection.execute(f"PRAGMA user_version = {_VERSION}")
-            connection.execute("INSERT OR IGNORE INTO meta VALUES ('seed', ?)", (os.urandom(SEED_BYTES),))
             return connection, self._contents(connection)
         except BaseException:
             connection.close()
             raise
 
     def _contents(self, connection: sqlite3.Connection) -> LogContents:
-        (seed,) = connection.execute("SELECT value FROM meta WHERE name = 'seed'").fetchone()
-        keys, dropped = {}, []
-        for number, topic, source, log_id, ranges in connection.execute("SELECT * FROM logs"):
-            keys[number] = LogKey(topic, source, bytes(log_id))
-            dropped.append((keys[number], tuple((int(first), int(last)) for first, last in json.loads(ranges))))
-        orphans = "FROM items WHERE log NOT IN (SELECT id FROM logs)"
-        (lost,) = connection.execute(f"SELECT count(*) {orphans}").fetchone()
-        if lost:
+        rows = load_rows(connection, self._wall_clock())
+        for problem in rows.problems:
+            log.error("log-row-unusable path=%s %s", self.path, problem)
+        if rows.problem_count > len(rows.problems):
+            log.error("log-row-unusable path=%s more=%d", self.path, rows.problem_count - len(rows.problems))
+        if rows.new_identity:
+            log.error("log-identity-renewed path=%s: numbers that were used before are in doubt", self.path)
+        if rows.orphans:
             # Nothing says which topic they belong to.
-            log.error("log-items-without-log path=%s items=%d: deleted", self.path, lost)
-            connection.execute(f"DELETE {orphans}")
-        now = self._wall_clock()
-        rows = connection.execute("SELECT log, number, length(data), stored_s, taken FROM items ORDER BY position")
-        items = tuple(
-            StoredItem(ItemId(keys[log_number], number), size, _age_s(stored_s, now), bool(taken))
-            for log_number, number, size, stored_s, taken in rows
-        )
-        return LogContents(bytes(seed), items, tuple(entry for entry in dropped if entry[1]))
+            log.error("log-items-without-log path=%s items=%d: deleted", self.path, rows.orphans)
+            connection.execute("DELETE FROM items WHERE log NOT IN (SELECT id FROM logs)")
+        return rows.contents
 
     # Jobs
 
-    def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
+    def put(self, item: ItemId, data: bytes, use: ItemUse, done: Callable[[bool], None]) -> None:
         stored_s = self._wall_clock()
         put = self.last_put = Put()
 
         def insert(connection: sqlite3.Connection) -> Callable[[], None]:
             connection.execute(
                 "INSERT OR REPLACE INTO items (log, number, data, stored_s, taken) VALUES (?, ?, ?, ?, ?)",
-                (_log_number(connection, item.log), item.number, data, stored_s, taken),
+                (_log_number(connection, item.log), item.number, data, stored_s, int(use)),
             )
             return stored
 
@@ -205,23 +186,31 @@ class SqliteLogStore:
 
         self._jobs.put((select, lambda: done(None)))
 
-    def take(self, item: ItemId) -> None:
+    def mark(self, items: Iterable[ItemId], use: ItemUse) -> None:
+        marked = tuple(items)
+
         def update(connection: sqlite3.Connection) -> None:
-            where = (_log_number(connection, item.log), item.number)
-            connection.execute("UPDATE items SET taken = 1 WHERE log = ? AND number = ?", where)
+            for item in marked:
+                where = (int(use), _log_number(connection, item.log), item.number)
+                connection.execute("UPDATE items SET taken = ? WHERE log = ? AND number = ?", where)
 
         self._jobs.put((update, lambda: None))
 
-    def drop(self, items: Iterable[ItemId], dropped: Iterable[tuple[LogKey, Ranges]]) -> None:
-        gone, remembered = tuple(items), tuple(dropped)
+    def drop(self, items: Iterable[ItemId], remembered: Iterable[RememberedLog]) -> None:
+        gone, kept = tuple(items), tuple(remembered)
 
         def delete(connection: sqlite3.Connection) -> None:
             for item in gone:
                 where = (_log_number(connection, item.log), item.number)
                 connection.execute("DELETE FROM items WHERE log = ? AND number = ?", where)
-            for key, ranges in remembered:
-                text = json.dumps(ranges, separators=(",", ":"))
-                connection.execute("UPDATE logs SET dropped = ? WHERE id = ?", (text, _log_number(connection, key)))
+            for entry in kept:
+                log_number = _log_number(connection, entry.log)
+                connection.execute("UPDATE logs SET dropped = ? WHERE id = ?", (_json(entry.received), log_number))
+                if entry.carried:
+                    values = (log_number, _json(entry.carried))
+                    connection.execute("INSERT OR REPLACE INTO carried (log, ranges) VALUES (?, ?)", values)
+                else:
+                    connection.execute("DELETE FROM carried WHERE log = ?", (log_number,))
 
         self._jobs.put((delete, lambda: None))
 
@@ -306,9 +295,8 @@ def _log_number(connection: sqlite3.Connection, key: LogKey) -> int:
     return int(row[0])
 
 
-def _age_s(stored_s: float, now: float) -> float:
-    """Time since an item was stored; 0 if the wall clock was not set then, or was set back since."""
-    return max(0.0, now - stored_s) if stored_s >= FIRST_PLAUSIBLE_S else 0.0
+def _json(ranges: Ranges) -> str:
+    return json.dumps(ranges, separators=(",", ":"))
 
 
 def _is_damaged(error: sqlite3.DatabaseError) -> bool:

@@ -13,14 +13,18 @@ import base64
 import json
 import logging
 import threading
+from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived
+from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 from udp_mesh.daemon.positions import Position, position_json
-from udp_mesh.daemon.status import Json, conditions_json, event_json
+from udp_mesh.daemon.status import Json, conditions_json, event_json, log_json
 
 log = logging.getLogger(__name__)
 
@@ -105,8 +109,15 @@ class Recorder:
         line = {"at": fields["name"], "x": fields["x_m"], "y": fields["y_m"], "z": fields["z_m"]}
         self._write({"t": self._at(now), "kind": "place", **line, "frame": fields["frame"], "age_s": fields["age_s"]})
 
-    def conditions(self, conditions: Conditions) -> None:
-        self._write({"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)})
+    def conditions(
+        self, conditions: Conditions, versions: Iterable[VersionConditions] = (), logs: Iterable[LogConditions] = ()
+    ) -> None:
+        fields: Json = {"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)}
+        if rows := [{"topic": entry.topic, **asdict(entry.counters)} for entry in versions]:
+            fields["versions"] = rows
+        if rows := [log_json(log) for log in logs]:
+            fields["logs"] = rows
+        self._write(fields)
         self._submit()
 
     def _at(self, now: float) -> float:

@@ -283,13 +283,13 @@ class Service:
             )
         except OSError as error:
             raise RequestError("cannot-record", f"{path}: {error.strerror}") from error
-        self.recorder.conditions(self.driver.conditions())
+        self.recorder.conditions(self.driver.conditions(), self.driver.node.versions(), self.driver.node.logs())
 
     async def stop_recording(self) -> Recorder | None:
         """Ends the recording and returns it once it is completely written (None: there was none)."""
         recorder, self.recorder = self.recorder, None
         if recorder is not None:
-            recorder.conditions(self.driver.conditions())
+            recorder.conditions(self.driver.conditions(), self.driver.node.versions(), self.driver.node.logs())
             await asyncio.wrap_future(recorder.close())
         return recorder
 

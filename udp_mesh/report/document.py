@@ -108,7 +108,24 @@ def _message_tables(recording: Recording) -> list[dict[str, Any]]:
             "Outcomes count destinations; a single-datagram broadcast has none. Latency is measured from sending to "
             "the acknowledgment.",
         ),
+        _table(
+            "Differences sent",
+            "topic|#whole|#differences|#MB|#MB on the wire|#saved",
+            (
+                (
+                    *(topic, str(totals.whole), str(totals.differences)),
+                    *(f"{size / 1e6:.2f}" for size in (totals.payload_bytes, totals.body_bytes)),
+                    _saved(totals.payload_bytes, totals.body_bytes),
+                )
+                for topic, totals in figures.differences(recording)
+            ),
+            "On the wire: without headers and retransmissions, once for each destination.",
+        ),
     ]
+
+
+def _saved(payload_bytes: int, body_bytes: int) -> str:
+    return MISSING if payload_bytes <= 0 else f"{1 - body_bytes / payload_bytes:.0%}"
 
 
 def _state_tables(recording: Recording) -> list[dict[str, Any]]:
@@ -137,6 +154,14 @@ def _state_tables(recording: Recording) -> list[dict[str, Any]]:
                 for each in figures.intervals(recording)
             ),
             "Deviation: of the intervals within 0.5 to 1.5 times the median; gaps are the others.",
+        ),
+        _table(
+            "Shared logs at the end",
+            "log|source|#items received|#MB on disk",
+            (
+                (*(topic, source), f"{log.received_items} of {log.known_items}", f"{log.held_bytes / 1e6:.2f}")
+                for (topic, source), log in sorted(recording.logs.items())
+            ),
         ),
         _table("Events", "node|event|#times", ((at, kind, str(count)) for (at, kind), count in sorted(counts.items()))),
     ]

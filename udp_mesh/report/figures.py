@@ -6,10 +6,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from udp_mesh.report.recording import Recording
+from udp_mesh.report.recording import Recording, VersionTotals
 
 # A periodic topic has enough messages, and a median interval that most of them keep to.
 _MIN_MESSAGES = 20
@@ -130,6 +130,12 @@ class SentTopic:
         return self.latencies_s[min(len(self.latencies_s) - 1, int(share * len(self.latencies_s)))]
 
 
+def differences(recording: Recording) -> list[tuple[str, VersionTotals]]:
+    """What each topic with `delta` sent during the recording, by topic."""
+    spans = ((topic, last.since(first)) for topic, (first, last) in sorted(recording.versions.items()))
+    return [(topic, totals) for topic, totals in spans if totals.whole or totals.differences]
+
+
 def sent_topics(recording: Recording) -> list[SentTopic]:
     """Every topic with sent messages or outcomes, most urgent first."""
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
@@ -183,6 +189,20 @@ def summary(recording: Recording) -> dict[str, Any]:
                 "latency_p99_s": each.latency_s(0.99),
             }
             for each in sent_topics(recording)
+        ],
+        "differences": [
+            {
+                "topic": topic,
+                "whole": totals.whole,
+                "differences": totals.differences,
+                "payload_bytes": totals.payload_bytes,
+                "body_bytes": totals.body_bytes,
+            }
+            for topic, totals in differences(recording)
+        ],
+        "logs": [
+            {"topic": topic, "source": source, **asdict(progress)}
+            for (topic, source), progress in sorted(recording.logs.items())
         ],
         "online": [
             {"peer": each.peer, "share": round(each.share, 6), "spans_s": [list(span) for span in each.spans_s]}

@@ -7,7 +7,9 @@ start), `kind`, and `at` (the node whose view it is) unless that is the node of 
 - `message-delivered` (`latency_s`), `message-expired`, `message-peer-lost`: `peer`, `topic`,
 - `peer-online`, `peer-offline`: `peer`,
 - `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`,
-  `capacity_bits_per_s`, `outbox_messages`, `hops` (all but the name are optional),
+  `capacity_bits_per_s`, `outbox_messages`, `hops` (all but the name are optional); optional `versions` (by `topic`:
+  `whole_sent`, `differences_sent`, `payload_bytes_sent`, `body_bytes_sent`, totals) and `logs` (by `topic` and
+  `source`: `received_items`, `known_items`, `held_bytes`),
 - `place`: `x`, `y` in meters (simulated runs),
 - `gap`: `lines`, the number of lines dropped here during recording.
 
@@ -46,6 +48,33 @@ class RecordedArrival:
     topic: str
     priority: int
     size: int
+
+
+@dataclass(frozen=True, slots=True)
+class VersionTotals:
+    """What was sent of a topic with `delta` since the daemon's start."""
+
+    whole: int = 0
+    differences: int = 0
+    payload_bytes: int = 0
+    body_bytes: int = 0
+
+    def since(self, earlier: VersionTotals) -> VersionTotals:
+        return VersionTotals(
+            self.whole - earlier.whole,
+            self.differences - earlier.differences,
+            self.payload_bytes - earlier.payload_bytes,
+            self.body_bytes - earlier.body_bytes,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LogProgress:
+    """A shared log as the node saw it last."""
+
+    received_items: int
+    known_items: int
+    held_bytes: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +147,12 @@ class Recording:
     sent: list[SentMessage] = field(default_factory=list)
     outcomes: list[SentOutcome] = field(default_factory=list)
     events: list[RecordedEvent] = field(default_factory=list)
+    versions: dict[str, tuple[VersionTotals, VersionTotals]] = field(default_factory=dict)
+    """By topic: at the beginning of the recording, and last."""
+    logs: dict[tuple[str, str], LogProgress] = field(default_factory=dict)
+    """By topic and source."""
+    snapshots: int = 0
+    """Lines with conditions."""
     missing_lines: int = 0
     end_s: float = 0.0
     """The latest time of a line."""
@@ -235,8 +270,14 @@ def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -
             recording.presences.append(Presence(t, at, peer, online[peer]))
             recording.events.append(RecordedEvent(t, at, kind, peer))
         case "conditions":
-            for peer_entry in _peers(entry):
+            recording.snapshots += 1
+            for peer_entry in _rows(entry, "peers"):
                 _sample(recording, t, at, peer_entry, online)
+            for row in _rows(entry, "versions") if "versions" in entry else ():
+                _add_versions(recording, row)
+            for row in _rows(entry, "logs") if "logs" in entry else ():
+                counts = (_integer(row, key) for key in ("received_items", "known_items", "held_bytes"))
+                recording.logs[_text(row, "topic"), _text(row, "source")] = LogProgress(*counts)
         case "place":
             x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
             recording.places.append(Place(t, at, x, y))
@@ -260,11 +301,20 @@ def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], onli
         recording.presences.append(Presence(t, at, name, now_online))
 
 
-def _peers(entry: dict[str, Any]) -> list[dict[str, Any]]:
-    peers = entry.get("peers")
-    if not isinstance(peers, list) or not all(isinstance(peer, dict) for peer in peers):
-        raise _UnreadableError("a list of objects as peers", peers)
-    return peers
+def _add_versions(recording: Recording, row: dict[str, Any]) -> None:
+    keys = ("whole_sent", "differences_sent", "payload_bytes_sent", "body_bytes_sent")
+    topic, totals = _text(row, "topic"), VersionTotals(*(_integer(row, key) for key in keys))
+    # A topic that is first seen later was unused at the beginning.
+    begin = VersionTotals() if recording.snapshots > 1 else totals
+    first, _ = recording.versions.get(topic, (begin, totals))
+    recording.versions[topic] = (first, totals)
+
+
+def _rows(entry: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    rows = entry.get(key)
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise _UnreadableError(f"a list of objects as {key}", rows)
+    return rows
 
 
 def _fields(entry: dict[str, Any]) -> str:

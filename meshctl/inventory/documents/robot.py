@@ -10,6 +10,19 @@ from meshctl.inventory.fields import Address, Flag, Interface, IPv4Only, Name, N
 from meshctl.model import Outbox, TopicClass
 
 
+class ComputerLinkDocument(Document):
+    """A further link of a robot's daemon, such as a second radio or a tether."""
+
+    interface: Text = ""
+    """Interface, or a pattern such as wlan*; or set `address`."""
+    address: Address = NOT_WRITTEN
+    """Address of the computer on that link, instead of its interface."""
+    neighbors: dict[Name, Address] = Field(default_factory=dict)
+    """Addresses of other robots there, by name, if no broadcast reaches them. Default: found by broadcast."""
+    mtu: Whole = Field(default=NOT_WRITTEN, ge=576, le=65_535)
+    """MTU in bytes, if the path carries less than the interface."""
+
+
 class ComputerDocument(Document):
     """A robot's computer, where the udp_mesh daemon runs."""
 
@@ -26,6 +39,8 @@ class ComputerDocument(Document):
     gateway: Address = NOT_WRITTEN
     """Its next hop to other networks: an address of one of the robot's radios. Default: that of the radio that routes
     the robot's LAN, else of the robot's first radio."""
+    links: tuple[ComputerLinkDocument, ...] = ()
+    """Links of the daemon beside the one with `address`, such as a second radio or a tether."""
 
 
 class OtherComputerDocument(Document):
@@ -134,6 +149,9 @@ class UdpMeshDocument(Document):
     """TCP port of Prometheus metrics. Default: no metrics."""
     relay_hops: Whole = Field(default=4, ge=1, le=8)
     """Maximum number of links between two robots with relays between them; 1 turns relays off."""
+    relay_keys: tuple[SecretDocument, ...] = ()
+    """Keys of the hops of relays, as `keys`: with them, relays without a fleet key pass on what they cannot read.
+    Default: the fleet keys."""
     etc_hosts: Flag = False
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
 

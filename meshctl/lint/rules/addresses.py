@@ -48,6 +48,10 @@ def stations(fleet: Fleet) -> Iterator[tuple[IpAddress, tuple[tuple[str, ...], s
     for robot in fleet.robots.values():
         for place, what, computer in robot.all_computers():
             yield computer.address.ip, (("robots", robot.name, *place, "address"), what)
+            for index, link in enumerate(computer.links):
+                if link.address is not None and link.address != computer.address.ip:
+                    path = ("robots", robot.name, *place, "links", str(index), "address")
+                    yield link.address, (path, f"a link of {what}")
         if robot.computer is None and robot.fielded is not None:
             yield robot.fielded, (("robots", robot.name, "fielded"), f"the computer of {robot.name}")
 

@@ -1,4 +1,4 @@
-"""Relays: daemons that pass datagrams on (MC761 to MC763)."""
+"""Relays: daemons that pass datagrams on and further links of daemons (MC761 to MC766)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
+from meshctl.lint.rules.secrets import identity
 from meshctl.model import Fleet
+from meshctl.render.daemon import link_selector
 
 _ALL = "all"
 
@@ -70,3 +72,66 @@ def relay_without_hops(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     relay = next((robot.name for robot in fleet.robots.values() if robot.relay), None)
     if relay is not None and hops < 2:
         yield Finding(("udp_mesh", "relay_hops"), f"{relay} is a relay", "at least 2", str(hops))
+
+
+@fleet_rule(
+    "MC764",
+    Severity.ERROR,
+    "A link of a computer selects nothing, or the same as another",
+    why="""The daemon finds a link by its interface or by the computer's address there. Two entries for one link are
+    rejected, and with them the whole configuration. The link with the computer's `address` is there by itself.""",
+    fix="Give each link its own `interface` or `address`, not both.",
+    failing="robots: {husky1: {computer: {links: [{interface: wlan1}, {interface: wlan1}]}}}",
+    passing="robots: {husky1: {computer: {links: [{interface: wlan1}, {interface: eth1}]}}}",
+)
+def link_not_found(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        if robot.computer is None:
+            continue
+        taken = {str(robot.computer.address.ip)}
+        for index, link in enumerate(robot.computer.links):
+            path = ("robots", robot.name, "computer", "links", str(index))
+            selector = link_selector(link)
+            if bool(link.interface) is (link.address is not None):
+                found = "both" if link.interface else "neither"
+                yield Finding(path, "not one link", "an interface or an address", found)
+            elif selector in taken:
+                yield Finding(path, "the same link as another entry", "another interface or address", selector)
+            taken.add(selector)
+
+
+@fleet_rule(
+    "MC765",
+    Severity.ERROR,
+    "A neighbor on a link is no robot of the fleet",
+    why="The daemon would send to an address that belongs to no robot of the inventory, or to the robot itself.",
+    fix="Use another robot defined in `robots`.",
+    failing="robots: {husky1: {computer: {links: [{interface: eth1, neighbors: {base-statoin: 10.50.0.1}}]}}}",
+    passing="robots: {husky1: {computer: {links: [{interface: eth1, neighbors: {base-station: 10.50.0.1}}]}}}",
+)
+def link_to_unknown_robot(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        others = [name for name in fleet.robots if name != robot.name]
+        for index, link in enumerate(robot.computer.links if robot.computer is not None else ()):
+            for name in link.neighbors:
+                if name not in others:
+                    path = ("robots", robot.name, "computer", "links", str(index), "neighbors", name)
+                    expected, hint = suggest(others, name)
+                    yield Finding(path, "no such robot", expected, name, hint)
+
+
+@fleet_rule(
+    "MC766",
+    Severity.ERROR,
+    "A relay key is also a fleet key",
+    why="""Relay keys are given to relays that must not read what they pass on. One that is also a fleet key lets them
+    read and send everything.""",
+    fix="Generate a separate key: `udp-mesh keygen FILE` or `openssl rand -hex 32`.",
+    failing="udp_mesh: {relay_keys: [{env: UDP_MESH_KEY}]}",
+    passing="udp_mesh: {relay_keys: [{env: UDP_MESH_RELAY_KEY}]}",
+)
+def relay_key_is_fleet_key(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    fleet_keys = {identity(context, ref) for ref in fleet.udp_mesh.keys}
+    for index, ref in enumerate(fleet.udp_mesh.relay_keys):
+        if identity(context, ref) in fleet_keys:
+            yield Finding(("udp_mesh", "relay_keys", str(index)), "also a fleet key", "a separate key", str(ref))

@@ -43,8 +43,14 @@ def secret_refs(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
     for mesh in fleet.meshes.values():
         if mesh.key is not None:
             yield ("meshes", mesh.name, "key"), mesh.key
-    for index, key in enumerate(fleet.udp_mesh.keys):
-        yield ("udp_mesh", "keys", str(index)), key
+    yield from transport_keys(fleet)
+
+
+def transport_keys(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SecretRef]]:
+    """The keys of the daemons: the fleet's, and those of the relays' hops."""
+    for name, keys in (("keys", fleet.udp_mesh.keys), ("relay_keys", fleet.udp_mesh.relay_keys)):
+        for index, key in enumerate(keys):
+            yield ("udp_mesh", name, str(index)), key
 
 
 def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
@@ -167,12 +173,12 @@ def secret_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]
     ),
 )
 def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for index, ref in enumerate(fleet.udp_mesh.keys):
+    for path, ref in transport_keys(fleet):
         secret = context.secret(ref)
         if secret is not None and key_bytes(key_text(secret)) is None:
             expected = f"{_KEY_BYTES} bytes: {2 * _KEY_BYTES} hexadecimal digits, or base64"
             found = f"{len(key_text(secret))} characters"
-            yield Finding(("udp_mesh", "keys", str(index)), "invalid key", expected, found)
+            yield Finding(path, "invalid key", expected, found)
 
 
 @fleet_rule(
@@ -201,15 +207,15 @@ def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}]}",
 )
 def secret_shared(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    mesh_keys = {_identity(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
-    for index, ref in enumerate(fleet.udp_mesh.keys):
-        place = mesh_keys.get(_identity(context, ref))
+    mesh_keys = {identity(context, ref): place for place, ref in secret_refs(fleet) if place[0] == "meshes"}
+    for path, ref in transport_keys(fleet):
+        place = mesh_keys.get(identity(context, ref))
         if place is not None:
             message = f"also the key of {place[0]}.{place[1]}"
-            yield Finding(("udp_mesh", "keys", str(index)), message, "a separate secret", str(ref))
+            yield Finding(path, message, "a separate secret", str(ref))
 
 
-def _identity(context: LintContext, ref: SecretRef) -> Hashable:
+def identity(context: LintContext, ref: SecretRef) -> Hashable:
     """Equal for two references to one secret: its value if available, else its location."""
     secret = context.secret(ref)
     return (ref.kind, ref.where, ref.key) if secret is None else Secret(key_text(secret))
@@ -225,7 +231,7 @@ def _identity(context: LintContext, ref: SecretRef) -> Hashable:
     passing="udp_mesh: {keys: [{env: UDP_MESH_KEY}, {env: UDP_MESH_OLD_KEY}]}",
 )
 def transport_key_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    marks = ((_identity(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
+    marks = ((identity(context, ref), index) for index, ref in enumerate(fleet.udp_mesh.keys))
     for _, indexes in duplicates(marks):
         for index in indexes[1:]:
             found = str(fleet.udp_mesh.keys[index])
@@ -319,11 +325,11 @@ def key_file_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     passing=Example("udp_mesh: {port: 8700}", environment={"UDP_MESH_KEY": _TRANSPORT_KEY}),
 )
 def transport_key_guessable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for index, ref in enumerate(fleet.udp_mesh.keys):
+    for path, ref in transport_keys(fleet):
         secret = context.secret(ref)
         raw = None if secret is None else key_bytes(key_text(secret))
         if raw is not None and _is_pattern(raw):
-            yield Finding(("udp_mesh", "keys", str(index)), "not random", "32 random bytes", "a pattern")
+            yield Finding(path, "not random", "32 random bytes", "a pattern")
 
 
 def _is_pattern(raw: bytes) -> bool:

@@ -16,6 +16,7 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import (
     Computer,
+    ComputerLink,
     FixedPosition,
     Fleet,
     Outbox,
@@ -28,7 +29,7 @@ from meshctl.model import (
     TopicLog,
     UdpMesh,
 )
-from meshctl.render.daemon import daemon_config, daemon_keys
+from meshctl.render.daemon import RELAY_KEY_NAME, daemon_config, daemon_keys, relay_keys
 from tests.meshctl.render import fleets
 from udp_mesh.core import settings as core
 from udp_mesh.daemon.configuration import Configuration, load
@@ -298,3 +299,63 @@ def test_with_a_routed_lan_every_daemon_has_all_others_as_fixed_neighbors(tmp_pa
         found = loaded(source, name, tmp_path)
         assert {(one.name, one.address[0]) for one in found.settings.neighbours} == others
         assert [link.broadcast for link in found.links] == [False]
+
+
+def with_links(*links: ComputerLink, **transport: Any) -> Fleet:
+    source = fleet(ESTOP, **transport)
+    spot = source.robots["spot"]
+    assert spot.computer is not None
+    changed = replace(spot, computer=replace(spot.computer, links=links))
+    return replace(source, robots={**source.robots, "spot": changed})
+
+
+def test_further_links_are_the_robots_alone_and_may_have_fixed_neighbors(tmp_path: Path) -> None:
+    tether = ComputerLink(address=IPv4Address("10.50.0.1"), neighbors={"uav": IPv4Address("10.50.0.2")}, mtu=1400)
+    source = with_links(ComputerLink("wlan*"), tether)
+    found = loaded(source, "spot", tmp_path)
+    assert found.links == (
+        LinkConfig(None, "10.42.0.101"),
+        LinkConfig("wlan*", None),
+        LinkConfig(None, "10.50.0.1", broadcast=False, mtu=1400),
+    )
+    (uav,) = found.settings.neighbours
+    assert (uav.address, uav.name, uav.link) == (("10.50.0.2", 8700), None, "10.50.0.1")
+    assert loaded(source, "uav", tmp_path).links == (LinkConfig(None, "10.42.0.102"),)
+
+
+def test_a_robot_may_be_a_fixed_neighbor_on_two_links(tmp_path: Path) -> None:
+    link = ComputerLink("eth1", neighbors={"uav": IPv4Address("10.50.0.2")})
+    found = loaded(with_links(link, broadcast=False), "spot", tmp_path)
+    addresses = sorted(peer.address[0] for peer in found.settings.neighbours)
+    assert addresses == ["10.42.0.100", "10.42.0.102", "10.50.0.2"]
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        ((ComputerLink(),), "expected an interface or an address, found neither"),
+        ((ComputerLink("wlan1", IPv4Address("10.50.0.1")),), "expected an interface or an address, found both"),
+        ((ComputerLink("wlan1"), ComputerLink("wlan1")), "expected another link than those before, found wlan1"),
+        ((ComputerLink(address=IPv4Address("10.42.0.101")),), "expected another link than those before"),
+    ],
+)
+def test_a_link_the_daemon_would_reject_is_rejected(links: tuple[ComputerLink, ...], message: str) -> None:
+    with pytest.raises(InvalidInput) as caught:
+        daemon_config(with_links(*links), "spot")
+    (found,) = caught.value.diagnostics
+    assert (found.code, found.path) == ("RND030", f"robots.spot.computer.links.{len(links) - 1}")
+    assert message in found.text
+
+
+def test_relay_keys_are_a_file_of_their_own(tmp_path: Path) -> None:
+    source = replace(fleet(ESTOP), udp_mesh=UdpMesh(keys=(NEW,), relay_keys=(OLD,)))
+    written = relay_keys(source, lambda ref: Secret(KEYS[ref]))
+    assert written is not None
+    (tmp_path / RELAY_KEY_NAME).write_bytes(written)
+    found = loaded(source, "spot", tmp_path)
+    assert len(found.settings.relay.keys) == 1
+    assert found.settings.relay.keys[0] not in found.settings.keys
+    assert relay_keys(fleet(ESTOP), lambda ref: Secret(KEYS[ref])) is None
+    with pytest.raises(InvalidInput) as caught:
+        relay_keys(source, lambda _: Secret("short"))
+    assert caught.value.diagnostics[0].path == "udp_mesh.relay_keys.0"

@@ -104,6 +104,20 @@ def test_one_answer_has_service_release_daemon_and_computer() -> None:
     assert json.loads(json.dumps(facts_object(facts)))["peers"][0]["name"] == "base"
 
 
+def test_peers_behind_relays_show_the_way() -> None:
+    routes = [
+        {"name": "base", "via": ["husky2", "b07"], "in_use": True},
+        {"name": "husky2", "via": ["base"], "in_use": False},
+        {"name": 7, "via": "nonsense", "in_use": "yes"},
+    ]
+    status = json.dumps({**json.loads(_STATUS), "relaying": {"routes": routes}})
+    facts = _facts(ANSWER.replace(_STATUS, status))
+    assert {peer.name: peer.via for peer in facts.peers} == {"base": ("husky2", "b07"), "husky2": ()}
+    assert facts_object(facts)["reached_through"] == ["base through husky2 and b07"]
+    assert "husky1: reaches base through husky2 and b07" in table([facts], 80).splitlines()
+    assert _facts().reached_through == ()
+
+
 def test_drift_lists_inventory_differences_and_manual_changes() -> None:
     text = ANSWER.replace("wheel=9999", "wheel=7777").replace("== computer", "damaged=etc/udp-mesh.toml\n== computer")
     text = text.replace("file=2222", "file=3333").replace("UnitFileState=enabled", "UnitFileState=disabled")

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from udp_mesh.core.logs.item import ItemId, LogKey
-from udp_mesh.core.logs.store import LogContents
-from udp_mesh.daemon.log_store import FIRST_PLAUSIBLE_S, SqliteLogStore
+from udp_mesh.core.logs.store import ItemUse, LogContents, RememberedLog
+from udp_mesh.crypto.signing import SigningKey
+from udp_mesh.daemon.log_rows import FIRST_PLAUSIBLE_S
+from udp_mesh.daemon.log_store import SqliteLogStore
 
 ITEM = ItemId(LogKey("artifact", "spot", bytes(32)), 1)
 NOW_S = FIRST_PLAUSIBLE_S + 1e6
@@ -41,7 +43,7 @@ def with_store(path: Path, use: Callable[[Store, LogContents], Awaitable[None]],
 
 
 def put(store: Store, item: ItemId, data: bytes) -> None:
-    store.put(item, data, taken=False, done=lambda _: None)
+    store.put(item, data, ItemUse.WAITING, done=lambda _: None)
 
 
 def test_a_refused_item_is_reported_to_its_publisher_alone(tmp_path: Path) -> None:
@@ -137,6 +139,114 @@ def test_an_item_whose_log_is_unknown_is_left_out(tmp_path: Path) -> None:
     connection.commit()
     connection.close()
     with_store(path, read)
+
+
+KEPT = ItemId(LogKey("artifact", "spot", bytes(range(32))), 7)
+
+DAMAGES = {
+    "seed of the wrong length": "UPDATE meta SET value = x'00' WHERE name = 'seed'",
+    "seed as text": "UPDATE meta SET value = 'secret' WHERE name = 'seed'",
+    "no seed": "DELETE FROM meta",
+    "ranges that are no JSON": "UPDATE logs SET dropped = '[[1, 2' WHERE topic = 'damaged'",
+    "ranges that overlap": "UPDATE logs SET dropped = '[[1, 5], [3, 9]]' WHERE topic = 'damaged'",
+    "ranges of something else": """UPDATE logs SET dropped = '{"1": [true, null]}' WHERE topic = 'damaged'""",
+    "deeply nested ranges": f"UPDATE logs SET dropped = '{'[' * 100_000}' WHERE topic = 'damaged'",
+    "ranges as a blob": "UPDATE logs SET dropped = x'ff' WHERE topic = 'damaged'",
+    "a short log id": "UPDATE logs SET log_id = x'00' WHERE topic = 'damaged'",
+    "a source that is no text": "UPDATE logs SET source = 1.5 || x'ff' WHERE topic = 'damaged'",
+    "an empty topic": "UPDATE logs SET topic = '' WHERE topic = 'damaged'",
+    "a number as text": "UPDATE items SET number = 'one' WHERE number = 1",
+    "a negative number": "UPDATE items SET number = -1 WHERE number = 1",
+    "data as text": "UPDATE items SET data = 'text' WHERE number = 1",
+    "a time as text": "UPDATE items SET stored_s = 'yesterday' WHERE number = 1",
+    "an unknown use": "UPDATE items SET taken = 9 WHERE number = 1",
+    "carried ranges that are no list": "INSERT INTO carried VALUES (1, '7')",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_rows_that_make_no_sense_cost_no_other_items(
+    tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "items.db"
+
+    async def write(store: Store, _: LogContents) -> None:
+        put(store, ItemId(ITEM.log._replace(topic="damaged"), 1), b"data")
+        put(store, KEPT, b"data")
+        assert store.last_put is not None
+        await asyncio.wait_for(store.last_put.stored.wait(), 10)
+
+    async def read(store: Store, contents: LogContents) -> None:
+        assert KEPT in [item.id for item in contents.items]
+        assert len(contents.seed) == 32
+        put(store, ItemId(KEPT.log, 8), b"more")
+        assert store.last_put is not None
+        await asyncio.wait_for(store.last_put.stored.wait(), 10)
+        assert store.last_put.problem is None
+
+    with_store(path, write)
+    connection = sqlite3.connect(path)
+    connection.execute(damage)
+    connection.commit()
+    connection.close()
+    with_store(path, read)
+    assert damage == DAMAGES["no seed"] or "log-row-unusable" in caplog.text
+    assert list(tmp_path.glob("*.damaged-*")) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "renewed"),
+    [
+        ("UPDATE logs SET dropped = 'none'", True),
+        ("UPDATE items SET number = 'nine' WHERE number = 9", True),
+        # Its number is known, and counts as used.
+        ("UPDATE items SET taken = 9 WHERE number = 9", False),
+    ],
+)
+def test_own_numbers_in_doubt_are_never_used_again(tmp_path: Path, damage: str, renewed: bool) -> None:
+    path, seeds = tmp_path / "items.db", list[bytes]()
+
+    async def write(store: Store, contents: LogContents) -> None:
+        seeds.append(contents.seed)
+        own = LogKey("artifact", "spot", SigningKey(contents.seed).public)
+        for number in (8, 9):
+            store.put(ItemId(own, number), b"data", ItemUse.TAKEN, lambda _: None)
+        store.drop((), (RememberedLog(own, ((1, 7),)),))
+
+    async def read(_: Store, contents: LogContents) -> None:
+        assert (contents.seed != seeds[0]) is renewed
+        assert [item.id.number for item in contents.items][:1] == [8]
+        if not renewed:
+            assert [entry.received for entry in contents.remembered] == [((1, 7), (9, 9))]
+
+    with_store(path, write)
+    connection = sqlite3.connect(path)
+    connection.execute(damage)
+    connection.commit()
+    connection.close()
+    with_store(path, read)
+
+
+def test_what_is_carried_is_remembered_with_items_and_without_them(tmp_path: Path) -> None:
+    path, log = tmp_path / "items.db", ITEM.log
+
+    async def write(store: Store, _: LogContents) -> None:
+        for number in (1, 2):
+            store.put(ItemId(log, number), b"data", ItemUse.CARRIED, lambda _: None)
+        store.drop((ItemId(log, 1),), (RememberedLog(log, ((1, 1),), ((1, 1),)),))
+
+    async def read(store: Store, contents: LogContents) -> None:
+        assert [(item.id.number, item.use) for item in contents.items] == [(2, ItemUse.CARRIED)]
+        assert contents.remembered == (RememberedLog(log, ((1, 1),), ((1, 1),)),)
+        store.mark((ItemId(log, 2),), ItemUse.WAITING)
+        store.drop((), (RememberedLog(log, ((2, 2),)),))
+
+    async def read_again(_: Store, contents: LogContents) -> None:
+        assert [(item.id.number, item.use) for item in contents.items] == [(2, ItemUse.WAITING)]
+        assert contents.remembered == (RememberedLog(log, ((2, 2),)),)
+
+    for use in (write, read, read_again):
+        with_store(path, use)
 
 
 def test_a_job_that_fails_in_any_way_does_not_end_the_thread(tmp_path: Path) -> None:

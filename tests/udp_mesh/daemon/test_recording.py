@@ -1,6 +1,7 @@
 """A recording is written by a thread: complete when closed, with its gaps recorded, without making a caller wait."""
 
 import json
+import random
 import threading
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.udp_mesh.links.sockets import WAIT_S
+from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import (
     ExpiryReason,
     MessageDelivered,
@@ -16,8 +18,12 @@ from udp_mesh.core.events import (
     MessagePeerLost,
     PeerOffline,
 )
+from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.settings import Settings
+from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon import recording
 from udp_mesh.daemon.recording import Recorder
+from udp_mesh.report.recording import LogProgress, read
 
 
 def recorder(path: Path, limit_bytes: int = 1 << 20) -> Recorder:
@@ -87,3 +93,20 @@ def test_an_existing_file_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError):
         recorder(tmp_path / "run.jsonl")
     assert (tmp_path / "run.jsonl").read_text() == "of yesterday"
+
+
+def test_counters_of_differences_and_shared_logs_reach_the_report(tmp_path: Path) -> None:
+    made = recorder(tmp_path / "run.jsonl")
+    endpoint = Endpoint(Settings("scout", unkeyed=True), boot_id=bytes(16), rng=random.Random(1), now=0.0)
+    log = LogConditions("artifact", "scout", bytes(32), 2, 900, 3, 3, 5, 0, (("base", 1),), ())
+    for saved, logs in ((0, ()), (400, (log,))):
+        counters = VersionCounters(whole_sent=1, payload_bytes_sent=1000 + saved, body_bytes_sent=1000)
+        made.conditions(endpoint.conditions(float(saved)), [VersionConditions("map", counters)], logs)
+    made.conditions(endpoint.conditions(401.0))
+    made.close().result(WAIT_S)
+    found = read(made.path)
+    assert found.problems == []
+    ((first, last),) = found.versions.values()
+    assert last.since(first).payload_bytes == 400
+    assert found.logs == {("artifact", "scout"): LogProgress(3, 5, 900)}
+    assert "versions" not in lines(made.path)[-1]

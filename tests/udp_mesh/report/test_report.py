@@ -275,3 +275,47 @@ def test_text_has_no_control_characters_of_names() -> None:
     assert "\x1b" not in text
     assert "\x07" not in text
     assert "to␊pic" in text
+
+
+def snapshot(t: float, **rows: object) -> bytes:
+    return json.dumps({"t": t, "kind": "conditions", "peers": [], **rows}).encode()
+
+
+def versions(topic: str, whole: int, differences: int, payload: int, body: int) -> dict[str, object]:
+    names = ("whole_sent", "differences_sent", "payload_bytes_sent", "body_bytes_sent")
+    return {"topic": topic, **dict(zip(names, (whole, differences, payload, body), strict=True))}
+
+
+def test_the_gain_of_differences_is_that_of_the_recording_alone() -> None:
+    recording = parse(
+        [
+            header("husky", 0.0).encode(),
+            snapshot(0.0, versions=[versions("map", 3, 5, 8_000_000, 4_000_000), versions("idle", 1, 1, 10, 10)]),
+            snapshot(1.0, versions=[versions("map", 4, 14, 18_000_000, 5_000_000), versions("late", 1, 0, 1000, 900)]),
+        ],
+        "r.jsonl",
+    )
+    assert recording.problems == []
+    assert summary(recording)["differences"] == [
+        {"topic": "late", "whole": 1, "differences": 0, "payload_bytes": 1000, "body_bytes": 900},
+        {"topic": "map", "whole": 1, "differences": 9, "payload_bytes": 10_000_000, "body_bytes": 1_000_000},
+    ]
+    shown = next(table for table in document_of(recording)["tables"] if table["title"] == "Differences sent")
+    assert ["map", "1", "9", "10.00", "1.00", "90%"] in shown["rows"]
+    assert [row[0] for row in shown["rows"]] == ["late", "map"]
+
+
+def test_shared_logs_are_shown_as_they_were_last() -> None:
+    rows = [{"topic": "artifact", "source": "<spot>", "received_items": 3, "known_items": 5, "held_bytes": 2_000_000}]
+    recording = parse([header("base", 0.0).encode(), snapshot(0.0), snapshot(1.0, logs=rows)], "r.jsonl")
+    assert summary(recording)["logs"] == rows
+    title = "Shared logs at the end"
+    shown = next(table for table in document_of(recording)["tables"] if table["title"] == title)
+    assert shown["rows"] == [["artifact", "<spot>", "3 of 5", "2.00"]]
+    assert title not in {table["title"] for table in document_of(parse(lines(*ITEMS), "r.jsonl"))["tables"]}
+
+
+@pytest.mark.parametrize("rows", [{"versions": 5}, {"logs": [1]}, {"versions": [{"topic": "map"}]}, {"logs": [{}]}])
+def test_invalid_counters_are_reported_with_their_line(rows: dict[str, object]) -> None:
+    recording = parse([header("base", 0.0).encode(), snapshot(0.0, **rows)], "r.jsonl")
+    assert [problem.split()[0] for problem in recording.problems] == ["r.jsonl:2:"]

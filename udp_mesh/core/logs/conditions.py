@@ -53,7 +53,7 @@ def conditions_of(
     for shelf in shelves.values():
         for item, held in shelf.items.items():
             size, waiting = sizes.get(item.log, (0, 0))
-            sizes[item.log] = (size + held.size_bytes, waiting + (not held.taken))
+            sizes[item.log] = (size + held.size_bytes, waiting + held.waits)
     rows = []
     for state in sorted(logs, key=lambda log: log.key):
         key = state.key

@@ -29,6 +29,8 @@ class LogState:
     key: LogKey
     held: RangeSet = field(default_factory=RangeSet)
     received: RangeSet = field(default_factory=RangeSet)
+    carried: RangeSet = field(default_factory=RangeSet)
+    """Those in `received` that no program here was to get, because this node was no reader then."""
     storing: set[int] = field(default_factory=set)
     """Numbers being written to the disk."""
     readers: dict[str, RangeSet] = field(default_factory=dict)
@@ -157,6 +159,13 @@ def limit_ranges(numbers: RangeSet) -> None:
     more: thousands of later items came meanwhile."""
     while len(numbers) > MAX_KEPT_RANGES:
         numbers.fill_lowest_gap()
+
+
+def forget_lowest(numbers: RangeSet) -> None:
+    """Bound the memory: beyond the limit the lowest ranges are forgotten."""
+    while len(numbers) > MAX_KEPT_RANGES:
+        first, last = numbers.ranges()[0]
+        numbers.remove_range(first, last)
 
 
 def as_set(ranges: Ranges | list[tuple[int, int]]) -> RangeSet:

@@ -17,7 +17,8 @@ MAX_OUTCOMES = 65_536
 class _Published:
     message_id: MessageId
     accepted_at: float
-    known_by: set[str] = field(default_factory=set)
+    read_by: set[str] = field(default_factory=set)
+    carried_by: set[str] = field(default_factory=set)
 
 
 class Outcomes:
@@ -55,20 +56,20 @@ class Outcomes:
                 continue
             for number in _numbers(published, ranges):
                 entry = published[number]
-                if name not in entry.known_by:
-                    entry.known_by.add(name)
+                if name not in entry.read_by:
+                    entry.read_by.add(name)
                     self._emit(MessageDelivered(entry.message_id, name, log.topic, now - entry.accepted_at))
         if readers and peer not in readers:
             for number in _numbers(published, carried):
                 entry = published[number]
-                if peer not in entry.known_by:
-                    entry.known_by.add(peer)
+                if peer not in entry.carried_by:
+                    entry.carried_by.add(peer)
                     self._emit(LogItemHeld(entry.message_id, peer, log.topic, number))
         awaited = {name for name in readers if name != log.source}
         if readers:
             for ranges in read.values():
                 for number in list(_numbers(published, ranges)):
-                    if awaited <= published[number].known_by:
+                    if awaited <= published[number].read_by:
                         del published[number]
 
 

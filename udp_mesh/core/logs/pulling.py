@@ -68,6 +68,12 @@ class Requests:
         ]
         self._remove(peer, gone)
 
+    def remove(self, log: LogKey, numbers: RangeSet) -> None:
+        """These items of a log are not needed any more."""
+        needless = [item for item in self.items if item.log == log and item.number in numbers]
+        for peer in {self.items[item] for item in needless}:
+            self._remove(peer, [item for item in needless if self.items.get(item) == peer])
+
     def _remove(self, peer: str, items: list[ItemId]) -> None:
         for item in items:
             del self.items[item]

@@ -8,7 +8,7 @@ from dataclasses import replace
 from udp_mesh.core.logs.item import LogKey
 from udp_mesh.core.logs.knowledge import LogState, as_set
 from udp_mesh.core.logs.retention import HeldItem, Shelf
-from udp_mesh.core.logs.store import LogContents
+from udp_mesh.core.logs.store import ItemUse, LogContents
 
 
 class Restorer:
@@ -22,12 +22,12 @@ class Restorer:
         self, topics: Container[str], log: Callable[[LogKey], LogState | None], shelves: Mapping[str, Shelf]
     ) -> None:
         """Fill the logs and shelves of these topics, once each. `log` returns a log's state (None: too many logs)."""
-        dropped, items = [], []
-        for key, ranges in self._contents.dropped:
-            if key.topic not in topics:
-                dropped.append((key, ranges))
-            elif (state := log(key)) is not None:
-                state.received = as_set(ranges)
+        remembered, items = [], []
+        for entry in self._contents.remembered:
+            if entry.log.topic not in topics:
+                remembered.append(entry)
+            elif (state := log(entry.log)) is not None:
+                state.received, state.carried = as_set(entry.received), as_set(entry.carried)
         for stored in self._contents.items:
             key, number = stored.id
             if key.topic not in topics:
@@ -35,6 +35,10 @@ class Restorer:
             elif (state := log(key)) is not None:
                 state.held.add(number)
                 state.received.add(number)
-                held = HeldItem(stored.size_bytes, self._loaded_at - stored.age_s, stored.taken)
+                if stored.use is ItemUse.CARRIED:
+                    state.carried.add(number)
+                else:
+                    state.carried.remove(number)
+                held = HeldItem(stored.size_bytes, self._loaded_at - stored.age_s, stored.use)
                 shelves[key.topic].add(stored.id, held)
-        self._contents = replace(self._contents, items=tuple(items), dropped=tuple(dropped))
+        self._contents = replace(self._contents, items=tuple(items), remembered=tuple(remembered))

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from udp_mesh.core.logs.item import ItemId
+from udp_mesh.core.logs.store import ItemUse
 from udp_mesh.core.settings import Log
 
 MAX_WRITING_BYTES = 16 << 20
@@ -23,8 +24,12 @@ class HeldItem:
 
     size_bytes: int
     stored_at: float
-    taken: bool
-    """No local program waits for it."""
+    use: ItemUse
+
+    @property
+    def waits(self) -> bool:
+        """Whether a local program is to get it."""
+        return self.use is ItemUse.WAITING
 
 
 class Shelf:
@@ -109,7 +114,7 @@ class Shelf:
 
     def _candidates(self, *, own: bool, wanted: bool) -> Iterator[ItemId]:
         """Lazily, since the first one is usually enough."""
-        yield from (item for item, held in self.items.items() if held.taken and self._is_read(item))
+        yield from (item for item, held in self.items.items() if not held.waits and self._is_read(item))
         if own or wanted:
             yield from self._unread(own=False)
         if own:
@@ -117,5 +122,5 @@ class Shelf:
 
     def _unread(self, *, own: bool) -> Iterator[ItemId]:
         for item, held in self.items.items():
-            if held.taken and self._is_own(item) is own and not self._is_read(item):
+            if not held.waits and self._is_own(item) is own and not self._is_read(item):
                 yield item

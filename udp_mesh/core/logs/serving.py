@@ -1,7 +1,8 @@
 """Requested items out: a queue per peer -> the store -> messages, a few at a time.
 
 Only a few items per peer are read ahead, so that memory holds little and more urgent topics are not delayed by reading.
-An item that is already on its way to a peer is not sent twice.
+An item that is already on its way to a peer is not sent twice, and one that is not needed any more is withdrawn, even
+halfway.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ RETRY_S = 0.5
 Send = Callable[[str, bytes, str | None, float], MessageId | Rejected]
 """(topic, payload, destination or None for all, now)."""
 
+Withdraw = Callable[[str, MessageId, float], None]
+"""(peer, message, now): the transport sends no more of it."""
+
 
 @dataclass(slots=True, eq=False)
 class _Service:
@@ -43,9 +47,12 @@ class _Service:
 class Serving:
     """`lost` is called for an item that the store could not read."""
 
-    def __init__(self, store: LogStore, send: Send, defer: Callable[[Callable[[float], None]], None]) -> None:
+    def __init__(
+        self, store: LogStore, send: Send, withdraw: Withdraw, defer: Callable[[Callable[[float], None]], None]
+    ) -> None:
         self._store = store
         self._send = send
+        self._withdraw = withdraw
         self._defer = defer
         self._peers: dict[str, _Service] = {}
         self._messages: dict[MessageId, tuple[str, ItemId]] = {}
@@ -66,11 +73,21 @@ class Serving:
         if service is not None:
             service.queue.clear()
 
-    def peer_has(self, peer: str, log: LogKey, held: RangeSet) -> None:
-        """The peer has these items, perhaps from others: what still waits for it is not sent."""
-        service = self._peers.get(peer)
-        if service is not None and service.queue:
-            service.queue = deque(item for item in service.queue if item.log != log or item.number not in held)
+    def peer_has(self, peer: str, log: LogKey, held: RangeSet, now: float) -> None:
+        """The peer has these items, perhaps from others."""
+        self.withdraw(lambda to, item: to == peer and item.log == log and item.number in held, now)
+
+    def withdraw(self, is_needless: Callable[[str, ItemId], bool], now: float) -> None:
+        """Send none of these (peer, item) any more: what waits, what is being read, and what the transport has."""
+        for peer, service in self._peers.items():
+            if any(is_needless(peer, item) for item in service.queue):
+                service.queue = deque(item for item in service.queue if not is_needless(peer, item))
+            for item in [item for item, size_bytes in service.sending.items() if not size_bytes]:
+                if is_needless(peer, item):
+                    del service.sending[item]
+        for message, (peer, item) in list(self._messages.items()):
+            if is_needless(peer, item):
+                self._withdraw(peer, message, now)
 
     def run(self, now: float, lost: Callable[[ItemId, float], None]) -> None:
         """Read and send what may go now."""

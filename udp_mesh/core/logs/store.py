@@ -8,10 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 from udp_mesh.core.logs.item import ItemId, LogKey
 from udp_mesh.core.logs.messages import Ranges
+
+
+class ItemUse(IntEnum):
+    """What the programs of this node have to do with an item. The values are on disk."""
+
+    WAITING = 0
+    """One of them is to get it."""
+    TAKEN = 1
+    """One of them took or published it."""
+    CARRIED = 2
+    """None was to get it: the node only carries it."""
+
+
+class RememberedLog(NamedTuple):
+    """What is remembered of a log whose items were dropped."""
+
+    log: LogKey
+    received: Ranges
+    """Numbers that were stored once and must not be requested again."""
+    carried: Ranges = ()
+    """Those of them that no program here was to get."""
 
 
 class StoredItem(NamedTuple):
@@ -21,8 +43,7 @@ class StoredItem(NamedTuple):
     size_bytes: int
     age_s: float
     """Time since it was stored."""
-    taken: bool
-    """Whether a local program took it, or none will."""
+    use: ItemUse
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +54,7 @@ class LogContents:
     seed: bytes
     items: tuple[StoredItem, ...] = ()
     """In the order they were stored."""
-    dropped: tuple[tuple[LogKey, Ranges], ...] = ()
-    """Numbers that were stored once and must not be requested again."""
+    remembered: tuple[RememberedLog, ...] = ()
 
 
 class LogStore(Protocol):
@@ -48,7 +68,7 @@ class LogStore(Protocol):
         """The wall clock, in milliseconds since 1970: the creation time of own items."""
         ...
 
-    def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
+    def put(self, item: ItemId, data: bytes, use: ItemUse, done: Callable[[bool], None]) -> None:
         """Store an item; `done(True)` once it survives a power cut, `done(False)` if the disk refused it."""
         ...
 
@@ -56,12 +76,12 @@ class LogStore(Protocol):
         """Read an item; `done(None)` if it cannot be read."""
         ...
 
-    def take(self, item: ItemId) -> None:
-        """Remember that a local program took the item."""
+    def mark(self, items: Iterable[ItemId], use: ItemUse) -> None:
+        """Change the use of items."""
         ...
 
-    def drop(self, items: Iterable[ItemId], dropped: Iterable[tuple[LogKey, Ranges]]) -> None:
-        """Remove items; `dropped` replaces what is remembered of these logs."""
+    def drop(self, items: Iterable[ItemId], remembered: Iterable[RememberedLog]) -> None:
+        """Remove items; `remembered` replaces what was remembered of these logs."""
         ...
 
 
@@ -71,33 +91,33 @@ class MemoryLogStore:
 
     seed: bytes
     clock: Callable[[], float] = lambda: 0.0
-    items: dict[ItemId, tuple[bytes, float, bool]] = field(default_factory=dict)
-    dropped: dict[LogKey, Ranges] = field(default_factory=dict)
+    items: dict[ItemId, tuple[bytes, float, ItemUse]] = field(default_factory=dict)
+    remembered: dict[LogKey, RememberedLog] = field(default_factory=dict)
 
     def load(self) -> LogContents:
         items = tuple(
-            StoredItem(item, len(data), max(0.0, self.clock() - at), taken)
-            for item, (data, at, taken) in self.items.items()
+            StoredItem(item, len(data), max(0.0, self.clock() - at), use)
+            for item, (data, at, use) in self.items.items()
         )
-        return LogContents(self.seed, items, tuple(self.dropped.items()))
+        return LogContents(self.seed, items, tuple(self.remembered.values()))
 
     def unix_ms(self) -> int:
         return int(self.clock() * 1000)
 
-    def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
-        self.items[item] = (data, self.clock(), taken)
+    def put(self, item: ItemId, data: bytes, use: ItemUse, done: Callable[[bool], None]) -> None:
+        self.items[item] = (data, self.clock(), use)
         done(True)
 
     def get(self, item: ItemId, done: Callable[[bytes | None], None]) -> None:
         stored = self.items.get(item)
         done(None if stored is None else stored[0])
 
-    def take(self, item: ItemId) -> None:
-        stored = self.items.get(item)
-        if stored is not None:
-            self.items[item] = (stored[0], stored[1], True)
+    def mark(self, items: Iterable[ItemId], use: ItemUse) -> None:
+        for item in items:
+            if (stored := self.items.get(item)) is not None:
+                self.items[item] = (stored[0], stored[1], use)
 
-    def drop(self, items: Iterable[ItemId], dropped: Iterable[tuple[LogKey, Ranges]]) -> None:
+    def drop(self, items: Iterable[ItemId], remembered: Iterable[RememberedLog]) -> None:
         for item in items:
             self.items.pop(item, None)
-        self.dropped.update(dropped)
+        self.remembered.update({entry.log: entry for entry in remembered})

@@ -248,7 +248,7 @@ class Relaying:
                 if name not in self._state.links or now - link.hello_at > FORGET_S:
                     del neighbour.links[name]
         self.routes.expire(self.neighbours, now)
-        self.routes.forget_announced()
+        self.routes.forget_announced(now)
         if self.active(now) and self._hello_at == _NEVER:
             self._hello_soon(now)
         self._select(self.routes.known() | set(self.neighbours), now)

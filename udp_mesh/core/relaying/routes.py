@@ -19,6 +19,9 @@ OFFER_FOR_INTERVALS = 3.5
 """Intervals of its relay after which an entry that is not repeated is gone."""
 MAX_OFFERS = 4096
 """Entries kept, over all neighbors: a member that invents nodes."""
+INFEASIBLE_FOR_S = 30.0
+"""A node whose offers were all infeasible for this long is treated as new: whoever announced a later round of it than
+there is has gone, and nothing that follows from our own announcement is left."""
 RETRACT_ROUNDS = 3
 """Hellos in which a lost node is listed as unreachable: one may be lost."""
 
@@ -57,6 +60,7 @@ class Routes:
         self._count = 0
         self._announced: dict[bytes, tuple[int, int]] = {}
         """What this node last announced: round and least cost. No larger offer is used (feasibility)."""
+        self._infeasible_since: dict[bytes, float] = {}
         self._retracting: dict[bytes, tuple[HopRoute, int]] = {}
 
     def on_offers(self, relay: bytes, nodes: Iterable[RelayedNode], own: bytes, now: float) -> set[bytes]:
@@ -186,11 +190,17 @@ class Routes:
                 del self._retracting[boot_id]
         return nodes
 
-    def forget_announced(self) -> None:
-        """Drop what was announced for nodes that are no longer offered, so that restarted boots do not accumulate."""
-        for boot_id in [boot_id for boot_id in self._announced if boot_id not in self._offers]:
-            if boot_id not in self.selected and boot_id not in self._retracting:
+    def forget_announced(self, now: float) -> None:
+        """Drop what was announced for nodes that are no longer offered, so that restarted boots do not accumulate, or
+        only in ways that are infeasible."""
+        for boot_id in list(self._announced):
+            if boot_id in self.selected or boot_id in self._retracting:
+                self._infeasible_since.pop(boot_id, None)
+            elif (
+                boot_id not in self._offers or now - self._infeasible_since.setdefault(boot_id, now) > INFEASIBLE_FOR_S
+            ):
                 del self._announced[boot_id]
+                self._infeasible_since.pop(boot_id, None)
 
 
 def _entry(route: HopRoute, cost: int, opened: bool) -> RelayedNode:

@@ -13,7 +13,7 @@ from udp_mesh.core.logs.messages import HaveEntry
 from udp_mesh.core.logs.outcomes import Outcomes
 from udp_mesh.core.logs.retention import MAX_WRITING_BYTES, Shelf
 from udp_mesh.core.logs.serving import MAX_QUEUED, RETRY_S, Serving
-from udp_mesh.core.logs.store import MemoryLogStore
+from udp_mesh.core.logs.store import ItemUse, MemoryLogStore
 from udp_mesh.core.settings import Log
 
 KEY = LogKey("artifact", "spot", bytes(32))
@@ -30,7 +30,7 @@ def test_gaps_and_removal_are_those_of_a_set(numbers: set[int], first: int, leng
 
 
 def test_a_peer_queues_no_more_requests_than_the_limit() -> None:
-    serving = Serving(MemoryLogStore(bytes(32)), lambda *_: MessageId(1), lambda _: None)
+    serving = Serving(MemoryLogStore(bytes(32)), lambda *_: MessageId(1), lambda *_: None, lambda _: None)
     answers = [serving.request("mallory", ItemId(KEY, number)) for number in range(1, 2 * MAX_QUEUED)]
     assert answers.count(True) == MAX_QUEUED
     assert len(serving._peers["mallory"].queue) == MAX_QUEUED
@@ -39,7 +39,7 @@ def test_a_peer_queues_no_more_requests_than_the_limit() -> None:
 def test_an_item_waits_while_the_queue_of_the_transport_is_full() -> None:
     store = MemoryLogStore(bytes(32))
     item = ItemId(KEY, 1)
-    store.put(item, b"data", taken=True, done=lambda _: None)
+    store.put(item, b"data", ItemUse.TAKEN, done=lambda _: None)
     full, sent, now = True, list[bytes](), 0.0
 
     def send(topic: str, payload: bytes, destination: str | None, at: float) -> MessageId | Rejected:
@@ -48,7 +48,7 @@ def test_an_item_waits_while_the_queue_of_the_transport_is_full() -> None:
         sent.append(payload)
         return MessageId(1)
 
-    serving = Serving(store, send, lambda call: call(now))
+    serving = Serving(store, send, lambda *_: None, lambda call: call(now))
     serving.request("base", item)
     serving.run(now, lambda *_: None)
     assert (sent, serving.next_at) == ([], RETRY_S)
@@ -65,7 +65,7 @@ def test_a_peer_that_keeps_asking_is_answered_a_few_times_a_second() -> None:
         sent += 1
         return MessageId(1)
 
-    announcements = Announcements(send, lambda log, peer: HaveEntry(log, ((1, 1),)), 0.0)
+    announcements = Announcements(send, lambda log, peer: HaveEntry(log, ((1, 1),)), lambda *_: True, 0.0)
     view = PeerView()
     for step in range(100):
         view.needs_all = True
@@ -80,7 +80,7 @@ def test_an_announcement_that_the_transport_refused_is_repeated() -> None:
     def send(*_: object) -> MessageId | Rejected:
         return MessageId(1) if accepts else Rejected(RejectReason.QUEUE_FULL, "full")
 
-    announcements = Announcements(send, lambda log, peer: HaveEntry(log, ((1, 1),)), 0.0)
+    announcements = Announcements(send, lambda log, peer: HaveEntry(log, ((1, 1),)), lambda *_: True, 0.0)
     view = PeerView()
     announcements.run([KEY], {"base": view}, 0.0)
     assert (view.needs_all, view.asked) == (True, False)

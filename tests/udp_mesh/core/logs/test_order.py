@@ -11,7 +11,7 @@ from udp_mesh.core.logs.item import ItemId, LogItem, LogKey, encode_item
 from udp_mesh.core.logs.knowledge import MAX_KEPT_RANGES, LogState, PeerView, as_set, limit_ranges
 from udp_mesh.core.logs.messages import MAX_ORDER, Have, HaveEntry, item_topic
 from udp_mesh.core.logs.serving import MAX_SENDING, Serving
-from udp_mesh.core.logs.store import MemoryLogStore
+from udp_mesh.core.logs.store import ItemUse, MemoryLogStore
 from udp_mesh.core.settings import Log, Topic
 from udp_mesh.crypto.signing import SigningKey
 
@@ -61,13 +61,15 @@ def test_what_the_peer_has_from_others_is_not_sent() -> None:
         sent.append(payload)
         return MessageId(len(sent))
 
-    serving = Serving(store, send, lambda call: call(0.0))
+    withdrawn = list[MessageId]()
+    serving = Serving(store, send, lambda _, message, now: withdrawn.append(message), lambda call: call(0.0))
     for number in range(1, 9):
-        store.put(ItemId(KEY, number), b"%d" % number, taken=True, done=lambda _: None)
+        store.put(ItemId(KEY, number), b"%d" % number, ItemUse.TAKEN, done=lambda _: None)
         serving.request("base", ItemId(KEY, number))
     serving.run(0.0, lambda *_: None)
     assert len(sent) == MAX_SENDING
-    serving.peer_has("base", KEY, as_set([(5, 7)]))
+    serving.peer_has("base", KEY, as_set([(2, 2), (5, 7)]), 0.0)
+    assert withdrawn == [MessageId(2)]
     serving.ended(MessageId(1))
     serving.run(0.0, lambda *_: None)
     assert sent[MAX_SENDING:] == [b"8"]

@@ -9,7 +9,7 @@ import pytest
 from tests.udp_mesh.core.logs.team import LogTeam
 from udp_mesh.core.events import ExpiryReason, LogItemDropped, Rejected, RejectReason
 from udp_mesh.core.logs.item import ItemId
-from udp_mesh.core.logs.store import MemoryLogStore
+from udp_mesh.core.logs.store import ItemUse, MemoryLogStore
 from udp_mesh.core.settings import Log, Outbox, Topic
 
 
@@ -122,11 +122,11 @@ class FullDisk(MemoryLogStore):
 
     full = True
 
-    def put(self, item: ItemId, data: bytes, *, taken: bool, done: Callable[[bool], None]) -> None:
+    def put(self, item: ItemId, data: bytes, use: ItemUse, done: Callable[[bool], None]) -> None:
         if self.full:
             done(False)
         else:
-            MemoryLogStore.put(self, item, data, taken=taken, done=done)
+            MemoryLogStore.put(self, item, data, use, done)
 
 
 def test_a_full_disk_loses_nothing_that_others_have() -> None:
