@@ -118,9 +118,7 @@ def main() -> None:
         plain = sum(map(len, messages[1:])) / count
         alone = sum(body_bytes(message, None) for message in messages[1:]) / count
         trained = sum(with_dictionary(message, dictionary) for message in messages[1:]) / count
-        delta = (
-            sum(body_bytes(message, before) for before, message in itertools.pairwise(messages)) / count
-        )
+        delta = sum(body_bytes(message, before) for before, message in itertools.pairwise(messages)) / count
         print(
             f"| {name} | {plain:.0f} | {alone:.0f} | {trained:.0f} | {delta:.0f} "
             f"| {trained + OVERHEAD_BYTES:.0f} | {delta + OVERHEAD_BYTES:.0f} |"
