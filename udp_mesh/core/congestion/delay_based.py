@@ -36,7 +36,8 @@ doubled window leaves in bursts that are themselves such a queue, and ending too
 round trip was measured."""
 
 MIN_CWND = 4.0
-"""Packets: below this, a lost packet has too few successors to be detected without a timeout."""
+"""Packets: below this, a lost packet has too few successors to be detected without a timeout. On a lossy path so many
+must be acknowledged: packets and acknowledgements are both lost, so the minimum is this divided by (1 - loss)²."""
 
 MAX_CWND = 8192.0
 """Packets: 92 Mbit at 1400 B, more than any link of these robots needs. Bounds the state per packet."""
@@ -367,7 +368,11 @@ class DelayBasedController:
             # Packets waiting for a batched acknowledgement are in flight too, and lost ones occupy the window.
             pipe = capacity * (min_rtt + ACK_BATCH_S) / (1 - min(self._loss, MAX_LOSS))
             packets = min(packets, max(INITIAL_CWND, factor * pipe + self._queue_packets(windowed_rtt)))
-        return min(MAX_CWND, max(MIN_CWND, packets))
+        return min(MAX_CWND, max(self._min_cwnd(), packets))
+
+    def _min_cwnd(self) -> float:
+        # Other senders keep the channel busy while a loss goes unnoticed, and their minimums add up to one queue.
+        return MIN_CWND if self.queue_share < 1.0 else MIN_CWND / (1 - min(self._loss, MAX_LOSS)) ** 2
 
     def _begin_drain(self, now: float, *, suspicion: bool) -> None:
         min_rtt, windowed_rtt = self._rtt.min_rtt, self._rtt.windowed_rtt
