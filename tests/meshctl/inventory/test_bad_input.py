@@ -312,3 +312,8 @@ def test_a_pipe_in_the_inventory_s_directory_is_not_waited_for(tmp_path: Path) -
     os.mkfifo(tmp_path / "fleet.yaml")
     (problem,) = load(tmp_path).diagnostics
     assert problem.message == "cannot be read: not a regular file (a pipe, socket or device)"
+
+
+@pytest.mark.parametrize("text", ["operators\n  ssh_keys: []\n", "nodes:\n  a: {}\n b: {}\n"])
+def test_a_syntax_error_that_is_noticed_late_points_above(text: str, tmp_path: Path) -> None:
+    assert errors_of(tmp_path, text)[0].hint.startswith("the mistake may be above")

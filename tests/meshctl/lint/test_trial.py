@@ -288,6 +288,7 @@ def test_an_unknown_target_unlike_any_known_one_is_accepted(target: str, tmp_pat
         ("robots: {husky1: {computer: {arch: arm64}}}", "MC631", "write aarch64"),
         ("robots: {husky1: {computer: {ros: melodic}}}", "MC632", ""),
         ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean 'kmod-ath9k'?"),
+        ("nodes: {b01: {packages: [IW]}}", "MC832", "did you mean 'iw'?"),
     ],
 )
 def test_a_misspelling_gets_a_suggestion(fragment: str, code: str, hint: str, tmp_path: Path) -> None:
