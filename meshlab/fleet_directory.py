@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import tempfile
 import time
@@ -38,7 +39,7 @@ def claim(directory: Path) -> None:
     if is_running(directory):
         raise LabError(
             f"a virtual fleet runs in {directory} already",
-            hint="run `meshctl lab down` to stop it, or choose another --dir",
+            hint=f"run `meshctl lab down --dir {shlex.quote(str(directory))}` to stop it, or choose another --dir",
         )
     try:
         if directory.exists() and any(directory.iterdir()) and not is_lab(directory):

@@ -53,6 +53,8 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     other contents or a running fleet, InputError when copying fails; nothing is replaced then.
     """
     fleet = load_fleet(source, environ=environ)
+    # the copy names the key file, and relative paths in it would start at the copy
+    directory = directory.absolute()
     folder = source if source.is_dir() else source.parent
     fleet_directory.claim(directory)
     kept = fleet_directory.replace_inventory(folder, directory, without=(_KNOWN_HOSTS, f".{_KNOWN_HOSTS}.lock"))

@@ -204,6 +204,8 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
     why = short_of_quorum(proven, needed, commit.success) if has_entry else "the base did not come back"
     if not why:
         return _confirm_all(commit)
+    if commit.run.interrupt.leaving:
+        why = "interrupted before enough nodes passed their checks"
     unproven = [unmet_of(participant) for participant in commit.participants if not participant.is_proven]
     commit.run.note(f"{why}; rolling back: {'; '.join(unproven)}")
     return _roll_back(commit, why)

@@ -221,9 +221,9 @@ def confirm(question: str) -> None:
 
 
 def lab_directory(given: Path | None) -> Path:
-    """The lab's directory, by default below $XDG_STATE_HOME."""
+    """The lab's absolute directory, by default below $XDG_STATE_HOME."""
     if given is not None:
-        return given
+        return given.absolute()
     home = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
     return Path(home) / "meshctl" / "lab"
 

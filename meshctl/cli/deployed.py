@@ -54,6 +54,7 @@ def deployed(
     Example: meshctl deployed husky1-b03 B4
 
     Example: meshctl deployed --from-mesh
+
     Example: meshctl deployed --watch 30
     """
     for other, is_set in (("--from-mesh", from_mesh), ("--watch", watch is not None)):

@@ -17,7 +17,7 @@ from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord, default_path
 from meshctl.fleet.run_files import CHANGES, RunFiles
 from meshctl.plan.values import FileChange
-from meshctl.report.changed_options import summary
+from meshctl.report.changed_options import diff_lines, summary
 
 
 def history(
@@ -124,7 +124,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
         for change in changes.get(outcome.node, ()):
             echo(f"  {change.kind:<{width}} /{change.path}: {summary(change)}".rstrip(": "))
             if with_diffs:
-                for line in change.diff.splitlines()[2:]:
+                for line in diff_lines(change):
                     echo(f"    {line}")
         for step in steps:
             if step.node == outcome.node:

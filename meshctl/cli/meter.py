@@ -80,6 +80,7 @@ def meter(
     Exit code: 0 after --count readings, 2 could not run, 130 interrupted.
 
     Example: meshctl meter spot1 --speak
+
     Example: meshctl meter spot1 --json --count 1
     """
     if deploy and deploy not in _DEPLOY:

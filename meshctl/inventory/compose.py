@@ -90,8 +90,18 @@ def _syntax_error(source: Source, reason: yaml.MarkedYAMLError) -> Diagnostic:
         place = Position(source.file, min(mark.line, last) + 1, column + 1)
     context = f" {reason.context}" if reason.context else ""
     return codes.error(
-        codes.YAML_SYNTAX, place, f"not valid YAML{context}: {reason.problem}", hint=_hint(source, place)
+        codes.YAML_SYNTAX,
+        place,
+        f"not valid YAML{context}: {reason.problem}",
+        hint=_hint(source, place) or _above(reason),
     )
+
+
+def _above(reason: yaml.MarkedYAMLError) -> str:
+    """A hint for errors that libyaml notices only after the line with the mistake."""
+    late = ("could not find expected ':'", "did not find expected key", "mapping values are not allowed")
+    is_late = (reason.problem or "").startswith(late)
+    return "the mistake may be above: a missing `:`, quote or bracket, or another indentation" if is_late else ""
 
 
 def _hint(source: Source, place: Position) -> str:

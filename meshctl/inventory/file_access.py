@@ -1,9 +1,9 @@
 """Files that an inventory may include: those of its tree, and no pipes or devices.
 
-An inventory may be untrusted, such as a pull request that CI lints. Findings and renderings show its includes and
-templates, so they must not reach /etc/shadow, a token next to the checkout, or an endless pipe. The tree is the git
-work tree of the inventory, else the directory of its first file. `MESHCTL_INCLUDE_PATH` (directories separated by `:`)
-adds others.
+An inventory may be untrusted, such as a pull request that CI lints. Findings and renderings show its files, includes
+and templates, so symbolic links must not reach /etc/shadow, a token next to the checkout, or an endless pipe. The tree
+is the git work tree of the inventory, else the directory of its first file. `MESHCTL_INCLUDE_PATH` (directories
+separated by `:`) adds others.
 """
 
 from __future__ import annotations
@@ -30,9 +30,18 @@ class Boundary:
         more = [path for path in environ.get(VARIABLE, "").split(":") if path]
         return cls((_tree(folder), *(os.path.realpath(os.path.expanduser(path)) for path in more)))
 
+    @property
+    def is_work_tree(self) -> bool:
+        """Whether the inventory is in a checkout, which may have been written by others."""
+        return (Path(self.roots[0]) / ".git").exists()
+
     def refusal(self, path: Path) -> str:
         """Why `path`, with symbolic links resolved, must not be read as part of the inventory; empty if it may."""
-        real = os.path.realpath(path)
+        try:
+            real = os.path.realpath(path)
+        except ValueError:
+            # an impossible name: reading reports it
+            return ""
         inside = [root for root in self.roots if real == root or real.startswith(root.rstrip("/") + "/")]
         if not inside:
             return f"outside the inventory's tree {self.roots[0]}"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from meshctl.diagnostics import Diagnostic
+from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import MAX_VALUES, compose
 from meshctl.inventory.file_access import HINT, Boundary
@@ -37,7 +37,14 @@ def first_file(path: Path) -> Path:
 def read_files(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> MergedFiles:
     """Read `path` and its includes. An include's `~` is `HOME` of `environ`."""
     first = first_file(path)
-    gathering = _FileMerger(environ, read, Boundary.of(first.parent, environ))
+    boundary = Boundary.of(first.parent, environ)
+    # any other file was named by the user, such as `<(COMMAND)`
+    refusal = boundary.refusal(first) if first != path or boundary.is_work_tree else ""
+    if refusal:
+        hint = HINT if refusal.startswith("outside") else ""
+        error = codes.error(codes.UNREADABLE, Position(str(first)), f"cannot be read: {refusal}", hint=hint)
+        return MergedFiles(None, (), (error,))
+    gathering = _FileMerger(environ, read, boundary)
     root = gathering.file(first, ())
     complete = root if not gathering.is_broken else None
     return MergedFiles(complete, tuple(gathering.files), tuple(gathering.diagnostics))

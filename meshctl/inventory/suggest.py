@@ -6,6 +6,9 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from functools import lru_cache
 
+# of difflib's ratio: above it, `chanel` resembles `channel`; below it, `absent` does not resemble `base`
+_MIN_SIMILARITY = 0.65
+
 
 def nearest(wrong: str, known: Iterable[str]) -> str:
     """The known name most similar to `wrong`, or an empty string."""
@@ -19,7 +22,7 @@ def _nearest(wrong: str, names: tuple[str, ...]) -> str:
     exact = lowered.get(wrong.lower().replace("-", "_"))
     if exact is not None:
         return exact
-    matches = get_close_matches(wrong.lower(), lowered, n=1, cutoff=0.6)
+    matches = get_close_matches(wrong.lower(), lowered, n=1, cutoff=_MIN_SIMILARITY)
     return lowered[matches[0]] if matches else ""
 
 

@@ -72,11 +72,27 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
         known = _known_keys(path[:-1])
         wrong = str(path[-1])
         hint = did_you_mean(wrong, known) or f"known keys: {', '.join(known)}"
+        if _is_rest_of_a_text(root, path):
+            hint = "a comma ends a text within {}: if this belongs to the text before it, quote the whole text"
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
     expected = expected_value(error)
     found = f"'{printable(str(path[-1]))}'" if is_key else _found(root, path, kind)
     hint = _enum_hint(root, path, error) if kind == "enum" else ""
     return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
+
+
+def _is_rest_of_a_text(root: MappingNode, path: tuple[int | str, ...]) -> bool:
+    """Whether a key without a value follows a plain text in flow style: `{timezone: MST7MDT,M3.2.0,M11.1.0}`."""
+    tree: Tree | None = root
+    for part in path[:-1]:
+        tree = None if tree is None else child(tree, part)
+    if not isinstance(tree, MappingNode) or not tree.is_flow or str(path[-1]) not in tree.keys:
+        return False
+    entries = list(tree.values.items())
+    number = next(number for number, (key, _) in enumerate(entries) if key == str(path[-1]))
+    value, before = entries[number][1], entries[number - 1][1]
+    is_bare = isinstance(value, Scalar) and value.is_null and not value.text
+    return number > 0 and is_bare and isinstance(before, Scalar) and before.is_plain
 
 
 def _place(root: MappingNode, path: tuple[int | str, ...], *, is_key: bool) -> Position:

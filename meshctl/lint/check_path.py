@@ -14,7 +14,7 @@ from meshctl.errors import InputError
 from meshctl.inventory import load
 from meshctl.inventory.codes import UNREADABLE
 from meshctl.inventory.secrets import SecretStore
-from meshctl.inventory.source import read_bytes
+from meshctl.inventory.source import MAX_FILE_BYTES, read_bytes
 from meshctl.lint.catalog import BY_CODE, RULES
 from meshctl.lint.context import LintContext, SecretLookup, SecretProblem
 from meshctl.lint.engine import lint, lint_texts
@@ -41,7 +41,10 @@ def check_path(path: Path, regdb: Regdb, environ: Mapping[str, str], rules: Iter
     kept: dict[str, bytes] = {}
 
     def read(file: Path) -> bytes:
-        kept[str(file)] = content = read_bytes(file)
+        content = read_bytes(file)
+        # no rule reads a file that the loader rejects for its size
+        if len(content) <= MAX_FILE_BYTES:
+            kept[str(file)] = content
         return content
 
     loaded = load(path, environ=environ, read=read)

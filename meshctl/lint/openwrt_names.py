@@ -44,7 +44,7 @@ _CHIPS = (
 )
 PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
     """wpad-basic wpad-basic-mbedtls wpad-basic-openssl wpad-basic-wolfssl wpad-mini wpa-supplicant hostapd
-    hostapd-common wifi-scripts batctl-default batctl-full batctl-tiny kmod-batman-adv iw-full iwinfo kmod-ath5k
+    hostapd-common wifi-scripts batctl-default batctl-full batctl-tiny kmod-batman-adv iw iw-full iwinfo kmod-ath5k
     kmod-ath6kl kmod-ath9k kmod-ath9k-htc kmod-ath10k kmod-ath10k-ct kmod-ath10k-ct-smallbuffers kmod-ath11k kmod-mt76
     kmod-mt7603 kmod-mt7615e kmod-mt7915e kmod-mac80211 kmod-cfg80211 ethtool tcpdump tcpdump-mini ip-full ip-tiny
     ip-bridge iperf3 iperf fping mtr-json dnsmasq dropbear firewall firewall4 odhcpd-ipv6only odhcp6c ppp-mod-pppoe
@@ -61,8 +61,10 @@ def chip_target(radio_path: str) -> str | None:
 
 
 def suggest_package(name: str) -> str | None:
-    """The known package one edit away from `name`; None if `name` is known, or similar to none."""
-    if name in PACKAGES or len(name) < _MIN_LETTERS:
+    """The known package one edit or upper case away from `name`; None if `name` is known, or similar to none."""
+    if name.lower() in PACKAGES:
+        return None if name in PACKAGES else name.lower()
+    if len(name) < _MIN_LETTERS:
         return None
     return next(
         (known for known in sorted(PACKAGES) if len(known) >= _MIN_LETTERS and is_one_edit_apart(name, known)), None

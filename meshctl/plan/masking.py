@@ -7,25 +7,14 @@ replaced by its scrypt hash, so that guessing passphrases against a saved plan i
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Iterable, Mapping
 from threading import Lock
 
 from meshctl.model import MASK
-from meshctl.uci import Package, Section, Value, dump
+from meshctl.uci import Package, Section, Value, dump, is_secret
 
-# UCI options that hold keys or passwords in any of OpenWrt's packages (wireless of all releases, network's VPN and PPP)
-_SECRET_OPTION = re.compile(
-    r"key[1-4]?|sae_password|wpa_psk_file|password|passwd|identity_secret|auth_secret|acct_secret|dae_secret"
-    r"|priv_key_pwd|priv_key2_pwd|private_key|preshared_key|secret|token|license(_key)?|r[01]_key"
-)
 # Cost of one guess (RFC 7914 section 2: N, r, p): about 50 ms and 16 MiB on a laptop.
 _SCRYPT_N, _SCRYPT_R, _SCRYPT_P = 2**14, 8, 1
-
-
-def is_secret(option: str, value: Value) -> bool:
-    """Whether an option holds a secret; wireless `key '1'` is only the index of a WEP key."""
-    return _SECRET_OPTION.fullmatch(option) is not None and value not in ("1", "2", "3", "4")
 
 
 def secrets_of(package: Package) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from meshctl.model import Node
 from meshctl.plan.firmware import runs_release
 from meshctl.plan.packages import unavailable
 from meshctl.plan.values import PackageStep
-from meshctl.uci import Package
+from meshctl.uci import Package, masked_changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +121,10 @@ def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
     changes = case.seen.uci_changes
     if not changes:
         return None
+    # masked as a whole: a secret may have several lines
+    shown = masked_changes("\n".join(changes)).splitlines()
     return FailedPrecondition(
-        f"it has uncommitted UCI changes: {'; '.join(changes[:3])}",
+        f"it has uncommitted UCI changes: {'; '.join(shown[:3])}",
         "run `uci commit` or `uci revert` on the node, then plan again",
     )
 

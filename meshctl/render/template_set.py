@@ -116,5 +116,7 @@ def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
             lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(SUFFIX)]
             if lines:
                 place = Position(lines[-1].filename, lines[-1].lineno or 0)
+    if isinstance(error, MemoryError):
+        return Diagnostic(TEMPLATE, Severity.ERROR, place, "the template exceeds its memory limit")
     kind = "" if isinstance(error, TemplateError | ValueError | TypeError) else f"{type(error).__name__}: "
     return Diagnostic(TEMPLATE, Severity.ERROR, place, f"{kind}{error}")

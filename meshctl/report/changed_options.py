@@ -9,18 +9,30 @@ import re
 from collections.abc import Iterable, Iterator
 
 from meshctl.plan import FileChange
+from meshctl.render.rendered import MARKER_PATH
 
 # above this, settings are only counted
 MAX_SETTINGS = 8
 
 _SECTION = re.compile(r"config\s+(\S+)(?:\s+'(.*)')?")
 _OPTION = re.compile(r"(?:option|list)\s+(\S+)\s+'(.*)'")
+# the node's record of its configuration, different on every node
+_DIGEST = re.compile(r"[+-]config=[0-9a-f]{64}")
 
 
 def changed_lines(change: FileChange) -> tuple[str, ...]:
     """The added and removed lines, without hunk headers and context."""
     body = change.diff.splitlines()
-    return tuple(line for line in body[2:] if line[:1] in "+-" and line[1:].strip()) or tuple(body[:1])
+    return tuple(line for line in diff_lines(change) if line[:1] in "+-" and line[1:].strip()) or tuple(body[:1])
+
+
+def diff_lines(change: FileChange) -> tuple[str, ...]:
+    """The diff without its head; without a digest that has changed, and empty if nothing else has."""
+    lines = change.diff.splitlines()[2:]
+    if change.path != MARKER_PATH or change.kind != "changed":
+        return tuple(lines)
+    shown = tuple(line for line in lines if not _DIGEST.fullmatch(line))
+    return shown if any(line[:1] in "+-" for line in shown) else ()
 
 
 def settings(change: FileChange) -> tuple[str, ...]:
@@ -30,6 +42,8 @@ def settings(change: FileChange) -> tuple[str, ...]:
     body = change.diff.splitlines()
     if not body or not body[0].startswith("---"):
         return tuple(body[:1])
+    if not diff_lines(change):
+        return ("digest of its configuration",)
     found = tuple(_by_section(body[2:]))
     return found or (f"{len(changed_lines(change))} lines",)
 

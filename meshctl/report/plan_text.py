@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
 from meshctl.plan.ways import IN_ORDER, TOGETHER
-from meshctl.report.changed_options import changed_lines, summary
+from meshctl.report.changed_options import changed_lines, diff_lines, summary
 from meshctl.report.duration import duration
 from meshctl.report.terminal_escapes import clean
 
@@ -181,7 +181,7 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
         words = summary(change)
         yield Line(f"  {change.kind:<9} {change.path}" + (f": {words}" if words else ""))
         if with_diffs:
-            yield from (_diff_line(text) for text in change.diff.splitlines()[2:])
+            yield from (_diff_line(text) for text in diff_lines(change))
     for note in node.notes:
         yield Line(f"  note: {note}", "dim")
 

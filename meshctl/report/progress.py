@@ -206,10 +206,12 @@ class LiveProgress(RunProgress):
         if not self._stopping:
             return Group(*lines, totals)
         names = ", ".join(list(self._active)[:_MAX_NAMES]) + (" ..." if len(self._active) > _MAX_NAMES else "")
-        doing = f"finishing {names}" if names else "no node in progress"
-        return Group(
-            *lines, totals, Text(f"{self._stopping.upper()}: {doing}; no other node will be started", "bold yellow")
-        )
+        doing = "no node in progress; no other node will be started"
+        if names and self._stopping == "leaving":
+            doing = f"disconnecting from {names}; unconfirmed changes roll back by themselves"
+        elif names:
+            doing = f"finishing {names}; no other node will be started"
+        return Group(*lines, totals, Text(f"{self._stopping.upper()}: {doing}", "bold yellow"))
 
 
 class ThreadedProgress(RunProgress):

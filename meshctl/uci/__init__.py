@@ -1,6 +1,16 @@
 """UCI, OpenWrt's configuration format: text -> tree -> text, and diffs of trees."""
 
-from meshctl.uci.difference import ChangeKind, Diff, OptionChange, SectionChange, apply, diff, is_secret_option
+from meshctl.uci.difference import (
+    ChangeKind,
+    Diff,
+    OptionChange,
+    SectionChange,
+    apply,
+    diff,
+    is_secret,
+    is_secret_option,
+    masked_changes,
+)
 from meshctl.uci.parser import parse, parse_export
 from meshctl.uci.text import dump, quote
 from meshctl.uci.tree import Package, Section, Value
@@ -16,7 +26,9 @@ __all__ = [
     "apply",
     "diff",
     "dump",
+    "is_secret",
     "is_secret_option",
+    "masked_changes",
     "parse",
     "parse_export",
     "quote",

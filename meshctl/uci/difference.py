@@ -20,13 +20,34 @@ from meshctl.uci.tree import Package, Section, Value
 # Options with keys and passwords in OpenWrt's packages, whose values are never shown. dropbear's PasswordAuth is only
 # on or off.
 _SECRET_OPTION = re.compile(
-    r"(?!(Root)?PasswordAuth$)(key\d?|.*(passw(or)?d|passphrase|psk|secret|private_key|_pwd).*)", re.IGNORECASE
+    r"(?!(Root)?PasswordAuth$)"
+    r"(key\d?|token|license(_key)?|r[01]_key|.*(passw(or)?d|passphrase|psk|preshared_key|secret|private_key|_pwd).*)",
+    re.IGNORECASE,
 )
+# wireless `key '1'` is only the index of a WEP key
+_KEY_INDEXES = ("1", "2", "3", "4")
+# a line of `uci changes`: `wireless.mesh0.key='it'\''s'`, `network.wg0.addresses+='...'`; values may have several lines
+_CHANGED_OPTION = re.compile(r"([\w@\[\]-]{1,64}\.[\w@\[\]-]{1,64}\.)([\w-]{1,64})(\+?=)((?:'[^']*'?|\\')+|[^\n;]*)")
 
 
 def is_secret_option(name: str) -> bool:
     """Whether an option of this name contains a key or password."""
     return _SECRET_OPTION.fullmatch(name) is not None
+
+
+def is_secret(name: str, value: Value) -> bool:
+    """Whether an option with this value contains a key or password."""
+    return is_secret_option(name) and value not in _KEY_INDEXES
+
+
+def masked_changes(text: str) -> str:
+    """The output of `uci changes` with secrets masked."""
+
+    def masked(found: re.Match[str]) -> str:
+        where, name, sign, value = found.groups()
+        return f"{where}{name}{sign}{MASK if is_secret(name, value.strip(chr(39))) else value}"
+
+    return _CHANGED_OPTION.sub(masked, text)
 
 
 class ChangeKind(Enum):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,7 +66,8 @@ def up(
     if copy.kept is not None:
         echo(f"kept:      {copy.kept}, the earlier copy of the inventory, which was edited")
     echo(f"inventory: {copy.inventory}")
-    echo(f"use it:    export MESHCTL_LAB={place} MESHCTL_INVENTORY={copy.inventory}")
+    lab, inventory_path = shlex.quote(str(place)), shlex.quote(str(copy.inventory))
+    echo(f"use it:    export MESHCTL_LAB={lab} MESHCTL_INVENTORY={inventory_path}")
     echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
     echo("next:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
 

@@ -199,3 +199,11 @@ def test_an_inventory_copy_is_attributed_to_its_lab(tmp_path: Path) -> None:
     assert lab_of(str(copy.inventory / "fleet.yaml")) == str(tmp_path / "lab")
     assert lab_of(str(EXAMPLE)) == ""
     assert lab_of(str(tmp_path / "inventory")) == ""
+
+
+def test_a_relative_directory_is_the_same_from_everywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    copy = copy_inventory(EXAMPLE, Path("lab"))
+    assert copy.inventory == tmp_path / "lab" / "inventory"
+    (key_file,) = copy.fleet.nodes["base"].ssh.key_files
+    assert key_file == str(tmp_path / "lab" / "keys" / "operator")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from meshctl.device.observation import ChangeStatus
+from meshctl.uci import masked_changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +24,8 @@ def parse_answer(stdout: str) -> Answer:
         if words[:1] == ["ok"]:
             return Answer(True, _values(words[1:]))
         if words[:1] == ["refused"]:
-            return Answer(False, {}, words[1] if len(words) > 1 else "", " ".join(words[2:]))
+            # the reason may be a list of uncommitted UCI changes
+            return Answer(False, {}, words[1] if len(words) > 1 else "", masked_changes(" ".join(words[2:])))
     return Answer(False, {}, "", stdout.strip())
 
 

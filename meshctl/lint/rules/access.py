@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from meshctl.device.trust import parse_pins
 from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
-from meshctl.inventory.file_paths import known_hosts_path
+from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
@@ -281,13 +281,21 @@ def computer_without_user(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "MC433",
     Severity.ERROR,
     "A public key is listed where a private key is needed",
-    why="Login needs the private key; with the `.pub` file every login fails.",
-    fix="Remove `.pub`.",
+    why="Login needs the private key; with the public key every login fails.",
+    fix="Name the private key: the file without `.pub`.",
     failing="nodes: {base: {ssh: {key_files: [id_ed25519.pub]}}}",
     passing=Example("nodes: {base: {ssh: {key_files: [id_ed25519]}}}", files={"id_ed25519": "a private key"}),
 )
-def public_key_to_log_in(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def public_key_to_log_in(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for place, ssh in logins(fleet):
         for index, file in enumerate(ssh.key_files):
-            if file.endswith(".pub"):
+            if file.endswith(".pub") or _is_public_key(context.files.text(file_path(fleet, file)) or ""):
                 yield Finding((*place, "key_files", str(index)), "login needs the private key", "a private key", file)
+
+
+def _is_public_key(text: str) -> bool:
+    try:
+        parse_authorized_key(text.strip())
+    except BadKey:
+        return False
+    return True

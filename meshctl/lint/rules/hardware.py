@@ -128,7 +128,7 @@ def package_contradiction(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "Board and profile name different devices",
     why="""`board` is the device's own name, `profile` the ImageBuilder's: the same words with a comma or an underscore.
     If they differ, one was probably copied from another profile, and the image will be rejected.""",
-    fix="Read the board from the device: `ubus call system board`.",
+    fix="Correct `board` or `profile`; `ubus call system board` on the device prints its board.",
     failing="hardware: {rocket: {profile: ubnt_bullet-m-xw}}",
     passing="hardware: {rocket: {profile: ubnt_rocket-m}}",
 )

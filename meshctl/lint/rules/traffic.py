@@ -283,7 +283,7 @@ def metrics_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "A peer counts as offline after fewer than three heartbeats",
     why="""On a lossy link one heartbeat in five is lost. With fewer than three heartbeats, peers flap between online
     and offline, and their outboxes with them.""",
-    fix="Set `offline_after_s` to at least three heartbeats; ten is usual.",
+    fix="Lower `heartbeat_s`, or set `offline_after_s` to at least three heartbeats; ten is usual.",
     failing="udp_mesh: {heartbeat_s: 5, offline_after_s: 10}",
     passing="udp_mesh: {heartbeat_s: 1, offline_after_s: 10}",
 )

@@ -64,6 +64,7 @@ def test_each_command_has_help_with_an_example(name: str, capsys: pytest.Capture
         root.main([name, "--help"])
     shown = capsys.readouterr().out
     assert ended.value.code == 0
+    assert not [line for line in shown.splitlines() if line.count("Example: ") > 1], "one example a line"
     assert COMMANDS[name].attribute == "app" or f"meshctl {name}" in shown.split("Usage:", 1)[1].split("\n", 1)[1]
 
 

@@ -112,7 +112,7 @@ def test_a_second_stop_request_replaces_the_displayed_state() -> None:
         progress(EVENTS[0])
         progress.stopping(STOPPING)
         progress.stopping("leaving: what armed changes roll back by itself")
-    assert "LEAVING: finishing b01" in screen.getvalue()
+    assert "LEAVING: disconnecting from b01; unconfirmed changes roll back by themselves" in screen.getvalue()
 
 
 def test_long_node_lists_are_cut_to_fit_the_totals_and_stopping_state() -> None:

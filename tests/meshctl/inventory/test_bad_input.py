@@ -284,3 +284,36 @@ def test_messages_are_single_line_without_control_characters(tmp_path: Path) -> 
 
 def test_every_code_has_a_meaning() -> None:
     assert all(text.endswith(".") for text in MEANINGS.values())
+
+
+def test_the_rest_of_an_unquoted_text_with_commas_gets_a_hint(tmp_path: Path) -> None:
+    (rest, _) = errors_of(tmp_path, "system: {timezone: MST7MDT,M3.2.0,M11.1.0}\n")
+    assert "quote the whole text" in rest.hint
+    # a key without a value of its own kind
+    (first,) = errors_of(tmp_path, "system: {M3.2.0, timezone: UTC}\n")
+    assert "known keys" in first.hint
+
+
+@pytest.mark.parametrize("target", ["/etc/shadow", "/dev/zero", "outside.yaml"])
+def test_an_inventory_that_leads_out_of_its_tree_is_refused_unread(target: str, tmp_path: Path) -> None:
+    (tmp_path / "outside.yaml").write_text("root:$y$hash:1: {}\n", encoding="utf-8")
+    checkout = tmp_path / "checkout"
+    (checkout / ".git").mkdir(parents=True)
+    (checkout / "fleet.yaml").symlink_to(tmp_path / target)
+    for path in (checkout, checkout / "fleet.yaml"):
+        (problem,) = load(path).diagnostics
+        assert (problem.code, problem.position.line) == ("INV001", 0)
+        assert problem.message == f"cannot be read: outside the inventory's tree {checkout}"
+    allowed = load(checkout, environ={"MESHCTL_INCLUDE_PATH": str(tmp_path)}).diagnostics
+    assert (allowed[0].code == "INV001") == (target != "outside.yaml")
+
+
+def test_a_pipe_in_the_inventory_s_directory_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fleet.yaml")
+    (problem,) = load(tmp_path).diagnostics
+    assert problem.message == "cannot be read: not a regular file (a pipe, socket or device)"
+
+
+@pytest.mark.parametrize("text", ["operators\n  ssh_keys: []\n", "nodes:\n  a: {}\n b: {}\n"])
+def test_a_syntax_error_that_is_noticed_late_points_above(text: str, tmp_path: Path) -> None:
+    assert errors_of(tmp_path, text)[0].hint.startswith("the mistake may be above")

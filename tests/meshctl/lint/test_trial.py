@@ -288,6 +288,7 @@ def test_an_unknown_target_unlike_any_known_one_is_accepted(target: str, tmp_pat
         ("robots: {husky1: {computer: {arch: arm64}}}", "MC631", "write aarch64"),
         ("robots: {husky1: {computer: {ros: melodic}}}", "MC632", ""),
         ("nodes: {b01: {packages: [kmod-ath9]}}", "MC832", "did you mean 'kmod-ath9k'?"),
+        ("nodes: {b01: {packages: [IW]}}", "MC832", "did you mean 'iw'?"),
     ],
 )
 def test_a_misspelling_gets_a_suggestion(fragment: str, code: str, hint: str, tmp_path: Path) -> None:
@@ -371,3 +372,10 @@ def test_802_11s_requires_driver_support(tmp_path: Path) -> None:
     assert _codes(fragment.replace("DRIVER", "ath11k"), tmp_path) == []
     (tmp_path / "other").mkdir()
     assert _codes(fragment.replace("DRIVER", "brcmfmac"), tmp_path / "other") == ["MC841"]
+
+
+@pytest.mark.parametrize("name", ["id.pub", "id"])
+def test_a_public_key_in_place_of_a_private_one_is_found_by_its_content(name: str, tmp_path: Path) -> None:
+    public = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f ada\n"
+    example = Example(f"nodes: {{base: {{ssh: {{key_files: [{name}]}}}}}}", files={name: public})
+    assert _codes(example, tmp_path) == ["MC433"]

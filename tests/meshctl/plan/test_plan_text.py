@@ -152,3 +152,25 @@ def test_settings_are_named_with_their_section_and_both_values() -> None:
     assert settings(FileChange("etc/x", "changed", "mode 0644 -> 0600\n")) == ("mode 0644 -> 0600",)
     assert settings(FileChange("etc/x", "added", HEAD + "+a\n")) == ()
     assert settings(FileChange("etc/x", "changed", HEAD + "-a\n+b\n")) == ("2 lines",)
+
+
+def test_nodes_that_differ_only_in_the_digest_of_their_configuration_form_one_block() -> None:
+    def record(node: str, digit: str) -> FileChange:
+        head = "--- a/etc/meshctl/node\n+++ b/etc/meshctl/node\n@@ -1,3 +1,3 @@\n"
+        return FileChange(
+            "etc/meshctl/node",
+            "changed",
+            f"{head} fleet=team\n node={node}\n-config={digit * 64}\n+config={'f' * 64}\n",
+        )
+
+    nodes = {
+        name: NodePlan(name, Verdict.CHANGE, files=(CHANNEL, record(name, digit)))
+        for name, digit in (("b01", "1"), ("b02", "2"))
+    }
+    text = read(Plan("team", 0.0, "b01", nodes))
+    assert "2 nodes  each cuts" in text
+    assert text.count("option channel") == 2
+    assert "  changed   etc/meshctl/node: digest of its configuration\n\n" in text
+    renamed = record("b01", "1")
+    renamed = replace(renamed, diff=renamed.diff.replace(" node=b01", "-node=spare1\n+node=b01"))
+    assert "-node=spare1" in read(Plan("team", 0.0, "b01", {"b01": NodePlan("b01", Verdict.CHANGE, files=(renamed,))}))

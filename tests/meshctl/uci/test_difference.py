@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from meshctl.model import MASK
-from meshctl.uci import apply, diff, is_secret_option, parse
+from meshctl.uci import apply, diff, is_secret_option, masked_changes, parse
 
 OLD = """
 config wifi-device 'radio0'
@@ -78,3 +78,23 @@ def test_options_that_hold_keys_are_secret(name: str) -> None:
 @pytest.mark.parametrize("name", ["ssid", "keyboard", "PasswordAuth", "RootPasswordAuth", "network"])
 def test_other_options_are_shown(name: str) -> None:
     assert not is_secret_option(name)
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("wireless.mesh0.key='it'\\''s; a secret'", "wireless.mesh0.key=********"),
+        ("wireless.@wifi-iface[0].sae_password=plain", "wireless.@wifi-iface[0].sae_password=********"),
+        ("-wireless.mesh0.key", "-wireless.mesh0.key"),
+        ("wireless.mesh0.key='1'", "wireless.mesh0.key='1'"),
+        ("network.wg0.private_key='a\nb'", "network.wg0.private_key=********"),
+        ("network.wg0.private_key='cut off\nnetwork.lan.mtu", "network.wg0.private_key=********"),
+        ("system.ntp.server+='key'", "system.ntp.server+='key'"),
+        (
+            "uncommitted: network.lan.mtu='9';wireless.m.key='x y';",
+            "uncommitted: network.lan.mtu='9';wireless.m.key=********;",
+        ),
+    ],
+)
+def test_secrets_in_uncommitted_changes_are_masked(line: str, shown: str) -> None:
+    assert masked_changes(line) == shown
