@@ -25,7 +25,8 @@ from meshctl.cli.robots_dry_run import (
 from meshctl.cli.robots_topics import rotate_key_command, topic_app
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet import Outcome, Result
-from meshctl.robots.facts import RobotFacts, collect_facts, expected_release, facts_object
+from meshctl.robots.expected_release import expected_release
+from meshctl.robots.facts import RobotFacts, collect_facts, facts_object
 from meshctl.robots.host import Host
 from meshctl.robots.status_table import table
 

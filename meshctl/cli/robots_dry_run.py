@@ -19,7 +19,8 @@ from meshctl.errors import ExitCode
 from meshctl.fleet import Outcome, Result
 from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, UNIT_TITLES
 from meshctl.robots.deploy import plan_deploy
-from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts
+from meshctl.robots.expected_release import ExpectedRelease
+from meshctl.robots.facts import RobotFacts, collect_facts
 from meshctl.robots.host import Host
 from meshctl.robots.status_table import difference
 

@@ -1,7 +1,7 @@
 """The state of one robot, in one round trip: `scripts/facts.sh` -> sections -> `RobotFacts`.
 
-`expected_release` is the desired state, `collect_facts` queries a robot, `parse_robot_facts` parses the reply,
-`facts_object` is its JSON. Ages are measured by the robot's monotonic clock; its wall clock is not trusted.
+`collect_facts` queries a robot, `parse_robot_facts` parses the reply and compares it with the desired
+release, `facts_object` is its JSON. Ages are measured by the robot's monotonic clock; its wall clock is not trusted.
 """
 
 from __future__ import annotations
@@ -9,31 +9,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from meshctl.model import Fleet, Secret, SecretRef
-from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, configuration
+from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME
+from meshctl.robots.expected_release import ExpectedRelease
 from meshctl.robots.host import Host
 from meshctl.robots.position_facts import PositionFacts, positions_in
-from meshctl.robots.wheels import own_wheel, stock_units
 
 # Two Python programs start and answer, possibly on a small, busy ARM board.
 FACTS_TIMEOUT_S = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedRelease:
-    """The desired release of one robot: `files` are hashes by path, `wheel` is the hash of our own package."""
-
-    files: Mapping[str, str] = field(default_factory=dict)
-    wheel: str = ""
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """The systemd units, the daemon's first."""
-        return (UNIT_NAME, *(name for name in (BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME) if name in self.files))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,15 +173,6 @@ class RobotFacts:
         away = [peer.name for peer in self.peers if not peer.online]
         problems += [f"offline peers: {', '.join(away)}"] if away else []
         return "; ".join(problems)
-
-
-def expected_release(fleet: Fleet, robot: str, secrets: Callable[[SecretRef], Secret]) -> ExpectedRelease:
-    """The desired release of one robot, without the wheels that only a deploy needs.
-
-    Raises InvalidInput for settings the daemon would reject, and for missing keys.
-    """
-    files = {file.path: file.sha256 for file in configuration(fleet, robot, secrets, stock_units())}
-    return ExpectedRelease(files, own_wheel().sha256)
 
 
 def collect_facts(

@@ -28,7 +28,8 @@ from meshctl.nodes.desired import Renderer
 from meshctl.plan import DesiredState, NodePlan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.robots.connection import RobotConnector
-from meshctl.robots.facts import ExpectedRelease, RobotFacts, collect_facts, expected_release
+from meshctl.robots.expected_release import ExpectedRelease, expected_release
+from meshctl.robots.facts import RobotFacts, collect_facts
 from meshctl.robots.host import Host
 from meshctl.status.assess import Snapshot
 from meshctl.status.emergency_stop import StopPlan, StopResult, send

@@ -7,7 +7,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from meshctl.robots.facts import ExpectedRelease, RobotFacts, facts_object, parse_robot_facts
+from meshctl.robots.expected_release import ExpectedRelease
+from meshctl.robots.facts import RobotFacts, facts_object, parse_robot_facts
 from meshctl.robots.scripts import script
 from meshctl.robots.status_table import table
 
