@@ -55,13 +55,18 @@ def test_the_nodes_of_the_example_load(tmp_path: Path) -> None:
 
 
 def test_the_robots_of_the_examples_load_with_their_lans_and_computers(tmp_path: Path) -> None:
-    lans, computers = (text for text in _examples() if text.startswith("robots:"))
+    lans, computers, links = (text for text in _examples() if text.startswith("robots:"))
     fleet = load_text(tmp_path, HEAD + lans).fleet
     assert fleet is not None
     assert [str(robot.lan) for robot in fleet.robots.values()] == ["10.43.1.0/24", "10.43.2.0/24"]
     fleet = load_text(tmp_path, HEAD + computers).fleet
     assert fleet is not None
     assert list(fleet.robots["husky1"].computers) == ["jetson", "lidar"]
+    fleet = load_text(tmp_path, HEAD + links).fleet
+    assert fleet is not None
+    computer = fleet.robots["husky1"].computer
+    assert computer is not None
+    assert len(computer.links) == 2
 
 
 def test_the_relays_of_the_example_load(tmp_path: Path) -> None:

@@ -20,8 +20,8 @@ OFFER_FOR_INTERVALS = 3.5
 MAX_OFFERS = 4096
 """Entries kept, over all neighbors: a member that invents nodes."""
 INFEASIBLE_FOR_S = 30.0
-"""A node whose offers were all infeasible for this long is treated as new: whoever announced a later round of it than
-there is has gone, and nothing that follows from our own announcement is left."""
+"""A node whose offers were all infeasible for this long is treated as new: the node that announced a later round of it
+than there is has gone, and nothing that follows from our own announcement is left."""
 RETRACT_ROUNDS = 3
 """Hellos in which a lost node is listed as unreachable: one may be lost."""
 
