@@ -175,7 +175,7 @@ class FaultInjection:
             state,
             f"""
             PATH=/bin:/sbin
-            rm -rf /tmp/lab/steps /tmp/lab/steps.log /tmp/lab/fatal /tmp/lab/go
+            rm -rf /tmp/lab/steps.log /tmp/lab/fatal /tmp/lab/struck /tmp/lab/go
             mkfifo /tmp/lab/go
             : >/tmp/lab/steps.log
             [ -z {shlex.quote(fatal)} ] || echo {shlex.quote(fatal)} >/tmp/lab/fatal

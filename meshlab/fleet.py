@@ -158,6 +158,10 @@ class VirtualNode:
             .stdout.splitlines()
         )
 
+    def awaits_fault(self) -> bool:
+        """Whether it runs with a fault at a step (`power-cut@n`) that it has not reached."""
+        return self.is_up() and self.exec("[ -e /tmp/lab/fatal ]").exit_status == 0
+
 
 class VirtualFleet:
     """A fleet in `directory` (created if needed). Use as a context manager, or call `up()` and `down()`."""

@@ -105,7 +105,8 @@ def _report(path: Path, page: Path | None = None) -> int:
             sys.stdout.write(json.dumps(record, indent=1) + "\n")
     bad = [record for record in cases if not record["holds"]]
     bad += [record for record in records if record["part"] == "crowd" and (record["wrong"] or record["not new"])]
-    sys.stdout.write(f"{len(cases)} cases, {len(bad)} failed\n")
+    missed = sum(not record.get("struck", True) for record in cases)
+    sys.stdout.write(f"{len(cases) - missed} cases, {len(bad)} failed; {missed} more ended before their step\n")
     return 1 if bad else 0
 
 

@@ -26,7 +26,8 @@ REST_S = 60.0
 @dataclass(frozen=True, slots=True)
 class Case:
     """One node struck once. `outcome` is what the struck run said, `state` what was on the node's flash afterwards,
-    `reachable` whether meshctl could see it then, `resumed` whether a resume brought it to the new state."""
+    `reachable` whether meshctl could see it then, `resumed` whether a resume brought it to the new state. `struck` is
+    False if the run ended before the step: then the case proves nothing."""
 
     verb: str
     kind: str
@@ -36,6 +37,7 @@ class Case:
     state: str
     reachable: bool
     resumed: bool
+    struck: bool = True
 
     @property
     def holds(self) -> bool:
@@ -61,6 +63,7 @@ def strike_nodes(
         out, err = talk.result()
     run = Ended(process.returncode, out, err)
     dead = [name for name in steps if rig.fleet.node(name).power is Power.DEAD]
+    missed = {name for name in steps if rig.fleet.node(name).awaits_fault()}
     for name in steps:
         rig.fleet.repair(name)
     if dead:
@@ -69,7 +72,7 @@ def strike_nodes(
         rig.meshctl("bootstrap", new, *dead, "--replace-key", "--yes", "--json")
     struck = {name: (kind, step) for name, step in steps.items()}
     return [
-        replace(case, state="bricked") if case.node in dead else case
+        replace(case, state="bricked" if case.node in dead else case.state, struck=case.node not in missed)
         for case in _afterwards(rig, struck, run, old=old, new=new, verb=verb)
     ]
 

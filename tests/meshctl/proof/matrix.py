@@ -167,9 +167,11 @@ def firmware(directory: Path) -> dict[str, str]:
 
 
 def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
-    """A Markdown table of the cases: operation, fault, step, and how they ended."""
+    """A Markdown table of the cases that were struck: operation, fault, step, and how they ended."""
     rows: dict[tuple[str, str, str], list[Mapping[str, object]]] = {}
     for record in records:
+        if not record.get("struck", True):
+            continue
         key = (str(record["verb"]), str(record["kind"]), str(record["phase"]))
         rows.setdefault(key, []).append(record)
     yield "| operation | fault | step | cases | old | new | bricked | neither | unreachable | not resumed |"
