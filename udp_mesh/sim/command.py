@@ -25,8 +25,8 @@ def run_command(arguments: Sequence[str]) -> int:
         prog="udp-mesh sim",
         description="Simulate a team in virtual time: the transport's core on a simulated radio channel.",
         epilog="exit codes: 0 success, 2 invalid scenario or results not writable, 130 interrupted\n\n"
-        "example: udp-mesh sim final-run --out /tmp/final-run\n\n"
-        "`udp-mesh sim sweep --help`: many seeds and settings, compared with confidence intervals",
+        "`udp-mesh sim sweep --help`: many seeds and settings, compared with confidence intervals\n\n"
+        "example: udp-mesh sim final-run --out /tmp/final-run",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("scenario", nargs="?", help="scenario file (YAML), or name of a shipped scenario")

@@ -69,7 +69,7 @@ def test_each_command_has_help_with_an_example(name: str, capsys: pytest.Capture
 
 
 # these read no inventory: they make one, describe its format, show journal or help, or act on a running virtual fleet
-_IN_THE_LAB = "down status shell break mend plug unplug image link move ground mission"
+_IN_THE_LAB = "down status shell break mend plug unplug image link move ground mission sweep"
 WITHOUT_INVENTORY = {
     "init",
     "schema",
