@@ -16,7 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
-from meshctl.placement.path_loss import Point, walls_between
+from meshctl.placement.path_loss import Point
+from meshlab.propagation import received_dbm
 from meshlab.scenario import Scenario, Snapshot, snapshot
 
 TRANSMISSIONS = 7
@@ -93,23 +94,15 @@ def run_trial(scenario: Scenario, seed: int) -> dict[str, float | None]:
 def losses_of(now: Snapshot, field: FadingField) -> Losses:
     """The loss of every link between nodes with power, with the fading of both ends."""
     environment, model = now.environment, now.environment.path_loss
-    explicit = {link.ends for link in environment.links}
-    names = sorted(now.powered & environment.positions.keys())
+    names = now.powered & environment.positions.keys()
     fading_db = {name: field.at(environment.positions[name].at) for name in names}
     losses: Losses = {}
-    for index, a in enumerate(names):
-        for b in names[index + 1 :]:
-            if frozenset((a, b)) in explicit:
-                continue
-            ends = environment.positions[a], environment.positions[b]
-            distance_m = math.dist(ends[0].at, ends[1].at)
-            walls = walls_between(environment.walls, ends[0].at, ends[1].at)
-            faded_db = (fading_db[a] + fading_db[b]) / math.sqrt(2.0)
-            for pair, end in (((a, b), ends[0]), ((b, a), ends[1])):
-                sent_dbm = model.tx_power_dbm if end.tx_power_dbm is None else end.tx_power_dbm
-                loss = model.loss(model.power_dbm(distance_m, sent_dbm, walls) - faded_db)
-                if loss < 1.0:
-                    losses[pair] = loss
+    for a, b, strengths in received_dbm(environment, names):
+        faded_db = (fading_db[a] + fading_db[b]) / math.sqrt(2.0)
+        for pair, strength in zip(((a, b), (b, a)), strengths, strict=True):
+            loss = model.loss(strength - faded_db)
+            if loss < 1.0:
+                losses[pair] = loss
     for link in environment.links:
         if link.up and link.ends <= now.powered:
             for pair in ((link.a, link.b), (link.b, link.a)):

@@ -9,7 +9,7 @@ Pure; `propagation_file` reads and writes the files. A moving fleet is a sequenc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from types import MappingProxyType
@@ -47,23 +47,32 @@ class RadioEnvironment:
 
 def links_of(environment: RadioEnvironment) -> tuple[LinkSpec, ...]:
     """A link for each pair of which at least one hears the other, sorted by name; then the explicit links."""
-    explicit = {link.ends for link in environment.links}
     found = [
         link
-        for a, b in combinations(sorted(environment.positions), 2)
-        if frozenset((a, b)) not in explicit and (link := _link(environment, a, b)) is not None
+        for a, b, strengths in received_dbm(environment, environment.positions)
+        if (link := _link(environment.path_loss, a, b, strengths)) is not None
     ]
     return (*found, *environment.links)
 
 
-def _link(environment: RadioEnvironment, a: str, b: str) -> LinkSpec | None:
-    first, second, model = environment.positions[a], environment.positions[b], environment.path_loss
-    distance_m = math.dist(first.at, second.at)
-    walls = walls_between(environment.walls, first.at, second.at)
-    strengths = [
-        model.power_dbm(distance_m, model.tx_power_dbm if own is None else own, walls)
-        for own in (first.tx_power_dbm, second.tx_power_dbm)
-    ]
+def received_dbm(environment: RadioEnvironment, names: Iterable[str]) -> Iterator[tuple[str, str, tuple[float, float]]]:
+    """Each pair of these nodes without an explicit link, sorted by name, with the power of the first at the second and
+    of the second at the first."""
+    explicit, model = {link.ends for link in environment.links}, environment.path_loss
+    for a, b in combinations(sorted(names), 2):
+        if frozenset((a, b)) in explicit:
+            continue
+        first, second = environment.positions[a], environment.positions[b]
+        distance_m = math.dist(first.at, second.at)
+        walls = walls_between(environment.walls, first.at, second.at)
+        there, back = (
+            model.power_dbm(distance_m, model.tx_power_dbm if own is None else own, walls)
+            for own in (first.tx_power_dbm, second.tx_power_dbm)
+        )
+        yield a, b, (there, back)
+
+
+def _link(model: RadioModel, a: str, b: str, strengths: tuple[float, float]) -> LinkSpec | None:
     there, back = (model.loss(strength) for strength in strengths)
     if there >= 1.0 and back >= 1.0:
         return None
