@@ -5,7 +5,6 @@ from __future__ import annotations
 import getpass
 import json
 import os
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,9 +15,9 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Options, with_options
+from meshctl.cli.input_file import read_input
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.public_key import own_public_key
-from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.interchange.device import MARKER, ExistingDevice, exported_device, observed_device, release_of
 from meshctl.interchange.device_differences import Fate
@@ -29,7 +28,6 @@ from meshctl.interchange.new_inventory import edited, edits_of, load_text, new_t
 from meshctl.inventory.edit import FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.secrets import SecretStore
-from meshctl.inventory.source import MAX_FILE_BYTES, Source, read_source
 from meshctl.model import Fleet, NodeState, Release, Role, Secret, SecretRef
 from meshctl.model.ip import IpInterface
 
@@ -220,7 +218,7 @@ def import_export(
             hint="or name a hardware profile of the inventory with --hardware",
         )
     known: Release | None = release_of(release) if release else None
-    source = _text(file)
+    source = read_input(file)
     device = exported_device(
         source.text,
         source.file,
@@ -229,17 +227,6 @@ def import_export(
         target=openwrt_target or (profile.target if profile else ""),
     )
     _import(target, device, source.file)
-
-
-def _text(file: str) -> Source:
-    """The file, or standard input. Raises InvalidInput."""
-    if file == "-":
-        read = read_source(Path("standard input"), lambda _: sys.stdin.buffer.read(MAX_FILE_BYTES + 1))
-    else:
-        read = read_source(Path(file))
-    if isinstance(read, Source):
-        return read
-    raise InvalidInput([read])
 
 
 def _import(target: ImportTarget, device: ExistingDevice, source: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -13,13 +12,13 @@ import typer
 
 from meshctl.cli.context import AsJson, DryRun, InventoryPath
 from meshctl.cli.device_import import import_device, import_export
+from meshctl.cli.input_file import read_input
 from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, checked, edits, read
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.inventory.load import load_fleet
-from meshctl.inventory.source import MAX_FILE_BYTES, Source, read_source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
 
@@ -49,7 +48,7 @@ def import_table(
     Example: meshctl inventory import csv boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    source = _source(table)
+    source = read_input(table)
     rows = read(source.text, source.file, headings=_headings(column or ()), ignored=ignore or ())
     _take_over(inventory, fleet, rows, source.file, add=add, dry_run=dry_run, as_json=as_json)
 
@@ -123,17 +122,6 @@ def _changes(inventory: Path, found: tuple[NodeEdit, ...], file: str) -> tuple[F
         return editor.changes()
     except InvalidInput as reason:
         raise InputError(f"{file}: the inventory would have errors, so nothing was written:\n{reason}") from reason
-
-
-def _source(table: str) -> Source:
-    """The file, or standard input. Raises InvalidInput."""
-    if table == "-":
-        found = read_source(Path("standard input"), lambda _: sys.stdin.buffer.read(MAX_FILE_BYTES + 1))
-    else:
-        found = read_source(Path(table))
-    if isinstance(found, Source):
-        return found
-    raise InvalidInput([found])
 
 
 def _headings(words: list[str] | tuple[str, ...]) -> dict[str, str]:
