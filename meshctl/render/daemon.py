@@ -36,6 +36,7 @@ DAEMON = "RND030"
 CONFIG_NAME = "udp-mesh.toml"
 KEY_NAME = "fleet.key"
 RELAY_KEY_NAME = "relay.key"
+LINK_SELECTORS = "an interface or an address"
 
 # Limits of the wire format and the daemon's reader.
 _MAX_NAME_BYTES = 63
@@ -167,17 +168,22 @@ def _check_relay(fleet: Fleet, robot: str) -> Iterator[Diagnostic]:
 
 
 def _check_links(fleet: Fleet, robot: str, computer: Computer) -> Iterator[Diagnostic]:
-    selectors = {str(computer.address.ip)}
-    for index, link in enumerate(computer.links):
+    for index, is_repeated, found in link_problems(computer):
         path = ("robots", robot, "computer", "links", str(index))
-        if bool(link.interface) is (link.address is not None):
-            found = "both" if link.interface else "neither"
-            yield _problem(fleet, path, "an interface or an address", found)
-            continue
+        yield _problem(fleet, path, "another link than those before" if is_repeated else LINK_SELECTORS, found)
+
+
+def link_problems(computer: Computer) -> Iterator[tuple[int, bool, str]]:
+    """The further links that a daemon rejects: (index, whether an earlier one is the same, what is there). Others have
+    not exactly one of `LINK_SELECTORS`."""
+    taken = {str(computer.address.ip)}
+    for index, link in enumerate(computer.links):
         selector = link_selector(link)
-        if selector in selectors:
-            yield _problem(fleet, path, "another link than those before", selector)
-        selectors.add(selector)
+        if bool(link.interface) is (link.address is not None):
+            yield index, False, "both" if link.interface else "neither"
+        elif selector in taken:
+            yield index, True, selector
+        taken.add(selector)
 
 
 def link_selector(link: ComputerLink) -> str:

@@ -10,7 +10,7 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.rules.secrets import identity
 from meshctl.model import Fleet
-from meshctl.render.daemon import link_selector
+from meshctl.render.daemon import LINK_SELECTORS, link_problems
 
 _ALL = "all"
 
@@ -88,16 +88,12 @@ def link_not_found(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():
         if robot.computer is None:
             continue
-        taken = {str(robot.computer.address.ip)}
-        for index, link in enumerate(robot.computer.links):
+        for index, is_repeated, found in link_problems(robot.computer):
             path = ("robots", robot.name, "computer", "links", str(index))
-            selector = link_selector(link)
-            if bool(link.interface) is (link.address is not None):
-                found = "both" if link.interface else "neither"
-                yield Finding(path, "not one link", "an interface or an address", found)
-            elif selector in taken:
-                yield Finding(path, "the same link as another entry", "another interface or address", selector)
-            taken.add(selector)
+            if is_repeated:
+                yield Finding(path, "the same link as another entry", "another interface or address", found)
+            else:
+                yield Finding(path, "not one link", LINK_SELECTORS, found)
 
 
 @fleet_rule(
