@@ -7,13 +7,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
+from meshlab.namespaces import die_with_parent
+from tests.waiting import until
 from udp_mesh.sim import main
 from udp_mesh.sim.sweep import run_sweep
 
@@ -150,10 +151,10 @@ def one_process(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @contextmanager
 def started(*words: str) -> Iterator[subprocess.Popen[str]]:
-    """A process of its own group, which ends with the block."""
+    """A process of its own group, which ends with the block, and with the tests if those are killed."""
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True, env={**os.environ,
-        "PYTHONPATH": str(ROOT)},
+        "PYTHONPATH": str(ROOT)}, preexec_fn=die_with_parent,
     ) as process:  # fmt: skip
         try:
             yield process
@@ -163,11 +164,13 @@ def started(*words: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
-    until = time.monotonic() + 120
-    while not path.exists() or path.read_bytes().count(b"\n") < count:
+    def are_there() -> bool:
+        if path.exists() and path.read_bytes().count(b"\n") >= count:
+            return True
         assert process.poll() is None, process.stdout.read() if process.stdout else ""
-        assert time.monotonic() < until
-        time.sleep(0.02)
+        return False
+
+    until(are_there, f"{count} lines of {path.name}", wait_s=120)
 
 
 def test_an_interrupted_sweep_continues_with_the_same_bytes(scenario: Path, one_process: bytes) -> None:
@@ -206,11 +209,12 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bytes(
             started(sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0",
                     "--no-dashboard", "--scheduler-file", str(address_file))
         )  # fmt: skip
-        until = time.monotonic() + 120
-        while not address_file.exists() or not address_file.read_text().endswith("}"):
+
+        def is_up() -> bool:
             assert scheduler.poll() is None
-            assert time.monotonic() < until
-            time.sleep(0.05)
+            return address_file.exists() and address_file.read_text().endswith("}")
+
+        until(is_up, "the Dask scheduler", wait_s=120)
         address = json.loads(address_file.read_text())["address"]
         first, _ = (
             stack.enter_context(
