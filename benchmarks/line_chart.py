@@ -17,10 +17,6 @@ def color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
-def _svg(parts: Sequence[str], height: int = HEIGHT) -> str:
-    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img">{"".join(parts)}</svg>'
-
-
 def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
@@ -28,31 +24,30 @@ def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
 class _Axes:
     """Maps values to coordinates."""
 
-    def __init__(self, x: tuple[float, float], y: tuple[float, float], height: int = HEIGHT) -> None:
+    def __init__(self, x: tuple[float, float], y: tuple[float, float]) -> None:
         self.x0, self.x1 = x
         self.y0, self.y1 = y
-        self.height = height
 
     def at_x(self, value: float) -> float:
         return _LEFT + (value - self.x0) / ((self.x1 - self.x0) or 1.0) * (WIDTH - _LEFT - _RIGHT)
 
     def at_y(self, value: float) -> float:
-        return self.height - _BOTTOM - (value - self.y0) / ((self.y1 - self.y0) or 1.0) * (self.height - _TOP - _BOTTOM)
+        return HEIGHT - _BOTTOM - (value - self.y0) / ((self.y1 - self.y0) or 1.0) * (HEIGHT - _TOP - _BOTTOM)
 
     def lines(self, x_label: str, y_label: str) -> list[str]:
         parts = []
         for value in ticks(self.x0, self.x1):
             x = self.at_x(value)
-            parts.append(f'<path class="grid" d="M{x:.1f} {_TOP}V{self.height - _BOTTOM}"/>')
-            parts.append(_text(x, self.height - _BOTTOM + 14, f"{value:g}"))
+            parts.append(f'<path class="grid" d="M{x:.1f} {_TOP}V{HEIGHT - _BOTTOM}"/>')
+            parts.append(_text(x, HEIGHT - _BOTTOM + 14, f"{value:g}"))
         for value in ticks(self.y0, self.y1, 4):
             y = self.at_y(value)
             parts.append(f'<path class="grid" d="M{_LEFT} {y:.1f}H{WIDTH - _RIGHT}"/>')
             parts.append(_text(_LEFT - 6, y + 4, f"{value:g}", "end"))
-        parts.append(_text((WIDTH + _LEFT) / 2, self.height - 4, x_label))
+        parts.append(_text((WIDTH + _LEFT) / 2, HEIGHT - 4, x_label))
         if y_label:
             parts.append(
-                f'<text transform="translate(14 {self.height / 2:.0f}) rotate(-90)" text-anchor="middle">'
+                f'<text transform="translate(14 {HEIGHT / 2:.0f}) rotate(-90)" text-anchor="middle">'
                 f"{escape(y_label)}</text>"
             )
         return parts
@@ -84,4 +79,4 @@ def over_time(series: Mapping[str, Sequence[tuple[float, float]]], end: float, x
         parts.append(
             f'<path d="{drawn}" fill="none" stroke="{color(index)}" stroke-width="1.5" stroke-linecap="round"/>'
         )
-    return _svg(parts)
+    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'

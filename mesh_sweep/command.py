@@ -6,7 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mesh_sweep.cases import Settings, cases_of, combinations, parse_parameters, parse_seeds
@@ -112,8 +112,7 @@ def _show(
     if options.report is not None:
         options.report.write_text(page(identity, comparison), encoding="utf-8")
     if options.as_json:
-        given = {"scenario": identity.scenario, "scenario_sha256": identity.scenario_sha256}
-        text = json.dumps({**given, "revision": identity.revision, **as_json(comparison)}, indent=2)
+        text = json.dumps({**asdict(identity), **as_json(comparison)}, indent=2)
     else:
         text = f"{comparison.runs} runs of {identity}\n{as_text(comparison)}"
     sys.stdout.write(f"{text}\n")

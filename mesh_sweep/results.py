@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -36,8 +36,7 @@ class Identity:
     @property
     def line_start(self) -> bytes:
         """How each line of such a result begins."""
-        given = {"scenario": self.scenario, "scenario_sha256": self.scenario_sha256, "revision": self.revision}
-        return json.dumps(given).encode()[:-1] + b", "
+        return json.dumps(asdict(self)).encode()[:-1] + b", "
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ text of `uci export`. Pure."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -126,11 +126,6 @@ def parse_marker(text: str) -> dict[str, str]:
     """The lines `key=value` of the marker file."""
     pairs = (line.partition("=") for line in text.splitlines())
     return {key: value for key, separator, value in pairs if separator}
-
-
-def device_macs(seen: Observation) -> Iterable[str]:
-    """All MAC addresses of the device, lower case."""
-    return {mac.lower() for mac in (seen.macs or {}).values()}
 
 
 def _memory_mib(total_bytes: int) -> int:

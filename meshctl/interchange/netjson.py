@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import combinations
 from typing import Any
 
-from meshctl.model import Band, Encryption, Fleet, MeshMode, Node, Secret, SecretRef
+from meshctl.model import Encryption, Fleet, MeshMode, Node, Secret, SecretRef
 from meshctl.model.ip import IpInterface
 from meshctl.resolve import Intent, resolve
 from meshctl.resolve.intent import MeshInterface, RadioIntent
@@ -20,7 +20,6 @@ from meshctl.resolve.intent import MeshInterface, RadioIntent
 PLANNED_COST = 1.0
 _ENCRYPTIONS: Mapping[Encryption, str] = {Encryption.PSK2: "wpa2_personal", Encryption.SAE: "wpa3_personal"}
 _MODES: Mapping[MeshMode, str] = {MeshMode.ADHOC: "adhoc", MeshMode.MESH: "802.11s"}
-_BANDS: Mapping[Band, str] = {Band.G2: "802.11n", Band.G5: "802.11n"}
 
 
 def network_graph(fleet: Fleet) -> dict[str, Any]:
@@ -137,7 +136,7 @@ def _radio(radio: RadioIntent) -> dict[str, Any]:
     """`channel` is 0, which NetJSON reads as automatic, for a radio that is off."""
     return {
         "name": radio.name,
-        "protocol": "802.11ac" if radio.htmode.startswith("VHT") else _BANDS[radio.band],
+        "protocol": "802.11ac" if radio.htmode.startswith("VHT") else "802.11n",
         "channel": radio.channel or 0,
         "channel_width": _width_mhz(radio.htmode),
         "tx_power": radio.tx_power_dbm,

@@ -283,15 +283,20 @@ class Service:
             )
         except OSError as error:
             raise RequestError("cannot-record", f"{path}: {error.strerror}") from error
-        self.recorder.conditions(self.driver.conditions(), self.driver.node.versions(), self.driver.node.logs())
+        self._record_totals(self.recorder)
 
     async def stop_recording(self) -> Recorder | None:
         """Ends the recording and returns it once it is completely written (None: there was none)."""
         recorder, self.recorder = self.recorder, None
         if recorder is not None:
-            recorder.conditions(self.driver.conditions(), self.driver.node.versions(), self.driver.node.logs())
+            self._record_totals(recorder)
             await asyncio.wrap_future(recorder.close())
         return recorder
+
+    def _record_totals(self, recorder: Recorder) -> None:
+        """Records the conditions, and what only the first and the last of them contain."""
+        node = self.driver.node
+        recorder.conditions(self.driver.conditions(), node.versions(), node.logs())
 
     # Events
 
