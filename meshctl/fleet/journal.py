@@ -1,8 +1,9 @@
 """The journal: runs, steps, outcomes, and the last known state of every node, on disk.
 
-One SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes can write and a killed one leaves it
-readable). `Journal.begin` starts a run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`,
-`outcomes`, `unfinished` and `last_known` read it. It contains no secret.
+A `Store`: one SQLite file in `$XDG_STATE_HOME/meshctl` (WAL, so that two meshctl processes can write and a killed one
+leaves it readable), or a database that operators share (`fleet.journal_store` opens either). `Journal.begin` starts a
+run; `Run.step`, `Run.finish_node` and `Run.end` fill it; `runs`, `steps`, `outcomes`, `unfinished` and `last_known`
+read it. It contains no secret.
 
 A lab's fleet has the same name and nodes as the real one. Their runs and facts are separate: a journal opened for a lab
 reads and writes under the fleet's name and the lab's directory.
@@ -20,9 +21,12 @@ from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
+from meshctl.fleet.alarm_actions import AlarmExchange
+from meshctl.fleet.journal_schema import LAB_SEPARATOR, REMEMBER, SCHEMA
 from meshctl.fleet.outcome import Outcome, Result
-from meshctl.fleet.process import owner, process_lives, this_process
-from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, Schema, SqliteFile
+from meshctl.fleet.process import owner, process_lives, runs_here, this_process
+from meshctl.fleet.sqlite_file import BUSY_TIMEOUT_S, SqliteFile
+from meshctl.fleet.store import Claim, Statement, Store
 
 # During a run nodes wait to be confirmed, so a locked journal is written later.
 STEP_TIMEOUT_S = 1.0
@@ -31,38 +35,11 @@ NODE_PREFIX = "status."
 ROBOT_PREFIX = "robot."
 # The fact that tells which device the others are of: the host keys that were pinned for it.
 _HOST_KEYS = "host_keys"
-# separates the name of a fleet and the directory of its lab (ASCII unit separator)
-_LAB_SEPARATOR = "\x1f"
+# more than any journal has: PostgreSQL has no LIMIT -1, SQLite no LIMIT NULL
+_ALL_RUNS = 2**62
 _RUN_COLUMNS = "id, command, fleet, inventory, owner, process, plan, began_s, ended_s, result"
 # Outcomes that leave the result of an earlier change unknown.
 _END_UNKNOWN = (Result.UNCERTAIN, Result.PENDING, Result.UNREACHABLE)
-_SCHEMA = Schema(
-    name="journal",
-    version=1,
-    space_hint="set XDG_STATE_HOME to a directory on a writable disk with free space",
-    statements="""
-CREATE TABLE runs (
-    id INTEGER PRIMARY KEY, command TEXT NOT NULL, fleet TEXT NOT NULL, inventory TEXT NOT NULL, owner TEXT NOT NULL,
-    process TEXT NOT NULL, plan TEXT NOT NULL, began_s REAL NOT NULL, ended_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE TABLE outcomes (
-    run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, result TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
-    began_s REAL NOT NULL, duration_s REAL NOT NULL DEFAULT 0, facts TEXT NOT NULL DEFAULT '{}', PRIMARY KEY (run, node)
-) STRICT;
-CREATE TABLE steps (
-    id INTEGER PRIMARY KEY, run INTEGER NOT NULL REFERENCES runs(id), node TEXT NOT NULL, step TEXT NOT NULL,
-    began_s REAL NOT NULL, duration_s REAL, result TEXT NOT NULL DEFAULT ''
-) STRICT;
-CREATE INDEX steps_of_run ON steps(run, node);
-CREATE TABLE nodes (
-    fleet TEXT NOT NULL, node TEXT NOT NULL, seen_s REAL NOT NULL, facts TEXT NOT NULL, PRIMARY KEY (fleet, node)
-) STRICT;
-""",
-)
-_REMEMBER = (
-    "INSERT INTO nodes (fleet, node, seen_s, facts) VALUES (?1, ?2, ?3, ?4) ON CONFLICT (fleet, node)"
-    " DO UPDATE SET seen_s = ?3, facts = ?4 WHERE ?3 >= seen_s"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +58,8 @@ class RunRecord:
     result: str
     lab: str = ""
     """The lab's directory, for a run in a virtual fleet."""
+    is_connected: bool | None = None
+    """Whether its process is connected to the shared journal; None for a journal of one computer."""
 
     @property
     def is_over(self) -> bool:
@@ -90,7 +69,10 @@ class RunRecord:
     def state(self) -> str:
         if self.ended_s is not None:
             return self.result
-        return "under way" if process_lives(self.process) else "interrupted"
+        if not process_lives(self.process):
+            return "interrupted"
+        is_here = runs_here(self.process)
+        return "under way" if is_here or self.is_connected is not False else "under way, or interrupted: out of contact"
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +96,23 @@ class LastKnown:
 class Journal:
     """The journal file. Safe for several threads and processes; close it, or use a `with` block."""
 
-    def __init__(self, path: Path, *, lab: str = "", pinned: Callable[[str], Iterable[str]] = lambda node: ()) -> None:
-        """`lab` is the directory of a virtual fleet, empty for real nodes; `pinned` are the fingerprints of the host
-        keys pinned for a node: facts of a device with other keys, which has been replaced since, are left out."""
-        self.path = path
+    def __init__(
+        self,
+        store: Path | Store,
+        *,
+        lab: str = "",
+        pinned: Callable[[str], Iterable[str]] = lambda node: (),
+        merge_later: Callable[[int], None] = lambda run: None,
+    ) -> None:
+        """`store` is the database, or the path of the file on this computer. `lab` is the directory of a virtual fleet,
+        empty for real nodes; `pinned` are the fingerprints of the host keys pinned for a node: facts of a device with
+        other keys, which has been replaced since, are left out. `merge_later` is called with each run that
+        belongs in another journal, which is out of reach, and with 0 for facts without a run."""
         self.lab = lab
         self._pinned = pinned
-        self._file = SqliteFile(path, _SCHEMA)
+        self._merge_later = merge_later
+        self._store = SqliteFile(store, SCHEMA) if isinstance(store, Path) else store
+        self.path = self._store.path
 
     def __enter__(self) -> Journal:
         return self
@@ -129,42 +121,70 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        self._file.close()
+        self._store.close()
 
     def begin(self, command: str, *, fleet: str, inventory: str, nodes: tuple[str, ...], plan: str = "") -> Run:
         """Start a run; each of its nodes is PENDING until it has an outcome."""
         now = time.time()
-        with self._file.write() as database:
-            cursor = database.execute(
+        with self._store.write(BUSY_TIMEOUT_S) as database:
+            row = database.execute(
                 "INSERT INTO runs (command, fleet, inventory, owner, process, plan, began_s)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                " VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id",
                 (command, self._key(fleet), inventory, owner(), this_process(), plan, now),
-            )
-            run_id = int(cursor.lastrowid or 0)
+            ).fetchone()
+            run_id = int(row[0])
             database.executemany(
                 "INSERT INTO outcomes (run, node, result, began_s) VALUES (?, ?, ?, ?)",
                 [(run_id, node, Result.PENDING.value, now) for node in dict.fromkeys(nodes)],
             )
+        self._merge_later(run_id)
         return Run(self, run_id)
+
+    def claim(self, run_id: int, fleet: str, nodes: Iterable[str]) -> tuple[Claim, ...]:
+        """Claim nodes for a run, where operators share the journal; returns those that another run is changing, and
+        claims none then."""
+        return self._store.claim(self._key(fleet), tuple(nodes), run_id)
+
+    def alarm_exchange(self, fleet: str) -> AlarmExchange | None:
+        """How operators share what they do about alarms; None where only this computer writes."""
+        return AlarmExchange(self._store, self._key(fleet)) if self._store.is_shared else None
+
+    @property
+    def notice(self) -> str:
+        """What the operator has to know about entries that are not where they belong."""
+        return self._store.notice
+
+    def wait_for_change(self, timeout_s: float) -> bool:
+        """Wait until another process has written, or the time is over; whether something may have changed."""
+        return self._store.wait_for_change(timeout_s)
 
     def runs(
         self, *, fleet: str | None = None, node: str | None = None, limit: int | None = 20
     ) -> tuple[RunRecord, ...]:
         """The latest runs (of a fleet, with a node), newest first; `limit` None: all."""
-        rows = self._file.read(
+        rows = self._store.read(
             f"SELECT {_RUN_COLUMNS} FROM runs WHERE (?1 IS NULL OR fleet = ?1)"
             " AND (?2 IS NULL OR EXISTS (SELECT 1 FROM outcomes WHERE run = id AND node = ?2))"
             " ORDER BY id DESC LIMIT ?3",
-            (None if fleet is None else self._key(fleet), node, -1 if limit is None else limit),
+            (None if fleet is None else self._key(fleet), node, _ALL_RUNS if limit is None else limit),
         )
-        return tuple(_record(row) for row in rows)
+        return self._records(rows)
 
     def run(self, run_id: int) -> RunRecord | None:
-        rows = self._file.read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,))
-        return _record(rows[0]) if rows else None
+        records = self._records(self._store.read(f"SELECT {_RUN_COLUMNS} FROM runs WHERE id = ?", (run_id,)))
+        return records[0] if records else None
+
+    def _records(self, rows: Iterable[tuple[Any, ...]]) -> tuple[RunRecord, ...]:
+        records = tuple(_record(row) for row in rows)
+        if all(record.ended_s is not None for record in records):
+            return records
+        connected = self._store.connected_runs()
+        return tuple(
+            replace(record, is_connected=None if connected is None else record.id in connected) for record in records
+        )
 
     def outcomes(self, run_id: int) -> tuple[Outcome, ...]:
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT node, result, reason, duration_s, facts FROM outcomes WHERE run = ? ORDER BY rowid", (run_id,)
         )
         return tuple(
@@ -173,7 +193,7 @@ class Journal:
         )
 
     def steps(self, run_id: int, node: str | None = None) -> tuple[StepRecord, ...]:
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT node, step, began_s, duration_s, result FROM steps WHERE run = ?1 AND (?2 IS NULL OR node = ?2)"
             " ORDER BY id",
             (run_id, node),
@@ -189,7 +209,7 @@ class Journal:
 
         Runs of `robots` and runs of radios are separate.
         """
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT run, node, outcomes.result FROM outcomes JOIN runs ON id = run WHERE fleet = ?1 AND NOT EXISTS"
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
             " AND later.node = outcomes.node AND after.id > runs.id"
@@ -206,7 +226,7 @@ class Journal:
     def unfinished_changes(self, fleet: str) -> dict[str, float]:
         """Node -> when its first change started (Unix time) whose end no run has observed."""
         ended = ", ".join(f"'{result.value}'" for result in Result if result not in _END_UNKNOWN)
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT node, MIN(steps.began_s) FROM steps JOIN runs ON runs.id = run WHERE fleet = ?1"
             " AND command NOT LIKE 'robots %' AND step IN ('apply', 'flash') AND NOT EXISTS"
             " (SELECT 1 FROM outcomes AS later JOIN runs AS after ON after.id = later.run WHERE after.fleet = ?1"
@@ -218,12 +238,12 @@ class Journal:
 
     def change_durations_s(self, fleet: str, *, limit: int = 100) -> tuple[float, ...]:
         """How long the latest confirmed changes of one node's files took, from staging to the proof."""
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT SUM(steps.duration_s) FROM steps JOIN runs ON runs.id = steps.run"
             " JOIN outcomes ON outcomes.run = steps.run AND outcomes.node = steps.node"
             " WHERE fleet = ?1 AND command NOT LIKE 'robots %' AND outcomes.result = ?2"
             " AND step IN ('stage', 'arm', 'apply', 'prove') GROUP BY steps.run, steps.node"
-            " HAVING SUM(step = 'prove') = 1 ORDER BY steps.run DESC LIMIT ?3",
+            " HAVING SUM(CASE WHEN step = 'prove' THEN 1 ELSE 0 END) = 1 ORDER BY steps.run DESC LIMIT ?3",
             (self._key(fleet), Result.DONE.value, limit),
         )
         return tuple(duration_s for (duration_s,) in rows)
@@ -233,14 +253,14 @@ class Journal:
         self.remember_all(fleet, {node: facts}, seen_s)
 
     def remember_all(self, fleet: str, facts: Mapping[str, Mapping[str, str]], seen_s: float) -> None:
-        with self._file.write() as database:
-            database.executemany(
-                _REMEMBER,
-                [_sighting(self._key(fleet), node, self._marked(node, known), seen_s) for node, known in facts.items()],
-            )
+        sightings = [
+            _sighting(self._key(fleet), node, self._marked(node, each), seen_s) for node, each in facts.items()
+        ]
+        self._store.put([(REMEMBER, values) for values in sightings], BUSY_TIMEOUT_S)
+        self._merge_later(0)
 
     def last_known(self, fleet: str) -> dict[str, LastKnown]:
-        rows = self._file.read(
+        rows = self._store.read(
             "SELECT node, seen_s, facts FROM nodes WHERE fleet = ? ORDER BY node", (self._key(fleet),)
         )
         found: dict[str, LastKnown] = {}
@@ -266,12 +286,12 @@ class Journal:
         `lab_of` maps a run's inventory to the lab's directory, empty for a real fleet. The nodes' facts move only if
         all runs are of one lab; otherwise their origin is unknown.
         """
-        rows = self._file.read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
+        rows = self._store.read("SELECT DISTINCT inventory FROM runs WHERE fleet = ?", (fleet,))
         labs = {inventory: lab_of(inventory) for (inventory,) in rows}
         moving = {inventory: lab for inventory, lab in labs.items() if lab}
         if not moving:
             return
-        with self._file.write() as database:
+        with self._store.write(BUSY_TIMEOUT_S) as database:
             for inventory, lab in moving.items():
                 new = _key_of(fleet, lab)
                 database.execute("UPDATE runs SET fleet = ? WHERE fleet = ? AND inventory = ?", (new, fleet, inventory))
@@ -293,7 +313,7 @@ class Run:
     def __init__(self, journal: Journal, run_id: int) -> None:
         self._journal = journal
         self._guard = threading.Lock()
-        self._pending: list[tuple[str, tuple[object, ...]]] = []
+        self._pending: list[Statement] = []
         self.id = run_id
         # why the journal is incomplete; a resume treats missing outcomes as not done
         self.error = ""
@@ -304,9 +324,7 @@ class Run:
             timeout_s = 0.0 if self._pending and wait_s <= STEP_TIMEOUT_S else wait_s
             self._pending.append((statement, values))
             try:
-                with self._journal._file.write(timeout_s) as database:
-                    for pending in self._pending:
-                        database.execute(*pending)
+                self._journal._store.put(self._pending, timeout_s)
             except MeshctlError as error:
                 self.error = str(error)
             else:
@@ -316,14 +334,14 @@ class Run:
     def remember(self, fleet: str, node: str, facts: Mapping[str, str], seen_s: float) -> None:
         """Store the facts of a node during this run."""
         marked = self._journal._marked(node, facts)
-        self._put(_REMEMBER, *_sighting(self._journal._key(fleet), node, marked, seen_s))
+        self._put(REMEMBER, *_sighting(self._journal._key(fleet), node, marked, seen_s))
 
     @contextmanager
     def step(self, node: str, name: str) -> Iterator[None]:
         """Record a step and its duration; a step without an end was cut short by the end of our process."""
         began_s, clock = time.time(), time.monotonic()
         key = (self.id, node, name, began_s)
-        self._put("INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?)", *key)
+        self._put("INSERT INTO steps (run, node, step, began_s) VALUES (?, ?, ?, ?) ON CONFLICT DO NOTHING", *key)
         result = "done"
         try:
             yield
@@ -353,12 +371,12 @@ class Run:
 
 def _key_of(fleet: str, lab: str) -> str:
     """The value of the tables' `fleet` column. A fleet name has no control character, so the parts are unambiguous."""
-    return f"{fleet}{_LAB_SEPARATOR}{lab}" if lab else fleet
+    return f"{fleet}{LAB_SEPARATOR}{lab}" if lab else fleet
 
 
 def _record(row: tuple[Any, ...]) -> RunRecord:
     record = RunRecord(*row)
-    fleet, _, lab = record.fleet.partition(_LAB_SEPARATOR)
+    fleet, _, lab = record.fleet.partition(LAB_SEPARATOR)
     return replace(record, fleet=fleet, lab=lab)
 
 

@@ -38,9 +38,14 @@ def this_process() -> str:
 
 def process_lives(process: str) -> bool:
     """Whether a process is still running; one on another host counts as running."""
-    host, _, rest = process.rpartition(":")
-    host, _, pid = host.rpartition(":")
-    return host != socket.gethostname() or (pid.isdigit() and _start_ticks(int(pid)) == rest)
+    name, _, start = process.rpartition(":")
+    pid = name.rpartition(":")[2]
+    return not runs_here(process) or (pid.isdigit() and _start_ticks(int(pid)) == start)
+
+
+def runs_here(process: str) -> bool:
+    """Whether a process is one of this computer's."""
+    return process.rpartition(":")[0].rpartition(":")[0] == socket.gethostname()
 
 
 def _start_ticks(pid: int) -> str:

@@ -23,11 +23,16 @@ CHANGES, BEFORE = "changes", "before"
 MAX_BEFORE = 50
 
 
+def runs_directory(journal: Path) -> Path:
+    """Where the files of a journal's runs are."""
+    return journal.parent / "runs"
+
+
 class RunFiles:
     """The files of all runs of a journal; `root` is the directory beside it."""
 
     def __init__(self, journal: Path) -> None:
-        self.root = journal.parent / "runs"
+        self.root = runs_directory(journal)
 
     def save(self, run_id: int, kind: str, nodes: Mapping[str, Any]) -> None:
         """Write one file of a run. Raises MeshctlError."""

@@ -10,16 +10,18 @@ import re
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import MeshctlError
+from meshctl.fleet.store import Claim, Statement
 
 # Two processes may write concurrently; a transaction takes milliseconds, so this is more than enough.
 BUSY_TIMEOUT_S = 20.0
+_LOOK_S = 0.25
 _TABLE = re.compile(r"CREATE TABLE (\w+)")
 
 
@@ -47,6 +49,7 @@ class SqliteFile:
         self.path = path
         self._schema = schema
         self._lock = threading.Lock()
+        self._data_version: int | None = None
         if read_only:
             self._open_read_only()
         else:
@@ -169,7 +172,40 @@ class SqliteFile:
                 what = f"cannot write the {self._schema.name}"
                 raise MeshctlError(f"{self.path}: {what}: {error}", hint=self._hint(error)) from error
 
-    def read(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
+    def put(self, statements: Sequence[Statement], wait_s: float = BUSY_TIMEOUT_S) -> None:
+        """Execute statements in one transaction. Raises MeshctlError, as `write` does."""
+        with self.write(wait_s) as database:
+            for statement in statements:
+                database.execute(*statement)
+
+    @property
+    def is_shared(self) -> bool:
+        return False
+
+    @property
+    def notice(self) -> str:
+        return ""
+
+    def claim(self, fleet: str, nodes: Sequence[str], run: int) -> tuple[Claim, ...]:
+        """None is refused: on one computer the lock on the node is enough."""
+        return ()
+
+    def connected_runs(self) -> frozenset[int] | None:
+        return None
+
+    def wait_for_change(self, timeout_s: float) -> bool:
+        """Wait until another process has written, or the time is over; whether one has."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            ((seen,),) = self.read("PRAGMA data_version", ())
+            if seen != self._data_version:
+                self._data_version = seen
+                return True
+            if (left := deadline - time.monotonic()) <= 0:
+                return False
+            time.sleep(min(_LOOK_S, left))
+
+    def read(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """The rows of a query. Raises MeshctlError."""
         with self._lock:
             try:

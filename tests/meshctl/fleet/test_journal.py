@@ -15,11 +15,17 @@ from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal, default_path
 from meshctl.fleet.process import process_lives, this_process
+from meshctl.fleet.sqlite_file import SqliteFile
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "state" / "meshctl" / "journal.sqlite"
+
+
+def database_of(journal: Journal) -> sqlite3.Connection:
+    assert isinstance(journal._store, SqliteFile)
+    return journal._store._database
 
 
 def test_every_node_of_a_run_is_pending_until_it_has_an_outcome(path: Path) -> None:
@@ -143,7 +149,7 @@ def test_a_file_that_is_not_a_journal_is_rejected_with_its_path(path: Path) -> N
 
 def test_a_journal_of_a_later_version_is_refused(path: Path) -> None:
     with Journal(path) as journal:
-        journal._file._database.execute("PRAGMA user_version = 7")
+        database_of(journal).execute("PRAGMA user_version = 7")
     with pytest.raises(MeshctlError, match="version 7, expected 1"):
         Journal(path)
 
@@ -165,7 +171,7 @@ def test_a_reused_pid_is_not_mistaken_for_the_original_process() -> None:
 def test_an_unwritable_journal_is_reported_without_stopping_the_run(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
-        journal._file._database.execute("PRAGMA query_only = ON")
+        database_of(journal).execute("PRAGMA query_only = ON")
         with run.step("a", "arm"):
             pass
         run.remember("f", "a", {"boot_id": "1"}, 5.0)
@@ -203,7 +209,7 @@ def test_writes_deferred_by_a_locked_journal_are_flushed_once_it_is_free(path: P
 def test_writes_deferred_by_a_full_disk_are_kept_until_space_is_available(path: Path) -> None:
     with Journal(path) as journal:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
-        database = journal._file._database
+        database = database_of(journal)
         (pages,) = database.execute("PRAGMA page_count").fetchone()
         database.execute(f"PRAGMA max_page_count = {pages}")
         run.finish_node(Outcome("a", Result.FAILED, "x" * 100_000))
@@ -219,7 +225,7 @@ def test_a_locked_journal_can_be_read_and_hints_at_the_process(
     Journal(path).close()
     with held_by_another(path), Journal(path) as journal:
         assert journal.runs() == ()
-        with pytest.raises(MeshctlError, match="locked") as caught, journal._file.write(0.0):
+        with pytest.raises(MeshctlError, match="locked") as caught, journal._store.write(0.0):
             pass
         assert "fuser" in caught.value.hint
 
