@@ -10,6 +10,7 @@ from importlib.metadata import version
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.meshctl.fleet.postgresql_server import NEEDS_POSTGRESQL, expects_postgresql
 from tests.meshctl.monitor.browser import CHROMIUM, NEEDS_BROWSER, expects_browser
 from tests.meshctl.monitor.prometheus_program import NEEDS_PROMETHEUS, expects_prometheus
 from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
@@ -52,7 +53,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("tried again")
         for reason in reasons:
             terminalreporter.line(reason)
-    if not all((expects_ros(), expects_ros2(), expects_prometheus(), expects_browser())):
+    if not all((expects_ros(), expects_ros2(), expects_prometheus(), expects_browser(), expects_postgresql())):
         terminalreporter.section("not tested here")
     if not expects_ros2():
         terminalreporter.line(
@@ -73,5 +74,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.line(
             "Prometheus: there is no prometheus in PATH, so tests/meshctl/monitor/test_prometheus.py was not"
             f" collected. scripts/setup-prometheus installs it (Debian, Ubuntu); {NEEDS_PROMETHEUS}=1 makes it fail"
+            " instead."
+        )
+    if not expects_postgresql():
+        terminalreporter.line(
+            "PostgreSQL: there is no /usr/lib/postgresql/*/bin/initdb, so the tests of a shared journal were not"
+            f" collected. scripts/setup-postgresql installs it (Debian, Ubuntu); {NEEDS_POSTGRESQL}=1 makes them fail"
             " instead."
         )

@@ -22,7 +22,7 @@ import typer
 
 from meshctl import event_log
 from meshctl.cli.extensions import LabFleet, attach_lab
-from meshctl.cli.output import console, echo
+from meshctl.cli.output import console, echo, echo_error
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Interrupt, Outcome, totals
 from meshctl.model import Fleet, Node
@@ -94,7 +94,7 @@ class Session:
 @contextmanager
 def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None = None) -> Iterator[Session]:
     """Open a session and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
-    from meshctl.fleet.journal import Journal, default_path
+    from meshctl.fleet.journal_store import open_journal
     from meshctl.fleet.lab_directory import lab_of
     from meshctl.fleet.process import lock_owner
     from meshctl.inventory import load_fleet
@@ -108,8 +108,9 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
     with (
-        Journal(
-            default_path(os.environ),
+        open_journal(
+            os.environ,
+            echo_error,
             lab=lab_directory,
             pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
         ) as journal,

@@ -12,9 +12,11 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.history_follow import follow as follow_runs
+from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.errors import InputError
-from meshctl.fleet.journal import Journal, RunRecord, default_path
+from meshctl.fleet.journal import Journal, RunRecord
+from meshctl.fleet.journal_store import open_journal
 from meshctl.fleet.run_files import CHANGES, RunFiles
 from meshctl.plan.values import FileChange
 from meshctl.report.changed_options import diff_lines, summary
@@ -29,15 +31,23 @@ def history(
     ] = None,
     diff: Annotated[bool, typer.Option("--diff", help="With a run number: show file diffs.")] = False,
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="Maximum number of runs.")] = 20,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Show what happens from now on, until Ctrl-C.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show past runs; with a run number, its nodes, changed settings, steps, outcomes and durations.
 
     Example: meshctl history 12 --node b03
     """
-    with Journal(default_path(os.environ)) as journal:
-        if run is None:
-            _list_runs(journal, _RunFilter(node, fleet, lab), limit, as_json=as_json)
+    if follow and run is not None:
+        raise InputError("--follow shows all runs", hint="leave out the run number, or narrow with --node")
+    with open_journal(os.environ, echo_error) as journal:
+        run_filter = _RunFilter(node, fleet, lab)
+        if follow:
+            follow_runs(journal, run_filter.matches, node, as_json=as_json)
+        elif run is None:
+            _list_runs(journal, run_filter, limit, as_json=as_json)
         else:
             _show_run(journal, run, node, as_json=as_json, with_diffs=diff)
 
@@ -73,14 +83,15 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
 
 
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
-    rows = [("RUN", "BEGAN", "COMMAND", "FLEET", "RESULT")]
+    rows = [("RUN", "BEGAN", "COMMAND", "FLEET", "BY", "RESULT")]
     rows += [
-        (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.state) for one in records
+        (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.owner, one.state)
+        for one in records
     ]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    widths = [max(len(row[column]) for row in rows) for column in range(5)]
     for row, record in zip(rows, [None, *records], strict=True):
-        cells = [cell.ljust(width) for cell, width in zip(row[1:4], widths[1:], strict=True)]
-        echo("  ".join([row[0].rjust(widths[0]), *cells, row[4]]).rstrip())
+        cells = [cell.ljust(width) for cell, width in zip(row[1:5], widths[1:], strict=True)]
+        echo("  ".join([row[0].rjust(widths[0]), *cells, row[5]]).rstrip())
         for outcome in journal.outcomes(record.id) if record is not None and node is not None else ():
             if outcome.node == node:
                 echo(f"{'':{widths[0]}}  {outcome}")

@@ -15,8 +15,9 @@ import typer
 
 from meshctl.cli.context import Session, exit_for, progress_for
 from meshctl.cli.output import echo, echo_json, ignore_broken_pipe
+from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome, totals
-from meshctl.fleet.journal import Run
+from meshctl.fleet.journal import ROBOT_PREFIX, Run
 
 if TYPE_CHECKING:
     from meshctl.apply.context import RunContext
@@ -34,19 +35,34 @@ class JournaledRun:
     outcomes: dict[str, Outcome]
 
 
+class NodesClaimed(MeshctlError):
+    """Nodes that another operator's run is changing. Nothing was changed."""
+
+    exit_code = ExitCode.FINDINGS
+
+
 @contextmanager
 def journaled_run(
-    opened: Session, command: str, names: Sequence[str], *, plan: str = "", as_json: bool
+    opened: Session,
+    command: str,
+    names: Sequence[str],
+    *,
+    changing: Sequence[str] | None = None,
+    plan: str = "",
+    as_json: bool,
 ) -> Iterator[JournaledRun]:
-    """Record a run of `command` on the nodes or robots `names`; `plan` is what `meshctl resume` needs.
+    """Record a run of `command` on the nodes or robots `names`; `changing` are those that it changes, by default all;
+    `plan` is what `meshctl resume` needs.
 
-    SIGINT, SIGTERM and SIGHUP within the block request a stop. The run ends in the journal in any case.
+    SIGINT, SIGTERM and SIGHUP within the block request a stop. The run ends in the journal in any case. Raises
+    NodesClaimed, before the block, where operators share the journal and one of them is changing a node.
     """
     entry = opened.journal.begin(
         command, fleet=opened.fleet.name, inventory=opened.inventory, nodes=tuple(names), plan=plan
     )
     outcomes: dict[str, Outcome] = {}
     try:
+        _claim(opened, entry, command, names if changing is None else changing)
         with (
             progress_for(len(names), as_json=as_json) as progress,
             opened.interrupt.on_signals(progress.stopping),
@@ -58,6 +74,27 @@ def journaled_run(
         with ignore_broken_pipe():
             echo(f"the journal is incomplete: {entry.error}", err=True)
             echo("hint: `meshctl resume` checks the missing nodes again", err=True)
+    if opened.journal.notice:
+        with ignore_broken_pipe():
+            echo(opened.journal.notice, err=True)
+
+
+def _claim(opened: Session, entry: Run, command: str, names: Sequence[str]) -> None:
+    prefix = ROBOT_PREFIX if command.startswith("robots ") else ""
+    taken = opened.journal.claim(entry.id, opened.fleet.name, [f"{prefix}{name}" for name in names])
+    if not taken:
+        return
+    by_run: dict[tuple[int, str], list[str]] = {}
+    for claim in taken:
+        by_run.setdefault((claim.run, claim.owner), []).append(claim.node.removeprefix(prefix))
+    text = "; ".join(
+        f"{owner}{f' (run {run})' if run else ''} is changing {', '.join(nodes)}"
+        for (run, owner), nodes in by_run.items()
+    )
+    raise NodesClaimed(
+        f"nothing was changed: {text}",
+        hint="wait for the end of that run (`meshctl history --follow`), or leave these out",
+    )
 
 
 def run_context(

@@ -157,7 +157,8 @@ def execute_plan(
     recorded = json.dumps(
         {"choices": asdict(choices), "stages": stages, **({} if undoes is None else {"undoes": undoes})}
     )
-    with journaled_run(opened, command, tuple(plan.nodes), plan=recorded, as_json=as_json) as run:
+    changing = [node.node for node in plan.of(Verdict.CHANGE)]
+    with journaled_run(opened, command, tuple(plan.nodes), changing=changing, plan=recorded, as_json=as_json) as run:
         _save_before(opened, run, prepared)
         assign_slots(prepared, opened.access)
         seen, flushes = prepared.observed.observations, StationFlushes()

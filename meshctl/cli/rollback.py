@@ -29,6 +29,7 @@ from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_exec
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import RunRecord
+from meshctl.fleet.process import runs_here
 from meshctl.fleet.run_files import BEFORE, RunFiles
 
 # These apply the plan of an inventory, and record what they replace.
@@ -117,7 +118,13 @@ def _states(
     opened: Session, record: RunRecord, selected: set[str] | None, *, as_json: bool
 ) -> Mapping[str, EarlierState]:
     """The earlier state of each node that the run changed. Prints what cannot be taken back."""
-    saved = RunFiles(opened.journal.path).load(record.id, BEFORE) or {}
+    saved = RunFiles(opened.journal.path).load(record.id, BEFORE)
+    if saved is None and not runs_here(record.process):
+        raise PlanRefused(
+            f"run {record.id} was {record.owner}'s: the files that it replaced are kept on that computer only",
+            hint=f"run `meshctl rollback {record.id}` there",
+        )
+    saved = saved or {}
     later = _later_runs(opened, record)
     states: dict[str, EarlierState] = {}
     refused: dict[str, str] = {}

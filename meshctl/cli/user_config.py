@@ -51,6 +51,8 @@ class Defaults:
             found["NO_COLOR"] = "1"
         if "parallel" in self.values:
             found["MESHCTL_PARALLEL"] = str(self.values["parallel"])
+        if "journal" in self.values:
+            found["MESHCTL_STORE"] = str(self.values["journal"])
         return found
 
     def for_command(self, name: str, command: Any) -> dict[str, Any]:
@@ -136,6 +138,7 @@ def load(file: str) -> Defaults:
 def _check_top_level(defaults: Defaults, key: str, value: Any) -> None:
     checks: dict[str, tuple[Callable[[Any], bool], str]] = {
         "color": (lambda given: given in _COLORS, f"one of {', '.join(_COLORS)}"),
+        "journal": (lambda given: isinstance(given, str), "the URL of a PostgreSQL database"),
         "parallel": (lambda given: type(given) is int and given >= 1, "an integer of 1 or more"),
         "verbose": (lambda given: type(given) is int and given >= 0, "0, 1 or 2"),
     }
@@ -144,8 +147,8 @@ def _check_top_level(defaults: Defaults, key: str, value: Any) -> None:
         if not isinstance(value, dict):
             raise defaults._error((), key, f"expected a table [{key}], found {value!r}")
     elif key not in (*_OPTIONS, *checks):
-        known = (*_OPTIONS, "parallel", "color", *COMMANDS)
-        hint = did_you_mean(key, known) or f"expected a command, or one of {', '.join(known[:6])}"
+        known = (*_OPTIONS, "parallel", "color", "journal", *COMMANDS)
+        hint = did_you_mean(key, known) or f"expected a command, or one of {', '.join(known[:7])}"
         raise defaults._error((), key, "unknown setting", hint)
     elif key in checks and not checks[key][0](value):
         raise defaults._error((), key, f"expected {checks[key][1]}, found {value!r}")

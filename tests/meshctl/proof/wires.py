@@ -17,27 +17,21 @@ from tests.meshctl.proof.rig import Rig
 WIRES = {"n001": "w1", "n002": "w2"}
 
 
-def in_own_network(directory: Path) -> list[str]:
-    """The command that runs this module where it may make interfaces, without touching the machine's own."""
+def in_own_network(directory: Path, module: str = "wires") -> list[str]:
+    """The command that runs a module where it may make interfaces, without touching the machine's own."""
     unshare = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--user", "--map-root-user"]
-    return [*unshare, sys.executable, "-m", "tests.meshctl.proof.wires", str(directory)]
+    return [*unshare, sys.executable, "-m", f"tests.meshctl.proof.{module}", str(directory)]
 
 
 def main() -> int:
     """Plug both in, bootstrap them at once, and look whether each became the one it was said to be."""
-    _ip("link set lo up")
+    ip("link set lo up")
     with Rig(Path(sys.argv[1]), 2, knows_lab=False) as rig:
         rig.wait_all_up()
-        for number, (name, wire) in enumerate(WIRES.items(), 1):
-            _plug(rig, name, wire)
-            # one address in the factory's network, one in the fleet's
-            for address in (f"192.168.1.{100 + number}/24", f"10.42.255.{number}/16"):
-                _ip(f"address add {address} dev {wire}")
+        plug_in(rig)
         words = [word for wire in WIRES.values() for word in ("--interface", wire)]
         taken = rig.meshctl("bootstrap", "a", *WIRES, *words, "--yes", "--json")
-        # from now on each has an address of its own, and the machine's routes say where
-        for number, wire in enumerate(WIRES.values(), 1):
-            _ip(f"route add 10.42.1.{number} dev {wire} src 10.42.255.{number}")
+        route()
         again = rig.meshctl("provision", "a", *WIRES, "--check", "--json")
         report = {
             "results": taken.results,
@@ -53,15 +47,29 @@ def main() -> int:
     return 0
 
 
-def _plug(rig: Rig, name: str, wire: str) -> None:
+def plug_in(rig: Rig) -> None:
+    """Give each device its cable, and this end of it one address in the factory's network and one in the fleet's."""
+    for number, (name, wire) in enumerate(WIRES.items(), 1):
+        plug(rig, name, wire)
+        for address in (f"192.168.1.{100 + number}/24", f"10.42.255.{number}/16"):
+            ip(f"address add {address} dev {wire}")
+
+
+def route() -> None:
+    """After the bootstrap each has an address of its own, and the machine's routes say where."""
+    for number, wire in enumerate(WIRES.values(), 1):
+        ip(f"route add 10.42.1.{number} dev {wire} src 10.42.255.{number}")
+
+
+def plug(rig: Rig, name: str, wire: str) -> None:
     """A cable between `wire` here and the node's bridge."""
     pid = next(node["pid"] for node in rig.fleet.status()["nodes"] if node["name"] == name)
-    _ip(f"link add {wire} type veth peer name plug netns {pid}")
-    _ip("link set plug master br-lan up", "nsenter", "-t", str(pid), "--net")
-    _ip(f"link set {wire} up")
+    ip(f"link add {wire} type veth peer name plug netns {pid}")
+    ip("link set plug master br-lan up", "nsenter", "-t", str(pid), "--net")
+    ip(f"link set {wire} up")
 
 
-def _ip(words: str, *inside: str) -> None:
+def ip(words: str, *inside: str) -> None:
     subprocess.run([*inside, "ip", *words.split()], check=True)
 
 

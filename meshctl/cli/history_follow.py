@@ -1,0 +1,98 @@
+"""`meshctl history --follow`: what happens in the journal from now on, one line for each beginning, outcome and end.
+
+The runs in progress -> wait until the journal changes -> the differences. Where operators share a journal, the lines
+are of all of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass
+
+from meshctl.cli.output import echo, echo_json
+from meshctl.fleet.journal import Journal, RunRecord
+from meshctl.fleet.outcome import Outcome, Result
+
+# A journal that is waited for so long is read anyway: a process that was killed writes no end.
+LOOK_S = 5.0
+# Runs that are looked at; more do not begin between two looks.
+_RUNS = 50
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """Something that happened in a run: `kind` is `began`, `node` or `ended`."""
+
+    kind: str
+    run: RunRecord
+    outcome: Outcome | None = None
+
+    def __str__(self) -> str:
+        run = self.run
+        about = f"run {run.id}: {run.command} of {run.fleet}{' (lab)' if run.lab else ''} by {run.owner}"
+        if self.outcome is not None:
+            took = f" ({self.outcome.duration_s:.1f} s)" if self.outcome.duration_s else ""
+            return f"run {run.id}: {self.outcome}{took}"
+        return f"{about}: {run.state if self.kind == 'ended' else 'began'}"
+
+    def as_json(self) -> dict[str, object]:
+        run = self.run
+        found: dict[str, object] = {"event": self.kind, "run": run.id, "fleet": run.fleet, "lab": run.lab}
+        found |= {"command": run.command, "owner": run.owner}
+        if self.outcome is not None:
+            found |= {"node": self.outcome.node, "result": self.outcome.result.value, "reason": self.outcome.reason}
+        elif self.kind == "ended":
+            found["state"] = run.state
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    run: RunRecord
+    results: Mapping[str, Result]
+
+
+def follow(journal: Journal, matches: Callable[[RunRecord], bool], node: str | None, *, as_json: bool) -> None:
+    """Print what happens until interrupted."""
+    for happening in happenings(journal, matches, node):
+        if as_json:
+            echo_json(json.dumps(happening.as_json()))
+        else:
+            echo(happening)
+
+
+def happenings(
+    journal: Journal, matches: Callable[[RunRecord], bool], node: str | None
+) -> Generator[Happening, None, None]:
+    """First the runs in progress, as `began`; then everything that happens."""
+    journal.wait_for_change(0.0)
+    latest = journal.runs(limit=_RUNS)
+    last = max((run.id for run in latest), default=0)
+    looks: dict[int, _Look] = {}
+    for run in reversed(latest):
+        if matches(run) and not run.is_over:
+            looks[run.id] = _Look(run, _results(journal, run, node))
+            yield Happening("began", run)
+    while True:
+        journal.wait_for_change(LOOK_S)
+        for run in reversed(journal.runs(limit=_RUNS)):
+            if not matches(run) or (run.id <= last and run.id not in looks):
+                continue
+            if run.id not in looks:
+                looks[run.id] = _Look(run, {})
+                yield Happening("began", run)
+            before = looks[run.id]
+            outcomes = [each for each in journal.outcomes(run.id) if node in (None, each.node)]
+            for outcome in outcomes:
+                if outcome.result not in (Result.PENDING, before.results.get(outcome.node)):
+                    yield Happening("node", run, outcome)
+            looks[run.id] = _Look(run, {each.node: each.result for each in outcomes})
+            if run.is_over:
+                del looks[run.id]
+                last = max(last, run.id)
+                yield Happening("ended", run)
+
+
+def _results(journal: Journal, run: RunRecord, node: str | None) -> dict[str, Result]:
+    return {each.node: each.result for each in journal.outcomes(run.id) if node in (None, each.node)}

@@ -1,0 +1,53 @@
+"""Which journal this computer uses: its own file, or the database that `MESHCTL_STORE` names.
+
+`open_journal` opens the database and merges what was kept here meanwhile; if it cannot be reached, the file is used and
+its runs are merged later. `notify` receives what the operator has to know about that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from meshctl.errors import MeshctlError
+from meshctl.fleet.journal import Journal, default_path
+
+STORE_VARIABLE = "MESHCTL_STORE"
+
+
+def open_journal(
+    environ: Mapping[str, str],
+    notify: Callable[[str], None],
+    *,
+    lab: str = "",
+    pinned: Callable[[str], Iterable[str]] = lambda node: (),
+) -> Journal:
+    """The journal of real fleets as `environ` says; that of a virtual fleet is always the file of this computer.
+
+    Raises InputError for a bad URL, MeshctlError for a file or a database that cannot be used.
+    """
+    path, url = default_path(environ), environ.get(STORE_VARIABLE, "")
+    if not url or lab:
+        return Journal(path, lab=lab, pinned=pinned)
+    # psycopg takes a tenth of a second to import
+    from meshctl.fleet.postgresql import Database, DatabaseLost, label_of
+    from meshctl.fleet.process import owner
+    from meshctl.fleet.shared_store import SharedStore, Spool
+
+    try:
+        store = SharedStore(Database(url, program=f"meshctl of {owner()}"), path)
+    except DatabaseLost as error:
+        spool, target = Spool(path), label_of(url)
+        notify(f"{error}; the journal of this computer is used, and merged later")
+        return Journal(path, pinned=pinned, merge_later=lambda run: spool.note_unmerged(target, run))
+    try:
+        merged = store.merge(path)
+    except MeshctlError as error:
+        notify(f"what this computer recorded while the shared journal was out of reach is not merged yet: {error}")
+    except BaseException:
+        store.close()
+        raise
+    else:
+        if merged:
+            numbers = ", ".join(str(number) for number in merged)
+            notify(f"runs of this computer are merged into the shared journal as {numbers}")
+    return Journal(store, pinned=pinned)
