@@ -15,7 +15,7 @@ import typer
 
 from meshctl.cli.context import AsJson, InventoryPath, Lab
 from meshctl.cli.monitor_history import HistoryFile, history_path
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.process import owner
 from meshctl.inventory.suggest import did_you_mean
@@ -39,11 +39,20 @@ By = Annotated[str | None, typer.Option("--by", help="Who; default: you.")]
 
 @contextmanager
 def _history(inventory: Path, lab: Path | None, store: Path | None) -> Iterator[FrameStore]:
-    if store is None:
-        from meshctl.inventory import load_fleet
+    if store is not None:
+        with FrameStore.open_running(store) as opened:
+            yield opened
+        return
+    from meshctl.fleet.journal_store import open_journal
+    from meshctl.inventory import load_fleet
 
-        store = history_path(load_fleet(inventory, environ=os.environ).name, lab)
-    with FrameStore.open_running(store) as opened:
+    fleet = load_fleet(inventory, environ=os.environ).name
+    with (
+        FrameStore.open_running(history_path(fleet, lab)) as opened,
+        open_journal(os.environ, echo_error, lab="" if lab is None else str(lab)) as journal,
+    ):
+        if (exchange := journal.alarm_exchange(fleet)) is not None:
+            opened.on_action = exchange.send
         yield opened
 
 
@@ -141,7 +150,7 @@ def silence_alarm(
     """
     until_s = None if for_time is None else time.time() + _seconds(for_time)
     with _history(inventory, lab, store) as history:
-        history.silence(_device(device), _code(code), Silence(until_s, reason, by or owner()))
+        history.silence(_device(device), _code(code), Silence(until_s, reason, by or owner()), time.time())
     echo(f"silenced{'' if for_time is None else f' for {for_time}'}: {device} {code}")
 
 
@@ -154,7 +163,7 @@ def end_silence(
     Example: meshctl alarms unsilence b03 '*'
     """
     with _history(inventory, lab, store) as history:
-        history.end_silence(_device(device), _code(code))
+        history.end_silence(_device(device), _code(code), owner(), time.time())
     echo(f"no longer silenced: {device} {code}")
 
 

@@ -44,6 +44,7 @@ from meshctl.monitor.sampler import FrameSampler
 from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
+from meshctl.monitor.shared_alarms import SharedAlarms
 from meshctl.monitor.store import FrameStore
 from meshctl.robots.local_daemon import socket_path
 
@@ -157,6 +158,11 @@ def monitor(
             sampler.listeners.append(TextfileWriter(textfile, history, lambda text: sampler.on_problem(text)))
         watch = _Watch(sampler, as_json=as_json)
         hooks.on_problem = sampler.on_problem
+        if (exchange := view.opened.journal.alarm_exchange(view.fleet.name)) is not None:
+            history.on_action = exchange.send
+            shared = SharedAlarms(exchange, history, on_change=watch.notify, on_problem=sampler.on_problem)
+            stack.callback(shared.stop)
+            shared.start()
         options = _shared_options(inventory, key or (), lab)
         raise typer.Exit(watch.run(web, options))
 
@@ -242,6 +248,10 @@ class _Watch:
         self._last_problem = ""
         sampler.listeners.append(self._report)
         sampler.on_problem = self._warn
+
+    def notify(self) -> None:
+        """Tell open pages that something other than a frame has changed."""
+        self._feed.notify()
 
     def run(self, web: WebOptions, options: list[str]) -> ExitCode:
         """Until a signal."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from meshctl.fleet.alarm_actions import AlarmAction, AlarmActionKind
 from meshctl.fleet.sqlite_file import Schema
 from meshctl.monitor.alarm_log import Acknowledgment, AlarmKey, LoggedAlarm, Silence
 
@@ -51,6 +52,8 @@ LOG_ALARM = (
     " acknowledged_ms = CASE WHEN ?9 THEN NULL ELSE acknowledged_ms END"
 )
 ALARM_COLUMNS = "device, code, level, text, hint, first_ms, last_ms, ended_ms, acknowledged_by, acknowledged_ms"
+# by how much the clocks of operators differ at most
+_CLOCK_DIFFERENCE_MS = 60_000
 # stands for every device, or every code, in a silence
 ANY = "*"
 
@@ -78,6 +81,28 @@ def row_of(alarm: LoggedAlarm) -> tuple[object, ...]:
         *(alarm.device, alarm.code, milliseconds(alarm.first_s), milliseconds(alarm.last_s), ended),
         *(alarm.level, alarm.text, alarm.hint, int(alarm.rose)),
     )
+
+
+def statement_of(action: AlarmAction) -> tuple[str, tuple[object, ...]]:
+    """The statement that does what an operator did about an alarm, and its values."""
+    alarm = (action.device, action.code)
+    match action.kind:
+        case AlarmActionKind.ACKNOWLEDGE:
+            at = milliseconds(action.at_s)
+            return (
+                "UPDATE alarms SET acknowledged_by = ?, acknowledged_ms = ?"
+                " WHERE device = ? AND code = ? AND ended_ms IS NULL AND first_ms <= ?",
+                # an alarm that began since, whatever the clocks say, was not meant
+                (action.by, at, *alarm, at + _CLOCK_DIFFERENCE_MS),
+            )
+        case AlarmActionKind.SILENCE:
+            until = None if action.until_s is None else milliseconds(action.until_s)
+            return (
+                "INSERT OR REPLACE INTO silences (device, code, until_ms, reason, by) VALUES (?, ?, ?, ?, ?)",
+                (*alarm, until, action.reason, action.by),
+            )
+        case AlarmActionKind.END_SILENCE:
+            return "DELETE FROM silences WHERE device = ? AND code = ?", alarm
 
 
 def milliseconds(time_s: float) -> int:

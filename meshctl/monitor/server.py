@@ -199,7 +199,7 @@ class MonitorServer:
         code = _text(body, "code")
         if code != ANY and code not in CODES:
             raise BadRequest(f"code: expected a code of an alarm or {ANY}, found {code!r}")
-        await run_in_threadpool(self.store.silence, _text(body, "device"), code, silence)
+        await run_in_threadpool(self.store.silence, _text(body, "device"), code, silence, self.clock())
         self.feed.notify()
         return await self._alarms(request)
 

@@ -11,12 +11,13 @@ import fcntl
 import os
 import threading
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from meshctl.errors import InputError, MeshctlError
+from meshctl.fleet.alarm_actions import AlarmAction, AlarmActionKind
 from meshctl.fleet.sqlite_file import SqliteFile
 from meshctl.monitor.alarm_log import (
     FLEET,
@@ -40,6 +41,7 @@ from meshctl.monitor.history_file import (
     milliseconds,
     row_of,
     silence_of,
+    statement_of,
 )
 from meshctl.monitor.timeline import TimelineBucket, buckets_of, thinned
 
@@ -64,7 +66,8 @@ class FrameStore:
     """The open history. Safe for several threads; one process appends, others may read, acknowledge and silence.
 
     `problem` says why the last frame is not in the file; empty if it is. `clock_stepped_s` is by how much the clock was
-    set forward since the file was opened: frames from before are not that much older.
+    set forward since the file was opened: frames from before are not that much older. `on_action` receives
+    what an operator did about an alarm through this object.
     """
 
     def __init__(self, path: Path, max_age_s: float, max_bytes: int, *, read_only: bool = False) -> None:
@@ -80,6 +83,7 @@ class FrameStore:
         except MeshctlError:
             self._file.close()
             raise
+        self.on_action: Callable[[AlarmAction], None] = lambda action: None
         self._claim: int | None = None
         self._lock = threading.Lock()
         self._unwritten: Frame | None = None
@@ -319,40 +323,38 @@ class FrameStore:
 
     def acknowledge(self, device: str, code: str, by: str, now_s: float) -> None:
         """Note that someone takes care of an open alarm. Raises InputError if none is open."""
-        with self._file.write() as database:
-            changed = database.execute(
-                "UPDATE alarms SET acknowledged_by = ?, acknowledged_ms = ?"
-                " WHERE device = ? AND code = ? AND ended_ms IS NULL",
-                (by, milliseconds(now_s), device, code),
-            ).rowcount
-        if not changed:
+        action = AlarmAction(AlarmActionKind.ACKNOWLEDGE, device, code, by, now_s)
+        if not self.apply(action):
             raise InputError(f"{device or 'the fleet'} has no open alarm {code}", hint="meshctl alarms lists them")
+        self.on_action(action)
 
-    def silence(self, device: str, code: str, silence: Silence) -> None:
+    def silence(self, device: str, code: str, silence: Silence, now_s: float) -> None:
         """Silence an alarm, now and when it comes again; `*` stands for any device or code. Raises InputError, also for
         a device that no frame or alarm has."""
         if not silence.reason.strip():
             raise InputError("expected a reason for the silence")
         if device not in (ANY, FLEET) and not self._knows(device):
             raise InputError(f"unknown device {device!r}", hint="meshctl alarms lists them; robot:NAME is a computer")
-        until = None if silence.until_s is None else milliseconds(silence.until_s)
+        action = AlarmAction(AlarmActionKind.SILENCE, device, code, silence.by, now_s, silence.until_s, silence.reason)
+        self.apply(action)
+        self.on_action(action)
+
+    def apply(self, action: AlarmAction) -> bool:
+        """Do what an operator, perhaps on another computer, did about an alarm; whether there was such an alarm."""
         with self._file.write() as database:
-            database.execute(
-                "INSERT OR REPLACE INTO silences (device, code, until_ms, reason, by) VALUES (?, ?, ?, ?, ?)",
-                (device, code, until, silence.reason, silence.by),
-            )
+            return database.execute(*statement_of(action)).rowcount > 0
 
     def _knows(self, device: str) -> bool:
         if (newest := self.latest()) is None or device in devices_of(newest.status):
             return True
         return bool(self._reader.read("SELECT 1 FROM alarms WHERE device = ? LIMIT 1", (device,)))
 
-    def end_silence(self, device: str, code: str) -> None:
+    def end_silence(self, device: str, code: str, by: str, now_s: float) -> None:
         """Raises InputError if there is none."""
-        with self._file.write() as database:
-            removed = database.execute("DELETE FROM silences WHERE device = ? AND code = ?", (device, code)).rowcount
-        if not removed:
+        action = AlarmAction(AlarmActionKind.END_SILENCE, device, code, by, now_s)
+        if not self.apply(action):
             raise InputError(f"{device or 'the fleet'} has no silence of {code}", hint="meshctl alarms lists them")
+        self.on_action(action)
 
     def _newest_ms(self) -> int | None:
         ((newest,),) = self._file.read("SELECT max(time_ms) FROM frames", ())

@@ -131,8 +131,8 @@ def test_only_an_open_alarm_is_acknowledged(store: FrameStore) -> None:
 
 
 def test_a_silence_covers_later_alarms_until_it_ends(store: FrameStore) -> None:
-    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"))
-    store.silence("*", "clock", Silence(None, "no NTP in the mine", "bob"))
+    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"), 0.0)
+    store.silence("*", "clock", Silence(None, "no NTP in the mine", "bob"), 0.0)
     store.append(frame(10.0, {**WEAK, ("b02", "clock"): "note", ("b02", "weak"): "warning"}))
 
     def reasons(now_s: float) -> dict[tuple[str, str], str | None]:
@@ -141,19 +141,19 @@ def test_a_silence_covers_later_alarms_until_it_ends(store: FrameStore) -> None:
     silenced = {("b01", "weak"): "being carried", ("b02", "clock"): "no NTP in the mine", ("b02", "weak"): None}
     assert reasons(49.0) == silenced
     assert reasons(50.0) == {**silenced, ("b01", "weak"): None}
-    store.end_silence("*", "clock")
+    store.end_silence("*", "clock", "bob", 0.0)
     assert set(reasons(51.0).values()) == {None}
     with pytest.raises(InputError, match="has no silence"):
-        store.end_silence("*", "clock")
+        store.end_silence("*", "clock", "bob", 0.0)
     with pytest.raises(InputError, match="reason"):
-        store.silence("b01", "weak", Silence(None, "  ", "bob"))
+        store.silence("b01", "weak", Silence(None, "  ", "bob"), 0.0)
     with pytest.raises(InputError, match="unknown device 'b07'"):
-        store.silence("b07", "weak", Silence(None, "gone", "bob"))
-    store.silence("robot:rover", "disk", Silence(None, "known", "bob"))
+        store.silence("b07", "weak", Silence(None, "gone", "bob"), 0.0)
+    store.silence("robot:rover", "disk", Silence(None, "known", "bob"), 0.0)
 
 
 def test_silences_are_in_force_by_the_wall_clock_also_while_frames_are_ahead_of_it(store: FrameStore) -> None:
-    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"))
+    store.silence("b01", "weak", Silence(50.0, "being carried", "bob"), 0.0)
     # the clock was set back: frames go on from the later time
     (began,) = store.append(frame(1000.0, WEAK), now_s=40.0)
     assert began.silenced is not None

@@ -139,7 +139,7 @@ def test_only_loud_alarms_above_the_level_are_reported() -> None:
 def test_an_alarm_that_begins_silenced_is_not_reported_and_one_that_continues_is_reported_once(tmp_path: Path) -> None:
     with receiver() as (url, got), FrameStore.open(tmp_path / "h", 1e5, MIN_BYTES) as store:
         hooks = AlarmHooks(HookSettings(url))
-        store.silence("b02", "*", Silence(None, "on the shelf", "bob"))
+        store.silence("b02", "*", Silence(None, "on the shelf", "bob"), 0.0)
         raised = {("b01", "weak"): "warning", ("b02", "weak"): "warning"}
         for time_s in (1.0, 2.0, 3.0):
             hooks.notify(store.append(frame(time_s, raised)))

@@ -298,7 +298,7 @@ def test_the_revision_follows_every_change_also_of_another_process(store: FrameS
     store.acknowledge("b01", "weak", "alice", 2.0)
     assert is_new()
     with FrameStore.open_running(path) as other:
-        other.silence("b01", "weak", Silence(None, "known", "bob"))
+        other.silence("b01", "weak", Silence(None, "known", "bob"), 0.0)
     assert is_new()
     assert not is_new()
 
