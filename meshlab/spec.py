@@ -49,7 +49,7 @@ class NodeSpec:
     release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
     `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: the release's defaults
     (19.07 RSA, later RSA and ed25519); `("ed25519",)` makes big fleets start faster. `flash_s` is the time to write an
-    image.
+    image, `first_boot_s` the time from the first login to the last init script at the boot after that.
     """
 
     name: str
@@ -66,6 +66,7 @@ class NodeSpec:
     memory_kib: int = 128 * 1024
     host_key_types: tuple[str, ...] | None = None
     flash_s: float = 1.0
+    first_boot_s: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

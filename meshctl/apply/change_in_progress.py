@@ -22,7 +22,7 @@ from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.observe import observe
-from meshctl.device.openwrt import root_in_ram
+from meshctl.device.openwrt import is_first_boot
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import UploadProgress
 from meshctl.errors import NodeError
@@ -45,8 +45,8 @@ PACKAGES_SETTLE_S = 3.0
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # How long a node that keeps its address is waited for over the connection that sent the change.
 AWAIT_RELOAD_S = 30
-# Erasing 16 MB of NOR takes up to three minutes, more with other work beside it.
-FLASH_READY_TIMEOUT_S = 600.0
+# Erasing 16 MB of NOR takes up to three minutes, more with other work beside it; then its init scripts run.
+FIRST_BOOT_TIMEOUT_S = 600.0
 ABSENT = ChangeStatus("absent", installed=False)
 
 
@@ -138,7 +138,7 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
     """Upload the change and arm it; no file has changed yet. Raises NodeRefused, NodeError."""
     ctx, owner = change.ctx, change.ctx.run.owner
     change.starts += 1
-    await_flash(ctx, connection)
+    await_first_boot(ctx, connection)
     with ctx.step("stage"):
         install_switch(ctx, connection)
         deadman.lock(connection, owner, ttl_s=change.window_s + LOCK_SLACK_S)
@@ -149,20 +149,22 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
         deadman.arm(connection, owner, change.id, nonce=change.nonce, window_s=change.window_s)
 
 
-def await_flash(ctx: NodeContext, connection: SshConnection) -> None:
-    """Wait until / is in flash: at its first boot a node runs from memory until its flash is formatted, and may lose
-    what is written before. Raises NodeError on timeout."""
-    if not ctx.before.root_in_ram or not root_in_ram(connection):
+def await_first_boot(ctx: NodeContext, connection: SshConnection) -> None:
+    """Wait until the first boot after a flash has ended: before, a power cut may undo what is written, even once it is
+    confirmed. Raises NodeError on timeout."""
+    if not ctx.before.is_first_boot or not is_first_boot(connection):
         return
-    ctx.run.note("waiting for its flash to be formatted (first boot)", ctx.name)
-    backoff = Backoff(FLASH_READY_TIMEOUT_S, ctx.run.interrupt)
-    with ctx.step("flash ready"):
-        while root_in_ram(connection):
-            if backoff.is_over or ctx.run.interrupt.leaving:
+    ctx.run.note("waiting until its first boot has ended (its flash is formatted, its services start)", ctx.name)
+    backoff = Backoff(FIRST_BOOT_TIMEOUT_S, ctx.run.interrupt)
+    with ctx.step("first boot"):
+        while is_first_boot(connection):
+            if ctx.run.interrupt.leaving:
+                raise NodeError(f"{ctx.name}: interrupted before its first boot had ended; nothing was changed")
+            if backoff.is_over:
                 raise NodeError(
-                    f"{ctx.name}: its flash was not ready within {FLASH_READY_TIMEOUT_S / 60:.0f} minutes; "
+                    f"{ctx.name}: its first boot has not ended within {FIRST_BOOT_TIMEOUT_S / 60:.0f} minutes; "
                     "nothing was changed",
-                    hint="power-cycle it, then run again",
+                    hint="power-cycle it, then run again; if it stays so, an init script of its image hangs",
                 )
             backoff.pause()
 
@@ -187,7 +189,7 @@ def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> Non
     """
     ctx = change.ctx
     change.starts += 1
-    await_flash(ctx, connection)
+    await_first_boot(ctx, connection)
     with ctx.step("apply"):
         install_switch(ctx, connection)
         change.listener.started()

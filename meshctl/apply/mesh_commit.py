@@ -22,6 +22,7 @@ from meshctl.apply.change_in_progress import (
     ChangeInProgress,
     abort,
     arm,
+    await_first_boot,
     confirm,
     connect,
     new_change,
@@ -88,7 +89,10 @@ def commit_mesh(
     window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
         commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, together, pool)
-        commit.each(participants, lambda participant: _arm(commit, participant))
+        # before the first is armed, because its lock ends soon after its window would
+        commit.each(participants, lambda participant: _await_first_boot(commit, participant))
+        if not any(participant.failure for participant in participants):
+            commit.each(participants, lambda participant: _arm(commit, participant))
         if any(participant.failure for participant in participants) or run_context.interrupt.stopping:
             return _cancel(commit, canceled_because(participants, "armed", commit.name))
         _schedule(commit)
@@ -101,6 +105,17 @@ def commit_mesh(
         must = "pass their checks" if together else "rejoin"
         run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must {must}")
         return _decide(commit, needed)
+
+
+def _await_first_boot(commit: _MeshCommit, participant: Participant) -> None:
+    ctx = participant.ctx
+    if not ctx.before.is_first_boot:
+        return
+    try:
+        with commit.run.connections.borrow(ctx.node) as connection:
+            await_first_boot(ctx, connection)
+    except NodeError as error:
+        participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)
 
 
 def _arm(commit: _MeshCommit, participant: Participant) -> None:

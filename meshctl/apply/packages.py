@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from meshctl.apply.change_in_progress import ChangeInProgress, await_flash
+from meshctl.apply.change_in_progress import ChangeInProgress, await_first_boot
 from meshctl.apply.change_set import new_change_id, new_nonce
 from meshctl.apply.commit_confirm import run_change
 from meshctl.apply.context import NodeContext
@@ -50,7 +50,7 @@ def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> O
             raise NodeError(f"{ctx.name}: expected opkg or apk, found no package manager")
         with ctx.step("packages"):
             # first, because files in memory do not survive the end of a first boot
-            await_flash(ctx, connection)
+            await_first_boot(ctx, connection)
             script = deadman.packages(tool, _upload(ctx, connection, files), step.remove)
     except BaseException:
         connection.close()

@@ -264,8 +264,8 @@ class Observation:
     load: Load | None = None
     memory: Memory | None = None
     overlay: Space | None = None
-    root_in_ram: bool | None = None
-    """Whether / is still in memory because the flash is not formatted yet (first boot)."""
+    is_first_boot: bool | None = None
+    """Whether the first boot after a flash has not ended: see `openwrt.is_first_boot`."""
     root_read_only: bool | None = None
     """Whether / cannot be written: failsafe mode, or a failing flash."""
     tmp: Space | None = None

@@ -135,7 +135,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         load=reader.read("load", system.parse_load),
         memory=reader.read("meminfo", system.parse_meminfo),
         overlay=_space(space, "/"),
-        root_in_ram=reader.read("root", system.parse_root, required=False),
+        is_first_boot=reader.read("root", system.parse_first_boot, required=False),
         root_read_only=reader.read("root", system.parse_read_only_root, required=False),
         tmp=_space(space, "/tmp"),
         macs=None if macs is None else MappingProxyType(macs),

@@ -112,9 +112,14 @@ def backup(connection: Connection) -> bytes:
     return connection.run(script).check(f"{connection.endpoint.label}: back up").stdout_bytes
 
 
-def root_in_ram(connection: Connection) -> bool:
-    """Whether / is still in memory, as at a first boot until the flash is formatted (fstools, overlay.c)."""
-    return connection.run("grep -q '^overlayfs:/tmp/root / ' /proc/mounts").exit_status == 0
+def is_first_boot(connection: Connection) -> bool:
+    """Whether the first boot after a flash has not ended.
+
+    Until then / is in memory, if its flash has to be formatted (fstools, overlay.c), or each boot unpacks the archive
+    that the flash kept, which the last init script deletes (base-files, 80_mount_root and etc/init.d/done).
+    """
+    script = "[ -e /sysupgrade.tgz ] || grep -q '^overlayfs:/tmp/root / ' /proc/mounts"
+    return connection.run(script).exit_status == 0
 
 
 @dataclass(frozen=True, slots=True)

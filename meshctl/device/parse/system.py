@@ -95,10 +95,11 @@ def parse_df(text: str) -> dict[str, Space] | None:
     return found or None
 
 
-def parse_root(text: str) -> bool:
-    """The lines of /proc/mounts about /: whether it is the memory that stands in for flash at a first boot (fstools,
-    overlay.c)."""
-    return any(line.startswith("overlayfs:/tmp/root / ") for line in text.splitlines())
+def parse_first_boot(text: str) -> bool:
+    """The lines of /proc/mounts about /, and that of sysupgrade's archive: whether / is the memory that stands in for
+    flash at a first boot (fstools, overlay.c), or the archive that the next boot unpacks is there."""
+    lines = text.splitlines()
+    return "/sysupgrade.tgz" in lines or any(line.startswith("overlayfs:/tmp/root / ") for line in lines)
 
 
 def parse_read_only_root(text: str) -> bool:

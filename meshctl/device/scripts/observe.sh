@@ -17,6 +17,12 @@ first_line() {
 	echo "$line"
 }
 
+# the mounts on /, and the archive of a flash whose first boot has not ended
+root() {
+	[ ! -e /sysupgrade.tgz ] || echo /sysupgrade.tgz
+	while read -r device at rest; do [ "$at" != / ] || echo "$device $at $rest"; done </proc/mounts
+}
+
 macs() {
 	for d in /sys/class/net/*; do
 		[ ! -f "$d/address" ] || { read -r mac <"$d/address" && read -r index <"$d/ifindex" && echo "${d##*/} $mac $index"; }
@@ -123,7 +129,7 @@ section board.json cat /etc/board.json
 section load load
 section meminfo cat /proc/meminfo
 section df df -k / /tmp
-section root grep ' / ' /proc/mounts
+section root root
 section macs macs
 section ubus.wireless ubus call network.wireless status
 section ubus.interfaces ubus call network.interface dump

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import cast
 
-from meshctl.apply.context import NodeContext
+import pytest
+
+from meshctl.apply import mesh_commit
+from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.mesh_commit import commit_mesh
 from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
-from meshctl.fleet import Outcome, Result
+from meshctl.device.observation import Observation
+from meshctl.errors import NodeError
+from meshctl.fleet import Interrupt, Outcome, Result
 
 
 def participant(*meshes: str) -> Participant:
@@ -71,3 +79,34 @@ def test_a_node_that_keeps_its_cell_is_given_up_after_a_failed_reload() -> None:
 def test_a_node_that_went_back_is_given_up_in_either_case() -> None:
     assert looked_at(Action.WENT_BACK, leaves_cell=True).has_failed
     assert looked_at(Action.WENT_BACK, leaves_cell=False).has_failed
+
+
+def test_no_node_is_armed_while_another_one_is_in_its_first_boot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its wait may be longer than the lock of a node that is armed already."""
+
+    @contextmanager
+    def borrow(_: object) -> Iterator[None]:
+        yield None
+
+    def never_ends(ctx: NodeContext, _: object) -> None:
+        raise NodeError(f"{ctx.name}: its first boot has not ended")
+
+    armed: list[object] = []
+    monkeypatch.setattr(mesh_commit, "await_first_boot", never_ends)
+    monkeypatch.setattr(mesh_commit, "arm", lambda *change: armed.append(change))
+    run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow), interrupt=Interrupt()))
+    contexts = [
+        cast(
+            "NodeContext",
+            SimpleNamespace(
+                name=name,
+                node=SimpleNamespace(confirm_window_s=60),
+                before=Observation(0.0, 0.1, is_first_boot=name == "b02"),
+            ),
+        )
+        for name in ("b01", "b02")
+    ]
+    ended = commit_mesh(run, contexts, quorum=1.0, parallel=2, entry="")
+    assert armed == []
+    assert (ended["b01"].result, ended["b02"].result) == (Result.PENDING, Result.FAILED)
+    assert "b02 could not be armed: b02: its first boot has not ended" in ended["b01"].reason

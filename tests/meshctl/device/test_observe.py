@@ -212,7 +212,7 @@ def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshCo
     assert seen.mesh is None
     assert seen.change is not None
     assert (seen.change.state, seen.change.version) == ("idle", "9")
-    assert seen.root_in_ram is False
+    assert seen.is_first_boot is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None
     assert (secret.mode, secret.text) == (0o600, None)
@@ -360,8 +360,8 @@ def test_the_survey_is_that_of_the_channel_in_use() -> None:
 
 def test_a_root_in_memory_is_distinguished_from_one_in_flash() -> None:
     ram = "/dev/root /rom squashfs ro 0 0\noverlayfs:/tmp/root / overlay rw,noatime 0 0\n"
-    assert system.parse_root(ram)
-    assert not system.parse_root(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
+    assert system.parse_first_boot(ram)
+    assert not system.parse_first_boot(ram.replace("overlayfs:/tmp/root", "overlayfs:/overlay"))
 
 
 def test_a_root_that_cannot_be_written_is_recognized() -> None:

@@ -193,5 +193,11 @@ def test_starting_sysupgrade_answers_before_the_connection_ends(connection: Conn
     eventually(lambda: calls(node) == ["sysupgrade -n -f /tmp/config.tgz /tmp/image.bin"])
 
 
-def test_a_root_in_flash_is_not_reported_as_in_ram(connection: SshConnection) -> None:
-    assert not openwrt.root_in_ram(connection)
+def test_a_first_boot_lasts_until_sysupgrades_archive_is_deleted(connection: SshConnection, node: Sandbox) -> None:
+    assert not openwrt.is_first_boot(connection)
+    node.put("/sysupgrade.tgz", "the configuration that the flash kept")
+    assert openwrt.is_first_boot(connection)
+    assert observe(connection).is_first_boot
+    node.run("/bin/sh", "-c", "rm -f /sysupgrade.tgz")
+    assert not openwrt.is_first_boot(connection)
+    assert observe(connection).is_first_boot is False

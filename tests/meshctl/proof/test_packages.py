@@ -41,14 +41,14 @@ def test_bootstrap_waits_for_the_flash_and_installs_packages_first(tmp_path: Pat
             said = []
             for text in process.stdout:
                 said.append(text)
-                if "waiting for its flash" in text:
+                if "waiting until its first boot" in text:
                     # nothing is written to a node whose flash would lose it
                     assert not {"n001: stage\n", "n001: apply\n"} & set(said)
                     mark.unlink()
             assert process.stderr is not None
             stderr = process.stderr.read()
         assert process.returncode == 0, "".join(said) + stderr
-        assert "n001: flash ready\n" in said
+        assert "n001: first boot\n" in said
         for name in ("base", "n001"):
             steps = [text.split(": ")[1].strip() for text in said if text.startswith(f"{name}: ")]
             # packages are uploaded and staged step by step, files with one command
