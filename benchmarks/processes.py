@@ -43,7 +43,7 @@ _FORK, _EXEC = 1, 2
 _NETLINK_CONNECTOR = 11
 _RECEIVE_BUFFER_BYTES = 8 << 20
 _PARTS = (
-    ("reload", re.compile(r"/tmp/meshctl/reload")),
+    ("reload", re.compile(r"^sh -c PACKAGES=")),
     ("switch: change", re.compile(r"meshctl-deadman change")),
     ("switch: timers", re.compile(r"meshctl-deadman (watch|guard|expire)")),
     ("switch: confirm", re.compile(r"meshctl-deadman (confirm|status|abort)")),

@@ -73,6 +73,11 @@ listed_radios() {
 	return $known
 }
 
+listed_configuration() {
+	[ -r /etc/config ] || return
+	for conf in /etc/config/*; do echo "${conf##*/}"; done
+}
+
 package_tool() { command -v apk || command -v opkg; }
 
 # the channel in use alone: some drivers list every channel of the band
@@ -86,18 +91,31 @@ sensors() {
 		/sys/class/ieee80211/phy*/hwmon*/temp1_input /sys/class/ieee80211/phy*/device/hwmon/hwmon*/temp1_input
 }
 
-authorized_keys() { [ ! -f /etc/dropbear/authorized_keys ] || cat /etc/dropbear/authorized_keys; }
+# contents NAME FILE...: a section for each file, all from one process: starting one takes a small processor longer than
+# printing them. A file is one record to awk, and its last line ends as it does there.
+contents() {
+	awk -v N="$N" 'BEGIN {
+		RS = "\001"
+		for (i = 1; i < ARGC; i += 2) {
+			printf "%s begin %s\n", N, ARGV[i]
+			for (count = 0; (got = (getline record <ARGV[i + 1])) > 0; count++) printf "%s%s", count ? RS : "", record
+			printf "\n%s end %d\n", N, (got < 0)
+		}
+	}' "$@"
+}
 
 host_keys() { for key in /etc/dropbear/dropbear_*_host_key; do [ ! -f "$key" ] || dropbearkey -y -f "$key"; done; }
 
 # entries of the global translation table by type: counted here, since the table of a large mesh is long
 transglobal() { # meshif|-m INTERFACE
 	entries=$(batctl "$1" "$2" transglobal -H -n) || return
-	echo "$entries" | awk '
+	awk '
 		{ mac = $1 ~ /:/ ? $1 : $2 }
 		mac ~ /^[0-9a-f][13579bdf]:/ { multicast++ }
 		mac ~ /^[0-9a-f][02468ace]:/ { unicast++ }
-		END { printf "unicast %d\nmulticast %d\n", unicast, multicast }'
+		END { printf "unicast %d\nmulticast %d\n", unicast, multicast }' <<-END
+		$entries
+	END
 }
 
 # batctl prints JSON from 2021.1 on; older ones print tables
@@ -122,12 +140,9 @@ section uptime first_line /proc/uptime
 section clock date +%s
 section boot_id first_line /proc/sys/kernel/random/boot_id
 section ubus.board ubus call system board
-section openwrt_release cat /etc/openwrt_release
 section board_name first_line /tmp/sysinfo/board_name
 section model first_line /tmp/sysinfo/model
-section board.json cat /etc/board.json
 section load load
-section meminfo cat /proc/meminfo
 section df df -k / /tmp
 section root root
 section macs macs
@@ -155,11 +170,17 @@ section bridges bridges
 section package_tool package_tool
 section packages packages
 section uci.changes uci changes
-section config.list ls /etc/config
+section config.list listed_configuration
+set -- openwrt_release /etc/openwrt_release board.json /etc/board.json meminfo /proc/meminfo
 for conf in /etc/config/*; do
-	[ ! -f "$conf" ] || section "config ${conf##*/}" cat "$conf"
+	[ ! -f "$conf" ] || set -- "$@" "config ${conf##*/}" "$conf"
 done
-section authorized_keys authorized_keys
+if [ -f /etc/dropbear/authorized_keys ]; then
+	set -- "$@" authorized_keys /etc/dropbear/authorized_keys
+else
+	section authorized_keys true
+fi
+contents "$@"
 section host_keys host_keys
 for path in $EXTRA; do
 	section "mode $path" ls -lnd "$path"

@@ -62,7 +62,7 @@ until_s() {
 # barrier: returns once procd has run every script triggered before it. procd delays each trigger and queues the scripts
 # in the order in which their delays end, so ours, triggered last with the same delay, runs last.
 barrier() {
-	rm -f "$PASSED"
+	[ ! -e "$PASSED" ] || rm -f "$PASSED"
 	if ! ubus call service set "{\"name\":\"$BARRIER\",\"triggers\":[[\"config.change\",[\"if\",[\"eq\",\"package\",\"$BARRIER\"],[\"run_script\",\"touch\",\"$PASSED\"]],1000]]}" ||
 		! ubus call service event "{\"type\":\"config.change\",\"data\":{\"package\":\"$BARRIER\"}}"; then
 		pause $BLIND_S
@@ -71,7 +71,7 @@ barrier() {
 	until_s $BARRIER_LIMIT_S [ -e "$PASSED" ]
 	passed=$?
 	ubus call service delete "{\"name\":\"$BARRIER\"}"
-	rm -f "$PASSED"
+	[ ! -e "$PASSED" ] || rm -f "$PASSED"
 	return $passed
 }
 
@@ -149,27 +149,29 @@ settle_radios() {
 
 is_firewall_running() { [ -e /var/run/fw4.state ] || [ -e /var/run/fw3.state ]; }
 
-# Every ruleset that nft accepts has new rules with new handles.
-rules_of_fw4() { nft -a list chain inet fw4 input 2>/dev/null; }
+# is_firewall_enabled: what `/etc/init.d/firewall enabled` tests (rc.common), without its interpreter and libraries
+is_firewall_enabled() {
+	for link in /etc/rc.d/S[0-9][0-9]firewall; do [ ! -x "$link" ] || return 0; done
+	return 1
+}
 
 # load_firewall: loads the ruleset and verifies it. fw4 exits with 0 and writes its state file even if nft rejected the
 # ruleset (firewall4: root/sbin/fw4), so the loaded rules are compared; fw3 reports by its exit status. Without its state
 # file fw4 does not reload and has to be started. The firewall's lock waits for a concurrent reload by hotplug.
 load_firewall() {
-	[ -x /etc/init.d/firewall ] && /etc/init.d/firewall enabled || return 0
+	[ -x /etc/init.d/firewall ] && is_firewall_enabled || return 0
 	verb=reload
 	is_firewall_running || verb=start
-	before=$(rules_of_fw4)
+	# every ruleset that nft accepts has new rules with new handles
+	before=$(nft -a list chain inet fw4 input 2>/dev/null)
 	/etc/init.d/firewall $verb
 	ended=$?
 	if command -v fw4 >/dev/null && command -v nft >/dev/null; then
-		[ "$(rules_of_fw4)" != "$before" ]
+		[ "$(nft -a list chain inet fw4 input 2>/dev/null)" != "$before" ]
 	else
 		return $ended
 	fi
 }
-
-dropbear_service() { ubus call service list '{"name":"dropbear"}' 2>/dev/null; }
 
 # split_service JSON: WITHOUT_PIDS are its lines but those with a pid, PIDS these
 split_service() {
@@ -191,7 +193,7 @@ split_service() {
 # dropbear_is_new: no old process runs with old options. procd lists the new command at once and starts it when the old
 # process has ended.
 dropbear_is_new() {
-	split_service "$(dropbear_service)"
+	split_service "$(ubus call service list '{"name":"dropbear"}' 2>/dev/null)"
 	[ "$WITHOUT_PIDS" != "$before_options" ] || return 0
 	for pid in $before_pids; do
 		! kill -0 "$pid" 2>/dev/null || return 1
@@ -208,10 +210,11 @@ resolve_without_dnsmasq() {
 	done
 }
 
-mkdir -p /tmp/meshctl
-split_service "$(dropbear_service)"
+[ -d /tmp/meshctl ] || mkdir -p /tmp/meshctl
+split_service "$(ubus call service list '{"name":"dropbear"}' 2>/dev/null)"
 before_options=$WITHOUT_PIDS before_pids=$PIDS
-before_interfaces=" $(cd /sys/class/net && echo *) "
+before_interfaces=' '
+for interface in /sys/class/net/*; do before_interfaces="$before_interfaces${interface##*/} "; done
 [ -z "$PACKAGES" ] || take_up
 ! changed dhcp || resolve_without_dnsmasq
 if changed network wireless; then

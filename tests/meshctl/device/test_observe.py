@@ -201,6 +201,7 @@ def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshCo
     assert seen.uci is not None
     assert set(seen.uci) == {"network", "odd"}
     assert seen.uci["network"] == "config interface 'lan'\n\toption ipaddr '192.168.1.1'\n\n"
+    assert seen.uci["odd"] == "\ufffd\ufffd no text"
     assert seen.uci_changes == ("network.lan.ipaddr='10.0.0.9'",)
     assert seen.package_tool == "opkg"
     assert seen.packages == {"base-files": "1650-r1", "iw": "6.9-r1"}
