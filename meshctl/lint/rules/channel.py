@@ -155,6 +155,7 @@ def channel_needs_radar_detection(fleet: Fleet, context: LintContext) -> Iterato
     failing="""
     meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
     defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+    hardware: {rocket: {confirm_window_s: 200}}
     """,
     passing="""
     meshes: {main: {band: 5g, channel: 149, mode: mesh, encryption: sae}}

@@ -1,4 +1,4 @@
-"""Policy of changes: how many nodes at once, canary, quorum, when to stop (MC613 to MC616)."""
+"""Policy of changes: how many nodes at once, canary, quorum, when to stop, radar detection (MC613 to MC620)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,18 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
-from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import Fleet
+from meshctl.lint.rule import Example, Finding, fleet_rule
+from meshctl.model import Fleet, Mesh, MeshMode
+from meshctl.regdb import CHANNELS, Country, DfsRegion, Flag, Span, check_span, occupied_span, primary_span
+
+# Radar detection before the first frame on a channel (channel availability check): the kernel's minimum, and that of
+# ETSI EN 301 893 where the channel overlaps weather radar.
+_CAC_S, _WEATHER_CAC_S = 60, 600
+_WEATHER_MHZ = (5600, 5650)
+# A mesh change decides after three quarters of the window (`meshctl.apply.mesh_commit`). The reload and the meeting of
+# the nodes get as much of that as the default window of 120 s leaves them where there is no radar.
+_DECISION_SHARE = 0.75
+_MEETING_S = 90
 
 
 @fleet_rule(
@@ -74,3 +84,70 @@ def stops_late(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     if fleet.apply.stop_after_failures > 5:
         found = str(fleet.apply.stop_after_failures)
         yield Finding(("apply", "stop_after_failures"), "many nodes fail before the run stops", "at most 5", found)
+
+
+@fleet_rule(
+    "MC620",
+    Severity.ERROR,
+    "The confirm window is too short for radar detection",
+    why="""On a DFS channel a radio listens for radar for a minute before it transmits, in Europe for ten minutes on
+    5600 to 5650 MHz (channels 120 to 128). The nodes of a changed mesh do not meet before that, so a good change is
+    rolled back, and the way back may need radar detection, too.""",
+    fix="Set `confirm_window_s` to 200, or to 920 where weather radar is, or choose a channel without DFS.",
+    failing=Example(
+        """
+        meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
+        defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+        """,
+        also=("MC325",),
+    ),
+    passing=Example(
+        """
+        meshes: {main: {band: 5g, channel: 52, mode: mesh, encryption: sae}}
+        defaults: {radios: {radio0: {mesh: null}, radio1: {mesh: main}}}
+        hardware: {rocket: {confirm_window_s: 200}}
+        """,
+        also=("MC325",),
+    ),
+)
+def window_without_radar_detection(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    country = context.regdb.country(fleet.country)
+    if country is None:
+        return
+    detection_s = {
+        name: seconds for name, mesh in fleet.meshes.items() if (seconds := _radar_detection_s(mesh, country))
+    }
+    found: set[tuple[str, ...]] = set()
+    for node in fleet.managed():
+        longest_s = max((detection_s.get(mesh, 0) for mesh in node.meshes), default=0)
+        path = ("nodes", node.name, "confirm_window_s")
+        if node.confirm_window_s == node.hardware.confirm_window_s:
+            path = ("hardware", node.hardware.name, "confirm_window_s")
+        needed_s = round((longest_s + _MEETING_S) / _DECISION_SHARE)
+        if longest_s and node.confirm_window_s < needed_s and path not in found:
+            found.add(path)
+            expected = f"at least {needed_s} s, {longest_s} of them for radar detection"
+            yield Finding(path, "too short for radar detection", expected, f"{node.confirm_window_s} s")
+
+
+def _radar_detection_s(mesh: Mesh, country: Country) -> int:
+    """How long a radio of the mesh listens before it transmits; 0 on a channel without DFS, and for ad-hoc cells, which
+    cannot use one at all (MC324)."""
+    if mesh.mode is not MeshMode.MESH or mesh.channel not in CHANNELS[mesh.band]:
+        return 0
+    span = _span(mesh)
+    verdict = check_span(country, span)
+    if not verdict.covered or Flag.DFS not in verdict.flags:
+        return 0
+    low_mhz, high_mhz = _WEATHER_MHZ
+    has_weather_radar = span.low_mhz < high_mhz and span.high_mhz > low_mhz
+    return _WEATHER_CAC_S if has_weather_radar and country.dfs_region is DfsRegion.ETSI else _CAC_S
+
+
+def _span(mesh: Mesh) -> Span:
+    """What the mesh occupies, or its primary channel where other rules report the width (MC327, MC329)."""
+    try:
+        occupied = occupied_span(mesh.band, mesh.channel, mesh.htmode)
+    except ValueError:
+        occupied = None
+    return occupied or primary_span(mesh.band, mesh.channel)
