@@ -12,11 +12,15 @@
 # named by process id, because a rollback may start while the reload of its change is still running
 BARRIER=meshctl-barrier-$$
 PASSED=/tmp/meshctl/$BARRIER
-BARRIER_LIMIT_S=90   # all reloads in sequence, on a slow board under load; the first one makes host keys
+#
+# The limits are for what hangs, not for what is slow: a change's waits end with its window (is_late), and a reload after a
+# rollback that fails reboots the node, which takes a slow one longer than to wait. deadman.sh ends that after 300 s.
+BARRIER_LIMIT_S=240  # all reloads in sequence; 10 s on an idle 400 MHz processor, minutes if it also formats flash or makes keys
 BLIND_S=10           # if procd rejects our trigger: about the time its reloads take
-NETIFD_LIMIT_S=20    # a radio with SAE or DFS, or a WAN without a server, takes longer; the health checks cover those
-RADIO_LIMIT_S=8      # netifd may not have started, or the radio is between down and up
-DROPBEAR_LIMIT_S=15  # procd waits 5 s for the old process before it kills it
+SETUP_LIMIT_S=60     # netifd kills a setup that takes more than 30 s, and tries again
+NETIFD_LIMIT_S=20    # a WAN without a server takes longer; the health checks cover what matters
+RADIO_LIMIT_S=15     # netifd may not have started, or the radio is between down and up
+DROPBEAR_LIMIT_S=30  # procd waits 5 s for the old process before it kills it
 STATUS=0
 NEWLINE='
 '
@@ -92,9 +96,18 @@ take_up() {
 	barrier || fail "procd did not run the reloads in time"
 }
 
-netifd_is_idle() {
-	case $(ubus call network.wireless status 2>/dev/null) in *'"pending": true'*) return 1 ;; esac
-	case $(ubus call network.interface dump 2>/dev/null) in *'"pending": true'*) return 1 ;; esac
+is_pending() { # OBJECT METHOD: of netifd
+	case $(ubus call "$1" "$2" 2>/dev/null) in *'"pending": true'*) ;; *) return 1 ;; esac
+}
+
+radios_are_set_up() { ! is_pending network.wireless status; }
+
+interfaces_are_set_up() { ! is_pending network.interface dump; }
+
+# await_netifd: radios first, since the interfaces on them follow
+await_netifd() {
+	until_s $SETUP_LIMIT_S radios_are_set_up
+	until_s $NETIFD_LIMIT_S interfaces_are_set_up
 }
 
 # radio_interfaces: prints `+NAME` for each enabled radio interface and `-NAME` for each disabled one; sections without
@@ -130,7 +143,7 @@ no_radio_is_lost() {
 # the end of that setup and the next one, the radio is up for a moment (25.12: wireless-device.uc, wdev_setup_cb).
 stay_settled() {
 	is_late || pause 1
-	until_s $NETIFD_LIMIT_S netifd_is_idle
+	await_netifd
 	until_s $RADIO_LIMIT_S no_radio_is_lost
 }
 
@@ -138,13 +151,13 @@ stay_settled() {
 # has just created when a radio changes from wpa_supplicant to an open cell (wifi-scripts: mac80211.sh, wdev.uc). Taking
 # the radios down first clears that state.
 settle_radios() {
-	until_s $NETIFD_LIMIT_S netifd_is_idle
+	await_netifd
 	configured_interfaces=$(radio_interfaces)
 	until_s $RADIO_LIMIT_S no_radio_is_lost && stay_settled && return
 	[ -x /sbin/wifi ] || return 0
 	/sbin/wifi down
 	/sbin/wifi up
-	until_s $NETIFD_LIMIT_S netifd_is_idle
+	await_netifd
 }
 
 is_firewall_running() { [ -e /var/run/fw4.state ] || [ -e /var/run/fw3.state ]; }
