@@ -22,6 +22,8 @@ from meshctl.uci import Package, Section
 # The share of its former neighbors a node must hear again; not all, because robots move.
 MIN_NEIGHBOR_SHARE = 0.5
 RELOADING = "its services are still reloading"
+# scripts/reload.sh: the window was about to end
+_RELOAD_WAS_LATE = 75
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,8 @@ def _reload(after: Observation) -> tuple[str, ...]:
     status = after.change.reload_status
     if status is None:
         return (RELOADING,)
+    if status == _RELOAD_WAS_LATE:
+        return ("its services had not reloaded within the confirm window: it needs a longer confirm_window_s",)
     return (f"reloading its services failed with exit status {status}",) if status != 0 else ()
 
 

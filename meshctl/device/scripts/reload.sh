@@ -1,6 +1,6 @@
 # A change's reload: reloads the services of changed files and waits until all effects on logins are in force. Sent with
 # PACKAGES (changed UCI packages), SERVICES (services to restart, by name) and SPEAK_FRAMES set before it. Exits with 0
-# if every effect was observed.
+# if every effect was observed, with 75 if the confirm window was too short for that, with 1 if something failed.
 #
 #   reload_config -> procd has run the triggered scripts (`barrier`) -> netifd has set up interfaces and radios
 #   (`settle_radios`) -> procd has run the scripts triggered by interfaces -> the firewall is loaded (`load_firewall`) ->
@@ -254,4 +254,6 @@ fi
 if changed network dropbear; then
 	until_s $DROPBEAR_LIMIT_S dropbear_is_new || fail "dropbear still runs with its old options"
 fi
+# whether it failed or would have taken longer is not known then
+[ $STATUS -eq 0 ] || ! is_late || STATUS=75
 exit $STATUS

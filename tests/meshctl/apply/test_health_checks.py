@@ -57,6 +57,10 @@ def test_a_node_that_regained_everything_passes_the_health_check() -> None:
             replace(good(), change=ChangeStatus("applied", "c1", reload_status=2)),
             "reloading its services failed with exit status 2",
         ),
+        (
+            replace(good(), change=ChangeStatus("applied", "c1", reload_status=75)),
+            "its services had not reloaded within the confirm window: it needs a longer confirm_window_s",
+        ),
         (replace(good(), interfaces=()), "its LAN is down"),
         (
             replace(good(), interfaces=(NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.9/24",)),)),
