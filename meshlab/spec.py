@@ -49,7 +49,8 @@ class NodeSpec:
     release's own. `mac` is the label's address, on the first LAN port; radios without one get `mac` + 1, ...
     `overlay_kib` is the flash left for changes, `memory_kib` the RAM. `host_key_types` None: the release's defaults
     (19.07 RSA, later RSA and ed25519); `("ed25519",)` makes big fleets start faster. `flash_s` is the time to write an
-    image, `first_boot_s` the time from the first login to the last init script at the boot after that.
+    image, `first_boot_s` the time from the first login to the last init script at the boot after that. `slowness` is
+    how many times longer than on a fast machine reloads of services and radios, and writing to flash, take.
     """
 
     name: str
@@ -67,6 +68,7 @@ class NodeSpec:
     host_key_types: tuple[str, ...] | None = None
     flash_s: float = 1.0
     first_boot_s: float = 1.0
+    slowness: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,6 +73,7 @@ def write_board(state: NodeState, radios_mac: str, seed: int = 0) -> None:
         "HOST_KEY_TYPES": " ".join(types),
         "FLASH_S": f"{spec.flash_s:g}",
         "FIRST_BOOT_S": f"{spec.first_boot_s:g}",
+        "SLOWNESS": str(spec.slowness),
         "SEED": str(seed * 1000 + state.number),
     }
     _replace(state.home / "board", "".join(f"{key}={shlex.quote(value)}\n" for key, value in facts.items()))

@@ -5,7 +5,11 @@ mkdir -p $RUN
 umask 022
 
 # take MS [MORE]: sleep MS plus up to MORE; not while the node boots, because a real boot takes many times as long
-take() { [ ! -f /tmp/run/procd/booted ] || /rom/lab/genuine/busybox usleep $((($1 + $(chance "${2:-0}")) * 1000)); }
+take() {
+	[ -f /tmp/run/procd/booted ] || return 0
+	. /lab/node/board
+	/rom/lab/genuine/busybox usleep $((($1 + $(chance "${2:-0}")) * 1000 * SLOWNESS))
+}
 # the current device of each network
 devices_now() {
 	ubus call network.interface dump 2>/dev/null | awk -F '"' '

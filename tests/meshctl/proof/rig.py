@@ -108,6 +108,8 @@ class Rig:
     release: Release = Release.V23_05
     # each node hears the one before and the one after it, instead of the base
     is_chain: bool = False
+    # node -> `NodeSpec.slowness`, where it is not 1
+    slowness: Mapping[str, int] = field(default_factory=dict)
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
@@ -144,6 +146,7 @@ class Rig:
                 medium=Medium.BASE if name == "base" else Medium.BENCH,
                 host_key_types=("ed25519",),
                 packages=self.packages,
+                slowness=self.slowness.get(name, 1),
             )
             for name in names
         )
