@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from meshctl.model import Fleet, Node, Robot, Role
-from meshctl.resolve import computer_gateway
+from meshctl.resolve import computer_gateway, lan_filter_needs
 from meshlab.errors import LabError
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
@@ -61,6 +61,7 @@ def _lan_spec(fleet: Fleet, robot: Robot, names: Sequence[str]) -> LanSpec:
 
 def _node_spec(node: Node, number: int) -> NodeSpec:
     hardware = node.hardware
+    filter_packages = (need.any_of[0] for need in lan_filter_needs(node))
     radios = tuple(
         RadioSpec(
             name=radio.name,
@@ -77,7 +78,7 @@ def _node_spec(node: Node, number: int) -> NodeSpec:
         model=hardware.name,
         target=hardware.target,
         release=node.release,
-        packages=tuple(dict.fromkeys((*MESH_PACKAGES, *hardware.packages, *node.packages))),
+        packages=tuple(dict.fromkeys((*MESH_PACKAGES, *filter_packages, *hardware.packages, *node.packages))),
         radios=radios,
         lan_ports=hardware.lan_ports or node.lan_ports,
         mac=node.mac or _MAC.format(number // 256, number % 256, 0),

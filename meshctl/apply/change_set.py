@@ -11,7 +11,8 @@ from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
 from meshctl.plan import DesiredState, NodePlan
-from meshctl.plan.seen import file_info, package_of, text_of
+from meshctl.plan.effects import loaded_package
+from meshctl.plan.seen import file_info, text_of
 
 # The id is part of a file name on the node; the nonce must be unguessable for a confirm window of minutes.
 ID_BYTES, NONCE_BYTES = 5, 16
@@ -63,7 +64,7 @@ def reload_script(paths: set[str], services: tuple[str, ...]) -> str:
 
     `paths` have no leading slash; `services` are restarted in addition. See scripts/reload.sh.
     """
-    packages = sorted(package for path in paths if (package := package_of(path)) is not None)
+    packages = sorted({package for path in paths if (package := loaded_package(path)) is not None})
     values = {"PACKAGES": " ".join(packages), "SERVICES": " ".join(services), "SPEAK_FRAMES": str(SPEAK_FRAMES)}
     return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), script("reload.sh")])
 

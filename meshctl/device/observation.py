@@ -168,6 +168,14 @@ class Bridge:
 
 
 @dataclass(frozen=True, slots=True)
+class LanFilterCounts:
+    """Frames of the wired ports that the LAN filter kept out of the mesh since the firewall was last loaded."""
+
+    dropped_packets: int
+    dropped_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class MeshInfo:
     """`batctl meshif bat0 mesh_json`; on 19.07 the text commands."""
 
@@ -283,6 +291,8 @@ class Observation:
     """The radio interfaces that wpa_supplicant runs; a mesh interface without it is unencrypted."""
     interfaces: tuple[NetInterface, ...] | None = None
     bridges: tuple[Bridge, ...] | None = None
+    lan_filter: LanFilterCounts | None = None
+    """None: the node has no LAN filter, or has not loaded it."""
     mesh: MeshInfo | None = None
     neighbours: tuple[MeshNeighbour, ...] | None = None
     originators: tuple[Originator, ...] | None = None

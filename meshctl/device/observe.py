@@ -30,7 +30,7 @@ from meshctl.device.observation import (
     Station,
     WirelessLink,
 )
-from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
+from meshctl.device.parse import batctl, iw, keys, nft, packages, system, ubus
 from meshctl.device.parse.deadman import parse_status
 from meshctl.device.parse.sections import OutputSection, split_sections
 from meshctl.device.scripts import script
@@ -148,6 +148,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         supplicants=reader.read("supplicants", lambda text: tuple(text.split()), required=False),
         interfaces=reader.read("ubus.interfaces", ubus.parse_interfaces),
         bridges=reader.read("bridges", system.parse_bridges),
+        lan_filter=reader.read("lan_filter", nft.parse_lan_filter, required=False),
         mesh=mesh,
         neighbours=neighbours,
         originators=originators,

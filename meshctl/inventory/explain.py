@@ -37,6 +37,8 @@ def _values(node: Node) -> Iterator[tuple[str, str]]:
         for key, value in _radio_values(radio):
             yield f"radios.{radio.name}.{key}", value
     yield "lan_ports", _listed(node.lan_ports)
+    if node.lan_filter is not None:
+        yield "lan_filter.udp_ports", _listed(tuple(map(str, node.lan_filter.udp_ports)))
     yield "ssh.host", node.ssh.host
     yield "ssh.port", str(node.ssh.port)
     yield "ssh.user", node.ssh.user

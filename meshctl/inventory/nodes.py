@@ -15,10 +15,21 @@ from typing import Any
 from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import codes
 from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
-from meshctl.inventory.documents import PositionDocument, RadioLayer, SshLayer
+from meshctl.inventory.documents import LanFilterLayer, PositionDocument, RadioLayer, SshLayer
 from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Band, FixedPosition, HardwareProfile, Mesh, Node, NodeState, Radio, Role, SshSettings
+from meshctl.model import (
+    Band,
+    FixedPosition,
+    HardwareProfile,
+    LanFilter,
+    Mesh,
+    Node,
+    NodeState,
+    Radio,
+    Role,
+    SshSettings,
+)
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 
 # Placeholder in a template until the node's address is known.
@@ -162,6 +173,7 @@ class _Building:
             extra_uci=MappingProxyType(values.get("extra_uci", {})),
             gateway=values.get("gateway"),
             position=fixed_position(values.get("position")),
+            lan_filter=_lan_filter(values.get("lan_filter")),
         )
         network = self.meshes[first_mesh].network if first_mesh is not None else None
         return _Template(node, values["address"], address_layer, values.get("hostname", ""), network)
@@ -248,6 +260,10 @@ def _only_meshes(meshes: Mapping[str, Mesh]) -> dict[Band, str]:
     """The mesh of each band with exactly one, the default for its radios."""
     counts = Counter(mesh.band for mesh in meshes.values())
     return {mesh.band: mesh.name for mesh in meshes.values() if counts[mesh.band] == 1}
+
+
+def _lan_filter(document: LanFilterLayer | None) -> LanFilter | None:
+    return None if document is None else LanFilter(document.udp_ports)
 
 
 def fixed_position(document: PositionDocument | None) -> FixedPosition | None:

@@ -97,10 +97,19 @@ class FixedPosition:
 
 
 @dataclass(frozen=True, slots=True)
+class LanFilter:
+    """Which group-addressed frames a radio passes from its wired ports into the mesh: address resolution, DHCP, group
+    membership and udp_mesh, and UDP to `udp_ports`."""
+
+    udp_ports: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Node:
     """One radio device. `address` is its management address with the prefix length, in its mesh's network.
 
     `lan_address` is its address in its robot's own LAN, between which and the mesh it routes; None: it bridges the two.
+    `lan_filter` None: it bridges every frame.
     """
 
     name: str
@@ -125,6 +134,12 @@ class Node:
     gateway: IpAddress | None = None
     lan_address: IpInterface | None = None
     position: FixedPosition | None = None
+    lan_filter: LanFilter | None = None
+
+    @property
+    def bridges_lan(self) -> bool:
+        """Whether frames pass between its wired ports and its mesh."""
+        return bool(self.lan_ports and self.meshes) and self.lan_address is None
 
     @property
     def unswitched_ports(self) -> tuple[str, ...]:

@@ -47,6 +47,11 @@ class Release(Enum):
         return self >= Release.V21_02
 
     @property
+    def has_fw4(self) -> bool:
+        """The firewall is firewall4, with nftables (22.03 and later)."""
+        return self >= Release.V22_03
+
+    @property
     def has_ed25519(self) -> bool:
         """dropbear supports ed25519 keys (21.02 and later); 19.07 supports RSA with SHA-1 only."""
         return self >= Release.V21_02

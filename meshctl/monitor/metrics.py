@@ -96,8 +96,12 @@ def _nodes(nodes: Iterable[_Device], status: Document) -> Iterator[MetricFamily]
     free = MetricFamily("meshctl_node_memory_free_ratio", "gauge", "Share of memory available, 0 to 1.")
     flash = MetricFamily("meshctl_node_flash_free_bytes", "gauge", "Free flash.")
     temperature = MetricFamily("meshctl_node_temperature_celsius", "gauge", "The highest that the board reports.")
+    filtered = MetricFamily(
+        "meshctl_node_lan_filter_dropped_packets_total", "counter", "Frames of its wired ports kept out of the mesh."
+    )
     for node in nodes:
         name = node.name
+        filtered.add((node.get("lan_filter") or {}).get("dropped_packets"), node=name)
         up.add(node.get("answers"), node=name, role=node.get("role"), state=node.get("state"))
         age.add(node.get("age_s"), device=name, kind="radio")
         if (files := node.get("drift")) is not None:
@@ -118,7 +122,7 @@ def _nodes(nodes: Iterable[_Device], status: Document) -> Iterator[MetricFamily]
             info.add(1, node=name, release=node.get("version"), revision=node.get("revision"))
     for robot in status.get("robots") or ():
         age.add(robot.get("age_s"), device=robot.get("name"), kind="computer")
-    yield from (up, drift, age, quality, hops, cut, free, flash, temperature, load, boot, info)
+    yield from (up, drift, age, quality, hops, cut, free, flash, temperature, filtered, load, boot, info)
 
 
 def _air(nodes: Iterable[_Device]) -> Iterator[MetricFamily]:

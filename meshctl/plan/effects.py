@@ -10,8 +10,9 @@ from collections.abc import Iterable, Mapping
 
 from meshctl.model import Release
 from meshctl.plan.radios import RadioChange, radio_changes
-from meshctl.plan.seen import address_options, management_section
+from meshctl.plan.seen import address_options, management_section, package_of
 from meshctl.plan.values import Cut, Effect
+from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import Package, Section
 
 # Package -> (service, what its reload cuts), whatever options changed.
@@ -37,16 +38,21 @@ def effects(
 def _effects(
     path: str, before: Mapping[str, Package | None], after: Mapping[str, Package | None], release: Release
 ) -> list[Effect]:
-    if not path.startswith("etc/config/"):
+    package = loaded_package(path)
+    if package is None:
         # keys and markers are read on use
         return []
-    package = path.rpartition("/")[2]
     if package == "network":
         return _network(before.get(package), after.get(package))
     if package == "wireless":
         return _wireless(before.get(package), after.get(package), release)
     service, cut = _RELOADS.get(package, (package, Cut.MESH))
     return [Effect(service, cut, f"{package} changes")]
+
+
+def loaded_package(path: str) -> str | None:
+    """The UCI package whose services read the file at `path`; None: nothing has to be reloaded."""
+    return "firewall" if path == LAN_FILTER_PATH else package_of(path)
 
 
 def _wireless(before: Package | None, after: Package | None, release: Release) -> list[Effect]:

@@ -12,12 +12,13 @@ from meshctl.render.daemon import daemon_config, daemon_keys
 from meshctl.render.facts import DeviceFacts, with_switch
 from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
 from meshctl.render.node import UnknownNode, render, render_fleet, render_node, render_nodes
-from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile
+from meshctl.render.rendered import CONFIG_FOLDER, LAN_FILTER_PATH, MARKER_PATH, Rendered, RenderedFile
 from meshctl.render.templates import Templates
 from meshctl.render.write import write_folder, write_node
 
 __all__ = [
     "CONFIG_FOLDER",
+    "LAN_FILTER_PATH",
     "MARKER_PATH",
     "DeviceFacts",
     "FileDifference",

@@ -15,7 +15,7 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
 from meshctl.render.extra import with_extra
 from meshctl.render.facts import NO_FACTS, DeviceFacts, with_board_sections
-from meshctl.render.rendered import CONFIG_FOLDER, MARKER_PATH, Rendered, RenderedFile, replace_secrets
+from meshctl.render.rendered import CONFIG_FOLDER, LAN_FILTER_PATH, MARKER_PATH, Rendered, RenderedFile, replace_secrets
 from meshctl.render.template_files import NOT_UCI, TemplateFile
 from meshctl.render.templates import Templates
 from meshctl.resolve import Intent, resolve
@@ -124,6 +124,8 @@ def _files(intent: Intent, templates: Templates, facts: DeviceFacts) -> Iterator
     context = {"intent": intent, "device": facts}
     packages: dict[str, uci.Package] = {}
     for file in templates.files(intent.backend, intent.operator_parts):
+        if file.path == LAN_FILTER_PATH and intent.lan_filter is None:
+            continue
         text = templates.text(file, intent.backend, intent.operator_parts, context)
         if file.is_uci:
             package = _parsed(file, text)

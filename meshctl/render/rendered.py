@@ -11,6 +11,8 @@ from meshctl.model import MASK, Secret
 # The marker that identifies a device's node and configuration: lines of `key=value`.
 MARKER_PATH = "etc/meshctl/node"
 CONFIG_FOLDER = "etc/config/"
+# Run by the firewall; only nodes with `lan_filter` have it.
+LAN_FILTER_PATH = "etc/meshctl/lan-filter.sh"
 
 
 @dataclass(frozen=True, slots=True)

@@ -111,6 +111,15 @@ class Backbone:
 
 
 @dataclass(frozen=True, slots=True)
+class LanFilterIntent:
+    """The filter of group-addressed frames that leave the bridge at `port`, its port into the mesh; UDP to `udp_ports`
+    passes."""
+
+    port: str
+    udp_ports: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Login:
     """SSH login to the node."""
 
@@ -145,6 +154,7 @@ class Intent:
     extra_positions: Mapping[str, Position] = field(default_factory=lambda: MappingProxyType({}))
     backbone: Backbone | None = None
     routes: tuple[StaticRoute, ...] = ()
+    lan_filter: LanFilterIntent | None = None
 
     @property
     def management_network(self) -> str:

@@ -15,7 +15,16 @@ from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.model import Backend, Encryption, Fleet, Mesh, Node, OperatorParts, Radio, Secret, SecretRef
 from meshctl.model.ip import IpNetwork
-from meshctl.resolve.intent import Backbone, BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
+from meshctl.resolve.intent import (
+    Backbone,
+    BatmanInterface,
+    Intent,
+    Lan,
+    LanFilterIntent,
+    Login,
+    MeshInterface,
+    RadioIntent,
+)
 from meshctl.resolve.intervals import Intervals, UnreachableTarget, batman_intervals
 from meshctl.resolve.packages import package_plan
 from meshctl.resolve.refusals import COMBINATION, RECONNECT, SECRET, ValueChecks
@@ -66,6 +75,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         lan=_lan(node, primary, masters),
         backbone=_backbone(node, primary, masters),
         routes=routes(fleet, node),
+        lan_filter=_lan_filter(fleet, node, primary, masters),
         login=Login(_ssh_port(node), fleet.operators.password_login, fleet.operators.ssh_keys),
         system=fleet.system,
         backend=primary.backend if primary is not None else Backend.BATMAN,
@@ -207,15 +217,28 @@ def _lan(node: Node, primary: Mesh | None, masters: dict[str, str]) -> Lan:
         gateway = node.gateway if node.gateway is not None and node.gateway in node.lan_address.network else None
         address = node.lan_address
         return Lan(BRIDGE, tuple(dict.fromkeys(ports)), address, gateway, mtu, node.hardware.switch_vlans)
-    if primary is not None:
-        match primary.backend:
-            case Backend.BATMAN:
-                ports.append(masters[primary.name])
-            case Backend.MESHMERIZE if primary.operator_parts.interface:
-                ports.append(primary.operator_parts.interface)
-            case Backend.MESHMERIZE:
-                pass
+    if mesh_port := _mesh_port(primary, masters):
+        ports.append(mesh_port)
     return Lan(BRIDGE, tuple(dict.fromkeys(ports)), node.address, node.gateway, mtu, node.hardware.switch_vlans)
+
+
+def _mesh_port(primary: Mesh | None, masters: dict[str, str]) -> str:
+    """The bridge's port into the mesh; empty without a mesh, or if meshmerize bridges its interface itself."""
+    if primary is None:
+        return ""
+    return masters[primary.name] if primary.backend is Backend.BATMAN else primary.operator_parts.interface
+
+
+# DHCP's and DHCPv6's client and server ports (RFC 2131, 4.1; RFC 8415, 7.2)
+_DHCP_PORTS = (67, 68, 546, 547)
+
+
+def _lan_filter(fleet: Fleet, node: Node, primary: Mesh | None, masters: dict[str, str]) -> LanFilterIntent | None:
+    port = _mesh_port(primary, masters)
+    if node.lan_filter is None or not node.bridges_lan or not port:
+        return None
+    allowed = {*_DHCP_PORTS, fleet.udp_mesh.port, *node.lan_filter.udp_ports}
+    return LanFilterIntent(port, tuple(sorted(allowed)))
 
 
 def _ssh_port(node: Node) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, Node, Release
@@ -44,7 +45,18 @@ def package_needs(fleet: Fleet, node: Node) -> tuple[PackageNeed, ...]:
         supplicant = supplicant_need(mesh, node.release)
         if supplicant is not None:
             needs[supplicant] = None
+    needs.update(dict.fromkeys(lan_filter_needs(node)))
     return tuple(needs)
+
+
+def lan_filter_needs(node: Node) -> Iterator[PackageNeed]:
+    """nf_tables for bridges, in every release since 19.07 (package/kernel/linux/modules/netfilter.mk), and nft, which
+    firewall4 brings from 22.03 on; nothing without a filter."""
+    if node.lan_filter is None or not node.bridges_lan:
+        return
+    yield PackageNeed(("kmod-nft-bridge",), "the LAN filter works in the bridge")
+    if not node.release.has_fw4:
+        yield PackageNeed(("nftables-nojson", "nftables-json", "nftables"), "the LAN filter is loaded with nft")
 
 
 def _backend_needs(mesh: Mesh) -> tuple[PackageNeed, ...]:

@@ -36,6 +36,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "dropped": "a beacon marked as carried relays for others, or did when last seen, or is away from its robot",
         "cut-vertex": "others reach the base only through it",
         "bridge": "a LAN port or the mesh is not in a bridge",
+        "lan-filter": "its LAN filter is not loaded",
         "flash": "low on flash storage",
         "change": "a change awaits confirmation or is being rolled back",
         "locked": "locked by another operator",

@@ -183,6 +183,7 @@ def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
         channels=tuple(dict.fromkeys(link.channel for link in mesh_links if link.channel is not None)),
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,
+        lan_filter=observed.lan_filter,
         radios=seen.radios,
         temperature_c=temperature_of(observed),
         mesh_statistics=observed.mesh_statistics,

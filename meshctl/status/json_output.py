@@ -86,6 +86,7 @@ def _node(node: NodeStatus) -> dict[str, Any]:
         if node.mesh_tables is None
         else {name: asdict(sizes) for name, sizes in node.mesh_tables.items()},
         "bridge_ports": None if node.lan_ports is None else list(node.lan_ports),
+        "lan_filter": None if node.lan_filter is None else asdict(node.lan_filter),
         "neighbours": [_neighbor(neighbor) for neighbor in node.neighbors] if answers else None,
         "hops": node.hops,
         "quality": _rounded(node.quality),

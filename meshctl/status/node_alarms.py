@@ -175,6 +175,16 @@ def _bridge(seen: NodeAlarmInput) -> Iterator[Alarm]:
         yield Alarm(level, "bridge", text, f"meshctl plan {seen.node.name}")
 
 
+def _lan_filter(seen: NodeAlarmInput) -> Iterator[Alarm]:
+    """A filter that is configured, but not loaded; with other files than the inventory's, that is the alarm."""
+    plan = seen.plan
+    if seen.node.lan_filter is None or not seen.node.bridges_lan or plan is None or plan.files:
+        return
+    if seen.observation.lan_filter is None:
+        text = "its LAN filter is not loaded: broadcasts of its wired ports reach the mesh"
+        yield Alarm(Level.WARNING, "lan-filter", text, f"meshctl run {seen.node.name} -- logread -e meshctl")
+
+
 def _resources(seen: NodeAlarmInput) -> Iterator[Alarm]:
     memory, flash, load = seen.observation.memory, seen.observation.overlay, seen.observation.load
     if memory is not None and memory.total and memory.available / memory.total < LOW_MEMORY_SHARE:
@@ -227,6 +237,7 @@ _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _air,
     _dropped,
     _bridge,
+    _lan_filter,
     _resources,
     _changes,
     _time,

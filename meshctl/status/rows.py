@@ -85,12 +85,22 @@ def _node_row(node: NodeStatus) -> dict[str, TableCell]:
         "release": TableCell(node.version),
         "config": TableCell(_same(node.drift)),
         "channel": TableCell(",".join(map(str, node.channels))),
-        "bridge": TableCell("" if node.lan_ports is None else "+".join(node.lan_ports) or "nothing"),
+        "bridge": _bridge(node),
         "hears": _hears(node),
         "path": _path(node.hops, node.quality) if node.is_path_known else TableCell(),
         "via": TableCell(node.via),
         **_air(node),
     }
+
+
+def _bridge(node: NodeStatus) -> TableCell:
+    """The ports of its LAN bridge, and how many frames its LAN filter dropped: `eth0+bat0, 12 dropped`."""
+    if node.lan_ports is None:
+        return TableCell()
+    ports = "+".join(node.lan_ports) or "nothing"
+    if node.lan_filter is None:
+        return TableCell(ports)
+    return TableCell(f"{ports}, {node.lan_filter.dropped_packets} dropped", ports)
 
 
 def _air(node: NodeStatus) -> dict[str, TableCell]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-from meshctl.device.observation import MeshTableSizes
+from meshctl.device.observation import LanFilterCounts, MeshTableSizes
 from meshctl.errors import ExitCode
 from meshctl.model import Node, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
@@ -132,6 +132,8 @@ class NodeStatus:
     tx_power_dbm: float | None = None
     lan_ports: tuple[str, ...] | None = None
     """Ports of its LAN bridge."""
+    lan_filter: LanFilterCounts | None = None
+    """None: it has no LAN filter, or has not loaded it."""
     radios: tuple[RadioStatus, ...] = ()
     temperature_c: float | None = None
     """The highest that the board reports."""

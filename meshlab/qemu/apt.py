@@ -37,6 +37,7 @@ PACKAGES = (
     "iputils-ping",
     "iw",
     "libpython3-stdlib",
+    "nftables",
     # the cryptography wheel needs it; with it udp_mesh runs on the robots' computers
     "python3-cffi-backend",
     "python3-minimal",

@@ -32,7 +32,7 @@ _CODE = ("__init__.py", "diagnostics.py", "errors.py", "model")
 CODE_FOLDER = "opt/lab"
 FLEET_FOLDER = "lab"
 # Debian's programs that the nodes' stand-ins run on real devices
-_NODE_PROGRAMS = ("iw", "batctl", "ip", "wpa_supplicant", "iperf3", "tcpdump")
+_NODE_PROGRAMS = ("iw", "batctl", "ip", "wpa_supplicant", "iperf3", "nft", "tcpdump")
 _PROGRAM_FOLDERS = ("usr/sbin", "sbin", "usr/bin", "bin")
 _LIBRARY_FOLDERS = ("lib/x86_64-linux-gnu", "usr/lib/x86_64-linux-gnu", "lib64")
 _FOLDERS = ("proc", "sys", "dev", "run", "tmp", "mnt", "root", "etc", "sbin", "bin", FLEET_FOLDER)

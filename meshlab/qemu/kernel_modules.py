@@ -13,6 +13,7 @@ MODULES = (
     "crc32c_generic", "virtio_pci", "virtio_net", "af_packet", "bridge", "veth",
     "aes_generic", "ctr", "ccm", "cmac", "gcm", "mac80211_hwsim", "batman-adv",
     "sch_netem", "sch_htb", "sch_ingress", "cls_flower", "cls_matchall", "act_gact", "act_mirred", "ifb",
+    "nf_tables", "nft_meta_bridge", "nft_counter",
 )  # fmt: skip
 _DEPENDS = re.compile(rb"\0depends=([^\0]*)\0")
 

@@ -167,6 +167,7 @@ section sensors sensors
 section supplicants supplicants
 section batctl.version batctl -v
 section bridges bridges
+[ ! -e /etc/meshctl/lan-filter.sh ] || section lan_filter nft list table bridge meshctl_lan
 section package_tool package_tool
 section packages packages
 section uci.changes uci changes

@@ -186,6 +186,9 @@ load_firewall() {
 	fi
 }
 
+# drop_lan_filter: the firewall's include loads the table, but nothing unloads that of a configuration without the include
+drop_lan_filter() { uci -q get firewall.lan_filter >/dev/null || nft delete table bridge meshctl_lan 2>/dev/null; }
+
 # split_service JSON: WITHOUT_PIDS are its lines but those with a pid, PIDS these
 split_service() {
 	WITHOUT_PIDS='' PIDS=''
@@ -248,6 +251,7 @@ if changed network; then
 	# interfaces that come up trigger dropbear, and the firewall by hotplug
 	barrier || fail "procd did not run the reloads in time"
 fi
+! changed firewall || drop_lan_filter
 if changed network firewall; then
 	load_firewall || ! changed firewall || fail "the firewall's new ruleset is not loaded"
 fi

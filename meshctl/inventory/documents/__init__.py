@@ -6,6 +6,7 @@ The models hold one mapping as written; ranges, groups and references are resolv
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import (
     GroupDocument,
+    LanFilterLayer,
     NodeDocument,
     NodeLayer,
     PositionDocument,
@@ -45,6 +46,7 @@ __all__ = [
     "HardwareDocument",
     "InventoryDocument",
     "LanDocument",
+    "LanFilterLayer",
     "MeshDocument",
     "NodeDocument",
     "NodeLayer",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field
 
 from meshctl.inventory.addresses import AddressField
@@ -36,6 +38,14 @@ class SshLayer(Document):
     """Node to use as a jump host."""
 
 
+class LanFilterLayer(Document):
+    """Which broadcasts and multicasts of the wired ports reach the mesh: ARP, IPv6 neighbor and group discovery, IGMP,
+    DHCP and udp_mesh always do; all others are dropped."""
+
+    udp_ports: tuple[Annotated[Whole, Field(ge=1, le=65_535)], ...] = ()
+    """Destination ports that pass, too, such as 5353 (mDNS) or 7400 (ROS 2 discovery in domain 0)."""
+
+
 class PositionDocument(Document):
     """Where a device stands for the whole mission, in meters in the frame of the fleet's map."""
 
@@ -68,6 +78,9 @@ class NodeLayer(Document):
     """OpenWrt release series. Default: the hardware profile's."""
     lan_ports: tuple[Text, ...] = NOT_WRITTEN
     """Ports bridged into the LAN. Default: the hardware profile's."""
+    lan_filter: LanFilterLayer | None = NOT_WRITTEN
+    """Keep the broadcasts of devices on its wired ports, such as a lidar, out of the mesh: `{}`, or with exceptions.
+    Default: none; null removes that of an outer layer."""
     ssh: SshLayer = Field(default_factory=SshLayer)
     """SSH login."""
     robot: Name = NOT_WRITTEN

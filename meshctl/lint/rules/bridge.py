@@ -1,4 +1,4 @@
-"""Bridging into the robot's LAN: ports, loops, confirm windows, extra options (MC521 to MC530)."""
+"""Bridging into the robot's LAN: ports, loops, confirm windows, extra options, broadcasts (MC521 to MC532)."""
 
 from __future__ import annotations
 
@@ -284,3 +284,45 @@ def vlan_without_switch(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             yield Finding(
                 path, f"no switch VLAN for {port}", expected, f"VLANs {join_limited(vlans)}" if vlans else "none"
             )
+
+
+_LIDAR = "robots: {husky1: {computers: {lidar: {address: 10.42.0.60/24}}}}\n"
+
+
+@fleet_rule(
+    "MC531",
+    Severity.WARNING,
+    "Broadcasts of a robot's devices can reach the air",
+    why="""The radio bridges the robot's switch into the mesh. Many sensors broadcast until they are configured (lidars,
+    to 255.255.255.255): one such device fills the channel of the whole team, at the multicast rate, repeated by every
+    node, and no priority in the computers helps.""",
+    fix="""Set `lan_filter: {}` on the radio, its group or in `defaults`, with `udp_ports` for the broadcasts that other
+    robots need; or give the robot a `lan` of its own, which is routed.""",
+    failing=_LIDAR,
+    passing=_LIDAR + "nodes: {husky1-front: {lan_filter: {}}}",
+)
+def broadcasts_unfiltered(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for robot in fleet.robots.values():
+        nodes = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        open_ones = [node.name for node in nodes if node.state.is_managed and node.bridges_lan and not node.lan_filter]
+        if robot.computers and open_ones:
+            message = f"{join_limited(open_ones)} bridges the broadcasts of {join_limited(list(robot.computers))}"
+            yield Finding(("robots", robot.name, "computers"), message, "a LAN filter", "none")
+
+
+@fleet_rule(
+    "MC532",
+    Severity.WARNING,
+    "A LAN filter has nothing to filter",
+    why="""A radio that routes its LAN, or has no wired ports or no mesh, bridges no frames: the filter is not
+    installed, and the entry suggests a protection that does not exist.""",
+    fix="Remove `lan_filter` from this node; `lan_filter: null` removes that of a group or of `defaults`.",
+    failing="nodes: {b01: {lan_ports: [], lan_filter: {}}}",
+    passing="nodes: {b01: {lan_ports: [eth0], lan_filter: {}}}",
+)
+def filter_without_bridge(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        # inherited from `defaults`, it is right for the nodes that do bridge
+        written = fleet.where("nodes", node.name, "lan_filter").layer
+        if node.lan_filter is not None and not node.bridges_lan and written != "defaults":
+            yield Finding(("nodes", node.name, "lan_filter"), "it bridges nothing", "a bridged LAN", "none")

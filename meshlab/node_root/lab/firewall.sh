@@ -26,6 +26,12 @@ put_rules() {
 	echo $((handle + 50 + $(wc -l <$LOADED.new))) >$RUN/handle
 	mv -f $LOADED.handles $LOADED
 }
+# run_includes: the administrator's scripts, which the firewall sources after its own rules
+run_includes() {
+	for path in $(uci -q show firewall | sed -n "s/^firewall\.[^.]*\.path='\(.*\)'$/\1/p"); do
+		[ ! -f "$path" ] || (. "$path")
+	done
+}
 no_rules() {
 	: >$LOADED
 	rm -f $RUN/handle

@@ -33,6 +33,7 @@ Installed-Time: 1700000000
 	case $1 in
 	batctl-*) ln -sf /rom/lab/tools.d/batctl /usr/sbin/batctl ;;
 	iw | iw-full) ln -sf /rom/lab/tools.d/iw /usr/sbin/iw ;;
+	nftables*) ln -sf /rom/lab/firewall/nft /usr/sbin/nft ;;
 	opkg) ln -sf /rom/lab/tools.d/opkg /usr/bin/opkg ;;
 	apk-*) ln -sf /rom/lab/tools.d/apk /usr/bin/apk ;;
 	esac

@@ -17,6 +17,7 @@ from types import MappingProxyType
 import pytest
 
 from meshctl.apply.change_set import SPEAK_FRAMES, reload_script
+from meshctl.render import LAN_FILTER_PATH
 
 DROPBEAR = '{"dropbear": {"instances": {"instance1": {\n"running": true,\n"pid": %s,\n"command": ["-p", "%s"]\n}}}}'
 # `service set` keeps the trigger's file, an event with its name creates it (once `procd` says so); each call is logged
@@ -144,6 +145,23 @@ def test_a_fixed_delay_is_used_if_procd_rejects_the_trigger(node: Node) -> None:
     (node.place / "no-triggers").touch()
     assert node.reload("system") == (0, "")
     assert node.slept_s() == 10
+
+
+@pytest.mark.parametrize(("has_include", "is_unloaded"), [(True, False), (False, True)])
+def test_a_lan_filter_is_unloaded_when_the_firewall_no_longer_includes_it(
+    node: Node, has_include: bool, is_unloaded: bool
+) -> None:
+    node.tool("nft", 'case $1 in delete) echo "nft $*" >>"$HERE/log" ;; *) cat "$HERE/rules" ;; esac')
+    node.tool("uci", 'case $* in *get*lan_filter*) [ -e "$HERE/include" ] ;; esac')
+    if has_include:
+        (node.place / "include").touch()
+    assert node.reload("firewall") == (0, "")
+    assert ("nft delete table bridge meshctl_lan" in node.log) == is_unloaded
+
+
+def test_a_changed_lan_filter_reloads_the_firewall() -> None:
+    assert "PACKAGES=firewall\n" in reload_script({LAN_FILTER_PATH}, ())
+    assert reload_script({LAN_FILTER_PATH, "etc/config/firewall"}, ()) == reload_script({LAN_FILTER_PATH}, ())
 
 
 def test_a_ruleset_rejected_by_nft_is_a_failure_even_if_fw4_exits_with_0(node: Node) -> None:

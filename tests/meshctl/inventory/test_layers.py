@@ -8,7 +8,8 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.meshctl.inventory.inventories import HEAD, load_text
+from meshctl.model import LanFilter
+from tests.meshctl.inventory.inventories import HEAD, fleet_of, load_text
 
 _GROUPS = ("g0", "g1", "g2", "g3")
 # What a layer may say: drive level, port, label.
@@ -76,3 +77,15 @@ def test_the_nearest_layer_wins(
     assert node.radios[0].tx_power_dbm == expected.get("power", 28)
     assert node.ssh.port == expected.get("port", 22)
     assert node.label == (f"L{expected['label']}" if "label" in expected else "")
+
+
+def test_a_lan_filter_of_defaults_is_removed_or_replaced_by_a_nearer_layer(tmp_path: Path) -> None:
+    text = """
+    defaults: {hardware: rocket, lan_filter: {udp_ports: [5353]}}
+    nodes:
+      b01: {address: 10.42.0.11}
+      b02: {address: 10.42.0.12, lan_filter: null}
+      b03: {address: 10.42.0.13, lan_filter: {}}
+    """
+    fleet = fleet_of(tmp_path, text)
+    assert [node.lan_filter for node in fleet.nodes.values()] == [LanFilter((5353,)), None, LanFilter()]

@@ -8,6 +8,7 @@ from meshctl.model import RELEASES, Release
 from meshctl.plan import Cut
 from meshctl.plan.effects import effects
 from meshctl.plan.values import Effect
+from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import Package, parse
 
 WIRELESS = """\
@@ -95,6 +96,11 @@ def test_dropbear_and_firewall_changes_cut_logins() -> None:
     for package in empty:
         (effect,) = effects([f"etc/config/{package}"], empty, empty, Release.V24_10)
         assert effect.cut is Cut.LOGIN
+
+
+def test_a_changed_lan_filter_reloads_the_firewall() -> None:
+    (effect,) = effects([LAN_FILTER_PATH], {}, {}, Release.V24_10)
+    assert (effect.service, effect.cut) == ("firewall", Cut.LOGIN)
 
 
 BRIDGED = """\

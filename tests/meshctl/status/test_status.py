@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from meshctl.device.observation import (
     BoardInfo,
     Bridge,
     ChangeStatus,
+    LanFilterCounts,
     Load,
     Memory,
     MeshNeighbour,
@@ -21,10 +23,12 @@ from meshctl.device.observation import (
 )
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet
+from meshctl.model import Fleet, LanFilter
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
+from meshctl.status.json_output import as_json
 from meshctl.status.last_known import facts_to_record, merge_by_device, typed
+from meshctl.status.rows import row
 from meshctl.status.text import text
 from meshctl.status.unreachable import no_answer_of
 from meshctl.status.values import NoAnswer
@@ -155,6 +159,30 @@ def test_drift_is_reported_with_the_files_and_the_command_that_fixes_it(fleet: F
     output = text(status_of(fleet, plans={"rover": plan}))
     assert "rover: configuration differs: wireless" in output
     assert "meshctl provision rover fixes them" in output
+
+
+def filtering(fleet: Fleet) -> Fleet:
+    rover = replace(fleet.nodes["rover"], lan_filter=LanFilter())
+    return replace(fleet, nodes=MappingProxyType({**fleet.nodes, "rover": rover}))
+
+
+def test_a_lan_filter_is_counted_in_table_and_json(fleet: Fleet) -> None:
+    rover = replace(HEALTHY["rover"], lan_filter=LanFilterCounts(12, 14_472))
+    plan = NodePlan("rover", Verdict.SAME)
+    status = status_of(filtering(fleet), {**HEALTHY, "rover": rover}, plans={"rover": plan})
+    assert "lan-filter" not in alarms(status, "rover")
+    (node,) = [node for node in as_json(status)["nodes"] if node["name"] == "rover"]
+    assert node["lan_filter"] == {"dropped_packets": 12, "dropped_bytes": 14_472}
+    (shown,) = [row(node)["bridge"] for node in status.nodes if node.name == "rover"]
+    assert shown.text.endswith(", 12 dropped")
+
+
+def test_a_lan_filter_that_is_not_loaded_is_reported_if_the_files_are_right(fleet: Fleet) -> None:
+    same = NodePlan("rover", Verdict.SAME)
+    assert "lan-filter" in alarms(status_of(filtering(fleet), plans={"rover": same}), "rover")
+    differs = replace(same, files=(FileChange("etc/meshctl/lan-filter.sh", "added", ""),))
+    assert "lan-filter" not in alarms(status_of(filtering(fleet), plans={"rover": differs}), "rover")
+    assert "lan-filter" not in alarms(status_of(fleet, plans={"rover": same}), "rover")
 
 
 def test_a_stranger_in_the_mesh_is_reported(fleet: Fleet) -> None:

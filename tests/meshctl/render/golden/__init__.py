@@ -10,7 +10,7 @@ from dataclasses import replace
 from ipaddress import IPv4Address
 from pathlib import Path
 
-from meshctl.model import Backend, Fleet, Mesh, OperatorParts, Release
+from meshctl.model import Backend, Fleet, LanFilter, Mesh, OperatorParts, Release
 from meshctl.render import Rendered, render_node
 from tests.meshctl.render import fleets
 
@@ -31,6 +31,7 @@ def cases() -> Iterator[tuple[str, Fleet]]:
             for backend in Backend:
                 yield f"{release}-{backend.value}-{mode}", _fleet(release, replace(mesh, backend=backend))
         yield f"{release}-router", fleets.routed_lans(release)
+        yield f"{release}-lan-filter", fleets.fleet(fleets.node(release, lan_filter=LanFilter((5353,))))
 
 
 def _fleet(release: Release, mesh: Mesh) -> Fleet:
