@@ -21,6 +21,7 @@ from meshctl.inventory.documents import (
     LanDocument,
     MeshDocument,
     OtherComputerDocument,
+    ReductionDocument,
     RobotDocument,
     SecretDocument,
     SshLayer,
@@ -41,10 +42,12 @@ from meshctl.model import (
     Firmware,
     Fleet,
     HardwareProfile,
+    JpegEncoding,
     Mesh,
     OperatorParts,
     Operators,
     RadioHardware,
+    Reduction,
     Robot,
     SecretKind,
     SecretRef,
@@ -351,6 +354,19 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         log=_log(document.log) if document.log is not None else None,
         delta=document.delta,
         delta_bytes=document.delta_bytes,
+        reduce=_reduction(document.reduce) if document.reduce is not None else None,
+    )
+
+
+def _reduction(document: ReductionDocument) -> Reduction:
+    jpeg = document.encode
+    return Reduction(
+        rate_hz=document.rate_hz,
+        encode=None if jpeg is None else JpegEncoding(jpeg.quality, jpeg.min_quality, jpeg.scale),
+        voxel_m=document.voxel_m,
+        max_voxel_m=document.max_voxel_m,
+        fields=tuple(document.fields),
+        adapt=document.adapt,
     )
 
 

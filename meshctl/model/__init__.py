@@ -27,7 +27,7 @@ from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile,
 from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
 from meshctl.model.release import RELEASES, PackageTool, Release
 from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
-from meshctl.model.topic import Outbox, Topic, TopicClass, TopicLog
+from meshctl.model.topic import JpegEncoding, Outbox, Reduction, Topic, TopicClass, TopicLog
 
 __all__ = [
     "MASK",
@@ -44,6 +44,7 @@ __all__ = [
     "FixedPosition",
     "Fleet",
     "HardwareProfile",
+    "JpegEncoding",
     "LanFilter",
     "Mesh",
     "MeshMode",
@@ -57,6 +58,7 @@ __all__ = [
     "PackageTool",
     "Radio",
     "RadioHardware",
+    "Reduction",
     "Release",
     "Robot",
     "Role",

@@ -38,9 +38,32 @@ class TopicLog:
 
 
 @dataclass(frozen=True, slots=True)
+class JpegEncoding:
+    """JPEG quality (1 to 95), adapted down to `min_quality`; width and height are multiplied by `scale`."""
+
+    quality: int = 60
+    min_quality: int = 10
+    scale: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """What the ROS bridge sends instead of what is published: at most `rate_hz` messages a second, images as JPEG, of
+    point clouds one point per cube of `voxel_m` (adapted up to `max_voxel_m`) with these `fields` (empty: all)."""
+
+    rate_hz: float | None = None
+    encode: JpegEncoding | None = None
+    voxel_m: float | None = None
+    max_voxel_m: float | None = None
+    fields: tuple[str, ...] = ()
+    adapt: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Topic:
     """`priority` 0 is the most urgent, 15 the least. `sources` and `destinations` name robots; empty sources means
-    every robot, the destination `all` means broadcast. `rate_hz` x `size_bytes` is the offered load per source."""
+    every robot, the destination `all` means broadcast. `sent_rate_hz` x `size_bytes` is the offered load per source:
+    the size is that of a message as sent, after `reduce`."""
 
     name: str
     priority: int
@@ -62,3 +85,10 @@ class Topic:
     log: TopicLog | None = None
     delta: bool = False
     delta_bytes: int = 16 << 20
+    reduce: Reduction | None = None
+
+    @property
+    def sent_rate_hz(self) -> float:
+        """The rate after the bridge's throttle."""
+        limit_hz = None if self.reduce is None else self.reduce.rate_hz
+        return self.rate_hz if limit_hz is None else min(self.rate_hz, limit_hz)

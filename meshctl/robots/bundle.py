@@ -15,6 +15,7 @@ from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1, ROS_2, ROS_TOO_OLD
+from meshctl.render.bridge import BRIDGE_CONFIG_NAME, bridge_config
 from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, RELAY_KEY_NAME, daemon_config, daemon_keys, relay_keys
 from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
@@ -141,9 +142,11 @@ def configuration(
         hosts = f"{_CURRENT}/bin/udp-mesh hosts --write /etc/hosts"
         files.append(File(HOSTS_UNIT_NAME, service_unit(units[HOSTS_UNIT_NAME], hosts).encode()))
     if has_bridge(fleet, robot):
+        reductions = bridge_config(fleet)
         files += [
             File("bin/udp-mesh-ros1", shipped("bridge.sh").encode(), 0o755),
             File("ros", f"/opt/ros/{ROS_1}/setup.bash\n".encode()),
+            *([] if reductions is None else [File(f"etc/{BRIDGE_CONFIG_NAME}", reductions)]),
             File(BRIDGE_UNIT_NAME, service_unit(units[BRIDGE_UNIT_NAME], f"{_CURRENT}/bin/udp-mesh-ros1").encode()),
         ]
     return tuple(files)

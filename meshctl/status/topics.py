@@ -32,9 +32,9 @@ def urgent_priorities(fleet: Fleet) -> frozenset[int]:
 
 def limit_s(topic: Topic) -> float | None:
     """The longest gap that its rate and deadline allow; None for a topic without a rate."""
-    if topic.rate_hz <= 0:
+    if topic.sent_rate_hz <= 0:
         return None
-    return max(SILENT_PERIODS / topic.rate_hz, topic.deadline_s or 0.0, MIN_LIMIT_S)
+    return max(SILENT_PERIODS / topic.sent_rate_hz, topic.deadline_s or 0.0, MIN_LIMIT_S)
 
 
 def topic_statuses(fleet: Fleet, robots: Mapping[str, RobotFacts], robot: str) -> tuple[TopicStatus, ...]:

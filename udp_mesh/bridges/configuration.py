@@ -2,6 +2,8 @@
 
     topics:
       map: { depth: 5 }
+      camera: { rate_hz: 1, encode: { quality: 40, scale: 0.5 }, adapt: true }
+      cloud: { rate_hz: 2, voxel_m: 0.2, fields: [x, y, z] }
     tf: { rate_hz: 5 }
     services:
       /get_map: { timeout_s: 5 }
@@ -21,12 +23,14 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
 
 from udp_mesh.bridges.message_definition import DefinitionError, MessageDefinition
+from udp_mesh.bridges.reduction import JpegOptions, Reduction
 
 
 class TopicOptions(NamedTuple):
     """`depth`: history of a transient local ROS 2 publisher, which the graph does not report."""
 
     depth: Optional[int] = None
+    reduction: Optional[Reduction] = None
 
 
 class TfOptions(NamedTuple):
@@ -51,6 +55,11 @@ class BridgeConfiguration(NamedTuple):
     services: Dict[str, ServiceOptions]
     actions: Dict[str, ActionOptions]
     types: Dict[str, MessageDefinition]
+
+    @property
+    def reductions(self) -> Dict[str, Reduction]:
+        """By topic."""
+        return {name: topic.reduction for name, topic in self.topics.items() if topic.reduction is not None}
 
 
 EMPTY = BridgeConfiguration({}, None, {}, {}, {})
@@ -157,15 +166,55 @@ class _Reader:
         found = self.mapping(node, at, set(limits))
         return {name: self.number(value, at + "." + name, *limits[name]) for name, value in found.items()}
 
+    def texts(self, node: Any, at: str) -> Tuple[str, ...]:
+        if node.id != "sequence" or not all(item.id == "scalar" for item in node.value):
+            self.refuse(node, at, "a list of names", getattr(node, "value", None) if node.id == "scalar" else node.id)
+            return ()
+        return tuple(str(item.value) for item in node.value)
+
     def flag(self, node: Any, at: str) -> bool:
         if node.id != "scalar" or node.value not in ("true", "false"):
             self.refuse(node, at, "true or false", getattr(node, "value", None))
         return bool(node.value == "true")
 
 
+_TOPIC_NUMBERS = {"rate_hz": (0.001, 1000.0), "voxel_m": (0.001, 100.0), "max_voxel_m": (0.001, 100.0)}
+
+
 def _topic(reader: _Reader, node: Any, at: str) -> TopicOptions:
-    found = reader.mapping(node, at, {"depth"})
-    return TopicOptions(reader.number(found["depth"], at + ".depth", 1, 10_000, int) if "depth" in found else None)
+    found = reader.mapping(node, at, {"depth", "encode", "fields", "adapt", *_TOPIC_NUMBERS})
+    depth = reader.number(found["depth"], at + ".depth", 1, 10_000, int) if "depth" in found else None
+    if not set(found) - {"depth"}:
+        return TopicOptions(depth)
+    values = {
+        name: reader.number(found[name], "{}.{}".format(at, name), *limits)
+        for name, limits in _TOPIC_NUMBERS.items()
+        if name in found
+    }
+    reduction = Reduction(
+        values.get("rate_hz"),
+        _jpeg(reader, found["encode"], at + ".encode") if "encode" in found else None,
+        values.get("voxel_m"),
+        values.get("max_voxel_m"),
+        reader.texts(found["fields"], at + ".fields") if "fields" in found else (),
+        reader.flag(found["adapt"], at + ".adapt") if "adapt" in found else False,
+    )
+    if reduction.adapt and not (reduction.rate_hz and (reduction.encode or reduction.max_voxel_m)):
+        reader.refuse(found["adapt"], at + ".adapt", "rate_hz, and encode or max_voxel_m, beside it", "true")
+    if reduction.max_voxel_m is not None and not (reduction.voxel_m or 1e9) <= reduction.max_voxel_m:
+        reader.refuse(found["max_voxel_m"], at + ".max_voxel_m", "at least voxel_m", reduction.max_voxel_m)
+    return TopicOptions(depth, reduction)
+
+
+def _jpeg(reader: _Reader, node: Any, at: str) -> JpegOptions:
+    found = reader.mapping(node, at, {"quality", "min_quality", "scale"})
+    whole = {
+        name: reader.number(found[name], "{}.{}".format(at, name), 1, 95, int)
+        for name in ("quality", "min_quality")
+        if name in found
+    }
+    scale = reader.number(found["scale"], at + ".scale", 0.01, 1) if "scale" in found else 1.0
+    return JpegOptions(scale=scale, **whole)
 
 
 def _tf(reader: _Reader, node: Any) -> TfOptions:

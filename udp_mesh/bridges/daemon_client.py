@@ -83,14 +83,15 @@ class DaemonClient:
             log.warning("messages-refused count=%d %s", self._unlogged, reason)
             self._unlogged = 0
 
-    def publish(self, topic: str, payload: bytes, peer: str | None, type_text: str) -> bool:
-        """Publishes a message; False if there is no daemon now. A refusal by the daemon is logged."""
+    def publish(self, topic: str, payload: bytes, peer: str | None, type_text: str, *, notify: bool = False) -> bool:
+        """Publishes a message; False if there is no daemon now. A refusal by the daemon is logged. With `notify`, an
+        event `outcome` follows if the topic is reliable."""
         client = self._client
         if client is None:
             self._count_refused("{}: the daemon is not connected".format(topic))
             return False
         try:
-            client.publish(topic, payload, to=peer, type=type_text, wait=False)
+            client.publish(topic, payload, to=peer, type=type_text, notify=notify, wait=False)
             return True
         except MeshError as error:
             self._count_refused("{}: {}".format(topic, error))

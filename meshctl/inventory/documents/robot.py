@@ -169,6 +169,34 @@ class TopicLogDocument(Document):
     """How many robots that reach each other carry an item, besides its source and its destinations."""
 
 
+class JpegDocument(Document):
+    """How images are encoded."""
+
+    quality: Whole = Field(default=60, ge=1, le=95)
+    """JPEG quality."""
+    min_quality: Whole = Field(default=10, ge=1, le=95)
+    """The lowest quality with `adapt`."""
+    scale: Real = Field(default=1.0, ge=0.01, le=1)
+    """Factor for width and height."""
+
+
+class ReductionDocument(Document):
+    """What the ROS bridge sends of a topic instead of everything that is published."""
+
+    rate_hz: Real = Field(default=NOT_WRITTEN, ge=0.001, le=1000)
+    """Maximum number of messages per second; the others are left out."""
+    encode: JpegDocument = NOT_WRITTEN
+    """Send images as JPEG, as sensor_msgs/CompressedImage. `{}` for the defaults."""
+    voxel_m: Real = Field(default=NOT_WRITTEN, ge=0.001, le=100)
+    """Send one point of a cloud per cube of this edge in meters."""
+    max_voxel_m: Real = Field(default=NOT_WRITTEN, ge=0.001, le=100)
+    """The largest edge with `adapt`."""
+    fields: tuple[Text, ...] = ()
+    """Fields of a cloud's points to keep, such as [x, y, z]. Default: all."""
+    adapt: Flag = False
+    """Lower the quality when messages take too long to arrive, and raise it again, within these bounds."""
+
+
 class TopicDocument(Document):
     """A topic that udp_mesh carries."""
 
@@ -185,9 +213,9 @@ class TopicDocument(Document):
     destinations: tuple[Text, ...] = ("all",)
     """Robots that receive the topic; `all` for all."""
     rate_hz: Real = Field(default=0.0, ge=0, le=100_000)
-    """Messages per second that one source offers."""
+    """Messages per second that one source publishes."""
     size_bytes: Whole = Field(default=0, ge=0, le=1_000_000_000)
-    """Size of one message."""
+    """Size of one message, as sent."""
     keep_last: Whole = Field(default=0, ge=0, le=1_000_000)
     """Number of queued messages to keep when the queue grows; 0 keeps all."""
     deadline_s: Real = Field(default=NOT_WRITTEN, gt=0, le=86_400)
@@ -210,3 +238,5 @@ class TopicDocument(Document):
     """Maximum size of a message for that; a larger one is sent whole."""
     log: TopicLogDocument = NOT_WRITTEN
     """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""
+    reduce: ReductionDocument = NOT_WRITTEN
+    """Send fewer or smaller messages than are published; done by the ROS bridge."""

@@ -106,6 +106,7 @@ def name_is_no_host_name(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     status` says nothing about them.""",
     fix="Name the computer that runs the daemon in `computer`.",
     failing="""
+        nodes: {husky1-front: {lan_filter: {}}}
         robots:
           husky1: {computer: <removed>, computers: {jetson: {address: 10.42.0.111/24}}}
         topics:
@@ -114,7 +115,10 @@ def name_is_no_host_name(fleet: Fleet, _context: LintContext) -> Iterator[Findin
           map: <removed>
           video: <removed>
     """,
-    passing="robots: {husky1: {computers: {jetson: {address: 10.42.0.111/24}}}}",
+    passing="""
+        nodes: {husky1-front: {lan_filter: {}}}
+        robots: {husky1: {computers: {jetson: {address: 10.42.0.111/24}}}}
+    """,
 )
 def others_not_monitored(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for robot in fleet.robots.values():

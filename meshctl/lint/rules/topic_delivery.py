@@ -51,7 +51,9 @@ def _path(topic: Topic, *key: str) -> tuple[str, ...]:
 )
 def video_reliable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
-        if topic.topic_class is TopicClass.VIDEO and topic.reliable:
+        # an adapted topic needs the outcomes; MC722 has it keep the newest frame only
+        is_adapted = topic.reduce is not None and topic.reduce.adapt
+        if topic.topic_class is TopicClass.VIDEO and topic.reliable and not is_adapted:
             yield Finding(_path(topic, "reliable"), "old frames delay new ones", "false", "true")
 
 
@@ -216,7 +218,7 @@ def delta_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
         elif size > topic.delta_bytes:
             path = _path(topic, "delta_bytes")
             yield Finding(path, "every message is sent whole", f"at least {size} (size_bytes)", str(topic.delta_bytes))
-        elif 2 * size * topic.rate_hz > _COMPARED_BYTES_PER_S:
+        elif 2 * size * topic.sent_rate_hz > _COMPARED_BYTES_PER_S:
             expected = f"at most {_COMPARED_BYTES_PER_S} bytes/s with their bases"
-            found = f"{topic.rate_hz:g} Hz x 2 x {size} bytes"
+            found = f"{topic.sent_rate_hz:g} Hz x 2 x {size} bytes"
             yield Finding(_path(topic, "delta"), "part of the messages is sent whole", expected, found)

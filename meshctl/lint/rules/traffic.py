@@ -71,7 +71,7 @@ def offered_load(fleet: Fleet) -> dict[str, OfferedLoad]:
     for topic in fleet.topics:
         sources = [name for name in topic.sources if name in meshes_of] or ([] if topic.sources else peers)
         for source in sources:
-            bytes_per_s = topic.rate_hz * topic.size_bytes
+            bytes_per_s = topic.sent_rate_hz * topic.size_bytes
             if topic.rate_limit_bytes_per_s is not None:
                 bytes_per_s = min(bytes_per_s, topic.rate_limit_bytes_per_s)
             is_broadcast = _ALL in topic.destinations and can_broadcast
@@ -199,11 +199,11 @@ def video_to_all(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def limit_below_load(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
-        offered = topic.rate_hz * topic.size_bytes
+        offered = topic.sent_rate_hz * topic.size_bytes
         limit = topic.rate_limit_bytes_per_s
         if limit is not None and offered > limit and not topic.keep_last:
             path = ("topics", topic.name, "rate_limit_bytes_per_s")
-            expected = f"at least {offered:g} ({topic.rate_hz:g} Hz x {topic.size_bytes} bytes)"
+            expected = f"at least {offered:g} ({topic.sent_rate_hz:g} Hz x {topic.size_bytes} bytes)"
             yield Finding(path, "its queue grows without bound", expected, str(limit))
 
 

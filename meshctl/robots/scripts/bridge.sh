@@ -5,4 +5,6 @@ read -r setup <"$release/ros"
 # shellcheck disable=SC1090  # ROS's own, as on the command line of its users
 . "$setup" || exit 1
 export PYTHONPATH=$release/ros1${PYTHONPATH:+:$PYTHONPATH} PYTHONDONTWRITEBYTECODE=1
+config=$release/etc/bridge.yaml
+[ ! -f "$config" ] || set -- "_config:=$config" "$@"
 exec python3 -m udp_mesh.bridges.ros1 "$@"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import replace
+from dataclasses import astuple, replace
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,9 @@ from meshctl.model import (
     ComputerLink,
     FixedPosition,
     Fleet,
+    JpegEncoding,
     Outbox,
+    Reduction,
     Robot,
     Secret,
     SecretKind,
@@ -29,8 +31,12 @@ from meshctl.model import (
     TopicLog,
     UdpMesh,
 )
+from meshctl.render.bridge import bridge_config
 from meshctl.render.daemon import RELAY_KEY_NAME, daemon_config, daemon_keys, relay_keys
 from tests.meshctl.render import fleets
+from udp_mesh.bridges.configuration import parse_configuration
+from udp_mesh.bridges.reduction import JpegOptions
+from udp_mesh.bridges.reduction import Reduction as BridgeReduction
 from udp_mesh.core import settings as core
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.links.attachments import LinkConfig
@@ -69,6 +75,29 @@ def loaded(source: Fleet, robot: str, folder: Path) -> Configuration:
     if keys is not None:
         (folder / "fleet.key").write_bytes(keys)
     return load(folder / "udp-mesh.toml")
+
+
+def test_the_bridge_reads_what_the_inventory_reduces() -> None:
+    jpeg = JpegEncoding(quality=40, min_quality=5, scale=0.5)
+    camera = replace(VIDEO, reduce=Reduction(rate_hz=1.0, encode=jpeg, adapt=True))
+    cloud = replace(GRID, reduce=Reduction(voxel_m=0.1, max_voxel_m=0.5, fields=("x", "y")))
+    text = bridge_config(fleet(ESTOP, camera, cloud))
+    assert text is not None
+    assert parse_configuration(text.decode(), "bridge.yaml").reductions == {
+        "video": BridgeReduction(1.0, JpegOptions(40, 5, 0.5), adapt=True),
+        "grid": BridgeReduction(None, None, 0.1, 0.5, ("x", "y")),
+    }
+    assert bridge_config(fleet(ESTOP, GRID)) is None
+
+
+def test_bridge_and_inventory_have_the_same_defaults() -> None:
+    assert JpegOptions(*astuple(JpegEncoding())) == JpegOptions()
+    assert BridgeReduction(*astuple(Reduction())) == BridgeReduction()
+
+
+def test_a_topic_is_sent_at_the_lower_of_its_rates() -> None:
+    camera = replace(VIDEO, rate_hz=30.0)
+    assert [replace(camera, reduce=Reduction(rate_hz=rate)).sent_rate_hz for rate in (None, 1.0, 60.0)] == [30, 1, 30]
 
 
 def test_the_daemon_configuration_matches_the_inventory(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from io import BytesIO
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
@@ -16,8 +17,8 @@ import pytest
 from meshctl.errors import InputError
 from meshctl.fleet import Result
 from meshctl.inventory import load_fleet
-from meshctl.model import Computer, Robot, SecretKind, SecretRef
-from meshctl.robots.bundle import UNIT_NAME, Bundle, File, service_unit
+from meshctl.model import Computer, Reduction, Robot, SecretKind, SecretRef, Topic
+from meshctl.robots.bundle import UNIT_NAME, Bundle, File, configuration, service_unit
 from meshctl.robots.connection import selected_robots
 from meshctl.robots.deploy import parse_switch
 from meshctl.robots.key_rotation import inventory_value, parse_ref, rotation_stages
@@ -283,3 +284,16 @@ def test_a_robot_without_a_computer_is_skipped_or_rejected_with_a_hint() -> None
     with pytest.raises(InputError) as caught:
         selected_robots(fleet, ["cart"], str)
     assert caught.value.hint == "set robots.cart.computer"
+
+
+def test_a_release_with_a_bridge_has_what_it_reduces() -> None:
+    camera = Topic("camera", 9, reduce=Reduction(rate_hz=1.0))
+    computer = Computer(IPv4Interface("10.42.0.10/24"), ros="noetic")
+    robots = {"husky1": Robot("husky1", (), computer), "spot": Robot("spot", (), replace(computer, ros="humble"))}
+    fleet = fleets.fleet(robots=robots, topics=(camera,))
+    paths = {name: {file.path for file in configuration(fleet, name, fleets.secrets, stock_units())} for name in robots}
+    assert "etc/bridge.yaml" in paths["husky1"]
+    assert "etc/bridge.yaml" not in paths["spot"]
+    plain = replace(fleet, topics=(replace(camera, reduce=None),))
+    unchanged = {file.path for file in configuration(plain, "husky1", fleets.secrets, stock_units())}
+    assert unchanged == paths["husky1"] - {"etc/bridge.yaml"}

@@ -113,9 +113,10 @@ class Ros1Node(NodeProcess):
         self._command(subscribe=name, type=type_name, **more)
         self.expect("subscribed", name)
 
-    def stream(self, name: str, type_name: str, rate_hz: float, payload_bytes: int = 0) -> None:
-        """Publishes at this rate until `stop_streams`: images of so many bytes, or texts with number and time."""
-        self._command(stream=name, type=type_name, rate_hz=rate_hz, bytes=payload_bytes)
+    def stream(self, name: str, type_name: str, rate_hz: float, payload_bytes: int = 0, **more: object) -> None:
+        """Publishes at this rate until `stop_streams`: images of so many bytes, or texts with number and time; with
+        `picture` (width, height), whole images."""
+        self._command(stream=name, type=type_name, rate_hz=rate_hz, bytes=payload_bytes, **more)
 
     def stop_streams(self) -> dict[str, int]:
         """How many messages each stream has published."""

@@ -103,7 +103,11 @@ def stream(command: dict[str, Any]) -> None:
         while not stop.wait(1.0 / command["rate_hz"]):
             message = message_class()
             number += 1
-            if command["type"] == "sensor_msgs/Image":
+            if "picture" in command:
+                message.width, message.height = command["picture"]
+                message.encoding, message.step = "rgb8", 3 * message.width
+                message.data = bytes(message.step * message.height)
+            elif command["type"] == "sensor_msgs/Image":
                 message.header.seq = number
                 # Pixels that do not compress.
                 message.data = command["bytes"] // len(NOISE) * NOISE

@@ -15,7 +15,19 @@ from tests.udp_mesh.bridges.interpreters import older_interpreters
 
 PACKAGE = Path(udp_mesh.__file__).parent
 SOURCES = sorted(path for part in ("bridges", "client") for path in (PACKAGE / part).rglob("*.py"))
-MIDDLEWARE = {"genpy", "rosgraph", "roslib", "rospy", "std_msgs", "rclpy", "rosidl_runtime_py", "zenoh", "yaml"}
+MIDDLEWARE = {
+    "genpy",
+    "rosgraph",
+    "roslib",
+    "rospy",
+    "std_msgs",
+    "rclpy",
+    "rosidl_runtime_py",
+    "zenoh",
+    "yaml",
+    "numpy",
+    "PIL",
+}
 NEWER_NAMES = {
     *("removeprefix", "removesuffix", "bit_count", "pairwise", "batched", "lcm", "cache", "to_thread", "TaskGroup"),
     *("StrEnum", "Self", "Never", "assert_never", "override", "ParamSpec", "TypeAlias", "Annotated", "timeout_at"),
@@ -28,7 +40,8 @@ RUNS = """
 import sys
 before = set(sys.modules)
 from udp_mesh.bridges import envelope, names, relay, rmw_zenoh, types
-from udp_mesh.bridges import protocol, calls, configuration, message_codec, message_types, mixed_team, transforms
+from udp_mesh.bridges import protocol, calls, configuration, message_codec, message_types, mixed_team
+from udp_mesh.bridges import reduction, transforms
 from udp_mesh.bridges import daemon_client
 from udp_mesh.bridges.ros1 import publications
 from udp_mesh.bridges.ros2 import quality

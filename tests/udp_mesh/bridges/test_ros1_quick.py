@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from io import BytesIO
 
 import pytest
+from PIL import Image
 
 from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import poll, two_daemons
+from udp_mesh.bridges.message_codec import decode as decode_message
+from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS, Definition, decode, encode
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
 from udp_mesh.client.mesh_client import Message
@@ -15,6 +19,10 @@ from udp_mesh.client.mesh_client import Message
 pytestmark = pytest.mark.xdist_group("ros1")
 
 PROTOCOL_TOPIC = "bridge/ros1"
+REDUCED = """
+topics:
+  camera: { rate_hz: 2, encode: { quality: 60, min_quality: 10, scale: 0.5 }, adapt: true }
+"""
 STRING = TypeKey("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1")
 MADE = TypeKey("made_up/Thing", "0123456789abcdef" * 2)
 
@@ -55,3 +63,36 @@ def test_a_real_ros_node_sends_and_receives_mesh_messages_of_known_and_unknown_t
         client.publish(PROTOCOL_TOPIC, encode(Definition(MADE, "uint8[2] thing\n")), to="alice", type="bridge")
         thing = node.expect("hex", "0102")
         assert (thing["type"], thing["md5sum"], thing["definition"]) == (*MADE, "uint8[2] thing\n")
+
+
+def test_a_camera_is_throttled_and_sent_as_jpeg_whose_quality_follows_the_outcomes() -> None:
+    with two_daemons() as (alice, bob), ExitStack() as kept:
+        master = Master(alice.folder, "alice")
+        kept.callback(master.stop)
+        master.start_bare()
+        (alice.folder / "bridge.yaml").write_text(REDUCED)
+        with alice.client() as client:
+            client.request("set-topic", topic="camera", values={"priority": 9, "keep_last": 1})
+        bridge = Ros1Bridge(master, alice)
+        kept.callback(bridge.stop)
+        bridge.start(arguments=[f"_config:={alice.folder}/bridge.yaml"])
+        node = Ros1Node(master, "camera")
+        kept.callback(node.close)
+        heard = kept.enter_context(bob.client())
+        heard.subscribe("camera")
+        node.stream("/alice/mesh_comm/bob/camera", "sensor_msgs/Image", 20.0, picture=[64, 48])
+        arrived: list[Message] = []
+
+        def enough() -> bool:
+            arrived.extend(heard.messages(0.2))
+            return len(arrived) >= 4
+
+        poll(enough, "four images at bob's daemon")
+        streamed = node.stop_streams()["/alice/mesh_comm/bob/camera"]
+        assert len(arrived) < streamed / 4, "two a second of twenty"
+        key = TypeKey("sensor_msgs/CompressedImage", TYPES["sensor_msgs/CompressedImage"].md5sum)
+        for message in arrived:
+            assert message.type == kind_text(MessageKind(key))
+            image = decode_message(TYPES[key.name], message.payload, 1)
+            assert image["format"] == "jpeg"
+            assert Image.open(BytesIO(image["data"].data)).size == (32, 24)

@@ -31,6 +31,7 @@ TO_ALICE = "/bob/mesh_comm/alice/status"
 CONFIGURATION = """
 topics:
   history: { depth: 4 }
+  slow: { rate_hz: 2 }
 tf: { rate_hz: 5 }
 services:
   /reset: { timeout_s: 2 }
@@ -45,6 +46,7 @@ status = { priority = 0 }
 map = { priority = 5 }
 history = { priority = 5 }
 camera = { priority = 5 }
+slow = { priority = 5 }
 """
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
@@ -189,6 +191,23 @@ def test_a_remapped_topic_is_sent_under_its_mesh_name(team: tuple[Side, Side]) -
     received = "/alice/mesh_comm/bob/camera"
     bob.node.subscribe(received)
     alice.node.publish_until_received("/sensors/front/camera", "remapped", bob.node, received_as=received)
+
+
+def test_a_topic_with_a_lower_rate_is_throttled(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    with bob.daemon.client() as client:
+        client.subscribe("slow")
+        arrived = published = 0
+
+        def enough() -> bool:
+            nonlocal arrived, published
+            alice.node.publish("/alice/mesh_comm/bob/slow", f"number {published}")
+            published += 1
+            arrived += len(list(client.messages(0.04)))
+            return arrived >= 4
+
+        poll(enough, "four messages at bob's daemon")
+        assert published > 4 * arrived
 
 
 def test_a_type_with_another_hash_is_reported_and_not_published(team: tuple[Side, Side]) -> None:

@@ -17,7 +17,14 @@ from typing import Callable
 import rosgraph
 import rospy
 
+from udp_mesh.bridges.configuration import (
+    EMPTY,
+    BridgeConfiguration,
+    BridgeConfigurationError,
+    load_configuration,
+)
 from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, DaemonClient
+from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.names import (
     Route,
     outbound_name,
@@ -27,6 +34,7 @@ from udp_mesh.bridges.names import (
     undeclared_route,
 )
 from udp_mesh.bridges.position_input import PositionInput
+from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
 from udp_mesh.bridges.runtime import BridgeRuntime
@@ -44,7 +52,7 @@ REFRESH_S = 1.0
 class Ros1Bridge:
     """The running bridge."""
 
-    def __init__(self, daemon: DaemonClient, own: str, given: Parameters) -> None:
+    def __init__(self, daemon: DaemonClient, own: str, given: Parameters, options: BridgeConfiguration = EMPTY) -> None:
         self._daemon = daemon
         self._own = own
         self._refresh_requested = threading.Event()
@@ -54,8 +62,9 @@ class Ros1Bridge:
             log.error("parameter-refused %s", problem)
         wanted = {topic.topic: {"priority": topic.priority} for topic in listed}
         wanted.setdefault(ANY, {"priority": 1})
-        relay = Relay(own, PROTOCOL_TOPICS[1], ros_version=1, nonce=os.urandom(16))
-        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
+        types = {**TYPES, **options.types}
+        relay = Relay(own, PROTOCOL_TOPICS[1], ros_version=1, nonce=os.urandom(16), types=types)
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted, Reducer(options.reductions, 1))
         self._master_gone = False
         self._positions = PositionInput(daemon, 1, given.odometry, [str(frame) for frame in given.tf_frames])
         self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
@@ -151,6 +160,14 @@ def main() -> int:
     stop = threading.Event()
     rospy.on_shutdown(stop.set)
     given = parameters(DEFAULT_SOCKET)
+    try:
+        options = load_configuration(given.config) if given.config else EMPTY
+    except BridgeConfigurationError as error:
+        for line in str(error).splitlines():
+            log.error("configuration-refused %s", line)
+        return 2
+    if options.tf or options.services or options.actions:
+        log.warning("configuration-ignored tf, services and actions: only the ROS 2 bridge carries them")
     daemon = DaemonClient(given.socket, ["*", CONDITIONS_TOPIC])
     own: list[str] = []
 
@@ -164,7 +181,7 @@ def main() -> int:
     _wait_for(named, "daemon")
     if not own:
         return 0
-    bridge = Ros1Bridge(daemon, given.hostname or own[0], given)
+    bridge = Ros1Bridge(daemon, given.hostname or own[0], given, options)
     bridge.start(stop)
 
     def serve() -> None:

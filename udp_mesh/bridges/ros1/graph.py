@@ -88,6 +88,7 @@ class Parameters(NamedTuple):
     host_list: list[object]
     odometry: str = ""
     tf_frames: list[object] = []  # noqa: RUF012 - a tuple's default, never changed
+    config: str = ""
 
 
 class Graph:
@@ -244,6 +245,7 @@ def parameters(default_socket: str) -> Parameters:
         _list_parameter("host_list"),
         str(rospy.get_param("~odometry", "")),
         _list_parameter("tf_frames"),
+        str(rospy.get_param("~config", "")),
     )
 
 

@@ -29,6 +29,7 @@ from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.position_input import PositionInput
+from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import MAX_DEPTH, Quality, common, parse_quality, quality_text, ros2_name
 from udp_mesh.bridges.runtime import BridgeRuntime
@@ -98,7 +99,7 @@ class Ros2Bridge:
         self._node, self._daemon, self._own, self._options = node, daemon, own, options
         relay = Relay(own, PROTOCOL_TOPICS[2], ros_version=2, nonce=os.urandom(16), types={**TYPES, **options.types})
         wanted = TOPIC_SETTINGS if options.tf is not None else {}
-        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted)
+        self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted, Reducer(options.reductions, 2))
         self._calls = Ros2Calls(node, daemon, own, options, os.urandom(8).hex())
         self._gatherer = None if options.tf is None else TransformGatherer(2, options.tf.rate_hz)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
