@@ -1,4 +1,4 @@
-"""`status`, `peers`, `topics`, `logs`, `events`, `metrics`: show the daemon's state."""
+"""`status`, `peers`, `topics`, `logs`, `subscriptions`, `events`, `metrics`: show the daemon's state."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 from udp_mesh.cli.output import Exit, fields_text, print_json, print_json_line, print_text, write_raw, write_text
-from udp_mesh.cli.views import Json, logs_view, peers_view, status_view, topics_view
+from udp_mesh.cli.views import Json, logs_view, peers_view, status_view, subscriptions_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient, MeshError
 from udp_mesh.report.terminal_escapes import clean
 
@@ -32,6 +32,10 @@ def topics(arguments: argparse.Namespace) -> int:
 
 def logs(arguments: argparse.Namespace) -> int:
     return _show(arguments, "logs", logs_view)
+
+
+def subscriptions(arguments: argparse.Namespace) -> int:
+    return _show(arguments, "subscriptions", subscriptions_view)
 
 
 def _show(arguments: argparse.Namespace, op: str, view: Callable[[Json], str]) -> int:

@@ -13,6 +13,7 @@ from pathlib import Path
 from udp_mesh import __version__
 from udp_mesh.cli import change, hosts, inspect, serve, traffic
 from udp_mesh.cli.argument_types import count, ping_s, positive
+from udp_mesh.cli.hints import hint
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
 from udp_mesh.daemon.interface import CONDITIONS_TOPIC, DEFAULT_PATH
@@ -46,6 +47,7 @@ RUNS_UNTIL_INTERRUPTED: tuple[Command, ...] = (
     inspect.peers,
     inspect.topics,
     inspect.logs,
+    inspect.subscriptions,
     inspect.events,
     hosts.hosts,
     traffic.echo,
@@ -75,8 +77,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = parsed.command
         return command(parsed)
     except MeshError as error:
-        hint = _hint(error)
-        print_error(f"{error} ({hint})" if hint else str(error))
+        text = hint(error)
+        print_error(f"{error} ({text})" if text else str(error))
         return Exit.UNREACHABLE if error.code == "unreachable" else Exit.FAILED
     except BrokenPipeError:
         # The reader of standard output has gone away; there is nothing left to write to.
@@ -97,23 +99,6 @@ def _forward(package: str, arguments: list[str]) -> int:
         code = command(arguments)
         sys.stdout.flush()
     return code
-
-
-def _hint(error: MeshError) -> str:
-    """What to do about an error, if known."""
-    match error.code, error.__cause__:
-        case "unreachable", PermissionError():
-            return "run as root or as a member of the group in `socket_group` of [daemon]"
-        case "unreachable", FileNotFoundError() | ConnectionRefusedError():
-            return "start it with `udp-mesh run`, or set --socket or UDP_MESH_SOCKET"
-        case "unknown-peer", _:
-            return "run `udp-mesh peers` for the known peers"
-        case "cannot-record", _ if "File exists" not in str(error):
-            return "the daemon writes the file; as a service it may do so only below /var/lib/udp-mesh"
-        case "unknown-topic", _:
-            return "run `udp-mesh topics` for the configured topics"
-        case _:
-            return ""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -214,6 +199,7 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("peers", inspect.peers, "show peers and their queues"),
         ("topics", inspect.topics, "show topics and their settings"),
         ("logs", inspect.logs, "show shared logs and which nodes have their items"),
+        ("subscriptions", inspect.subscriptions, "show what programs read here and at peers, and what that saves"),
     ):
         parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
         parser.add_argument(
@@ -343,6 +329,8 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     echo.add_argument("topics", nargs="+", metavar="TOPIC", help=f"topics or patterns, or {CONDITIONS_TOPIC}")
     echo.add_argument("--count", type=count, help="exit after this many messages")
     echo.add_argument("--timeout", type=positive, metavar="SECONDS", help="exit after this long without a message")
+    echo.add_argument("--rate", type=positive, metavar="HZ", help="at most this many messages per second and source")
+    echo.add_argument("--max-age", type=positive, metavar="SECONDS", help="leave out what waited longer at its sender")
     echo.add_argument("--raw", action="store_true", help="write only the payloads' bytes")
     ping = _command(
         commands, "ping", traffic.ping, "measure round-trip times to a peer", example="udp-mesh ping base --count 5"

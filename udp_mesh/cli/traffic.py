@@ -141,7 +141,7 @@ def _await_outcomes(mesh: MeshClient, waiting: set[tuple[int, str]], arguments: 
 def echo(arguments: argparse.Namespace) -> int:
     """Prints messages as they arrive."""
     with MeshClient(arguments.socket) as mesh:
-        mesh.subscribe(*arguments.topics)
+        mesh.subscribe(*arguments.topics, rate_hz=arguments.rate, max_age_s=arguments.max_age)
         shown = 0
         while arguments.count is None or shown < arguments.count:
             frame = mesh.next_frame(arguments.timeout)

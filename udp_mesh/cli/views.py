@@ -123,6 +123,10 @@ def status_view(status: Json) -> str:
         f"datagrams: {counters['datagrams_sent']} sent, {counters['datagrams_received']} received; fragments: "
         f"{counters['fragments_retransmitted']} retransmitted, {counters['duplicates_received']} duplicates"
     )
+    saved_messages = sum(peer["saved_messages"] for peer in conditions["peers"])
+    if saved_messages:
+        saved_bytes = sum(peer["saved_bytes"] for peer in conditions["peers"])
+        lines.append(f"not sent because no program there wants it: {saved_messages} messages, {size(saved_bytes)}")
     dropped = {name.removeprefix("dropped_"): n for name, n in counters.items() if name.startswith("dropped_") and n}
     if dropped:
         lines.append("dropped: " + ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in dropped.items()))
@@ -222,6 +226,34 @@ def logs_view(reply: Json) -> str:
     return "\n".join([*lines, table(head, rows)])
 
 
+def subscriptions_view(reply: Json) -> str:
+    """What is read here, then one line per peer and pattern, then what was not sent."""
+    lines = [] if reply["selective"] else ["NOT SELECTIVE: peers are sent everything (selective = false)"]
+    rows = [["here", entry["topics"], *_bounds(entry)] for entry in reply["read_here"]] or [["here", "nothing", "", ""]]
+    for peer in reply["peers"]:
+        if peer["reads"] is None:
+            rows.append([peer["name"], "everything" if peer["known"] else "not known: is sent everything", "", ""])
+        else:
+            read = [[peer["name"], entry["topics"], *_bounds(entry)] for entry in peer["reads"]]
+            rows += read or [[peer["name"], "nothing", "", ""]]
+    lines.append(table(["at", "topics read", "at most", "not older than"], rows))
+    saved = [(peer["name"], peer["saved"]) for peer in reply["peers"]] + [("all", reply["broadcasts_saved"])]
+    kinds = ("unread", "thinned", "aged")
+    rows = [
+        [name, *(text for kind in kinds for text in (str(one[f"{kind}_messages"]), size(one[f"{kind}_bytes"])))]
+        for name, one in saved
+        if any(one[f"{kind}_messages"] for kind in kinds)
+    ]
+    if rows:
+        lines += ["", table(["not sent to", "not read", "", "too many", "", "too old", ""], rows)]
+    return "\n".join(lines)
+
+
+def _bounds(entry: Json) -> tuple[str, str]:
+    rate_hz, max_age_s = entry["rate_hz"], entry["max_age_s"]
+    return "" if rate_hz is None else f"{rate_hz:g} Hz", "" if max_age_s is None else f"{max_age_s:g} s"
+
+
 def _delivery(topic: Json) -> str:
     words = ["reliable" if topic["reliable"] else "best effort"]
     if topic["log"] is not None:
@@ -237,6 +269,8 @@ def _delivery(topic: Json) -> str:
         words.append("compressed")
     if topic["delta"]:
         words.append("differences")
+    if topic["always"]:
+        words.append("always")
     if topic["outbox"] != "none":
         words.append(f"outbox {topic['outbox']}" + (" on disk" if topic["outbox_on_disk"] else ""))
     if topic["destinations"]:

@@ -209,16 +209,24 @@ class MeshClient:
             return None
         return int(self.request("publish", payload, **fields)["message"])
 
-    def subscribe(self, *topics: str, acknowledge: bool = False) -> None:
+    def subscribe(
+        self,
+        *topics: str,
+        acknowledge: bool = False,
+        rate_hz: Optional[float] = None,
+        max_age_s: Optional[float] = None,
+    ) -> None:
         """Subscribes to topics; patterns such as "map/*" and "*" are allowed.
+
+        Peers send only what programs read. With `rate_hz`, only the newest message of each interval comes from each
+        source; with `max_age_s`, none that is older when a peer gets to send it.
 
         With `acknowledge`, messages of topics whose outboxes are on disk have receipts. The daemon keeps each one,
         and sends it to the next program, until `acknowledge` is called for it.
         """
-        if acknowledge:
-            self.request("subscribe", topics=list(topics), acknowledge=True)
-        else:
-            self.request("subscribe", topics=list(topics))
+        given: Header = {"acknowledge": acknowledge or None, "rate_hz": rate_hz, "max_age_s": max_age_s}
+        fields = {name: value for name, value in given.items() if value is not None}
+        self.request("subscribe", topics=list(topics), **fields)
 
     def acknowledge(self, *receipts: int) -> int:
         """Tells the daemon that these messages are processed; returns how many it still kept."""

@@ -74,6 +74,9 @@ class PeerConditions:
     delivered_bytes: int = 0
     received_bytes: int = 0
     """Since its current boot was heard, of authentic datagrams to this node alone, each counted once."""
+    saved_messages: int = 0
+    """Messages not sent because its programs do not want them, since the node's start."""
+    saved_bytes: int = 0
 
 
 @dataclass(slots=True)

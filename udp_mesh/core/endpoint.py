@@ -26,11 +26,13 @@ from udp_mesh.core.receive import receive_datagram
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.relaying import Relaying
 from udp_mesh.core.relaying.snapshot import snapshot
+from udp_mesh.core.selective_sending import SelectiveSending
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
+from udp_mesh.core.subscriptions.messages import TABLE_TOPIC, with_subscription_topics
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
@@ -63,9 +65,11 @@ class Endpoint:
         `log_store` the items of logs (None: in memory). `legacy_positions` are those of the previous run."""
         if len(boot_id) != BOOT_ID_BYTES:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
-        self._state = State(with_log_topics(settings), boot_id, rng, now, store)
+        self._state = State(_with_reserved_topics(settings), boot_id, rng, now, store)
         self._legacy = LegacyPeers(self._state, legacy_positions)
         self._relaying = Relaying(self._state, now)
+        self.selective = SelectiveSending(self._state, now)
+        """What the programs here and at peers read."""
         self._log_store = log_store
         self._logs: SharedLogs | None = None
         self._start_logs(settings, now)
@@ -115,7 +119,7 @@ class Endpoint:
         at = transmit.next_timer(self._state)
         if at is None:
             return None
-        at = min(at, self._relaying.next_at())
+        at = min(at, self._relaying.next_at(), self.selective.next_at)
         if self._legacy:
             at = min(at, self._legacy.next_at())
         return at if self._logs is None else min(at, self._logs.next_at)
@@ -124,6 +128,7 @@ class Endpoint:
         """Do what is due at `now`. Calling early or late is harmless."""
         transmit.handle_timer(self._state, now)
         self._relaying.handle_timer(now)
+        self.selective.handle_timer(now)
         if self._legacy:
             self._legacy.handle_timer(now)
 
@@ -136,7 +141,8 @@ class Endpoint:
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
-        return self._state.next_peer_at() < at or bool(self._state.compression_queue or self._state.versions.jobs)
+        soon = min(self._state.next_peer_at(), self._state.selection.next_at)
+        return soon < at or bool(self._state.compression_queue or self._state.versions.jobs)
 
     @property
     def is_quiet(self) -> bool:
@@ -180,13 +186,14 @@ class Endpoint:
 
         Drops no accepted message. Raises ValueError if the name or port changed: that requires a restart.
         """
-        lines = reconfigure.apply(self._state, with_log_topics(settings), now)
+        lines = reconfigure.apply(self._state, _with_reserved_topics(settings), now)
+        self.selective.apply()
         self._legacy.apply()
         self._relaying.apply(now)
         self._start_logs(settings, now)
         if self._logs is not None:
             self._logs.apply(settings, now)
-        return [line for line in lines if not line.startswith(f"topic {LOG_PREFIX}")]
+        return [line for line in lines if not line.startswith((f"topic {LOG_PREFIX}", f"topic {TABLE_TOPIC}"))]
 
     def logs(self) -> tuple[LogConditions, ...]:
         """A snapshot of each shared log."""
@@ -252,6 +259,10 @@ class Endpoint:
             self._logs.process(now)
 
 
+def _with_reserved_topics(settings: Settings) -> Settings:
+    return with_subscription_topics(with_log_topics(settings))
+
+
 def _snapshot(state: State, now: float) -> Conditions:
     """See `Endpoint.conditions`."""
     idle = Sender(state.settings)
@@ -303,6 +314,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
     fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
     meters = session.meters if session is not None else peer.legacy_meters
     address, link, last_heard = _current_path(peer)
+    saved = state.selection.saved(peer.name)
     return PeerConditions(
         peer.name,
         peer.online,
@@ -333,6 +345,8 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
         sender.sent_bytes,
         sender.delivered_bytes,
         session.received_bytes if session is not None else meters.received.total if meters is not None else 0,
+        saved.messages,
+        saved.bytes,
     )
 
 

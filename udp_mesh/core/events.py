@@ -44,6 +44,8 @@ class ExpiryReason(Enum):
     LOG_FULL = "log full"
     TOO_OLD = "older than the log keeps"
     DISK = "disk error"
+    NOT_WANTED = "not wanted"
+    """No program there reads the topic."""
 
 
 @dataclass(frozen=True, slots=True)

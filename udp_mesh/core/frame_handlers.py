@@ -200,6 +200,8 @@ def deliver(state: State, session: Session, now: float) -> None:
         if number is not None and number < FIRST_UNREPAIRED_NUMBER and repairs is not None:
             repairs.on_received(number, now, receiver.broadcasts.finished)
             state.schedule_repair(session.boot_id, repairs)
+        if state.on_subscriptions(session, message.topic, message.payload, now):
+            continue
         state.event_queue.counters.messages_received += 1
         state.event_queue.emit(
             MessageReceived(

@@ -32,6 +32,7 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.send_quota import pack_until
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
+from udp_mesh.core.subscriptions.messages import is_about_subscriptions
 from udp_mesh.core.versions.outgoing import OutgoingVersion
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import ANNOUNCE_BYTES
@@ -184,8 +185,10 @@ def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, stor
     if peer is None or ((not peer.online) and topic.outbox is not Outbox.NONE):
         _hold(state, name, HeldMessage(accepted, store_key), now)
         return
-    if peer.session is not None:
-        accepted = acceptable(accepted, peer.session)
+    admitted = state.selection.admit(peer, accepted, now)
+    if admitted is None:
+        return
+    accepted = admitted if peer.session is None else acceptable(admitted, peer.session)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
         # Older messages of the topic still wait in the outbox; only urgent ones go ahead of stale ones.
@@ -249,12 +252,19 @@ def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
         accepted = acceptable(accepted, session)
     fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
-        state.broadcasts.push(accepted)
+        broadcast_wanted(state, accepted, now)
     for peer in list(state.peer_table.peers.values()):
         if peer.legacy and not can_publish(accepted.channel.type_name):
             continue
         if (peer.online and (not fits or peer.legacy)) or (not peer.online and topic.outbox is not Outbox.NONE):
             enqueue(state, peer.name, accepted, now)
+
+
+def broadcast_wanted(state: State, accepted: AcceptedMessage, now: float) -> None:
+    """Broadcast a message that fits a datagram, if some peer wants it now."""
+    admitted = state.selection.admit_to_all(state.peer_table.online(), accepted, now)
+    if admitted is not None:
+        state.broadcasts.push(admitted)
 
 
 def broadcast_room(state: State, sessions: Iterable[Session]) -> int:
@@ -353,9 +363,9 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
         accepted = message.accepted
         if message.store_key is not None:
             state.outboxes.forget(message.store_key)
-        if accepted.broadcast_number is not None:
-            continue
         topic = accepted.channel.name
+        if accepted.broadcast_number is not None or is_about_subscriptions(topic):
+            continue
         if outcome is Outcome.SENT:
             continue
         if outcome is Outcome.DELIVERED:
@@ -370,6 +380,8 @@ def report_ended(state: State, peer: Peer, now: float) -> None:
             if message.reliable:
                 state.event_queue.emit(MessagePeerLost(accepted.message_id, peer.name, topic))
         elif isinstance(outcome, ExpiryReason):
+            if outcome is ExpiryReason.DEADLINE:
+                state.selection.on_deadline(peer.name, accepted)
             report_expired(state, peer.name, accepted, outcome)
 
 

@@ -103,9 +103,9 @@ def _changes(old: Settings, new: Settings) -> list[str]:
         lines += [f"{what}: {text}" for text in _differences(getattr(old, what), getattr(new, what))]
     lines += _topic_without_name(old.undeclared, new.undeclared)
     lines += _neighbours(old.neighbours, new.neighbours)
-    for what in ("window", "fragment_bytes"):
+    for what in ("window", "fragment_bytes", "selective"):
         if getattr(old, what) != getattr(new, what):
-            lines.append(f"{what}: {getattr(old, what)} -> {getattr(new, what)}")
+            lines.append(f"{what}: {_shown(getattr(old, what))} -> {_shown(getattr(new, what))}")
     return lines
 
 
@@ -188,6 +188,7 @@ def close(state: State, now: float) -> None:
     if state.closed:
         return
     flush_compression(state, now)
+    state.selection.close()
     for peer in state.peer_table.peers.values():
         sender = peer.sender
         if sender is None:

@@ -130,7 +130,7 @@ class Topic:
     one replaces the oldest (None: no limit). `deadline_s` is a message's lifetime from its `send`. `destinations` lists
     the peers that get a message sent without a destination (empty: all). `repair` lets receivers request a lost
     broadcast again. `delta` sends a message as the difference to the last one that its receiver has, if both have at
-    most `delta_bytes`.
+    most `delta_bytes`. With `always`, it is also sent to peers whose programs do not read it.
     """
 
     name: str
@@ -148,6 +148,7 @@ class Topic:
     log: Log | None = None
     delta: bool = False
     delta_bytes: int = 16 << 20
+    always: bool = False
 
     @property
     def keeps_on_disk(self) -> bool:
@@ -348,7 +349,8 @@ class Settings:
     `window` is "adaptive" or a fixed number of packets in flight per peer (3 in the legacy udp_mesh). `fragment_bytes`
     is the maximum payload of one datagram; a link's MTU may lower it. `undeclared` applies to topics that `topics` does
     not list (None: they are refused). With `confirms`, the driver calls `Endpoint.confirm` for each received message
-    that has a receipt, once the message is safe.
+    that has a receipt, once the message is safe. With `selective`, it announces what its programs read to peers that
+    ask, and sends peers only what theirs read.
     """
 
     name: str
@@ -361,6 +363,7 @@ class Settings:
     window: Literal["adaptive"] | int = "adaptive"
     fragment_bytes: int = 1400
     confirms: bool = False
+    selective: bool = False
     relay: RelaySettings = field(default_factory=RelaySettings)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)

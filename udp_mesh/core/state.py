@@ -5,7 +5,7 @@ The parts, in the order that bytes and messages pass them: `receive` and `frame_
 (conditions out). Each consists of functions of this state and of `now`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from heapq import heappop, heappush
 
 from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
@@ -24,6 +24,7 @@ from udp_mesh.core.sender.message import TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Settings, Topic
+from udp_mesh.core.subscriptions.selection import Selection
 from udp_mesh.core.versions.sent import SentVersions
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
@@ -61,6 +62,10 @@ class State:
         self.compression_queue = CompressionQueue()
         self.versions = SentVersions(settings.limits.version_bytes, self.peer_table.version_counters)
         """What peers have of topics that are sent as differences."""
+        self.selection = Selection()
+        """Which messages peers' programs want."""
+        self.on_subscriptions: Callable[[Session, str, bytes, float], bool] = lambda *_: False
+        """Takes messages about subscriptions, given session, topic, payload and now; False for any other message."""
         self.inflating: dict[Session, None] = {}
         """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)

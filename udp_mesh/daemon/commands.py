@@ -40,6 +40,7 @@ from udp_mesh.daemon.status import (
     topic_json,
     topics_json,
 )
+from udp_mesh.daemon.subscription_requests import subscribe, subscriptions, unsubscribe
 from udp_mesh.daemon.toml_source import ConfigurationError, Source, Table
 from udp_mesh.daemon.topic_settings import topic_from_values
 from udp_mesh.wire.header import VERSION as WIRE_VERSION
@@ -71,13 +72,6 @@ def _text(header: Header, key: str) -> str:
 
 def _optional_text(header: Header, key: str) -> str | None:
     return None if header.get(key) is None else _text(header, key)
-
-
-def _texts(header: Header, key: str) -> list[str]:
-    value = header.get(key)
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise RequestError("bad-request", f"{key}: expected a list of strings, found {value!r}")
-    return value
 
 
 def _values(header: Header, key: str) -> dict[str, object]:
@@ -118,21 +112,11 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
     return later()
 
 
-def subscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscriptions.add(client, _texts(header, "topics"), acknowledge=bool(header.get("acknowledge")))
-    return {}
-
-
 def acknowledge(service: Service, client: Client, header: Header, _: bytes) -> Header:
     receipts = header.get("receipts")
     if not isinstance(receipts, list) or not all(isinstance(item, int) for item in receipts):
         raise RequestError("bad-request", f"receipts: expected a list of numbers, found {receipts!r}")
     return {"acknowledged": service.acknowledge(client, receipts)}
-
-
-def unsubscribe(service: Service, client: Client, header: Header, _: bytes) -> Header:
-    service.subscriptions.remove(client, _texts(header, "topics"))
-    return {}
 
 
 def events(service: Service, client: Client, _header: Header, _: bytes) -> Header:
@@ -246,6 +230,7 @@ def render_metrics(service: Service) -> str:
         about=about,
         uptime_s=driver.now() - service.started,
         latencies=service.latencies.by_priority,
+        broadcasts_saved=driver.node.selective.conditions().broadcasts,
     )
 
 
@@ -370,6 +355,7 @@ COMMANDS = {
     "subscribe": subscribe,
     "acknowledge": acknowledge,
     "unsubscribe": unsubscribe,
+    "subscriptions": subscriptions,
     "events": events,
     "ping": ping,
     "status": status,

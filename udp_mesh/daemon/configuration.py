@@ -66,11 +66,11 @@ MAX_FILE_BYTES = 1 << 20
 RESERVED_TOPICS = (
     # Reliable: a ping measures whether and how fast an urgent message makes the round trip, not whether one datagram
     # does. The conditions report the share of lost datagrams.
-    Topic(PING_TOPIC, priority=0, deadline_s=10.0),
-    Topic(PONG_TOPIC, priority=0, deadline_s=10.0),
-    Topic(BENCH_TOPIC, priority=15, reliable=True),
+    Topic(PING_TOPIC, priority=0, deadline_s=10.0, always=True),
+    Topic(PONG_TOPIC, priority=0, deadline_s=10.0, always=True),
+    Topic(BENCH_TOPIC, priority=15, reliable=True, always=True),
     # The next one comes in seconds: a lost one is not sent again, an old one not at all.
-    Topic(POSITION_TOPIC, priority=13, reliable=False, keep_last=1, deadline_s=5.0),
+    Topic(POSITION_TOPIC, priority=13, reliable=False, keep_last=1, deadline_s=5.0, always=True),
 )
 
 
@@ -195,6 +195,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
         top.report("name", NODE_NAME, name)
     port = top.integer("port", DEFAULT_PORT, 1, 65_535) or DEFAULT_PORT
     window = top.integer_or_word("window", "adaptive", 1, 4096)
+    selective = top.boolean("selective", True)
     fragment_bytes = top.integer("fragment_bytes", 1400, 64, 8192) or 1400
     topics = tuple(read_topic(topic, entry) for topic, entry in top.table("topics").named_tables())
     undeclared = read_topic("*", top.table("undeclared")) if top.has("undeclared") else None
@@ -221,6 +222,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
             window=_window(window),
             fragment_bytes=fragment_bytes,
             confirms=True,
+            selective=selective,
             rates=rates,
             limits=limits,
         )

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.subscriptions.conditions import SavedCounters
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon.latencies import BOUNDS_S, Histogram
 from udp_mesh.daemon.status import TopicCount
@@ -41,6 +42,8 @@ _PEER_COUNTERS = {
     "sent_bytes": "Wire bytes of messages sent to the peer.",
     "received_bytes": "Wire bytes of datagrams from the peer to this node alone.",
     "delivered_bytes": "Payload bytes the peer acknowledged.",
+    "saved_messages": "Messages not sent because the peer's programs do not want them.",
+    "saved_bytes": "Bytes of these messages.",
 }
 _BUILD_LABELS = ("version", "wire_version")
 _QUEUE_GAUGES = (
@@ -62,6 +65,7 @@ def render(
     about: Mapping[str, str],
     uptime_s: float,
     latencies: Mapping[int, Histogram] | None = None,
+    broadcasts_saved: SavedCounters | None = None,
 ) -> str:
     """The Prometheus page; `extra` are counters of the daemon itself, `about` the labels of the info metric,
     `latencies` those of deliveries by priority."""
@@ -103,6 +107,10 @@ def render(
         _family(lines, f"topic_{field_name}_total", "counter", help_text, samples)
     lines += _log_lines(tuple(logs))
     lines += _version_lines(tuple(versions))
+    if broadcasts_saved is not None:
+        for name, total in (("messages", broadcasts_saved.messages), ("bytes", broadcasts_saved.bytes)):
+            help_text = f"{name.capitalize()} to all, not sent because no peer's programs want them."
+            _family(lines, f"broadcasts_saved_{name}_total", "counter", help_text, [({}, total)])
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"

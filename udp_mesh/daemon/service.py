@@ -27,6 +27,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.settings import Settings, Topic
+from udp_mesh.core.subscriptions.messages import Subscription
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
@@ -91,7 +92,7 @@ class Service:
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
-        self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority)
+        self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority, self._announce_subscriptions)
         self._watchers: set[Client] = set()
         self._outcomes: OrderedDict[int, Client] = OrderedDict()
         self.pings = Pings(self.driver)
@@ -108,6 +109,7 @@ class Service:
         if any(one is not None and one.outbox_on_disk for one in (*self.settings.topics, self.settings.undeclared)):
             self.store.check_writable()
         self._publish_conditions()
+        self.subscriptions.announce()
         self.positions.start()
 
     async def close(self) -> None:
@@ -297,6 +299,10 @@ class Service:
         """Records the conditions, and what only the first and the last of them contain."""
         node = self.driver.node
         recorder.conditions(self.driver.conditions(), node.versions(), node.logs())
+
+    def _announce_subscriptions(self, read: list[Subscription]) -> None:
+        self.driver.node.selective.set_subscriptions(read, self.driver.now())
+        self.driver.send_soon()
 
     # Events
 

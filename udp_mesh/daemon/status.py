@@ -16,6 +16,9 @@ from udp_mesh.core.events import Event
 from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import Address, Settings, Topic
+from udp_mesh.core.subscriptions.conditions import SubscriptionConditions
+from udp_mesh.core.subscriptions.messages import Bounds, Subscription
+from udp_mesh.core.subscriptions.table import united
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
@@ -110,6 +113,29 @@ def log_json(log: LogConditions) -> Json:
     assert isinstance(fields, dict)
     fields["missing_readers"] = dict(log.missing_readers)
     return fields
+
+
+def subscriptions_json(conditions: SubscriptionConditions, here: Iterable[Subscription]) -> Json:
+    """What programs read `here` and at each peer (null: everything), and what was saved."""
+    return {
+        "selective": conditions.selective,
+        "read_here": _subscriptions(united(here)),
+        "announced": None if conditions.own is None else _subscriptions(dict(conditions.own)),
+        "peers": [
+            {
+                "name": peer.name,
+                "known": peer.known,
+                "reads": None if peer.subscriptions is None else _subscriptions(dict(peer.subscriptions)),
+                "saved": plain(peer.saved),
+            }
+            for peer in conditions.peers
+        ],
+        "broadcasts_saved": plain(conditions.broadcasts),
+    }
+
+
+def _subscriptions(by_pattern: Mapping[str, Bounds]) -> list[Json]:
+    return [{"topics": pattern, **bounds._asdict()} for pattern, bounds in sorted(by_pattern.items())]
 
 
 def relaying_json(relaying: RelayConditions) -> Json:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import fnmatch
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
+from functools import reduce
 
 from udp_mesh.client.mesh_client import Header, encode_frame
 from udp_mesh.core.events import MessageReceived
+from udp_mesh.core.subscriptions.messages import UNBOUNDED, Bounds, Subscription
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.inbox import Inbox, LoggedItem
+from udp_mesh.daemon.interface import RESERVED_PREFIX
+from udp_mesh.daemon.thinning import Thinning
 
 MAX_PATTERNS = 1024
 """Patterns per client: each is matched against each new topic."""
@@ -22,62 +26,92 @@ READ_TIMEOUT_S = 30.0
 
 
 class Subscriptions:
-    """`spawn` runs a task; `priority` is that of a topic."""
+    """`spawn` runs a task; `priority` is that of a topic; `on_change` gets what programs read after each change."""
 
     def __init__(
         self,
         inbox: Inbox,
         spawn: Callable[[Coroutine[None, None, None]], None],
         priority: Callable[[str], int],
+        on_change: Callable[[list[Subscription]], None] = lambda _: None,
     ) -> None:
         self._inbox = inbox
         self._spawn = spawn
         self._priority = priority
-        self._patterns: dict[Client, list[str]] = {}
+        self._on_change = on_change
+        self._is_scheduled = False
+        self._patterns: dict[Client, dict[str, Bounds]] = {}
+        self._thinning: Thinning | None = None
         self._acknowledging: set[Client] = set()
         """Clients that acknowledge messages with receipts."""
-        self._routes: dict[str, list[Client]] = {}
+        self._routes: dict[str, dict[Client, float | None]] = {}
+        """By topic, its subscribers with the maximum rate of each."""
         self._passing_on = False
         self._full: set[Client] = set()
         """Clients that did not take a held message: they get no more until they have read what was sent to them."""
         self._reads: dict[LoggedItem, float] = {}
         """Items of logs being read for programs, with the time of the request."""
 
-    def add(self, client: Client, patterns: list[str], *, acknowledge: bool) -> None:
-        """Raises RequestError for too many patterns."""
-        wanted = self._patterns.setdefault(client, [])
-        # A client may subscribe to the same pattern repeatedly; store it once.
-        new = [pattern for pattern in dict.fromkeys(patterns) if pattern not in wanted]
-        if len(wanted) + len(new) > MAX_PATTERNS:
+    def add(
+        self, client: Client, patterns: list[str], bounds: Bounds = UNBOUNDED, *, acknowledge: bool = False
+    ) -> None:
+        """The last bounds of a pattern count. Raises RequestError for too many patterns."""
+        wanted = {**self._patterns.get(client, {}), **dict.fromkeys(patterns, bounds)}
+        if len(wanted) > MAX_PATTERNS:
             raise RequestError("too-many", f"a client may subscribe to at most {MAX_PATTERNS} patterns")
-        wanted.extend(new)
+        self._patterns[client] = wanted
         if acknowledge:
             self._acknowledging.add(client)
-        self._routes.clear()
+        self._changed()
         self.pass_on_held()
 
-    def remove(self, client: Client, patterns: list[str]) -> None:
-        kept = [pattern for pattern in self._patterns.get(client, ()) if pattern not in patterns]
-        self._patterns[client] = kept
+    def _changed(self) -> None:
+        """Announces all changes of this turn of the loop at once."""
         self._routes.clear()
+        if not self._is_scheduled:
+            self._is_scheduled = True
+            asyncio.get_running_loop().call_soon(self.announce)
+
+    def announce(self) -> None:
+        """Passes on what programs read."""
+        self._is_scheduled = False
+        self._on_change(self.read_here())
+
+    def remove(self, client: Client, patterns: list[str]) -> None:
+        kept = {
+            pattern: bounds for pattern, bounds in self._patterns.get(client, {}).items() if pattern not in patterns
+        }
+        self._patterns[client] = kept
+        self._changed()
+
+    def read_here(self) -> list[Subscription]:
+        """What programs read, other than what never crosses the network; repeated if several do."""
+        return [
+            Subscription(pattern, bounds)
+            for patterns in self._patterns.values()
+            for pattern, bounds in patterns.items()
+            if not pattern.startswith(RESERVED_PREFIX)
+        ]
 
     def remove_client(self, client: Client) -> None:
         self._patterns.pop(client, None)
         self._acknowledging.discard(client)
         self._full.discard(client)
-        self._routes.clear()
+        if self._thinning is not None:
+            self._thinning.remove_client(client)
+        self._changed()
         self._inbox.client_gone(client)
         self.pass_on_held()
 
-    def clients(self, topic: str) -> list[Client]:
-        """The clients subscribed to a topic."""
+    def clients(self, topic: str) -> dict[Client, float | None]:
+        """The clients subscribed to a topic, with the maximum rate that each of them wants."""
         clients = self._routes.get(topic)
         if clients is None:
-            clients = [
-                client
-                for client, patterns in self._patterns.items()
-                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
-            ]
+            clients = {}
+            for client, patterns in self._patterns.items():
+                matching = [bounds for pattern, bounds in patterns.items() if fnmatch.fnmatchcase(topic, pattern)]
+                if matching:
+                    clients[client] = reduce(Bounds.united, matching).rate_hz
             if len(self._routes) >= MAX_ROUTES:
                 self._routes.clear()
             self._routes[topic] = clients
@@ -96,8 +130,11 @@ class Subscriptions:
         if message.receipt is None:
             if clients:
                 frame = encode_frame(header, message.payload)
-                for client in clients:
-                    client.send_encoded(frame)
+                for client, rate_hz in clients.items():
+                    if rate_hz is None:
+                        client.send_encoded(frame)
+                    else:
+                        self._thinned().send(client, (message.topic, message.source), rate_hz, frame)
             return
         key = self._inbox.add(message)
         self._send_held(clients, key, header, message.payload)
@@ -108,7 +145,13 @@ class Subscriptions:
             if not self._reads:
                 self.pass_on_held()
 
-    def _send_held(self, clients: list[Client], key: int, header: Header, payload: bytes) -> None:
+    def _thinned(self) -> Thinning:
+        if self._thinning is None:
+            loop = asyncio.get_running_loop()
+            self._thinning = Thinning(loop.time, loop.call_at)
+        return self._thinning
+
+    def _send_held(self, clients: Iterable[Client], key: int, header: Header, payload: bytes) -> None:
         for client in clients:
             acknowledges = client in self._acknowledging
             if client.send_encoded(encode_frame({**header, "receipt": key} if acknowledges else header, payload)):

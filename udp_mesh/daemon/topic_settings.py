@@ -50,6 +50,7 @@ def read_topic(name: str, table: Table) -> Topic:
         outbox_on_disk=table.boolean("outbox_on_disk", default.outbox_on_disk),
         repair=table.boolean("repair", default.repair),
         delta=table.boolean("delta", default.delta),
+        always=table.boolean("always", default.always),
         delta_bytes=or_default(table.integer("delta_bytes", default.delta_bytes, 1, 1 << 30), default.delta_bytes),
     )
     log = _read_log(table.table("log")) if table.has("log") else None

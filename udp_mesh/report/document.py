@@ -121,6 +121,12 @@ def _message_tables(recording: Recording) -> list[dict[str, Any]]:
             ),
             "On the wire: without headers and retransmissions, once for each destination.",
         ),
+        _table(
+            "Not sent",
+            "peer|#messages|#MB",
+            ((peer, str(messages), f"{size / 1e6:.2f}") for peer, messages, size in figures.saved(recording)),
+            "No program at the peer reads the topic, or wants it that often or that old.",
+        ),
     ]
 
 

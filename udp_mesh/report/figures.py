@@ -136,6 +136,15 @@ def differences(recording: Recording) -> list[tuple[str, VersionTotals]]:
     return [(topic, totals) for topic, totals in spans if totals.whole or totals.differences]
 
 
+def saved(recording: Recording) -> list[tuple[str, int, int]]:
+    """By peer, the messages and bytes not sent to it during the recording, because no program there wants them."""
+    spans = (
+        (peer, last.messages - first.messages, last.bytes - first.bytes)
+        for peer, (first, last) in sorted(recording.saved.items())
+    )
+    return [(peer, messages, size) for peer, messages, size in spans if messages > 0]
+
+
 def sent_topics(recording: Recording) -> list[SentTopic]:
     """Every topic with sent messages or outcomes, most urgent first."""
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
@@ -200,6 +209,7 @@ def summary(recording: Recording) -> dict[str, Any]:
             }
             for topic, totals in differences(recording)
         ],
+        "saved": [{"peer": peer, "messages": messages, "bytes": size} for peer, messages, size in saved(recording)],
         "logs": [
             {"topic": topic, "source": source, **asdict(progress)}
             for (topic, source), progress in sorted(recording.logs.items())

@@ -7,7 +7,8 @@ start), `kind`, and `at` (the node whose view it is) unless that is the node of 
 - `message-delivered` (`latency_s`), `message-expired`, `message-peer-lost`: `peer`, `topic`,
 - `peer-online`, `peer-offline`: `peer`,
 - `conditions`: `peers`, a list of `name`, `online`, `round_trip_s`, `loss`, `received_bits_per_s`,
-  `capacity_bits_per_s`, `outbox_messages`, `hops` (all but the name are optional); optional `versions` (by `topic`:
+  `capacity_bits_per_s`, `outbox_messages`, `hops`, `saved_messages` and `saved_bytes` (totals; all but the name are
+  optional); optional `versions` (by `topic`:
   `whole_sent`, `differences_sent`, `payload_bytes_sent`, `body_bytes_sent`, totals) and `logs` (by `topic` and
   `source`: `received_items`, `known_items`, `held_bytes`),
 - `place`: `x`, `y` in meters (simulated runs),
@@ -126,6 +127,14 @@ class SentOutcome:
 
 
 @dataclass(frozen=True, slots=True)
+class SavedTotals:
+    """What a peer was not sent because no program there wants it, since the daemon's start."""
+
+    messages: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class RecordedEvent:
     t: float
     at: str
@@ -151,6 +160,8 @@ class Recording:
     """By topic: at the beginning of the recording, and last."""
     logs: dict[tuple[str, str], LogProgress] = field(default_factory=dict)
     """By topic and source."""
+    saved: dict[str, tuple[SavedTotals, SavedTotals]] = field(default_factory=dict)
+    """By peer: at the beginning of the recording, and last."""
     snapshots: int = 0
     """Lines with conditions."""
     missing_lines: int = 0
@@ -296,6 +307,11 @@ def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], onli
     keys = [key for key in _SAMPLED if entry.get(key) is not None and now_online is not False]
     known: dict[str, Any] = {key: _number(entry, key, 0.0, MAX_SAMPLE) for key in keys}
     recording.samples.append(Sample(t, at, name, **known))
+    if "saved_messages" in entry:
+        totals = SavedTotals(_integer(entry, "saved_messages"), _integer(entry, "saved_bytes"))
+        # A peer that is first seen later was sent nothing before.
+        begin = SavedTotals() if recording.snapshots > 1 else totals
+        recording.saved[name] = (recording.saved.get(name, (begin, totals))[0], totals)
     if isinstance(now_online, bool) and now_online != online.get(name, False):
         online[name] = now_online
         recording.presences.append(Presence(t, at, name, now_online))

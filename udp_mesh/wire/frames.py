@@ -41,6 +41,8 @@ class Feature:
     """Keeps versions of a topic's content and accepts differences to them (see `version`)."""
     RELAY = 256
     """Accepts relay datagrams: it can be reached through relays, and may be one."""
+    SUBSCRIPTIONS = 512
+    """Answers a question for what its programs read, and needs no other messages."""
 
 
 class Waiting(NamedTuple):

@@ -175,7 +175,8 @@ def test_versions_of_a_topic_are_shown_as_text_json_and_metrics(pair: Pair, run:
     alice, bob = pair
     grid = random.Random(2).randbytes(5000)
     assert run("set", "topic", "grid", "delta=true", "delta_bytes=20000")[0] == Exit.OK
-    with alice.client() as client:
+    with alice.client() as client, bob.client() as reader:
+        reader.subscribe("grid")
         for number in range(3):
             client.publish("grid", grid + bytes([number]) * 40, to="bob", notify=True)
             assert set(outcomes(client, 1).values()) == {"delivered"}

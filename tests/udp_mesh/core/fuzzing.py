@@ -19,7 +19,10 @@ from typing import NamedTuple
 
 from tests.udp_mesh.core.pair import Pair, pair, settings
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
+from tests.udp_mesh.wire.subscription_vectors import SUBSCRIPTIONS
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour
+from udp_mesh.core.subscriptions.messages import decode_message, encode_ask, encode_table
+from udp_mesh.core.subscriptions.table import KnownTable
 from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
@@ -46,6 +49,9 @@ class Fuzzer:
         self.seeds = [encode(frames) for frames in FRAMES.values()]
         self.legacy_seeds = [encode_legacy(datagram) for datagram in LEGACY.values()]
         self.legacy_seeds += fragment_legacy(encode_mesh_data(MESH_DATA))
+        self.subscription_seeds = [
+            encode_ask() if table is None else encode_table(table) for table in SUBSCRIPTIONS.values()
+        ]
         self.pair = self._new_pair()
 
     def _new_pair(self) -> Pair:
@@ -161,9 +167,20 @@ def legacy(fuzzer: Fuzzer) -> None:
     fuzzer.pair.b.receive(data, "mesh", LEGACY_ADDRESS, fuzzer.pair.now)
 
 
+def subscriptions(fuzzer: Fuzzer) -> None:
+    """Messages of a key holder about what its programs read."""
+    seeds = fuzzer.subscription_seeds
+    try:
+        table = decode_message(fuzzer.mutated(seeds[fuzzer.rng.getrandbits(16) % len(seeds)]))
+    except DecodeError:
+        return
+    if table is not None:
+        KnownTable(table, fuzzer.pair.now).bounds("artifacts/1")
+
+
 SURFACES = {
     surface.__name__: surface
-    for surface in (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy)
+    for surface in (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy, subscriptions)
 }
 
 

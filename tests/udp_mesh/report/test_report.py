@@ -305,6 +305,30 @@ def test_the_gain_of_differences_is_that_of_the_recording_alone() -> None:
     assert [row[0] for row in shown["rows"]] == ["late", "map"]
 
 
+def test_what_peers_were_not_sent_is_that_of_the_recording_alone() -> None:
+    def peers(**saved: tuple[int, int]) -> list[dict[str, object]]:
+        return [{"name": name, "saved_messages": count, "saved_bytes": size} for name, (count, size) in saved.items()]
+
+    def conditions(t: float, **saved: tuple[int, int]) -> bytes:
+        return json.dumps({"t": t, "kind": "conditions", "peers": peers(**saved)}).encode()
+
+    recording = parse(
+        [
+            header("husky", 0.0).encode(),
+            conditions(0.0, base=(10, 1_000_000), idle=(3, 300)),
+            conditions(1.0, base=(14, 3_500_000), idle=(3, 300), late=(1, 10_000)),
+        ],
+        "r.jsonl",
+    )
+    assert recording.problems == []
+    assert summary(recording)["saved"] == [
+        {"peer": "base", "messages": 4, "bytes": 2_500_000},
+        {"peer": "late", "messages": 1, "bytes": 10_000},
+    ]
+    shown = next(table for table in document_of(recording)["tables"] if table["title"] == "Not sent")
+    assert shown["rows"] == [["base", "4", "2.50"], ["late", "1", "0.01"]]
+
+
 def test_shared_logs_are_shown_as_they_were_last() -> None:
     rows = [{"topic": "artifact", "source": "<spot>", "received_items": 3, "known_items": 5, "held_bytes": 2_000_000}]
     recording = parse([header("base", 0.0).encode(), snapshot(0.0), snapshot(1.0, logs=rows)], "r.jsonl")

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.udp_mesh.wire.subscription_vectors import make_subscriptions
 from udp_mesh.core.relaying.hop_channel import HopChannels, hop_key, membership_proof
 from udp_mesh.crypto import Key, SendChannel
 from udp_mesh.wire.codec import encode
@@ -352,6 +353,7 @@ def make_relay() -> object:
 MAKERS = {
     "frames.json": make_frames,
     "sealed.json": make_sealed,
+    "subscriptions.json": make_subscriptions,
     "versions.json": make_versions,
     "relay.json": make_relay,
     "legacy.json": make_legacy,

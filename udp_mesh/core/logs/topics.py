@@ -16,8 +16,8 @@ def with_log_topics(settings: Settings) -> Settings:
     logs = [topic for topic in settings.topics if topic.log is not None]
     if not logs:
         return settings
-    control = Topic(CONTROL_TOPIC, priority=min(topic.priority for topic in logs))
-    items = tuple(replace(topic, name=item_topic(topic.name), log=None) for topic in logs)
+    control = Topic(CONTROL_TOPIC, priority=min(topic.priority for topic in logs), always=True)
+    items = tuple(replace(topic, name=item_topic(topic.name), log=None, always=True) for topic in logs)
     return replace(settings, topics=(*settings.topics, control, *items))
 
 

@@ -33,6 +33,8 @@ def own_features(settings: Settings) -> int:
         features |= Feature.LOGS
     if settings.relay.hops > 1:
         features |= Feature.RELAY
+    if settings.selective:
+        features |= Feature.SUBSCRIPTIONS
     return features
 
 

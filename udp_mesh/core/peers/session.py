@@ -22,6 +22,7 @@ from udp_mesh.core.receiver.receiver import Receiver
 from udp_mesh.core.sender.path import Path
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
+from udp_mesh.core.subscriptions.table import KnownTable
 from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
 from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
 from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
@@ -187,6 +188,7 @@ class Session:
         "receiver",
         "reception",
         "state",
+        "subscriptions",
         "versions",
     )
 
@@ -224,6 +226,8 @@ class Session:
         self.interval_s = settings.rates.heartbeat_s
         self.versions = (1, 1)
         self.features = 0
+        self.subscriptions: KnownTable | None = None
+        """What its programs read; None until it announced that."""
         self.receiver = Receiver(settings.rates, settings.limits, memory or MemoryBudget(1 << 62))
         self.path = Path(SendChannel(keys[0], own_boot, boot_id))
         self.pending_control: list[Frame] = []
