@@ -9,6 +9,9 @@
       /get_map: { timeout_s: 5 }
     actions:
       /move: { lost_s: 30 }
+    receive:
+      map: {}
+      video: { rate_hz: 1, max_age_s: 2 }
     types:
       my_msgs/Gas: |
         Header header
@@ -23,6 +26,7 @@ from pathlib import Path
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Tuple
 
 from udp_mesh.bridges.message_definition import DefinitionError, MessageDefinition
+from udp_mesh.bridges.receiving import Receive
 from udp_mesh.bridges.reduction import JpegOptions, Reduction
 
 
@@ -55,6 +59,7 @@ class BridgeConfiguration(NamedTuple):
     services: Dict[str, ServiceOptions]
     actions: Dict[str, ActionOptions]
     types: Dict[str, MessageDefinition]
+    receive: Tuple[Receive, ...] = ()
 
     @property
     def reductions(self) -> Dict[str, Reduction]:
@@ -89,7 +94,7 @@ def parse_configuration(text: str, path: str) -> BridgeConfiguration:
         raise BridgeConfigurationError("{}: {}".format(path, " ".join(str(error).split()))) from error
     if root is None:
         return EMPTY
-    found = reader.mapping(root, "", {"topics", "tf", "services", "actions", "types"})
+    found = reader.mapping(root, "", {"topics", "tf", "services", "actions", "types", "receive"})
     configuration = BridgeConfiguration(
         {name: _topic(reader, node, at) for name, (node, at) in reader.named(found.get("topics"), "topics").items()},
         _tf(reader, found["tf"]) if "tf" in found else None,
@@ -102,6 +107,10 @@ def parse_configuration(text: str, path: str) -> BridgeConfiguration:
             for name, (node, at) in reader.absolute(found.get("actions"), "actions").items()
         },
         _types(reader, found.get("types")),
+        tuple(
+            Receive(name, **reader.numbers(node, at, {"rate_hz": (0.001, 1e6), "max_age_s": (0.001, 1e6)}))
+            for name, (node, at) in reader.named(found.get("receive"), "receive").items()
+        ),
     )
     if reader.problems:
         raise BridgeConfigurationError("\n".join(reader.problems))

@@ -13,6 +13,7 @@ import threading
 import time
 from typing import Any, Callable, Mapping, Sequence
 
+from udp_mesh.bridges.receiving import EVERYTHING, Receive
 from udp_mesh.client.mesh_client import Frame, Header, MeshClient, MeshError
 
 log = logging.getLogger(__name__)
@@ -29,9 +30,9 @@ LOG_INTERVAL_S = 10.0
 class DaemonClient:
     """The daemon, as seen by a bridge."""
 
-    def __init__(self, path: str, patterns: Sequence[str]) -> None:
+    def __init__(self, path: str, received: Sequence[Receive] = EVERYTHING) -> None:
         self._path = path
-        self._patterns = list(patterns)
+        self._received = list(received)
         self._client: MeshClient | None = None
         self._commands: MeshClient | None = None
         self._command_lock = threading.Lock()
@@ -46,7 +47,8 @@ class DaemonClient:
         while not stop.is_set():
             try:
                 with MeshClient(self._path) as client:
-                    client.subscribe(*self._patterns)
+                    for each in self._received:
+                        client.subscribe(each.pattern, rate_hz=each.rate_hz, max_age_s=each.max_age_s)
                     client.request("events")
                     self._client = client
                     log.info("daemon-connected socket=%s", self._path)

@@ -26,6 +26,7 @@ except ModuleNotFoundError as error:
 
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.envelope import TYPE, Envelope, EnvelopeError, open_envelope, seal
+from udp_mesh.bridges.receiving import Receive, parse_receive, with_needed
 from udp_mesh.bridges.rmw_zenoh import (
     CARRIED,
     HISTORY,
@@ -287,7 +288,22 @@ def arguments() -> argparse.ArgumentParser:
         metavar="[DOMAIN:]/ros/topic=TOPIC[@PEER,...]",
         help="carry a ROS 2 topic of rmw_zenoh on a mesh topic (repeatable)",
     )
+    parser.add_argument(
+        "--receive",
+        action="append",
+        default=[],
+        type=_receive,
+        metavar="'TOPIC [rate_hz=HZ] [max_age_s=S]'",
+        help="receive this topic or pattern, and no other; peers send nothing else (repeatable; default: all)",
+    )
     return parser
+
+
+def _receive(text: str) -> Receive:
+    try:
+        return parse_receive(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -307,7 +323,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     with session:
-        daemon = DaemonClient(options.socket, ["*"])
+        daemon = DaemonClient(options.socket, with_needed(options.receive, [PROTOCOL_TOPIC]))
         bridge = ZenohBridge(daemon, session, [*options.route, *options.ros2])
         bridge.start()
         thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)

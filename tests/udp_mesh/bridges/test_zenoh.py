@@ -52,11 +52,11 @@ class Side:
     bridge: subprocess.Popen[bytes] | None = None
     kept: list[Any] = field(default_factory=list)
 
-    def start_bridge(self, mode: str = "peer") -> None:
+    def start_bridge(self, mode: str = "peer", more: tuple[str, ...] = ()) -> None:
         command = [sys.executable, "-m", "udp_mesh.bridges.zenoh_bridge", "--socket", str(self.daemon.socket)]
         for key, value in {**settings(connect=self.port), "mode": json.dumps(mode)}.items():
             command += ["--set", f"{key}={value}"]
-        command += ["--route", "demo/**=map", "--ros2", "/chatter=status", "--ros2", "/tf_static=map"]
+        command += ["--route", "demo/**=map", "--ros2", "/chatter=status", "--ros2", "/tf_static=map", *more]
         with (self.daemon.folder / f"{self.daemon.name}-zenoh.log").open("ab") as log:
             self.bridge = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT)
 
@@ -271,3 +271,26 @@ def test_a_restarted_daemon_is_found_again(team: tuple[Side, Side]) -> None:
     alice.put_until_seen(bob, "demo/again", b"after the restart")
     assert bob.bridge is not None
     assert bob.bridge.poll() is None
+
+
+def test_a_bridge_asks_for_the_topics_that_it_is_to_receive(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    bob.stop_bridge()
+    bob.start_bridge(more=("--receive", "status", "--receive", "video rate_hz=5 max_age_s=2"))
+
+    def reads() -> list[dict[str, Any]] | None:
+        with alice.daemon.client() as client:
+            # Asks if it is not known yet.
+            client.publish("map", b"", to="bob")
+            (peer,) = client.request("subscriptions")["peers"]
+            found: list[dict[str, Any]] | None = peer["reads"]
+        return found if found is not None and len(found) == 3 else None
+
+    assert poll(reads, "alice knows what bob's bridge receives") == [
+        {"topics": "bridge/zenoh", "rate_hz": None, "max_age_s": None},
+        {"topics": "status", "rate_hz": None, "max_age_s": None},
+        {"topics": "video", "rate_hz": 5.0, "max_age_s": 2.0},
+    ]
+    bob.stop_bridge()
+    bob.start_bridge()
+    alice.put_until_seen(bob, "demo/after", b"everything again")

@@ -34,6 +34,7 @@ from udp_mesh.bridges.names import (
     undeclared_route,
 )
 from udp_mesh.bridges.position_input import PositionInput
+from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
@@ -168,7 +169,8 @@ def main() -> int:
         return 2
     if options.tf or options.services or options.actions:
         log.warning("configuration-ignored tf, services and actions: only the ROS 2 bridge carries them")
-    daemon = DaemonClient(given.socket, ["*", CONDITIONS_TOPIC])
+    received = with_needed((*given.receive, *options.receive), ["bridge/*"])
+    daemon = DaemonClient(given.socket, [*received, Receive(CONDITIONS_TOPIC)])
     own: list[str] = []
 
     def named() -> bool:

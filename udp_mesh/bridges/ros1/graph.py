@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 import xmlrpc.client
-from typing import Any, Callable, Mapping, NamedTuple
+from typing import Any, Callable, Mapping, NamedTuple, Sequence
 
 import rosgraph
 import roslib.message
@@ -22,6 +22,7 @@ import rospy
 from std_msgs.msg import String
 
 from udp_mesh.bridges.names import Route
+from udp_mesh.bridges.receiving import Receive, parse_receive
 from udp_mesh.bridges.relay import ToRos
 from udp_mesh.bridges.ros1 import legacy
 from udp_mesh.bridges.ros1.publications import Publications, RosPublication
@@ -89,6 +90,7 @@ class Parameters(NamedTuple):
     odometry: str = ""
     tf_frames: list[object] = []  # noqa: RUF012 - a tuple's default, never changed
     config: str = ""
+    receive: Sequence[Receive] = ()
 
 
 class Graph:
@@ -246,7 +248,19 @@ def parameters(default_socket: str) -> Parameters:
         str(rospy.get_param("~odometry", "")),
         _list_parameter("tf_frames"),
         str(rospy.get_param("~config", "")),
+        _receive_parameter(),
     )
+
+
+def _receive_parameter() -> list[Receive]:
+    """`~receive`; without a valid entry, everything is received."""
+    found: list[Receive] = []
+    for entry in _list_parameter("receive"):
+        try:
+            found.append(parse_receive(str(entry)))
+        except ValueError as error:
+            log.error("parameter-refused receive: %s", error)
+    return found
 
 
 def _list_parameter(name: str) -> list[object]:

@@ -29,6 +29,7 @@ from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.position_input import PositionInput
+from udp_mesh.bridges.receiving import with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import MAX_DEPTH, Quality, common, parse_quality, quality_text, ros2_name
@@ -263,7 +264,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         metavar=("MAP", "ROBOT"),
         help="take the robot's position from /tf: the map's frame and the robot's",
     )
-    parser.add_argument("--config", default="", metavar="FILE", help="the bridge's file: topics, tf, services, actions")
+    parser.add_argument("--config", default="", metavar="FILE", help="the bridge's file (docs/bridges.md)")
     options, ros_arguments = parser.parse_known_args(argv)
     try:
         configuration = load_configuration(options.config) if options.config else EMPTY
@@ -271,7 +272,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("{}\n".format(error))
         return 2
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
-    daemon = DaemonClient(options.socket, ["*"])
+    merged = [TF, TF_STATIC] if configuration.tf is not None and configuration.tf.merge else []
+    daemon = DaemonClient(options.socket, with_needed(configuration.receive, ["bridge/*", *merged]))
     stop = threading.Event()
     rclpy.init(args=ros_arguments)
     try:
