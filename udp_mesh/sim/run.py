@@ -54,6 +54,8 @@ class RunResult:
     ledger: Ledger
     counts: ChannelCounters
     observer_bytes: dict[str, int]
+    saved: tuple[int, int] = (0, 0)
+    """Messages and bytes that robots did not send because no program wants them, since each last started."""
 
     def summary(self) -> dict[str, Any]:
         """The totals as JSON values."""
@@ -68,6 +70,7 @@ class RunResult:
             "expired": self.ledger.total(MessageExpired),
             "peer_lost": self.ledger.total(MessagePeerLost),
             "ended_twice": len(self.ledger.ended_twice),
+            "saved": {"messages": self.saved[0], "bytes": self.saved[1]},
             "observer_bytes": dict(self.observer_bytes),
             "channel": {
                 "airtime_share": self.counts.airtime_s / self.scenario.duration_s,
@@ -96,7 +99,9 @@ class _Run:
         self.rng = random.Random(scenario.seed)
         self.trajectories: dict[str, Trajectory] = {**scenario.robots, **scenario.relays}
         self.settings = {
-            name: Settings(name, unkeyed=True, topics=scenario.topics, window=scenario.window)
+            name: Settings(
+                name, unkeyed=True, topics=scenario.topics, window=scenario.window, selective=bool(scenario.reads)
+            )
             for name in scenario.robots
         }
         self.random_bytes = self.rng.randbytes(MAX_MESSAGE_BYTES)
@@ -108,6 +113,12 @@ class _Run:
             self.settings, relays=scenario.relays, channel=scenario.channel, loss=self._loss, seed=scenario.seed,
             on_event=self._on_event,
         )  # fmt: skip
+        for robot in scenario.robots:
+            self._subscribe(robot)
+
+    def _subscribe(self, robot: str) -> None:
+        if robot in self.scenario.reads:
+            self.team.subscribe(robot, self.scenario.reads[robot])
 
     def _loss(self, a: str, b: str, now: float) -> float:
         return self.scenario.air.loss(self.trajectories[a].at(now), self.trajectories[b].at(now))
@@ -133,6 +144,7 @@ class _Run:
                 self.team.crash(incident.who)
             case "restart":
                 self.team.restart(incident.who, self.settings[incident.who])
+                self._subscribe(incident.who)
             case _:
                 raise ValueError(f"unknown incident {incident.what}")
 
@@ -195,6 +207,8 @@ def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: Non
     """Runs to the end; calls `progress` with the virtual time about once per virtual second."""
     run = _Run(scenario)
     run.run(progress)
+    saved = [run.team.saved(robot) for robot in scenario.robots]
     return RunResult(
-        scenario, run.lines, run.topics, run.offered, run.team.ledger, run.team.medium.counts, run.observer_bytes
-    )
+        scenario, run.lines, run.topics, run.offered, run.team.ledger, run.team.medium.counts, run.observer_bytes,
+        (sum(messages for messages, _ in saved), sum(size for _, size in saved)),
+    )  # fmt: skip

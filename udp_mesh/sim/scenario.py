@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ import yaml
 from udp_mesh.core.settings import MAX_COPIES, Log, Outbox, Settings, Topic
 from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
+from udp_mesh.sim.reads import Reads, read_reads
 from udp_mesh.sim.yaml_entry import Entry
 
 _MAX_SHOWN_PROBLEMS = 20
@@ -75,7 +76,8 @@ INCIDENTS = ("off", "on", "crash", "restart")
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """`robots` and `relays` map names to trajectories; a relay may `appear` later (a beacon that is dropped)."""
+    """`robots` and `relays` map names to trajectories; a relay may `appear` later (a beacon that is dropped). `reads`:
+    what the programs of each robot read (not listed: everything); if any is listed, all send selectively."""
 
     name: str
     seed: int
@@ -90,6 +92,7 @@ class Scenario:
     incidents: tuple[Incident, ...]
     observer: str
     window: Literal["adaptive"] | int
+    reads: Reads = field(default_factory=dict)
 
 
 def load(path: Path) -> Scenario:
@@ -130,7 +133,7 @@ def parse(raw: bytes, file: str) -> Scenario:
 
 _KEYS = (
     "name", "seed", "duration_s", "observer", "window", "channel", "air", "robots", "relays", "topics", "flows",
-    "incidents",
+    "incidents", "reads",
 )  # fmt: skip
 
 
@@ -178,6 +181,7 @@ def _scenario(at: Entry, name: str) -> Scenario:
         flows=tuple(_flow(item, topic_names, tuple(robots)) for item in get("flows").items()),
         incidents=tuple(_incident(item, tuple(robots), tuple(relays)) for item in get("incidents").items()),
         observer=get("observer").text(next(iter(robots), ""), tuple(robots)),
+        reads=read_reads(get("reads"), tuple(robots)),
         window="adaptive" if window == "adaptive" else get("window").integer(3, minimum=1, maximum=4096),
     )
 
@@ -252,13 +256,13 @@ def _path_loss(at: Entry) -> PathLoss:
 def _topic(name: str, at: Entry, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
-        "outbox", "repair", "log", "delta", "delta_bytes",
+        "outbox", "repair", "log", "delta", "delta_bytes", "always",
     )  # fmt: skip
     entries = at.mapping(keys)
     values: dict[str, Any] = {}
     for key, entry in entries.items():
         match key:
-            case "reliable" | "compression" | "repair" | "delta":
+            case "reliable" | "compression" | "repair" | "delta" | "always":
                 values[key] = entry.flag()
             case "deadline_s":
                 values[key] = entry.number(1.0, minimum=1e-3)

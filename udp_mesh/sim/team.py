@@ -25,6 +25,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.logs.store import MemoryLogStore
 from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
+from udp_mesh.core.subscriptions.messages import Subscription
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
@@ -168,6 +169,18 @@ class Team:
 
     def conditions(self, robot: str) -> Conditions:
         return self._members[robot].node.conditions(self.event_queue.now)
+
+    def subscribe(self, robot: str, subscriptions: Iterable[Subscription]) -> None:
+        """What the robot's programs read from now on."""
+        member = self._members[robot]
+        member.node.selective.set_subscriptions(subscriptions, self.event_queue.now)
+        self._pump(member)
+
+    def saved(self, robot: str) -> tuple[int, int]:
+        """Messages and bytes that the robot's current run did not send because no program wants them."""
+        conditions = self._members[robot].node.selective.conditions()
+        counters = [conditions.broadcasts, *(peer.saved for peer in conditions.peers)]
+        return sum(one.messages for one in counters), sum(one.bytes for one in counters)
 
     # Called by the medium and the timers
 
