@@ -367,6 +367,7 @@ def _reduction(document: ReductionDocument) -> Reduction:
         max_voxel_m=document.max_voxel_m,
         fields=tuple(document.fields),
         adapt=document.adapt,
+        always=document.always,
     )
 
 
@@ -392,4 +393,5 @@ def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
         relay_hops=settings.relay_hops,
         relay_keys=_transport_keys(settings.relay_keys, "relay_keys", root),
         etc_hosts=settings.etc_hosts,
+        selective=settings.selective,
     )

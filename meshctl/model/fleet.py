@@ -255,7 +255,8 @@ class ApplyPolicy:
 @dataclass(frozen=True, slots=True)
 class UdpMesh:
     """Transport settings of all robots; `keys` are the live fleet keys, of which the first encrypts. `relay_hops` is
-    the greatest number of links between two robots with relays between them, `relay_keys` those of the hops."""
+    the greatest number of links between two robots with relays between them, `relay_keys` those of the hops. With
+    `selective`, robots send each other only what programs there read."""
 
     port: int = 8700
     keys: tuple[SecretRef, ...] = ()
@@ -268,6 +269,7 @@ class UdpMesh:
     relay_hops: int = 4
     relay_keys: tuple[SecretRef, ...] = ()
     etc_hosts: bool = False
+    selective: bool = True
 
 
 @dataclass(frozen=True, slots=True)

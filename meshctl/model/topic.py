@@ -86,6 +86,7 @@ class Topic:
     delta: bool = False
     delta_bytes: int = 16 << 20
     reduce: Reduction | None = None
+    always: bool = False
 
     @property
     def sent_rate_hz(self) -> float:

@@ -77,7 +77,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         f"key_file = {_text(key_name)}" if transport.keys else "unkeyed = true",
         f"window = {transport.window}" if transport.window is not None else 'window = "adaptive"',
         f"fragment_bytes = {transport.fragment_bytes}",
-        *_relay(fleet.robots[robot], transport),
+        *_optional(fleet.robots[robot], transport),
         *_rates(transport),
         *_position(fleet, robot),
         *_links(fleet, robot, computer),
@@ -255,7 +255,7 @@ def _further_link(link: ComputerLink) -> Iterator[str]:
         yield from ("", "[[neighbours]]", f'address = "{address}"', f"link = {selector}")
 
 
-def _relay(robot: Robot, transport: UdpMesh) -> Iterator[str]:
+def _optional(robot: Robot, transport: UdpMesh) -> Iterator[str]:
     """Only what differs from the daemon's defaults: daemons of earlier versions reject unknown keys."""
     if robot.relay:
         yield f"relay = [{', '.join(map(_text, robot.relay))}]"
@@ -263,6 +263,8 @@ def _relay(robot: Robot, transport: UdpMesh) -> Iterator[str]:
         yield f"relay_hops = {transport.relay_hops}"
     if transport.relay_keys:
         yield f"relay_key_file = {_text(RELAY_KEY_NAME)}"
+    if not transport.selective:
+        yield "selective = false"
 
 
 def _position(fleet: Fleet, robot: str) -> Iterator[str]:
@@ -319,6 +321,8 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
     if topic.delta:
         yield "delta = true"
         yield f"delta_bytes = {topic.delta_bytes}"
+    if topic.always:
+        yield "always = true"
 
 
 def _log(topic: Topic, log: TopicLog) -> Iterator[str]:

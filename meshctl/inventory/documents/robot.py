@@ -154,6 +154,8 @@ class UdpMeshDocument(Document):
     Default: the fleet keys."""
     etc_hosts: Flag = False
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
+    selective: Flag = True
+    """Send robots only what their programs read, and no faster than they want it."""
 
 
 class TopicLogDocument(Document):
@@ -236,6 +238,8 @@ class TopicDocument(Document):
     """Send a message as the difference to the last one that its receiver has (maps, grids, images, states)."""
     delta_bytes: Whole = Field(default=16_777_216, ge=1, le=1_073_741_824)
     """Maximum size of a message for that; a larger one is sent whole."""
+    always: Flag = False
+    """Send the topic also to robots whose programs do not read it."""
     log: TopicLogDocument = NOT_WRITTEN
     """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""
     reduce: ReductionDocument = NOT_WRITTEN

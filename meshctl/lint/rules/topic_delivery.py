@@ -1,4 +1,4 @@
-"""Topics: delivery, names, differences (MC712 to MC720)."""
+"""Topics: delivery, names, differences, subscriptions (MC712 to MC720, MC725)."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ _TOPIC = re.compile(r"/?[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 _MIN_BASE_BYTES = 32
 # udp_mesh compares at most so many bytes of a topic per second, those of the bases included
 _COMPARED_BYTES_PER_S = 32 << 20
+# udp_mesh sends topics of these levels whether they are read or not
+_URGENT_PRIORITY = 3
 # names and payload of a message that udp_mesh broadcasts in one datagram of 1500 bytes: less IPv6 and UDP (48), the
 # sealed header (23), announcement and head (30), and the legacy format's header (14)
 _BROADCAST_BYTES = 1385
@@ -222,3 +224,31 @@ def delta_without_gain(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
             expected = f"at most {_COMPARED_BYTES_PER_S} bytes/s with their bases"
             found = f"{topic.sent_rate_hz:g} Hz x 2 x {size} bytes"
             yield Finding(_path(topic, "delta"), "part of the messages is sent whole", expected, found)
+
+
+@fleet_rule(
+    "MC725",
+    Severity.WARNING,
+    "`always` has no effect on a topic",
+    why="""With `always`, a topic is sent to robots whose programs do not read it. udp_mesh does that in any case for
+    urgent topics (priority 0 to 3), topics with an outbox and shared logs, and with `selective: false` for all.""",
+    fix="Remove `always`.",
+    failing="topics: {commands: {priority: 3, always: true}}",
+    passing="topics: {telemetry: {always: true}}",
+)
+def always_without_effect(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        reason = _always_sent(fleet, topic) if topic.always else ""
+        if reason:
+            yield Finding(_path(topic, "always"), f"sent in any case: {reason}", "false", "true")
+
+
+def _always_sent(fleet: Fleet, topic: Topic) -> str:
+    """Why the topic is sent whether it is read or not; empty if it is not."""
+    if not fleet.udp_mesh.selective:
+        return "udp_mesh.selective is false"
+    if topic.priority <= _URGENT_PRIORITY:
+        return f"priority {topic.priority} is urgent"
+    if topic.log is not None:
+        return "it is a shared log"
+    return f"its outbox is {topic.outbox.value}" if topic.outbox is not Outbox.NONE else ""

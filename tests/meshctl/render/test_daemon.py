@@ -133,6 +133,18 @@ def test_the_inventorys_default_and_bounds_of_delta_bytes_are_the_daemons(tmp_pa
         assert {topic.delta_bytes for topic in found if topic.delta} == {size}
 
 
+def test_what_is_sent_unread_is_written_only_where_it_differs_from_the_default(tmp_path: Path) -> None:
+    """Daemons of earlier versions reject unknown keys."""
+    telemetry = Topic("telemetry", 6)
+    plain = daemon_config(fleet(telemetry), "uav").decode()
+    assert "selective" not in plain
+    assert "always" not in plain
+    assert loaded(fleet(telemetry), "uav", tmp_path).settings.selective
+    found = loaded(fleet(replace(telemetry, always=True), selective=False), "uav", tmp_path).settings
+    assert not found.selective
+    assert [topic for topic in found.topics if topic.name == "telemetry"] == [core.Topic("telemetry", 6, always=True)]
+
+
 def test_the_destinations_of_a_log_are_its_readers(tmp_path: Path) -> None:
     """At the base, too, which reads it: a log has the same readers everywhere."""
     log = TopicLog(max_items=500, max_bytes=1_000_000, max_age_s=3600, copies=2)
