@@ -119,7 +119,9 @@ def ipv6_neighbours() -> None:
         both.ip(both.alice, "addr add fd00::1/64 dev mesh0 nodad")
         both.ip(both.bob, "addr add fd00::2/64 dev mesh0 nodad")
         met(both)
-        assert both.addresses() == {"alice": "[fd00::1]:8700", "bob": "[fd00::2]:8700"}
+        # They may hear each other from the link-local ones first.
+        expected = {"alice": "[fd00::1]:8700", "bob": "[fd00::2]:8700"}
+        poll(lambda: both.addresses() == expected, f"peers at {expected}")
         both.exchange()
 
 
