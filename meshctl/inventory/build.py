@@ -355,6 +355,7 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         delta=document.delta,
         delta_bytes=document.delta_bytes,
         reduce=_reduction(document.reduce) if document.reduce is not None else None,
+        always=document.always,
     )
 
 
@@ -367,7 +368,6 @@ def _reduction(document: ReductionDocument) -> Reduction:
         max_voxel_m=document.max_voxel_m,
         fields=tuple(document.fields),
         adapt=document.adapt,
-        always=document.always,
     )
 
 

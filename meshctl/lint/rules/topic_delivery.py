@@ -1,4 +1,4 @@
-"""Topics: delivery, names, differences, subscriptions (MC712 to MC720, MC725)."""
+"""Topics: delivery, names, differences, subscriptions (MC712 to MC725)."""
 
 from __future__ import annotations
 

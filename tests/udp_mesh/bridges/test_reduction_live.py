@@ -22,6 +22,7 @@ from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.message_codec import Numbers, decode, encode
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.names import Route
+from udp_mesh.bridges.receiving import EVERYTHING
 from udp_mesh.bridges.reduction import IMAGE, JPEG, JpegOptions, Reducer, Reduction
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay
 from udp_mesh.bridges.runtime import BridgeRuntime
@@ -42,7 +43,7 @@ IMAGES = 40
 @contextmanager
 def bridge(socket: Path, reduction: Reduction) -> Iterator[tuple[BridgeRuntime, Reducer]]:
     reducer = Reducer({"camera": reduction}, 1)
-    daemon = DaemonClient(str(socket), ["*"])
+    daemon = DaemonClient(str(socket), EVERYTHING)
     relay = Relay("alice", PROTOCOL_TOPICS[1], ros_version=1, nonce=b"nonce")
     runtime = BridgeRuntime(daemon, relay, lambda message: None, None, reducer)
     stop, up = threading.Event(), threading.Event()
