@@ -133,7 +133,7 @@ def parse(raw: bytes, file: str) -> Scenario:
 
 _KEYS = (
     "name", "seed", "duration_s", "observer", "window", "channel", "air", "robots", "relays", "topics", "flows",
-    "incidents", "reads",
+    "reads", "incidents",
 )  # fmt: skip
 
 
