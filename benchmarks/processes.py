@@ -7,6 +7,9 @@ fork and exec. Each process counts for the part of meshctl that started it, as o
 - `in tools`: started inside such a tool. The lab's stand-ins for ubus, uci, iw, batctl and nft are shell scripts; on a
   router those are programs that start nothing. Init scripts and reload_config start processes there, too.
 - `OpenWrt`: started by procd and netifd because the configuration has changed.
+
+A process that has ended before its command line was read counts as what its parent is: on a busy machine only the sum
+of the first two is exact.
 """
 
 from __future__ import annotations
@@ -169,11 +172,11 @@ def measure() -> dict[str, Any]:
 
 def table(result: Mapping[str, Any]) -> str:
     counts = {(part, kind): count for part, kind, count in result["counts"]}
-    lines = ["| started by | meshctl | in the tools it calls |", "| --- | ---: | ---: |"]
-    for part in sorted({part for part, kind in counts if kind != OPENWRT}):
-        lines.append(f"| {part} | {counts.get((part, OURS), 0)} | {counts.get((part, IN_TOOLS), 0)} |")
-    ours, tools = (sum(count for (_, kind), count in counts.items() if kind == wanted) for wanted in (OURS, IN_TOOLS))
-    lines.append(f"| together | {ours} | {tools} |")
+    lines = ["| started by | meshctl | in the tools it calls | both |", "| --- | ---: | ---: | ---: |"]
+    parts = sorted({part for part, kind in counts if kind != OPENWRT})
+    rows = [(part, counts.get((part, OURS), 0), counts.get((part, IN_TOOLS), 0)) for part in parts]
+    rows.append(("together", sum(row[1] for row in rows), sum(row[2] for row in rows)))
+    lines += [f"| {part} | {ours} | {tools} | {ours + tools} |" for part, ours, tools in rows]
     rest = counts.get(("", OPENWRT), 0)
     return "\n".join([*lines, "", f"OpenWrt's own reload started {rest} more; {result['syncs']} syncs."])
 

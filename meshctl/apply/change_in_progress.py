@@ -256,7 +256,7 @@ def observe_and_decide(
         busy = _while_it_reloads(change, connection)
         if busy is not None:
             return busy
-    change.last = observe(connection)
+    change.last = observe(connection, brief=True)
     age_s = applied_age_s(change.status)
     if age_s is not None:
         change.login_refused = change.connect_error = ""

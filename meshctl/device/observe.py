@@ -45,27 +45,30 @@ def observe(
     connection: Connection,
     *,
     extra_paths: Iterable[str] = (),
+    brief: bool = False,
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> Observation:
-    """Observe everything about the node in one round trip; `extra_paths` are further files to read.
+    """Observe everything about the node in one round trip; `extra_paths` are further files to read. `brief` leaves
+    out what no proof of a change needs.
 
     Raises Timeout and ConnectionLost; a missing or unreadable answer is data.
     """
     nonce = f"meshctl-{secrets.token_hex(16)}"
-    sent = observation_script(nonce, extra_paths)
+    sent = observation_script(nonce, extra_paths, brief=brief)
     asked = clock()
     done = connection.run(sent, timeout_s=timeout_s)
     return interpret(split_sections(done.stdout_bytes, nonce), asked_at_s=asked, answered_at_s=clock())
 
 
-def observation_script(nonce: str, extra_paths: Iterable[str] = ()) -> str:
-    """observe.sh with its two inputs set. Raises ValueError for a path with blanks or quotes."""
+def observation_script(nonce: str, extra_paths: Iterable[str] = (), *, brief: bool = False) -> str:
+    """observe.sh with its inputs set. Raises ValueError for a path with blanks or quotes."""
     paths = tuple(extra_paths)
     for path in paths:
         if not path.startswith("/") or quoted(path) != path:
             raise ValueError(f"{path!r}: expected an absolute path of letters, digits and ._+@%:,-")
-    return f"N={quoted(nonce)}\nEXTRA={quoted(' '.join(paths))}\n{script('observe.sh')}"
+    values = {"N": nonce, "EXTRA": " ".join(paths), "BRIEF": "yes" if brief else ""}
+    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), script("observe.sh")])
 
 
 class _OutputReader:

@@ -1,6 +1,7 @@
-# Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain) and `EXTRA` (further paths)
-# set before it. Each section is `N begin NAME`, the raw output of a tool, a newline, `N end STATUS`. A missing or
-# failing tool gives an empty section with its status. Nothing here changes the node.
+# Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain), `EXTRA` (further paths) and
+# `BRIEF` (not empty: only what the proof of a change needs) set before it. Each section is `N begin NAME`, the raw output
+# of a tool, a newline, `N end STATUS`. A missing or failing tool gives an empty section with its status. Nothing here
+# changes the node.
 
 section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
@@ -9,6 +10,9 @@ section() { # NAME COMMAND...
 	STATUS=$?
 	printf '\n%s end %s\n' "$N" $STATUS
 }
+
+# detail NAME COMMAND...: a section that no proof of a change needs; each costs one to three processes
+detail() { [ -n "$BRIEF" ] || section "$@"; }
 
 # first_line FILE: without a process, for the short files of the kernel
 first_line() {
@@ -125,25 +129,25 @@ mesh() { # INTERFACE
 	section "batctl.neighbors_json $1" batctl meshif "$1" neighbors_json
 	section "batctl.originators_json $1" batctl meshif "$1" originators_json
 	if [ $STATUS -eq 0 ]; then
-		section "batctl.statistics $1" batctl meshif "$1" statistics
-		section "batctl.transglobal $1" transglobal meshif "$1"
+		detail "batctl.statistics $1" batctl meshif "$1" statistics
+		detail "batctl.transglobal $1" transglobal meshif "$1"
 		return
 	fi
-	section "batctl.statistics $1" batctl -m "$1" statistics
-	section "batctl.transglobal $1" transglobal -m "$1"
+	detail "batctl.statistics $1" batctl -m "$1" statistics
+	detail "batctl.transglobal $1" transglobal -m "$1"
 	section "batctl.interface $1" batctl -m "$1" if
 	section "batctl.neighbors $1" batctl -m "$1" n
 	section "batctl.originators $1" batctl -m "$1" o
 }
 
 section uptime first_line /proc/uptime
-section clock date +%s
+detail clock date +%s
 section boot_id first_line /proc/sys/kernel/random/boot_id
 section ubus.board ubus call system board
 section board_name first_line /tmp/sysinfo/board_name
 section model first_line /tmp/sysinfo/model
 section load load
-section df df -k / /tmp
+detail df df -k / /tmp
 section root root
 section macs macs
 section ubus.wireless ubus call network.wireless status
@@ -156,21 +160,20 @@ while read -r word dev _; do
 	[ "$word" = Interface ] || continue
 	section "iw.link $dev" iw dev "$dev" link </dev/null
 	section "iw.stations $dev" iw dev "$dev" station dump </dev/null
-	section "iw.survey $dev" survey "$dev" </dev/null
+	detail "iw.survey $dev" survey "$dev" </dev/null
 done <<-END
 	$radios
 END
 for dev in /sys/class/net/bat*; do
 	[ ! -e "$dev" ] || mesh "${dev##*/}"
 done
-section sensors sensors
+detail sensors sensors
 section supplicants supplicants
-section batctl.version batctl -v
 section bridges bridges
 [ ! -e /etc/meshctl/lan-filter.sh ] || section lan_filter nft list table bridge meshctl_lan
 section package_tool package_tool
 section packages packages
-section uci.changes uci changes
+detail uci.changes uci changes
 section config.list listed_configuration
 set -- openwrt_release /etc/openwrt_release board.json /etc/board.json meminfo /proc/meminfo
 for conf in /etc/config/*; do
@@ -182,7 +185,7 @@ else
 	section authorized_keys true
 fi
 contents "$@"
-section host_keys host_keys
+detail host_keys host_keys
 for path in $EXTRA; do
 	section "mode $path" ls -lnd "$path"
 	[ ! -f "$path" ] || section "hash $path" sha256sum "$path"

@@ -244,6 +244,19 @@ Auto-Installed: yes
 """
 
 
+def test_a_brief_observation_has_what_a_proof_needs(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/etc/config/network", "config interface 'lan'\n")
+    node.put("/usr/lib/opkg/status", OPKG_STATUS)
+    node.put("/usr/bin/opkg", "#!/bin/sh\nexit 1\n", 0o755)
+    full, brief = observe(connection), observe(connection, brief=True)
+    assert brief.boot_id == full.boot_id
+    assert brief.macs == full.macs
+    assert brief.packages == full.packages
+    assert brief.change is not None
+    assert (full.clock_s is None, brief.clock_s is None) == (False, True)
+    assert brief.overlay is None
+
+
 def test_an_apk_database_is_read_by_the_script(connection: SshConnection, node: Sandbox) -> None:
     node.put("/usr/bin/apk", "#!/bin/sh\nexit 1\n", 0o755)
     node.put("/lib/apk/db/installed", "C:Q1x\nP:batctl-full\nV:2025.4-r1\nA:mips_24kc\n\nP:iw\nV:6.17-r1\n\n")

@@ -34,12 +34,12 @@ PHASES = (
     ("apply", "start-stop-daemon"),
     ("put", "mv -f /etc/meshctl/change/new"),
     ("reload", "reload_config"),
-    ("prove", "cat /proc/uptime"),
+    ("prove", "ubus call system board"),
     ("confirm", "confirmed."),
 )
 # A flash ends in a reboot that forgets what was recorded, so its steps are named: phase and words of a command.
 FLASH_STEPS = (
-    ("observe", "cat /etc/board.json"),
+    ("observe", "df -k / /tmp"),
     ("lock", "ln /tmp/meshctl/new"),
     ("upload", "dd if=/dev/null of=/tmp/meshctl/.firmware.bin"),
     ("upload", "tail -c"),
