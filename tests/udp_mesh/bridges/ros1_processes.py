@@ -128,6 +128,19 @@ class Ros1Node(NodeProcess):
         self._command(call=service)
         return dict(self.expect("answer")["answer"])
 
+    def serve(self, service: str, **more: object) -> None:
+        """Serves made/Add until the node ends."""
+        self._command(serve=service, **more)
+        self.expect("serves", service)
+
+    def add(self, service: str, a: int, b: int) -> None:
+        """Calls made/Add; the answer follows as `added`."""
+        self._command(add=service, a=a, b=b)
+
+    def exists(self, service: str) -> bool:
+        self._command(exists=service)
+        return bool(self.expect("exists")["exists"])
+
     def publish(self, name: str, data: object, type_name: str = "std_msgs/String", **more: object) -> int:
         """Publishes; returns how many subscribers were connected."""
         self._command(publish=name, type=type_name, data=data, **more)

@@ -1,5 +1,7 @@
 """A robot's ROS node for tests, in ROS's own interpreter: commands as JSON lines in, messages as JSON lines out.
 
+{"serve": SERVICE, "delay_s": how long a call takes, "refuse": BOOL}, of the type made/Add; {"add": SERVICE, "a", "b"}
+calls it: {"added": SERVICE, "sum" or "error"}; {"exists": SERVICE} -> {"exists": BOOL};
 {"subscribe": NAME, "type": TYPE or "*", "delay_s": how long each message keeps the subscriber busy};
 {"publish": NAME, "type": TYPE, "data": VALUE, "latch": BOOL, "repeat": how often}; {"stream": NAME, "type": TYPE,
 "rate_hz": HZ, "bytes": SIZE}; {"stop_streams": true}; {"call": SERVICE}.
@@ -23,6 +25,7 @@ import rospy
 
 publishers: dict[Any, Any] = {}
 subscribers: list[Any] = []
+services: list[Any] = []
 streams: dict[str, Any] = {}
 streamed: dict[str, int] = {}
 printing = threading.Lock()
@@ -134,6 +137,48 @@ class GetHosts:
     ]
 
 
+class Add:
+    """A service whose package is installed nowhere."""
+
+    _type = "made/Add"
+    _md5sum = "0123456789abcdef" * 2
+    _request_class: Any = genpy.dynamic.generate_dynamic("made/AddRequest", "int64 a\nint64 b")["made/AddRequest"]
+    _response_class: Any = genpy.dynamic.generate_dynamic("made/AddResponse", "int64 sum")["made/AddResponse"]
+
+
+def serve(command: dict[str, Any]) -> None:
+    def added(request: Any) -> Any:
+        say(serving=command["serve"])
+        time.sleep(command.get("delay_s", 0.0))
+        if command.get("refuse"):
+            raise rospy.ServiceException("no sums today")
+        return Add._response_class(request.a + request.b)
+
+    services.append(rospy.Service(command["serve"], Add, added))
+    say(serves=command["serve"])
+
+
+def add(command: dict[str, Any]) -> None:
+    name = command["add"]
+
+    def run() -> None:
+        try:
+            answer = {"sum": rospy.ServiceProxy(name, Add)(command["a"], command["b"]).sum}
+        except rospy.ServiceException as error:
+            answer = {"error": str(error)}
+        say(added=name, **answer)
+
+    threading.Thread(target=run, daemon=True).start()
+
+
+def exists(name: str) -> bool:
+    try:
+        rospy.wait_for_service(name, timeout=0.2)
+    except rospy.ROSException:
+        return False
+    return True
+
+
 rospy.init_node(sys.argv[1], disable_signals=True)
 say(ready=True)
 for line in sys.stdin:
@@ -146,6 +191,12 @@ for line in sys.stdin:
         for event in streams.values():
             event.set()
         say(streamed=streamed)
+    elif "serve" in command:
+        serve(command)
+    elif "add" in command:
+        add(command)
+    elif "exists" in command:
+        say(exists=exists(command["exists"]))
     elif "call" in command:
         rospy.wait_for_service(command["call"])
         response = rospy.ServiceProxy(command["call"], GetHosts)()

@@ -38,6 +38,7 @@ from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
+from udp_mesh.bridges.ros1.services import Ros1Calls
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
@@ -66,6 +67,7 @@ class Ros1Bridge:
         types = {**TYPES, **options.types}
         relay = Relay(own, PROTOCOL_TOPICS[1], ros_version=1, nonce=os.urandom(16), types=types)
         self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted, Reducer(options.reductions, 1))
+        self._calls = Ros1Calls(daemon, own, options.services, os.urandom(8).hex())
         self._master_gone = False
         self._positions = PositionInput(daemon, 1, given.odometry, [str(frame) for frame in given.tf_frames])
         self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
@@ -84,11 +86,13 @@ class Ros1Bridge:
     def on_daemon_up(self) -> None:
         """Called by the daemon client after each connect. Raises MeshError."""
         self._runtime.on_daemon_up()
+        self._calls.on_daemon_up()
         self._refresh_requested.set()
 
     def on_frame(self, frame: Frame) -> None:
         """Called by the daemon client for each frame."""
         self._runtime.on_frame(frame)
+        self._calls.on_frame(frame)
         header = frame[0]
         event = header.get("event")
         if event == "conditions":
@@ -110,6 +114,7 @@ class Ros1Bridge:
         while not stop.wait(TICK_S):
             now = time.monotonic()
             self._runtime.tick(now)
+            self._calls.tick(now)
             if self._refresh_requested.is_set() or now - refreshed_at >= REFRESH_S:
                 self._refresh_requested.clear()
                 refreshed_at = now
@@ -118,7 +123,8 @@ class Ros1Bridge:
     def _refresh(self) -> None:
         """Registers with a restarted master, and subscribes to the names of the current topics and peers."""
         try:
-            self._graph.reregister()
+            self._graph.reregister(self._calls.registrations())
+            self._calls.refresh()
             self._master_gone = False
         except MASTER_ERRORS as error:
             if not self._master_gone:
@@ -167,8 +173,8 @@ def main() -> int:
         for line in str(error).splitlines():
             log.error("configuration-refused %s", line)
         return 2
-    if options.tf or options.services or options.actions:
-        log.warning("configuration-ignored tf, services and actions: only the ROS 2 bridge carries them")
+    if options.tf or options.actions:
+        log.warning("configuration-ignored tf and actions: only the ROS 2 bridge carries them")
     received = with_needed((*given.receive, *options.receive), ["bridge/*"])
     daemon = DaemonClient(given.socket, [*received, Receive(CONDITIONS_TOPIC)])
     own: list[str] = []

@@ -14,7 +14,7 @@ import logging
 import threading
 import time
 import xmlrpc.client
-from typing import Any, Callable, Mapping, NamedTuple, Sequence
+from typing import Any, Callable, Iterable, Mapping, NamedTuple, Sequence
 
 import rosgraph
 import roslib.message
@@ -187,8 +187,9 @@ class Graph:
 
     # The master
 
-    def reregister(self) -> bool:
-        """Registers everything with a restarted master; returns whether it was needed. Raises one of MASTER_ERRORS."""
+    def reregister(self, services: Iterable[tuple[str, str]] = ()) -> bool:
+        """Registers everything, and these services (name, URI), with a restarted master; returns whether it was needed.
+        Raises one of MASTER_ERRORS."""
         master = _master()
         pid = master.getPid()
         if pid == self._pid and _is_registered(master):
@@ -203,7 +204,8 @@ class Graph:
             publishers = master.registerSubscriber(name, rospy.AnyMsg._type, uri)
             # Pass the new master's answer to rospy as if the master had called.
             ourselves.publisherUpdate("/master", name, publishers)
-        master.registerService(self._service.resolved_name, self._service.uri, uri)
+        for name, service_uri in [(self._service.resolved_name, self._service.uri), *services]:
+            master.registerService(name, service_uri, uri)
         self._pid = pid
         log.info("master-restarted pid=%d", pid)
         return True
