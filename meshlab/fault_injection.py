@@ -13,7 +13,6 @@ from meshlab.errors import LabError
 from meshlab.faults import LINK_FAULTS, SLOW_DELAY_MS, SLOW_LOSS, SLOW_RATE_KBPS, Fault, FaultRequest, parse
 from meshlab.fleet_state import FleetState, NodeControl
 from meshlab.link_state import LinkState
-from meshlab.spec import Medium
 from meshlab.state import NodeState, Power, write_firmware
 
 _FREE_FLASH_KIB = 8
@@ -116,9 +115,8 @@ class FaultInjection:
     async def _repair_node(self, state: NodeState) -> None:
         name = state.spec.name
         state.faults.clear()
-        if name in self._link_state.severed:
-            self._link_state.severed.remove(name)
-            state.plugged = state.spec.medium is not Medium.NONE
+        # a cable that was plugged in meanwhile stays
+        state.plugged |= self._link_state.severed.pop(name, False)
         self._link_state.slowed.pop(name, None)
         state.hung = state.cut_at_flash = state.wrong_board = False
         (state.home / "clock").unlink(missing_ok=True)
@@ -162,7 +160,7 @@ class FaultInjection:
         os.close(go)
 
     def _cut_links(self, state: NodeState) -> None:
-        self._link_state.severed.add(state.spec.name)
+        self._link_state.severed.setdefault(state.spec.name, state.plugged)
         state.plugged = False
         self._link_state.changed()
 

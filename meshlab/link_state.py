@@ -33,8 +33,9 @@ class LinkState:
         self._overrides: dict[frozenset[str], LinkSpec] = {}
         # the parts received so far of a new set of links
         self.pending_links: list[LinkSpec] = []
-        # nodes with a `sever`, `link-down` or `slow` fault on all their links
-        self.severed: set[str] = set()
+        # nodes with a `sever` or `link-down` fault on all their links, and whether each was plugged in before
+        self.severed: dict[str, bool] = {}
+        # nodes with a `slow` fault on all their links
         self.slowed: dict[str, dict[str, Any]] = {}
         self._written: dict[str, str] = {}
         self._graph: dict[str, list[mesh_model.Edge]] = {}
@@ -62,7 +63,7 @@ class LinkState:
         return [self._with_faults(link) for link in {**self._base_links, **self._overrides}.values()]
 
     def _with_faults(self, link: LinkSpec) -> LinkSpec:
-        if link.ends & self.severed:
+        if link.ends & self.severed.keys():
             link = replace(link, up=False)
         for name in link.ends & self.slowed.keys():
             link = replace(link, **self.slowed[name])
@@ -93,11 +94,9 @@ class LinkState:
         self.changed()
 
     def restore(self, ends: frozenset[str] | None = None) -> None:
-        """Remove the override of one link, or all overrides and faults."""
+        """Remove the override of one link, or all overrides."""
         if ends is None:
             self._overrides.clear()
-            self.severed.clear()
-            self.slowed.clear()
         else:
             self._overrides.pop(ends, None)
         self.changed()

@@ -122,9 +122,24 @@ def test_a_node_severed_at_a_step_keeps_running_in_isolation(mesh: VirtualFleet)
     until(lambda: in_mesh(mesh) == {"near"}, "the cut")
     assert far.exec("ls /etc/a /etc/b").exit_status == 0
     mesh.repair("far")
-    far.plug(False)
     until(lambda: in_mesh(mesh) == {"near", "far"}, "the link to come back")
     until(lambda: answers(mesh.endpoint("10.42.0.3")), "the path to return")
+
+
+@pytest.mark.parametrize("where", ["far", ""], ids=["the node", "everything"])
+def test_a_repair_restores_the_cable_as_it_was_before_the_fault(mesh: VirtualFleet, where: str) -> None:
+    def plugged() -> dict[str, bool]:
+        return {node["name"]: node["plugged"] for node in mesh.status()["nodes"]}
+
+    mesh.node("near").plug(True)
+    before = plugged()
+    assert (before["near"], before["far"]) == (True, False)
+    for name in ("near", "far"):
+        mesh.inject_fault(name, "link-down")
+    assert not any(plugged()[name] for name in ("near", "far"))
+    for name in ("near", where) if where else ("",):
+        mesh.repair(name)
+    assert plugged() == before
 
 
 def test_nodes_with_different_keys_do_not_mesh(mesh: VirtualFleet) -> None:
