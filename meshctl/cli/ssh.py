@@ -28,6 +28,7 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.output import echo, echo_bytes, echo_error, echo_json
+from meshctl.device.framing import command_line
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
@@ -118,7 +119,7 @@ def run(
     ],
     limit: Limit = None,
     inventory: InventoryPath = Path(),
-    timeout: Annotated[float, typer.Option("--timeout", help="Timeout per node in seconds.")] = 60.0,
+    timeout: Annotated[float, typer.Option("--timeout", metavar="S", help="Timeout per node in seconds.")] = 60.0,
     raw: Annotated[
         bool, typer.Option("--raw", help="Print output unchanged: without node names, with control characters.")
     ] = False,
@@ -182,12 +183,7 @@ def _split(words: list[str]) -> tuple[list[str], str]:
     command = given[given.index("--") + 1 :]
     if not command or words[-len(command) :] != command:
         raise InputError("expected a command after `--`", hint="meshctl run b01 -- uptime")
-    return words[: -len(command)], shell_words(command)
-
-
-def shell_words(command: list[str]) -> str:
-    """The command line for the node's shell: one word unchanged, several words quoted."""
-    return command[0] if len(command) == 1 else shlex.join(command)
+    return words[: -len(command)], command_line(command)
 
 
 def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -> None:
@@ -203,7 +199,7 @@ def _print(name: str, stdout: str, stderr: str, *, as_json: bool, status: int) -
 
 
 def ssh(
-    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
     command: Annotated[list[str] | None, typer.Argument(help="After --: command to run instead of a shell.")] = None,
     inventory: InventoryPath = Path(),
     key: KeyFiles = None,
@@ -223,7 +219,7 @@ def ssh(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         there = selected_node(opened.fleet, node)
         arguments = ssh_arguments(opened, there)
-    os.execv(program, [*arguments, *([shell_words(command)] if command else [])])
+    os.execv(program, [*arguments, *([command_line(command)] if command else [])])
 
 
 def ssh_arguments(opened: Session, node: Node) -> list[str]:

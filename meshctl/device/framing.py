@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 # Far below dropbear's 9000; a long script has no advantage as an argument, which is visible in `ps`.
@@ -42,3 +43,8 @@ def framed(script: str) -> Framed:
 def quoted(*words: str) -> str:
     """Shell-quote words and join them."""
     return " ".join(shlex.quote(word) for word in words)
+
+
+def command_line(words: Sequence[str]) -> str:
+    """A user's words as the command line for a node's shell: one word unchanged, several words quoted."""
+    return words[0] if len(words) == 1 else quoted(*words)

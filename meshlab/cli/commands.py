@@ -12,6 +12,7 @@ import typer
 
 from meshctl.cli.context import AsJson, LabDirectory, lab_directory
 from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.device.framing import command_line
 from meshctl.errors import InputError
 from meshctl.model import Release
 from meshctl.resources import shipped
@@ -113,12 +114,12 @@ def shell(
     command: Annotated[list[str] | None, typer.Argument(help="A command; default: an interactive shell.")] = None,
     directory: LabDirectory = None,
 ) -> None:
-    """Open a node's serial console, which does not need its network.
+    """Open a node's serial console, which does not need its network. Commands are quoted as for `meshctl run`.
 
     Example: meshctl lab shell b01 -- uci show network
     """
     fleet = VirtualFleet.attach(lab_directory(directory))
-    raise typer.Exit(run_shell(fleet, fleet.node(node).name, " ".join(command or ())))
+    raise typer.Exit(run_shell(fleet, fleet.node(node).name, command_line(command) if command else ""))
 
 
 _BREAK_HELP = "\n\n".join(

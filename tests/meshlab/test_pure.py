@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from meshctl.errors import InputError
 from meshctl.firmware.metadata import read_metadata
 from meshctl.model import Release
 from meshlab import addresses, faults, from_inventory, releases, rootfs
+from meshlab.cli import commands
 from meshlab.errors import LabError
 from meshlab.faults import Fault, FaultRequest
 from meshlab.images import firmware_image
@@ -105,3 +109,17 @@ def test_hiding_applets_preserves_the_sort_order_of_the_table(names: list[str]) 
 def test_a_busybox_without_the_expected_applet_table_is_rejected() -> None:
     with pytest.raises(LabError, match="applet names"):
         rootfs.without_applets(b"nothing here", ["ash", "cat"], {"cat"}, keep=("ash",))
+
+
+@pytest.mark.parametrize(
+    ("words", "sent"),
+    [((), ""), (("ps | wc -l",), "ps | wc -l"), (("sh", "-c", "echo a; echo b"), "sh -c 'echo a; echo b'")],
+)
+def test_the_console_quotes_a_command_as_run_does(
+    words: tuple[str, ...], sent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_shell = mock.Mock(return_value=0)
+    monkeypatch.setattr("meshlab.cli.commands.run_shell", run_shell)
+    monkeypatch.setattr("meshlab.cli.commands.VirtualFleet", mock.MagicMock())
+    done = CliRunner().invoke(commands.app, ["shell", "b01", *(("--", *words) if words else ())])
+    assert (done.exit_code, run_shell.call_args.args[2]) == (0, sent)

@@ -11,7 +11,7 @@ import pytest
 from meshctl.cli.main import main
 from meshctl.cli.output import console
 from meshctl.cli.plan import bench_advice
-from meshctl.cli.ssh import shell_words
+from meshctl.device.framing import command_line
 from meshctl.fleet.journal import RunRecord
 from meshctl.plan import NodePlan, Plan, Verdict
 
@@ -60,7 +60,7 @@ def test_no_color_leaves_plans_and_live_lines_plain(monkeypatch: pytest.MonkeyPa
     [(["ps | grep x"], "ps | grep x"), (["echo", "a  b", "$HOME"], "echo 'a  b' '$HOME'"), (["uptime"], "uptime")],
 )
 def test_a_single_argument_is_passed_to_the_shell_and_several_are_quoted(command: list[str], sent: str) -> None:
-    assert shell_words(command) == sent
+    assert command_line(command) == sent
 
 
 def test_a_resumed_bootstrap_advises_connecting_unreachable_nodes_on_the_bench() -> None:
