@@ -51,8 +51,11 @@ from meshctl.robots.local_daemon import socket_path
 DEFAULT_PORT = 8765
 # Alarms that wait for a slow hook when the monitor ends.
 HOOK_CLOSE_S = 2.0
+# With --once there is no later moment at which the others are reported.
+ONCE_HOOK_CLOSE_S = 60.0
 # A round that is under way when the monitor ends.
 SAMPLER_CLOSE_S = 2.0
+_SHELL_OPERATORS = frozenset("|&;<>()")
 DEFAULT_DAYS = 7.0
 DEFAULT_MB = 512
 
@@ -60,7 +63,7 @@ DEFAULT_MB = 512
 def monitor(
     interval: Annotated[
         float,
-        typer.Option("--interval", min=1.0, max=3600, metavar="S", help="Seconds between two looks at the fleet."),
+        typer.Option("--interval", min=1.0, max=3600, metavar="S", help="Seconds between two snapshots of the fleet."),
     ] = 5.0,
     listen: Annotated[
         str, typer.Option("--listen", metavar="ADDRESS", help="IP address to serve the page on.")
@@ -84,7 +87,7 @@ def monitor(
         str, typer.Option("--hook", metavar="COMMAND", help="Run for each new alarm, with its JSON as input.")
     ] = "",
     hook_level: Annotated[
-        str, typer.Option("--hook-level", metavar="LEVEL", help="Least level for --webhook and --hook.")
+        str, typer.Option("--hook-level", metavar="LEVEL", help="Lowest level for --webhook and --hook.")
     ] = "warning",
     textfile: Annotated[
         Path | None,
@@ -92,10 +95,15 @@ def monitor(
     ] = None,
     store: HistoryFile = None,
     keep_days: Annotated[
-        float, typer.Option("--keep-days", min=0.01, max=36_500, help="Remove what is older from the history.")
+        float,
+        typer.Option(
+            "--keep-days", min=0.01, max=36_500, metavar="DAYS", help="Remove what is older from the history."
+        ),
     ] = DEFAULT_DAYS,
-    max_mb: Annotated[int, typer.Option("--max-mb", min=16, help="Largest size of the history.")] = DEFAULT_MB,
-    once: Annotated[bool, typer.Option("--once", help="Look once, store and print the result, and exit.")] = False,
+    max_mb: Annotated[
+        int, typer.Option("--max-mb", min=16, metavar="MB", help="Largest size of the history.")
+    ] = DEFAULT_MB,
+    once: Annotated[bool, typer.Option("--once", help="Take one snapshot, store and print it, and exit.")] = False,
     replay: Annotated[
         list[Path] | None,
         typer.Option(
@@ -149,13 +157,14 @@ def monitor(
         history = stack.enter_context(_open_history(view, store, keep_days, max_mb))
         history.claim()
         sampler = sampler_of(view, history, interval)
-        if once:
-            raise typer.Exit(_look_once(sampler, as_json=as_json))
         hooks = AlarmHooks(hook_settings, view.fleet.name)
-        stack.callback(hooks.close, HOOK_CLOSE_S)
+        stack.callback(hooks.close, ONCE_HOOK_CLOSE_S if once else HOOK_CLOSE_S)
         sampler.listeners.append(lambda frame, began: hooks.notify(began))
         if textfile is not None:
             sampler.listeners.append(TextfileWriter(textfile, history, lambda text: sampler.on_problem(text)))
+        if once:
+            sampler.on_problem = hooks.on_problem = _warn_on_standard_error
+            raise typer.Exit(_look_once(sampler, as_json=as_json))
         watch = _Watch(sampler, as_json=as_json)
         hooks.on_problem = sampler.on_problem
         if (exchange := view.opened.journal.alarm_exchange(view.fleet.name)) is not None:
@@ -168,11 +177,23 @@ def monitor(
 
 
 def _words(command: str) -> tuple[str, ...]:
-    """A command line as words. Raises InputError."""
+    """A command line as words. Raises InputError, also for the operators of a shell, which would be arguments."""
     try:
-        return tuple(shlex.split(command))
+        words = tuple(shlex.split(command))
+        tokens = tuple(shlex.shlex(command, punctuation_chars=True))
     except ValueError as error:
         raise InputError(f"--hook: expected a command line, found {command!r}: {error}") from error
+    if found := next((token for token in tokens if not set(token) - _SHELL_OPERATORS), ""):
+        raise InputError(
+            f"--hook: no shell runs the command, so {found!r} would be an argument",
+            hint=f"use a shell: --hook {shlex.quote(f'sh -c {shlex.quote(command)}')}",
+        )
+    return words
+
+
+def _warn_on_standard_error(text: str) -> None:
+    if text:
+        echo(f"warning: {text}", err=True)
 
 
 def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: int) -> FrameStore:

@@ -132,6 +132,8 @@ def test_recordings_of_robots_are_part_of_the_debriefing(history: Path) -> None:
         (["--tls-cert", "run.sqlite", "--tls-key", "run.sqlite"], "cannot use run.sqlite and run.sqlite: "),
         (["--token-file", "nothing"], "cannot read nothing: No such file or directory"),
         (["--hook", "notify 'unbalanced"], "--hook: expected a command line, found"),
+        (["--hook", "cat >> alarms"], "--hook: no shell runs the command, so '>>' would be an argument"),
+        (["--hook", "mail ops; date"], """hint: use a shell: --hook 'sh -c '"'"'mail ops; date"""),
         (["--webhook", "http://x:port/"], "webhook: expected an http or https URL, found 'http://x:port/'"),
         (["--hook-level", "loud"], "hook level: expected note, warning, error, found 'loud'"),
         (["--interval", "nan"], "Invalid value for '--interval'"),
@@ -158,6 +160,21 @@ def test_a_history_goes_where_a_directory_can_be_made(tmp_path: Path) -> None:
     code, output = run(*words, str(tmp_path / "new/run.sqlite"), "--timeout", "0.5", "--no-robots")
     assert (tmp_path / "new/run.sqlite").is_file(), output
     assert (tmp_path / "new").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_single_snapshot_reports_its_new_alarms_to_hook_and_textfile(tmp_path: Path) -> None:
+    trio(tmp_path)
+    script = tmp_path / "hook"
+    script.write_text(f"#!/bin/sh\nsleep 1\necho $MESHCTL_ALARM_DEVICE >>{tmp_path}/reported\n")
+    script.chmod(0o755)
+    words = ["--once", "-i", str(tmp_path / "fleet.yaml"), "--store", str(tmp_path / "run.sqlite"), "--no-robots"]
+    words += ["--timeout", "0.5", "--hook", str(script), "--textfile", str(tmp_path / "fleet.prom")]
+    _, output = run(*words)
+    assert sorted((tmp_path / "reported").read_text().split()) == ["b01", "base", "rover"], output
+    assert "meshctl_alarm" in (tmp_path / "fleet.prom").read_text()
+    # the alarms continue: the next one has nothing to report
+    run(*words)
+    assert len((tmp_path / "reported").read_text().split()) == 3
 
 
 @pytest.mark.parametrize("token", ["", "short", "with a space in it, which is long"])
