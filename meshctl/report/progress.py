@@ -157,6 +157,8 @@ class LiveProgress(RunProgress):
 
     def __enter__(self) -> LiveProgress:
         self._live.__enter__()
+        # rich hides the cursor, and nothing would show it again while Ctrl-Z has stopped the process
+        self._live.console.show_cursor(True)
         return self
 
     def __exit__(

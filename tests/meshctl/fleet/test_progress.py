@@ -57,6 +57,13 @@ def test_live_lines_keep_outcomes_and_count_them() -> None:
     assert "1/2 nodes: 1 rolled back" in shown
 
 
+def test_live_lines_leave_the_cursor_visible_for_a_shell_that_stops_the_process() -> None:
+    out = io.StringIO()
+    with LiveProgress(Console(file=out, force_terminal=True, width=100), 2):
+        shown = out.getvalue()
+    assert shown.rfind("\x1b[?25h") > shown.rfind("\x1b[?25l")
+
+
 def test_a_blocked_reader_does_not_block_the_run() -> None:
     may_write = threading.Event()
 
