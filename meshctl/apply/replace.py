@@ -18,7 +18,7 @@ from meshctl.device.ssh import connect
 from meshctl.device.trust import AcceptAnyKey, TrustStore
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Interrupt
-from meshctl.model import Fleet, Node, NodeState
+from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.nodes.collect import observe_cleared
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
@@ -93,11 +93,20 @@ def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
     )
 
 
+def state_after(old: Node) -> NodeState:
+    """The state of the old node on its new device: one that was lost is in use again, in its robot's rack if it has
+    one."""
+    if old.state is not NodeState.LOST:
+        return old.state
+    return NodeState.CARRIED if old.role is Role.BEACON and old.robot else NodeState.DEPLOYED
+
+
 def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
-    """The fleet with the spare's label and serial number on the old node, because templates may render them."""
-    if spare is None:
-        return fleet
-    adopted = replace(old, label=spare.label or old.label, serial=spare.serial or old.serial)
+    """The fleet with the old node in use, and with the spare's label and serial number, because templates may render
+    them."""
+    adopted = replace(old, state=state_after(old))
+    if spare is not None:
+        adopted = replace(adopted, label=spare.label or old.label, serial=spare.serial or old.serial)
     return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: adopted}))
 
 
@@ -113,5 +122,7 @@ def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Ma
         mine["mac"] = mac
     if spare is not None:
         mine.update({key: value for key, value in (("serial", spare.serial), ("label", spare.label)) if value})
+    if state_after(old) is not old.state:
+        mine["state"] = state_after(old).value
     theirs = {"state": NodeState.RETIRED.value} if spare is not None else {}
     return mine, theirs

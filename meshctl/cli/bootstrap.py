@@ -41,7 +41,7 @@ from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execu
 from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
-from meshctl.model import Node, NodeState
+from meshctl.model import Fleet, Node, NodeState
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Verdict
 from meshctl.report.progress import outcome_text
@@ -55,7 +55,9 @@ NO_ANSWER_HINT = f"check that it has booted and that this machine has an address
 At = Annotated[
     list[str] | None,
     typer.Option(
-        "--at", help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order."
+        "--at",
+        metavar="HOST",
+        help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order.",
     ),
 ]
 
@@ -63,6 +65,7 @@ Interfaces = Annotated[
     list[str] | None,
     typer.Option(
         "--interface",
+        metavar="IF",
         help="Interface with one factory-default device, e.g. eth1; one per NODE, in the same order.",
     ),
 ]
@@ -199,9 +202,11 @@ def _parse_place(text: str) -> BenchTarget:
 def replace(
     old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.")],
     new: Annotated[str, typer.Argument(help="Spare node, or `bench` for a device that is not in the inventory.")],
-    at: Annotated[str, typer.Option("--at", help="Address of the new device if not its own: HOST or HOST:PORT.")] = "",
+    at: Annotated[
+        str, typer.Option("--at", metavar="HOST", help="Address of the new device if not its own: HOST or HOST:PORT.")
+    ] = "",
     interface: Annotated[
-        str, typer.Option("--interface", help="Interface with the factory-default device, e.g. eth1.")
+        str, typer.Option("--interface", metavar="IF", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
     dry_run: DryRun = False,
@@ -218,13 +223,13 @@ def replace(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        node = selected_node(opened.fleet, old)
-        spare = _spare(opened, node, new)
+        old_node = _replaced(opened.fleet, old)
+        spare = _spare(opened, old_node, new)
         spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
-        place = with_changes(spots[0], node=node.name) if spots else None
-        fleet = with_identity(opened.fleet, node, spare)
+        place = with_changes(spots[0], node=old_node.name) if spots else None
+        fleet = with_identity(opened.fleet, old_node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
-        node = fleet.nodes[node.name]
+        node = fleet.nodes[old_node.name]
         with opened.interrupt.on_signals(echo_error):
             successor = adopt(
                 opened.renderer,
@@ -267,7 +272,7 @@ def replace(
                 restore_pins(opened.trust, successor.discovered, [node.name])
         if status == ExitCode.OK:
             found = successor.discovered.found[node.name]
-            changes = _record_identity(opened, inventory, node, spare, found, dry_run=dry_run)
+            changes = _record_identity(opened, inventory, old_node, spare, found, dry_run=dry_run)
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
@@ -280,11 +285,20 @@ def _replacement_text(node: Node, spare: Node | None, new: str, found: FoundDevi
     return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"
 
 
+def _replaced(fleet: Fleet, word: str) -> Node:
+    """The node that gets another device: in use, or lost."""
+    node = selected_node(fleet, word, with_unmanaged=True)
+    if node.state is NodeState.RETIRED:
+        hint = f"to use its name again, run `meshctl inventory state {node.name} deployed`"
+        raise InputError(f"{node.name} is retired: expected a node that is in use or lost", hint=hint)
+    return node
+
+
 def _spare(opened: Session, old: Node, new: str) -> Node | None:
     """The spare node; None for a device that is not in the inventory."""
     if new == BENCH:
         return None
-    spare = selected_node(opened.fleet, new)
+    spare = selected_node(opened.fleet, new, with_unmanaged=True)
     if spare.name == old.name:
         raise InputError(f"{spare.name} cannot replace itself")
     if spare.state is not NodeState.SPARE:

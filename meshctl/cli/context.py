@@ -46,7 +46,9 @@ InventoryPath = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LabDirectory = Annotated[
     Path | None,
-    typer.Option("--dir", envvar="MESHCTL_LAB", help="Directory of the lab; default: $XDG_STATE_HOME/meshctl/lab."),
+    typer.Option(
+        "--dir", metavar="DIR", envvar="MESHCTL_LAB", help="Directory of the lab; default: $XDG_STATE_HOME/meshctl/lab."
+    ),
 ]
 KeyFiles = Annotated[
     list[Path] | None,
@@ -54,7 +56,7 @@ KeyFiles = Annotated[
 ]
 Lab = Annotated[
     Path | None,
-    typer.Option("--lab", envvar="MESHCTL_LAB", help="Connect to the virtual fleet that runs in DIR."),
+    typer.Option("--lab", metavar="DIR", envvar="MESHCTL_LAB", help="Connect to the virtual fleet that runs in DIR."),
 ]
 Nodes = Annotated[
     list[str] | None,
@@ -107,6 +109,13 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     virtual, locate = _lab(lab)
     # a lab's copy of the inventory also works without --lab
     lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
+    if virtual is None and lab_directory:
+        # in another terminal, one of two variables is easily forgotten
+        echo(
+            f"note: the inventory is that of the lab in {lab_directory}, but its addresses are used as those of real "
+            f"devices: set MESHCTL_LAB={lab_directory} to reach the lab",
+            err=True,
+        )
     with (
         open_journal(
             os.environ,
@@ -164,22 +173,30 @@ def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
 
 
 def selected_nodes(
-    fleet: Fleet, words: Iterable[str] | None, limits: Iterable[str] | None = None, *, in_word_order: bool = False
+    fleet: Fleet,
+    words: Iterable[str] | None,
+    limits: Iterable[str] | None = None,
+    *,
+    in_word_order: bool = False,
+    with_unmanaged: bool = False,
 ) -> tuple[Node, ...]:
-    """The managed nodes that the words and every limit select (`inventory.selection`); all without words.
+    """The nodes that the words and every limit select (`inventory.selection`); all without words. Lost and retired ones
+    only `with_unmanaged`.
 
     Raises InputError for a word that selects nothing.
     """
     from meshctl.inventory.selection import select_nodes
 
-    return select_nodes(fleet, words or (), read_selection, limits or (), in_word_order=in_word_order)
+    return select_nodes(
+        fleet, words or (), read_selection, limits or (), in_word_order=in_word_order, with_unmanaged=with_unmanaged
+    )
 
 
-def selected_node(fleet: Fleet, word: str) -> Node:
-    """The one managed node that the word selects. Raises InputError for none or several."""
+def selected_node(fleet: Fleet, word: str, *, with_unmanaged: bool = False) -> Node:
+    """The one node that the word selects. Raises InputError for none or several."""
     from meshctl.inventory.selection import select_one
 
-    return select_one(fleet, word, read_selection)
+    return select_one(fleet, word, read_selection, with_unmanaged=with_unmanaged)
 
 
 def read_selection(path: str) -> str:

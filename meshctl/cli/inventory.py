@@ -11,19 +11,17 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.command_group import ImportGroup
-from meshctl.cli.context import AsJson, InventoryPath
+from meshctl.cli.context import AsJson, InventoryPath, Limit, Nodes, selected_node, selected_nodes
 from meshctl.cli.export import export
 from meshctl.cli.inventory_import import app as import_app
 from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.cli.public_key import own_public_key
-from meshctl.errors import InputError
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.inventory.explain import ExplainedValue, explain
 from meshctl.inventory.json_schema import json_schema
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.starter import write_starter
-from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Node, NodeState, Role
+from meshctl.model import Node, NodeState, Role
 
 app = typer.Typer(help="Show and edit the inventory.", no_args_is_help=True)
 app.command("export")(export)
@@ -66,20 +64,22 @@ def schema(
 
 @app.command("list")
 def list_nodes(
+    nodes: Nodes = None,
+    limit: Limit = None,
     inventory: InventoryPath = Path(),
     role: Annotated[Role | None, typer.Option("--role", help="Only nodes with this role.")] = None,
     state: Annotated[NodeState | None, typer.Option("--state", help="Only nodes in this state.")] = None,
     robot: Annotated[str, typer.Option("--robot", help="Only nodes on this robot.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List nodes with role, state, address, mesh and robot.
+    """List nodes with role, state, address, mesh and robot, also lost and retired ones.
 
-    Example: meshctl inventory list -i inventory/subt-final --robot husky1 --state carried
+    Example: meshctl inventory list robot:husky1 --state carried
     """
     fleet = load_fleet(inventory, environ=os.environ)
     rows = [
         _summary(node)
-        for node in fleet.nodes.values()
+        for node in selected_nodes(fleet, nodes, limit, with_unmanaged=True)
         if role in (None, node.role) and state in (None, node.state) and robot in ("", node.robot)
     ]
     if as_json:
@@ -91,7 +91,7 @@ def list_nodes(
 
 @app.command("show")
 def show(
-    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
     inventory: InventoryPath = Path(),
     why: Annotated[bool, typer.Option("--why", help="Show the layer, file and line of each value.")] = False,
     as_json: AsJson = False,
@@ -101,18 +101,19 @@ def show(
     Example: meshctl inventory show husky1-b03 --why
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    values = explain(fleet, _node(fleet, node))
+    name = selected_node(fleet, node, with_unmanaged=True).name
+    values = explain(fleet, fleet.nodes[name])
     if as_json:
-        echo_json(json.dumps({"node": node, "values": [_record(value) for value in values]}, indent=2))
+        echo_json(json.dumps({"node": name, "values": [_record(value) for value in values]}, indent=2))
         return
     written = [value for value in values if value.value or value.origin.layer != "built-in"]
-    echo(node)
+    echo(name)
     _table([_row(value, why) for value in written], indent="  ")
 
 
 @app.command("state")
 def change_state(
-    node: Annotated[str, typer.Argument(help="Name of the node.")],
+    node: Annotated[str, typer.Argument(help="The node: name, label, serial number or MAC.")],
     new: Annotated[NodeState, typer.Argument(help="New state.")],
     inventory: InventoryPath = Path(),
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the change without writing it.")] = False,
@@ -122,21 +123,14 @@ def change_state(
     Example: meshctl inventory state husky1-b03 deployed
     """
     fleet = load_fleet(inventory, environ=os.environ)
-    _node(fleet, node)
+    name = selected_node(fleet, node, with_unmanaged=True).name
     editor = Editor.open(inventory, environ=os.environ)
-    set_state(editor, node, new)
+    set_state(editor, name, new)
     changes = editor.changes()
     for change in changes:
         echo(change.diff(), nl=False)
     if not dry_run:
         save(changes)
-
-
-def _node(fleet: Fleet, name: str) -> Node:
-    node = fleet.nodes.get(name)
-    if node is None:
-        raise InputError(f"the inventory has no node '{name}'", hint=did_you_mean(name, fleet.nodes))
-    return node
 
 
 def _summary(node: Node) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, desc
 MAX_FILES = 256
 # The first file of a directory.
 FIRST_FILE = "fleet.yaml"
+_MISSING_HINT = "expected in {directory}: name another with `--inventory`, or write a first one with `meshctl init DIR`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,11 @@ class _FileMerger:
         source = read_source(path, self.read)
         if not isinstance(source, Source):
             is_first_missing = source.code == codes.UNREADABLE and not above
-            hint = "`meshctl init DIR` writes a first inventory" if is_first_missing else ""
+            place = path.absolute().parent
+            start = (
+                f"expected in {place}: name another with `--inventory`, or write a first one with `meshctl init DIR`"
+            )
+            hint = start if is_first_missing else ""
             self._fail(replace(source, hint=source.hint or hint))
             return None
         self.files.append(path)

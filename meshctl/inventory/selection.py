@@ -19,11 +19,12 @@ import re
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from types import MappingProxyType
 from typing import TypeVar
 
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet, Node, Robot
+from meshctl.model import Fleet, Node, NodeState, Robot
 
 LIST_HINT = "run `meshctl inventory list` to list all nodes"
 COMPUTER = "computer"
@@ -37,6 +38,16 @@ Attributes = Mapping[str, Collection[str]]
 """What a candidate can be selected by besides its name: attribute -> values."""
 
 K = TypeVar("K", bound=Hashable)
+
+
+@dataclass(frozen=True, slots=True)
+class _Subject:
+    """What is selected: `what` names a candidate in messages, `hint` follows the error for an unknown name, and
+    `unmanaged` are nodes that a user may name although they are no candidates, with their states."""
+
+    what: str
+    hint: str
+    unmanaged: Mapping[str, NodeState]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,18 +90,34 @@ def select_nodes(
     limits: Iterable[str] = (),
     *,
     in_word_order: bool = False,
+    with_unmanaged: bool = False,
 ) -> tuple[Node, ...]:
-    """The managed nodes that the words select; all if there are none. Raises InputError, see `select`."""
-    managed = {node.name: node for node in fleet.managed()}
-    candidates = {name: attributes_of(node) for name, node in managed.items()}
-    what = f"managed node of {fleet.name}"
-    names = select(words, candidates, read_file, limits, what=what, hint=LIST_HINT, in_word_order=in_word_order)
-    return tuple(managed[name] for name in names)
+    """The nodes that the words select; all if there are none. Lost and retired ones only `with_unmanaged`.
+
+    Raises InputError, see `select`.
+    """
+    nodes = {node.name: node for node in (fleet.nodes.values() if with_unmanaged else fleet.managed())}
+    names = select(
+        words,
+        {name: attributes_of(node) for name, node in nodes.items()},
+        read_file,
+        limits,
+        what=f"node of {fleet.name}" if with_unmanaged else f"managed node of {fleet.name}",
+        hint=LIST_HINT,
+        unmanaged=unmanaged_states(fleet),
+        in_word_order=in_word_order,
+    )
+    return tuple(nodes[name] for name in names)
 
 
-def select_one(fleet: Fleet, word: str, read_file: Callable[[str], str]) -> Node:
-    """The one managed node that the word selects. Raises InputError for none or several."""
-    found = select_nodes(fleet, [word], read_file)
+def unmanaged_states(fleet: Fleet) -> dict[str, NodeState]:
+    """The lost and retired nodes, which commands for managed nodes explain when they are named."""
+    return {node.name: node.state for node in fleet.nodes.values() if not node.state.is_managed}
+
+
+def select_one(fleet: Fleet, word: str, read_file: Callable[[str], str], *, with_unmanaged: bool = False) -> Node:
+    """The one node that the word selects. Raises InputError for none or several."""
+    found = select_nodes(fleet, [word], read_file, with_unmanaged=with_unmanaged)
     if len(found) != 1:
         names = ", ".join(node.name for node in found)
         raise InputError(f"{word!r} selects {len(found)} nodes: expected one, found {names}")
@@ -105,20 +132,22 @@ def select(
     *,
     what: str,
     hint: str = "",
+    unmanaged: Mapping[str, NodeState] = MappingProxyType({}),
     name_of: Callable[[K], str] = str,
     in_word_order: bool = False,
 ) -> tuple[K, ...]:
     """The candidates that the words select and every limit selects too; all if there are neither.
 
     They come in the candidates' order, or with `in_word_order` in that of the words. `read_file` returns the text of a
-    file or raises OSError; `what` names a candidate in messages, `hint` follows the error for an unknown name. Raises
-    InputError for a term that selects nothing, an unknown attribute, an unreadable file, or a selection that leaves
-    nothing.
+    file or raises OSError; `what` names a candidate in messages, `hint` follows the error for an unknown name, and
+    `unmanaged` are nodes that are no candidates because of their states. Raises InputError for a term that selects
+    nothing, an unknown attribute, an unreadable file, or a selection that leaves nothing.
     """
     named = {key: (name_of(key), attributes) for key, attributes in candidates.items()}
-    chosen = _select(tuple(words), named, read_file, what, hint)
+    subject = _Subject(what, hint, unmanaged)
+    chosen = _select(tuple(words), named, read_file, subject)
     for limit in limits:
-        allowed = set(_select((limit,), named, read_file, what, hint))
+        allowed = set(_select((limit,), named, read_file, subject))
         left = [key for key in chosen if key in allowed]
         if chosen and not left:
             raise InputError(f"{limit}: selects no {what} among those selected without it")
@@ -133,20 +162,20 @@ _Named = Mapping[K, tuple[str, Attributes]]
 
 
 def _select(
-    words: tuple[str, ...], candidates: _Named[K], read_file: Callable[[str], str], what: str, hint: str
+    words: tuple[str, ...], candidates: _Named[K], read_file: Callable[[str], str], subject: _Subject
 ) -> list[K]:
     """In the order of the terms, and for each in that of the candidates."""
     terms = tuple(_terms(words, read_file))
     if words and not terms:
         # an empty variable of a script, or an empty file, must not select everything
-        raise InputError(f"{' '.join(repr(word) for word in words)}: selects no {what}")
-    chosen = {term: _matching(term, candidates, what, hint) for term in terms}
+        raise InputError(f"{' '.join(repr(word) for word in words)}: selects no {subject.what}")
+    chosen = {term: _matching(term, candidates, subject) for term in terms}
     included = [term for term in terms if not term.is_exclusion]
     found = [key for term in included for key in chosen[term]] if included else list(candidates)
     excluded = {key for term in terms if term.is_exclusion for key in chosen[term]}
     left = [key for key in dict.fromkeys(found) if key not in excluded]
     if terms and not left:
-        raise InputError(f"{','.join(term.text for term in terms)}: selects no {what}")
+        raise InputError(f"{','.join(term.text for term in terms)}: selects no {subject.what}")
     return left
 
 
@@ -177,20 +206,32 @@ def _terms_of_file(path: str, read_file: Callable[[str], str]) -> Iterator[Term]
         yield from _terms(line.partition("#")[0].split(), read_file, source=f"{path}:{number}: ")
 
 
-def _matching(term: Term, candidates: _Named[K], what: str, hint: str) -> list[K]:
+def _matching(term: Term, candidates: _Named[K], subject: _Subject) -> list[K]:
     if term.attribute:
-        return _matching_attribute(term, candidates, what)
+        return _matching_attribute(term, candidates, subject.what)
     found = [key for key, (name, _) in candidates.items() if fnmatchcase(name, term.pattern)]
     for attribute in ("group", *_PRINTED):
         found = found or _having(attribute, term.pattern, candidates, exactly=True)
     found = found or [key for key, (name, _) in candidates.items() if name.lower() == term.pattern.lower()]
     if not found:
+        if state := subject.unmanaged.get(term.pattern):
+            # a similar name instead would be another device
+            raise InputError(
+                f"{term.pattern} is {state.value}: meshctl does not manage lost and retired nodes",
+                hint=f"if it is back, run `meshctl inventory state {term.pattern} deployed`",
+            )
         known = [*(name for name, _ in candidates.values()), *_values("group", candidates)]
         raise InputError(
-            f"no {what} matches {term.pattern!r}",
-            hint=did_you_mean(term.pattern, known) or hint,
+            f"no {subject.what} matches {term.pattern!r}",
+            hint=_pattern_hint(term.pattern, candidates) or did_you_mean(term.pattern, known) or subject.hint,
         )
     return found
+
+
+def _pattern_hint(text: str, candidates: _Named[K]) -> str:
+    """For the beginning of several names, such as a name whose end is not typed yet: one of them would be a guess."""
+    count = sum(name.startswith(text) for name, _ in candidates.values())
+    return f"{count} names begin with it: '{text}*' selects them" if count > 1 else ""
 
 
 def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from meshctl.errors import InputError
-from meshctl.inventory.selection import COMPUTER, LIST_HINT, attributes_of, robot_attributes, select
+from meshctl.inventory.selection import COMPUTER, LIST_HINT, attributes_of, robot_attributes, select, unmanaged_states
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, NodeState, Role
 from meshctl.status.alarm_codes import CODES
@@ -101,6 +101,7 @@ def select_devices(
         [",".join(one) for one in restrictions[1:]],
         what=f"node or robot of {fleet.name}",
         hint=LIST_HINT,
+        unmanaged=unmanaged_states(fleet),
         name_of=lambda device: device[1],
     )
     return Filter(

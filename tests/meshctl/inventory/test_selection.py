@@ -8,6 +8,7 @@ import pytest
 
 from meshctl.errors import InputError
 from meshctl.inventory.selection import Attributes, select, select_nodes, select_one
+from meshctl.model import NodeState
 from tests.meshctl.plan.support import fleet
 
 CANDIDATES: dict[str, Attributes] = {
@@ -129,3 +130,19 @@ def test_a_node_is_selected_by_name_label_serial_or_mac(word: str) -> None:
 def test_a_command_for_one_node_refuses_several() -> None:
     with pytest.raises(InputError, match=r"'b0\*' selects \d nodes: expected one, found b01, b02"):
         select_one(fleet(), "b0*", read)
+
+
+def test_an_unmanaged_node_is_named_with_its_state_and_never_replaced_by_a_similar_name() -> None:
+    team = fleet()
+    lost = replace(team.nodes["b01"], state=NodeState.LOST)
+    team = replace(team, nodes=MappingProxyType({**team.nodes, "b01": lost}))
+    with pytest.raises(InputError, match="b01 is lost: meshctl does not manage lost and retired nodes") as caught:
+        select_one(team, "b01", read)
+    assert caught.value.hint == "if it is back, run `meshctl inventory state b01 deployed`"
+    assert select_one(team, "b01", read, with_unmanaged=True).state is NodeState.LOST
+
+
+def test_the_beginning_of_several_names_suggests_a_pattern_and_not_one_of_them() -> None:
+    with pytest.raises(InputError, match="no managed node of lab matches 'b0'") as caught:
+        chosen("b0")
+    assert caught.value.hint == "2 names begin with it: 'b0*' selects them"

@@ -47,9 +47,14 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         fleet = load_fleet(inventory)
         assert (fleet.nodes["n001"].label, fleet.nodes["n002"].state.value) == ("S2", "retired")
         assert rig.meshctl("provision", "spare", "n001", "--check", "--json").verdicts == {"n001": "same"}
-        # its successor dies, too, and the inventory breaks while the next one takes over
+        # its successor dies, too, is marked as lost, and the inventory breaks while the next one takes over
         rig.fleet.inject_fault("n002", "off")
-        good = inventory.read_text(encoding="utf-8")
+        good = inventory.read_text(encoding="utf-8").replace("n001: {label: S2}", "n001: {label: S2, state: lost}")
+        inventory.write_text(good, encoding="utf-8")
+        refused = rig.meshctl("replace", "spare", "n003", "n001", "--yes")
+        assert "n001 is lost: expected a spare" in refused.err
+        shown = rig.meshctl("replace", "spare", "n001", "n003", "--dry-run")
+        assert (shown.code, "+  n001: {label: S3, state: deployed}" in shown.out) == (0, True), shown.out + shown.err
         with rig.start("replace", "spare", "n001", "n003", "--yes", "--json") as process:
             assert process.stdout is not None
             for line in process.stdout:
@@ -59,6 +64,6 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
             stderr = process.stderr.read()
         assert process.returncode == 2, stderr
         assert "n001 runs on its new device, but the inventory could not be updated" in stderr
-        assert '{"n001": {"label": "S3"}, "n003": {"state": "retired"}}' in stderr
+        assert '{"n001": {"label": "S3", "state": "deployed"}, "n003": {"state": "retired"}}' in stderr
         inventory.write_text(good, encoding="utf-8")
         assert rig.fleet.node("n003").address == "10.42.1.1"
