@@ -113,10 +113,10 @@ def _typer_argument(parameter: Any) -> Option:
 
 def _typer_option(parameter: Any) -> Option:
     names = (*sorted(parameter.opts, key=len), *parameter.secondary_opts)
-    metavar = "" if parameter.is_flag else parameter.metavar or parameter.name.upper()
+    metavar = "" if parameter.is_flag or parameter.count else parameter.metavar or parameter.name.upper()
     default = parameter.default
     shown = default is not None and not callable(default) and default not in (False, "", [], ()) and parameter.is_flag
-    if not parameter.is_flag and default not in (None, "", [], ()) and not callable(default):
+    if metavar and default not in (None, "", [], ()) and not callable(default):
         shown = True
     text = str(default.value if isinstance(default, Enum) else default) if shown and default is not True else ""
     return Option(names, metavar, _one_line(parameter.help), text, parameter.envvar or "")

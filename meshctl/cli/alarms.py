@@ -64,7 +64,7 @@ def list_alarms(
     lab: Lab = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the open alarms, the most severe first, with their age and who takes care of them.
+    """List the open alarms, the most severe first, with their age and who is handling them.
 
     Exit code: 0 none open that is neither acknowledged nor silenced (notes do not count), 1 some are, 2 could not run.
 
@@ -106,7 +106,7 @@ def _lines(alarms: tuple[LoggedAlarm, ...], now_s: float, newest_s: float | None
             yield f"  {alarm.hint}"
     if not alarms:
         yield "no alarms"
-    yield f"last look {duration(max(0.0, now_s - newest_s))} ago"
+    yield f"last snapshot {duration(max(0.0, now_s - newest_s))} ago"
 
 
 def _lasted(alarm: LoggedAlarm) -> str:
@@ -122,7 +122,7 @@ def acknowledge(
     store: HistoryFile = None,
     lab: Lab = None,
 ) -> None:
-    """Acknowledge an open alarm: you take care of it. It is loud again if it ends and comes back later.
+    """Acknowledge an open alarm: you are handling it. It is reported again if it ends and comes back later.
 
     Example: meshctl alarms ack b03 weak
     """

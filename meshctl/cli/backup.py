@@ -62,7 +62,9 @@ _TO_ANOTHER_CELL = (
 def backup(
     nodes: Nodes = None,
     limit: Limit = None,
-    out: Annotated[Path, typer.Option("--out", help="Directory for the NODE-TIME.tgz files.")] = Path("backups"),
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Directory for the NODE-TIME.tgz files.")] = Path(
+        "backups"
+    ),
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,
     key: KeyFiles = None,

@@ -1,11 +1,37 @@
-"""Groups of commands: their help, and a group with a command of its own for words that name none."""
+"""Commands and groups of commands: their help, and a group with a command of its own for words that name none."""
 
 from __future__ import annotations
 
 import sys
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, get_args, get_origin
 
-from typer.core import TyperGroup
+from typer.core import TyperArgument, TyperCommand, TyperGroup
+
+_METAVARS = {Path: "PATH", int: "N", float: "NUMBER"}
+
+
+class Command(TyperCommand):
+    """Names values in its help by what they are, where newer typers show Python's types (`--key <list[Path]>`)."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        for parameter in self.params:
+            _name_value(parameter)
+
+
+def _name_value(parameter: Any) -> None:
+    described = getattr(parameter, "type_descriptor", None)
+    if described is None or described.is_choice:
+        # an older typer, which names values itself, or a list of values
+        return
+    if isinstance(parameter, TyperArgument):
+        # its name is enough
+        vars(parameter)["display_type_rich"] = lambda ctx: None
+    elif parameter.metavar is None and not parameter.is_flag and not parameter.count:
+        kind = described.annotation
+        kind = get_args(kind)[0] if get_origin(kind) is list else kind
+        parameter.metavar = _METAVARS.get(kind) or parameter.name.upper()
 
 
 class CommandGroup(TyperGroup):

@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, session, with_options
-from meshctl.cli.output import is_plain
+from meshctl.cli.output import is_dumb, is_plain
 from meshctl.cli.robots_context import AskSudo, sudo_password
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node
@@ -139,7 +139,7 @@ def collect(
 
 def _progress(*, show_progress: bool) -> Progress:
     """A counter on the terminal that is erased at the end."""
-    if not (show_progress and sys.stderr.isatty()):
+    if not (show_progress and sys.stderr.isatty()) or is_dumb():
         return lambda done, count: None
 
     def show(done: int, count: int) -> None:

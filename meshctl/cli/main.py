@@ -6,6 +6,7 @@ one by its summary only, and hands over to typer.
 
 from __future__ import annotations
 
+import errno
 import functools
 import gc
 import importlib
@@ -19,10 +20,10 @@ import typer
 from typer.core import TyperGroup
 
 from meshctl import __version__
-from meshctl.cli.command_group import CommandGroup
+from meshctl.cli.command_group import Command, CommandGroup
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
-from meshctl.cli.output import echo, ignore_broken_pipe, prepare_streams
+from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, prepare_streams
 from meshctl.errors import ExitCode, MeshctlError
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ _EPILOG = """Start with `meshctl init DIR`, or with `meshctl lab up` for a virtu
 
 Exit codes: 0 success, 1 findings, 2 could not run, 3 required nodes unreachable, 130 interrupted."""
 
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Lines longer than this are hard to read.
 MAX_HELP_COLUMNS = 100
 # Objects created before the youngest are searched for cycles, and collections before the next older generation is.
@@ -55,6 +57,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except MeshctlError as error:
         _print_error(error)
         sys.exit(int(error.exit_code))
+    except OSError as error:
+        # of a stream; files have names
+        if error.errno not in _DISK_FULL or error.filename is not None:
+            raise
+        discard_output()
+        _print_error(MeshctlError(f"cannot write the output: {error.strerror}"))
+        sys.exit(int(ExitCode.COULD_NOT_RUN))
     except KeyboardInterrupt:
         # during the import of the command, which takes seconds on a busy machine
         echo("interrupted", err=True)
@@ -146,7 +155,7 @@ def _register(app: typer.Typer, name: str, entry: Entry) -> None:
         app.add_typer(target, name=name, cls=CommandGroup, help=entry.summary, no_args_is_help=True)
     else:
         # words after `--` in `meshctl run NODE -- CMD -x` belong to the command on the node
-        app.command(name)(_guarded(target))
+        app.command(name, cls=Command)(_guarded(target))
 
 
 def _print_error(error: MeshctlError) -> None:
@@ -157,6 +166,7 @@ def _print_error(error: MeshctlError) -> None:
 
 def _prepare_group(group: typer.Typer) -> None:
     for command in group.registered_commands:
+        command.cls = Command
         if command.callback is not None:
             command.callback = _guarded(command.callback)
     for inner in group.registered_groups:

@@ -74,8 +74,8 @@ def meter(
 ) -> None:
     """Show a robot's link margin in large digits, and when it should drop its next beacon.
 
-    Looks once a second over kept connections, at the robot's own radios and one relay in turn. The first look also asks
-    every node for its addresses. Positions come from this machine's udp_mesh daemon, or from the lab.
+    Once a second it queries the robot's own radios and one relay in turn, over kept connections. The first query also
+    asks every node for its addresses. Positions come from this machine's udp_mesh daemon, or from the lab.
 
     Exit code: 0 after --count readings, 2 could not run, 130 interrupted.
 
@@ -236,7 +236,7 @@ class _ReadingSource:
         """What the looks cost, and what is wrong."""
         cost = "?" if self.bytes_per_s is None else f"{self.bytes_per_s / 1000:.1f}"
         problem = self.watch.problem() or self._note
-        return f"looking costs {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
+        return f"queries cost {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
 
     def _count_bytes(self) -> None:
         now_s, total = time.monotonic(), sum(self.traffic().values())

@@ -1,4 +1,4 @@
-"""`meshctl metrics`: one look at the fleet as Prometheus metrics, and the files that Prometheus and Grafana need."""
+"""`meshctl metrics`: one snapshot of the fleet as Prometheus metrics, and the files for Prometheus and Grafana."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def metrics(
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
-    """Print one look at the fleet in Prometheus' text format; `meshctl monitor` serves the same at /metrics.
+    """Print one snapshot of the fleet in Prometheus' text format; `meshctl monitor` serves the same at /metrics.
 
-    With --store, the newest frame of a monitor's history is printed, and no device is asked.
+    With --store, the newest frame of a monitor's history is printed, and no device is queried.
 
     Exit code: 0 printed or written, 2 could not run.
 

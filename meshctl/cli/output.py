@@ -52,8 +52,13 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 
 def is_plain() -> bool:
-    """Whether NO_COLOR is set (no-color.org)."""
-    return bool(os.environ.get("NO_COLOR"))
+    """Whether NO_COLOR is set (no-color.org), or the terminal understands no escapes."""
+    return bool(os.environ.get("NO_COLOR")) or is_dumb()
+
+
+def is_dumb() -> bool:
+    """Whether the terminal understands no escapes, such as an editor's shell."""
+    return os.environ.get("TERM") == "dumb"
 
 
 def console() -> Console:
@@ -64,7 +69,15 @@ def console() -> Console:
 
 
 def prepare_streams() -> None:
-    """Escape characters that the terminal's encoding lacks instead of failing."""
+    """Escape characters that the terminal's encoding lacks instead of failing; replace closed streams by /dev/null.
+
+    Without the latter, the next file that is opened would be standard output (`meshctl status >&-`).
+    """
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # the lowest free number, which is this stream's
+            null = os.open(os.devnull, os.O_RDWR)
+            setattr(sys, name, open(null, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)
         if reconfigure is not None:
@@ -78,7 +91,11 @@ def ignore_broken_pipe() -> Iterator[None]:
         yield
         sys.stdout.flush()
     except OSError:
-        # or the interpreter flushes, and complains, once more at exit
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        os.close(null)
+        discard_output()
+
+
+def discard_output() -> None:
+    """Write nothing more to standard output, or the interpreter flushes, and complains, once more at exit."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)

@@ -30,27 +30,32 @@ from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
 
 NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Do not upgrade firmware.")]
 LeaveBehind = Annotated[
-    str, typer.Option("--leave-behind", help="Nodes (a,b,... or all) that may be left in the old cell of their mesh.")
+    str,
+    typer.Option(
+        "--leave-behind", metavar="NODES", help="Nodes (a,b,... or all) that may be left in the old cell of their mesh."
+    ),
 ]
 AcceptCut = Annotated[
-    str, typer.Option("--accept-cut", help="Cut vertices (a,b,... or all) that may be flashed anyway.")
+    str, typer.Option("--accept-cut", metavar="NODES", help="Cut vertices (a,b,... or all) that may be flashed anyway.")
 ]
 Together = Annotated[
     bool,
     typer.Option(
-        "--together", help="Change all nodes of running meshes at one moment; all roll back unless a quorum is well."
+        "--together", help="Change all nodes of running meshes at one moment; all roll back unless a quorum is healthy."
     ),
 ]
 Brief = Annotated[bool, typer.Option("--brief/--full", help="Hide file diffs.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation.")]
-Rate = Annotated[float | None, typer.Option("--rate", help="Upload limit per node in kB/s.")]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="KB_S", help="Upload limit per node in kB/s.")]
 
 
 def plan(
     nodes: Nodes = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),
-    out: Annotated[Path | None, typer.Option("--out", help="Save the plan for `meshctl apply`.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Save the plan for `meshctl apply`.")
+    ] = None,
     no_firmware: NoFirmware = False,
     together: Together = False,
     leave_behind: LeaveBehind = "",

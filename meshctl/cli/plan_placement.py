@@ -29,7 +29,7 @@ def plan_placement(
     ],
     route: Annotated[
         list[str],
-        typer.Argument(metavar="POINT...", help="The route from the base: nodes of the file, or X,Y in meters."),
+        typer.Argument(metavar="POINT", help="The route from the base: nodes of the file, or X,Y in meters."),
     ],
     margin: Annotated[
         float, typer.Option("--margin", metavar="DB", help="Margin to keep everywhere on the route.")
@@ -55,6 +55,7 @@ def plan_placement(
     Exit code: 0 the whole route has the margin, 1 not all of it has, 2 could not run.
 
     Example: meshctl plan-placement ground.yaml base 240,0 240,-60 --svg plan.svg
+
     Example: meshctl plan-placement mine.yaml 0,0 55,12 --beacons 4 --json
     """
     terrain, air, stops, view = _read(map_file, route, wall_loss, exponent)

@@ -36,10 +36,12 @@ def render(
     nodes: Nodes = None,
     limit: Limit = None,
     inventory: InventoryPath = Path(),
-    out: Annotated[Path | None, typer.Option("--out", help="Write each node's files to DIR/NODE/.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Write each node's files to DIR/NODE/.")
+    ] = None,
     imagebuilder: Annotated[
         Path | None,
-        typer.Option("--imagebuilder", help="Write ImageBuilder overlays and build scripts to DIR."),
+        typer.Option("--imagebuilder", metavar="DIR", help="Write ImageBuilder overlays and build scripts to DIR."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -132,7 +134,7 @@ def _report(
 def diff(
     before: Annotated[str, typer.Argument(metavar="A", help="Inventory, or REVISION:PATH in git.")],
     after: Annotated[
-        str | None, typer.Argument(metavar="[B]", help="Inventory, or REVISION:PATH in git; default: the inventory.")
+        str | None, typer.Argument(metavar="B", help="Inventory, or REVISION:PATH in git; default: the inventory.")
     ] = None,
     inventory: InventoryPath = Path(),
     as_json: AsJson = False,

@@ -115,7 +115,9 @@ def stop_command(context: RobotsContext, dry_run: DryRun = False) -> None:
 def logs_command(
     context: RobotsContext,
     lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="Number of lines per robot.")] = 50,
-    since: Annotated[str, typer.Option("--since", help="Only lines since this time: '10 min ago', 'today'.")] = "",
+    since: Annotated[
+        str, typer.Option("--since", metavar="TIME", help="Only lines since this time: '10 min ago', 'today'.")
+    ] = "",
 ) -> None:
     """Print the logs of the daemons and bridges.
 
@@ -167,7 +169,7 @@ def uninstall_command(
 @with_robots_context("robots", "limit", "inventory", "key")
 def trust_command(
     context: RobotsContext,
-    change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,
+    change: Annotated[bool, typer.Option("--replace", "--replace-key", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
     dry_run: DryRun = False,
 ) -> None:

@@ -53,12 +53,14 @@ Robots = Annotated[
 Named = Annotated[list[str], typer.Argument(metavar="ROBOTS", help="Robots or patterns such as 'husky*'.")]
 Wheels = Annotated[
     Path | None,
-    typer.Option("--wheels", help="Directory with the required wheels; default: download them with pip."),
+    typer.Option(
+        "--wheels", metavar="DIR", help="Directory with the required wheels; default: download them with pip."
+    ),
 ]
 AskSudo = Annotated[
     bool, typer.Option("--ask-sudo", help="Prompt for the sudo password (or set MESHCTL_SUDO_PASSWORD).")
 ]
-Wait = Annotated[int, typer.Option("--wait", min=2, help="Seconds a new release has to become healthy.")]
+Wait = Annotated[int, typer.Option("--wait", min=2, metavar="S", help="Seconds a new release has to become healthy.")]
 
 RobotTask = Callable[[Host, str], Outcome]
 Parameters = Mapping[str, Any]

@@ -29,7 +29,7 @@ topic_app = typer.Typer(help="Change topics in the inventory and on all robots."
 Topic = Annotated[str, typer.Argument(help="Topic name.")]
 Assignments = Annotated[
     list[str],
-    typer.Argument(metavar="KEY=VALUE...", help="Topic settings: priority=9 destinations=[base]"),
+    typer.Argument(metavar="KEY=VALUE", help="Topic settings: priority=9 destinations=[base]"),
 ]
 
 

@@ -33,7 +33,7 @@ from meshctl.status.text import preflight_text, text
 Names = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="[NAME]...",
+        metavar="NAME",
         help="Radios and robots: names, patterns, groups, role:beacon, '!b07', @FILE; default: all.",
     ),
 ]

@@ -77,6 +77,7 @@ def sweep(
     Exit code: 0 every case has a result, 1 some have none, 2 could not run.
 
     Example: meshctl lab sweep mission.yaml --seeds 200 --set beacons.b02.drop_s=80,99,120
+
     Example: meshctl lab sweep mission.yaml --set air.exponent=3.5,4.4 --set trial.route_s=1,5 --report mission.html
     """
     # here, so that other commands start without it

@@ -49,7 +49,7 @@ def test_alarms_are_listed_acknowledged_and_silenced(inventory: str, capfd: pyte
         "  look",
         "note: fleet not-compared: not-compared of  (since MINUTES)",
         "  look",
-        "last look MINUTES ago",
+        "last snapshot MINUTES ago",
     ]
     everything = said(capfd, "alarms", "list", "--all", "-i", inventory, code=1)
     assert re.search(r"note: b02 clock: clock of b02 \(ended \d+ min ago, after 5 min\)", everything)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from meshctl import __version__
 from meshctl.cli import main as root
 from meshctl.cli.commands import COMMANDS
 from meshctl.errors import InputError
+from meshctl.inventory.starter import write_starter
 
 
 def run(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
@@ -66,6 +68,19 @@ def test_each_command_has_help_with_an_example(name: str, capsys: pytest.Capture
     assert ended.value.code == 0
     assert not [line for line in shown.splitlines() if line.count("Example: ") > 1], "one example a line"
     assert COMMANDS[name].attribute == "app" or f"meshctl {name}" in shown.split("Usage:", 1)[1].split("\n", 1)[1]
+
+
+def test_help_names_values_in_words_and_gives_each_example_its_own_line() -> None:
+    wrong = []
+    for name in COMMANDS:
+        group: Any = typer.main.get_command(root.build(name))
+        for words, command in _leaves(group.commands[name], (name,)):
+            shown = command.get_help(typer.Context(command, info_name=words))
+            kinds = [line.strip() for line in shown.splitlines() if re.search(r"<(list|str|int|float|path)", line)]
+            wrong += [f"{words}: {line}" for line in kinds]
+            paragraphs = [" ".join(paragraph.split()) for paragraph in shown.split("\n\n")]
+            wrong += [f"{words}: {text}" for text in paragraphs if text.count("Example: ") > 1]
+    assert wrong == []
 
 
 # these read no inventory: they make one, describe its format, show journal or help, or act on a running virtual fleet
@@ -149,3 +164,21 @@ def test_ctrl_c_before_the_command_starts_is_reported_as_interrupted(
     with pytest.raises(SystemExit) as ended:
         root.main(["plan"])
     assert (ended.value.code, capsys.readouterr().err) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize("words", [("--help",), ("lint", "--list"), ("schema",)], ids=" ".join)
+def test_a_full_disk_behind_the_output_is_an_error_without_a_traceback(words: tuple[str, ...]) -> None:
+    with open("/dev/full", "w", encoding="utf-8") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "meshctl", *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, done.stderr) == (2, "error: cannot write the output: No space left on device\n")
+
+
+def test_closed_streams_are_not_taken_over_by_files(tmp_path: Path) -> None:
+    write_starter(tmp_path)
+    # rich asks whether standard output is a terminal; the log would be the next file with its number
+    command = f"exec <&- >&-; {sys.executable} -m meshctl inventory list -i {tmp_path} --log-file {tmp_path}/log"
+    done = subprocess.run(["sh", "-c", command], stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "base" not in (tmp_path / "log").read_text()
