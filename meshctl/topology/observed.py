@@ -7,7 +7,7 @@ nodes, `observed_graph` merges both directions of a link, `seen_by` finds the no
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from meshctl.topology.graph import Graph, Link, graph_of
 
@@ -17,12 +17,14 @@ NEIGHBOUR_FRESH_MS = 10_000
 
 @dataclass(frozen=True, slots=True)
 class HeardNeighbor:
-    """A neighbor in a node's table: `quality` 0..1, None if unknown."""
+    """A neighbor in a node's table: `quality` 0..1, None if unknown. `paths` are the other originators that are reached
+    through it: lower-case MAC -> quality of the whole path."""
 
     mac: str
     last_seen_ms: int
     quality: float | None = None
     signal_dbm: int | None = None
+    paths: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +65,22 @@ def neighbours_of(
         mac = heard.mac.lower()
         name = names.get(mac, mac)
         if heard.last_seen_ms <= fresh_ms and name != report.node:
+            measured = _with_quality(heard, name, names)
             known = best.get(name)
-            if known is None or _rank(heard) > _rank(known):
-                best[name] = heard
+            if known is None or _rank(measured) > _rank(known):
+                best[name] = measured
     return best
+
+
+def _with_quality(heard: HeardNeighbor, name: str, names: Mapping[str, str]) -> HeardNeighbor:
+    """With the quality of the path to another radio of the same neighbor, where its own is unknown.
+
+    batman-adv may list a node with several radios under the address of its first one only; that path ends here.
+    """
+    if heard.quality is not None:
+        return heard
+    paths = [quality for originator, quality in heard.paths.items() if names.get(originator, originator) == name]
+    return replace(heard, quality=max(paths, default=None))
 
 
 def _rank(heard: HeardNeighbor) -> tuple[float, int, int]:

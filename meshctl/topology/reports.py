@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from meshctl.device.observation import Observation, Originator
 from meshctl.topology.observed import HeardNeighbor, Report
 
@@ -21,16 +23,21 @@ def report_of(node: str, seen: Observation) -> Report:
             for station in seen.stations or ()
         ]
         return Report(node, mesh_macs(seen), tuple(heard))
-    quality = _direct_quality(seen.originators or ())
+    paths = _paths(seen.originators or ())
     return Report(
         node,
         mesh_macs(seen),
         tuple(
-            HeardNeighbor(mac, neighbour.last_seen_ms, quality.get(mac), signals.get(mac))
+            _heard(mac, neighbour.last_seen_ms, signals.get(mac), paths.get(mac, {}))
             for neighbour in seen.neighbours
             for mac in (neighbour.mac.lower(),)
         ),
     )
+
+
+def _heard(mac: str, last_seen_ms: int, signal_dbm: int | None, paths: Mapping[str, float]) -> HeardNeighbor:
+    others = {originator: quality for originator, quality in paths.items() if originator != mac}
+    return HeardNeighbor(mac, last_seen_ms, paths.get(mac), signal_dbm, others)
 
 
 def mesh_macs(seen: Observation) -> tuple[str, ...]:
@@ -41,18 +48,17 @@ def mesh_macs(seen: Observation) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mac.lower() for mac in macs if mac))
 
 
-def _direct_quality(originators: tuple[Originator, ...]) -> dict[str, float]:
-    """MAC -> quality of the direct link: the originator entries whose next hop is the originator itself."""
-    best: dict[str, float] = {}
+def _paths(originators: tuple[Originator, ...]) -> dict[str, dict[str, float]]:
+    """Next hop's MAC -> originator's MAC -> quality; the direct link where both are the same."""
+    paths: dict[str, dict[str, float]] = {}
     for entry in originators:
-        mac = entry.mac
-        if entry.next_hop != mac:
-            continue
         if entry.tq is not None:
             value = entry.tq / TQ_MAX
         elif entry.throughput_kbit_s is not None:
             value = entry.throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
         else:
             continue
+        best = paths.setdefault(entry.next_hop.lower(), {})
+        mac = entry.mac.lower()
         best[mac] = min(1.0, max(value, best.get(mac, 0.0)))
-    return best
+    return paths

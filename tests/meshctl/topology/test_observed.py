@@ -48,6 +48,16 @@ def test_the_best_measured_radio_of_a_neighbor_is_used() -> None:
     assert neighbours_of(Report("base", (), (unmeasured, front)), names) == {"husky": front}
 
 
+def test_a_second_radio_has_the_quality_of_the_path_that_ends_there() -> None:
+    """A relay whose originator has the address of its first radio is heard on its second one."""
+    names = {"02:00:00:00:00:01": "relay", "02:00:00:00:00:02": "relay", "02:00:00:00:00:03": "base"}
+    paths = {"02:00:00:00:00:01": 0.6, "02:00:00:00:00:03": 0.5}
+    end = Report("end", (), (HeardNeighbor("02:00:00:00:00:02", 10, paths=paths),))
+    assert neighbours_of(end, names)["relay"].quality == 0.6
+    graph = observed_graph([end], known_macs=names)
+    assert graph.neighbours["end"]["relay"].quality == 0.6
+
+
 def test_without_quality_the_strongest_signal_wins_then_the_latest_sighting() -> None:
     names = {"02:00:00:00:00:01": "husky", "02:00:00:00:00:02": "husky"}
     weak, strong = HeardNeighbor("02:00:00:00:00:01", 10, None, -80), HeardNeighbor("02:00:00:00:00:02", 900, None, -60)
