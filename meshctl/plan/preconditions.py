@@ -99,9 +99,11 @@ def _lan_ports(case: _Checked) -> FailedPrecondition | None:
         return None
     for port in case.node.lan_ports:
         # a VLAN (eth0.1) exists only while it is configured, its parent always
-        if port.partition(".")[0] not in known:
+        parent = port.partition(".")[0]
+        if parent not in known:
+            vlan = "" if parent == port else f", on which {port} is a VLAN"
             return FailedPrecondition(
-                f"it has no port {port}: found {', '.join(sorted(known))}",
+                f"it has no port {parent}{vlan}: found {', '.join(sorted(known))}",
                 "correct lan_ports in its hardware profile",
             )
     return None

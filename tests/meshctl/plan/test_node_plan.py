@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import pytest
@@ -109,6 +110,15 @@ def test_a_node_with_an_unmet_precondition_is_refused_with_the_reason(changes: d
     plan = planned(fleet(), "b01", running(fleet(), "b01", **changes), owner="alice@base:7")
     assert plan.verdict is Verdict.REFUSED
     assert plan.reason.startswith(reason)
+
+
+def test_a_missing_switch_port_is_named_by_itself_and_not_by_its_vlan() -> None:
+    team = fleet()
+    b01 = replace(team.nodes["b01"], lan_ports=("eth0.1",))
+    team = replace(team, nodes=MappingProxyType({**team.nodes, "b01": b01}))
+    macs = {"eth1": "02:00:00:00:00:10", "eth0.1": "02:00:00:00:00:11"}
+    plan = planned(team, "b01", running(team, "b01", macs=macs))
+    assert plan.reason.startswith("it has no port eth0, on which eth0.1 is a VLAN: found eth0.1, eth1")
 
 
 def test_a_radio_at_another_path_is_refused() -> None:
