@@ -68,6 +68,8 @@ def write_board(state: NodeState, radios_mac: str, seed: int = 0) -> None:
         "BOARD_NAME": "virtual,other-board" if state.wrong_board else spec.board,
         "MODEL": spec.model,
         "LAN_PORTS": " ".join(spec.lan_ports),
+        # a VLAN (eth0.1) is on a port of the board
+        "PORTS": " ".join(dict.fromkeys(name for port in spec.lan_ports for name in (port.partition(".")[0], port))),
         "LAN_MAC": radios_mac,
         "RADIOS": " ".join(radios),
         "HOST_KEY_TYPES": " ".join(types),

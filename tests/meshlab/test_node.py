@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+from pathlib import Path
 
 import paramiko
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from meshctl.model import Release
 from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.images import firmware_image, opkg_package
+from meshlab.spec import FleetSpec, NodeSpec
 from meshlab.state import Power
 from tests.meshlab.conftest import answers, connect, flash_text, run
 from tests.waiting import until
@@ -388,3 +390,9 @@ def test_netifd_detects_protocol_handlers_only_at_startup(fleet: VirtualFleet, n
     assert "batadv" not in json.loads(again.stdout)
     restarted = node.exec("ubus call network restart; ubus call network get_proto_handlers")
     assert "batadv" in json.loads(restarted.stdout)
+
+
+def test_a_vlan_of_a_switch_is_on_a_port_of_the_board(tmp_path: Path) -> None:
+    with VirtualFleet(FleetSpec("switch", (NodeSpec("box", lan_ports=("eth0.1",)),)), tmp_path / "lab") as fleet:
+        found = fleet.node("box").exec("ubus call network reload; ls /sys/class/net").check("list the devices")
+    assert {"eth0", "eth0.1"} <= set(found.stdout.split())
