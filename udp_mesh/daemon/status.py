@@ -18,7 +18,6 @@ from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import Address, Settings, Topic
 from udp_mesh.core.subscriptions.conditions import SubscriptionConditions
 from udp_mesh.core.subscriptions.messages import Bounds, Subscription
-from udp_mesh.core.subscriptions.table import united
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
@@ -119,7 +118,7 @@ def subscriptions_json(conditions: SubscriptionConditions, here: Iterable[Subscr
     """What programs read `here` and at each peer (null: everything), and what was saved."""
     return {
         "selective": conditions.selective,
-        "read_here": _subscriptions(united(here)),
+        "read_here": _subscriptions(dict(here)),
         "announced": None if conditions.own is None else _subscriptions(dict(conditions.own)),
         "peers": [
             {

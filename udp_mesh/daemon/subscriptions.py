@@ -9,7 +9,7 @@ from functools import reduce
 
 from udp_mesh.client.mesh_client import Header, encode_frame
 from udp_mesh.core.events import MessageReceived
-from udp_mesh.core.subscriptions.messages import UNBOUNDED, Bounds, Subscription
+from udp_mesh.core.subscriptions.messages import MAX_ENTRIES, UNBOUNDED, Bounds, Subscription
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.inbox import Inbox, LoggedItem
 from udp_mesh.daemon.interface import RESERVED_PREFIX
@@ -85,13 +85,16 @@ class Subscriptions:
         self._changed()
 
     def read_here(self) -> list[Subscription]:
-        """What programs read, other than what never crosses the network; repeated if several do."""
-        return [
-            Subscription(pattern, bounds)
-            for patterns in self._patterns.values()
-            for pattern, bounds in patterns.items()
-            if not pattern.startswith(RESERVED_PREFIX)
-        ]
+        """What programs read, other than what never crosses the network; everything if it is more than a peer accepts:
+        every change goes through all clients' patterns."""
+        found: dict[str, Bounds] = {}
+        for patterns in self._patterns.values():
+            for pattern, bounds in patterns.items():
+                if not pattern.startswith(RESERVED_PREFIX):
+                    found[pattern] = found[pattern].united(bounds) if pattern in found else bounds
+            if len(found) > MAX_ENTRIES:
+                return [Subscription("*")]
+        return [Subscription(pattern, bounds) for pattern, bounds in found.items()]
 
     def remove_client(self, client: Client) -> None:
         self._patterns.pop(client, None)

@@ -151,7 +151,8 @@ def test_the_guides_commands_and_program_work(pair: Pair, tmp_path: Path) -> Non
         with alice.client() as sender:
             sender.publish("map", b"four", to="bob")
         assert program.stdout is not None
-        assert program.stdout.readline() == b"alice map 4\n"
+        # The last frame of video, which waited for its turn, may come first.
+        assert b"alice map 4\n" in program.stdout
         program.kill()
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from udp_mesh.core.events import MessageReceived, Receipt
+from udp_mesh.core.subscriptions.messages import MAX_ENTRIES, Bounds, Subscription
 from udp_mesh.daemon.api import Client
 from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.outbox import DirectoryStore
@@ -101,3 +102,28 @@ def test_a_slow_program_does_not_make_a_log_read_its_backlog_again_and_again(tmp
         log.inbox.close()
 
     asyncio.run(run())
+
+
+def test_peers_are_announced_what_all_programs_read_together(tmp_path: Path) -> None:
+    async def announced() -> list[list[Subscription]]:
+        found: list[list[Subscription]] = []
+        inbox = Inbox(DirectoryStore(tmp_path, 1 << 20), lambda _: None, lambda _: None)
+        subscriptions = Subscriptions(inbox, lambda _: None, lambda _: 4, found.append)
+        slow, fast, greedy = (cast(Client, Program(1)) for _ in range(3))
+        subscriptions.add(slow, ["map", "video", "~mesh/conditions"], Bounds(1.0, 2.0))
+        subscriptions.add(fast, ["video"], Bounds(5.0))
+        await asyncio.sleep(0)
+        subscriptions.remove(slow, ["map"])
+        await asyncio.sleep(0)
+        subscriptions.add(greedy, [f"topic{number}" for number in range(MAX_ENTRIES)])
+        await asyncio.sleep(0)
+        subscriptions.remove_client(greedy)
+        subscriptions.remove_client(fast)
+        await asyncio.sleep(0)
+        return found
+
+    together, without_map, too_many, rest = asyncio.run(announced())
+    assert together == [Subscription("map", Bounds(1.0, 2.0)), Subscription("video", Bounds(5.0, None))]
+    assert without_map == together[1:]
+    assert too_many == [Subscription("*")]
+    assert rest == [Subscription("video", Bounds(1.0, 2.0))]
