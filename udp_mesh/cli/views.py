@@ -42,13 +42,18 @@ def peers_view(peers: list[Json]) -> str:
             duration(queue["oldest_s"]),
             duration(queue["starved_s"]),
             duration(queue["held_s"]),
+            # daemons of earlier versions do not tell
+            "-" if queue.get("drained_in_s") is None else duration(queue["drained_in_s"]),
         ]
         for peer in peers
         for queue in peer["queues"]
         if queue["messages"]
     ]
     if waiting:
-        lines += ["", table(["waiting for", "priority", "messages", "bytes", "oldest", "starved", "held"], waiting)]
+        lines += [
+            "",
+            table(["waiting for", "priority", "messages", "bytes", "oldest", "starved", "held", "sent in"], waiting),
+        ]
     return "\n".join(lines)
 
 

@@ -18,6 +18,10 @@ class QueueConditions:
     """Time in which this level waited while only more urgent ones were sent, since the node started."""
     held_s: float
     """Time in which this level was held back for other robots' more urgent messages."""
+    drained_in_s: float | None = None
+    """Time until what waits now on this level, and before it on more urgent ones, is sent at the link's estimated
+    capacity. Messages under way count whole, so it is an upper bound. None if the capacity is unknown, or the peer is
+    offline."""
 
 
 @dataclass(frozen=True, slots=True)

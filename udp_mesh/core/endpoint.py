@@ -312,6 +312,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
     held_messages, held_bytes = state.outboxes.count(peer.name)
     capacity = sender.congestion.capacity_packets_per_s()
     fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
+    capacity_bits_per_s = None if capacity is None else capacity * fragment_bytes * 8
     meters = session.meters if session is not None else peer.legacy_meters
     address, link, last_heard = _current_path(peer)
     saved = state.selection.saved(peer.name)
@@ -333,11 +334,11 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
         _reported_bits_per_s(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now)
         if session is not None
         else None,
-        None if capacity is None else capacity * fragment_bytes * 8,
+        capacity_bits_per_s,
         sender.congestion.cwnd,
         sender.in_flight.outstanding,
         sender.retransmitted,
-        _queue_conditions(sender, now),
+        _queue_conditions(sender, now, capacity_bits_per_s if peer.online else None),
         held_messages,
         held_bytes,
         session is not None and session.one_way_since is not None and _recently_heard(session, now),
@@ -362,9 +363,11 @@ def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]
     return peer.legacy_path or (None, None, None)
 
 
-def _queue_conditions(sender: Sender, now: float) -> tuple[QueueConditions, ...]:
+def _queue_conditions(sender: Sender, now: float, capacity_bits_per_s: float | None) -> tuple[QueueConditions, ...]:
     queues = []
+    waiting_bytes = 0
     for priority, level in enumerate(sender.levels):
+        waiting_bytes += level.bytes
         oldest = level.oldest()
         starved_s = level.starved_s + (now - level.starved_since if level.starved_since is not None else 0.0)
         if not level.messages and not starved_s and not level.held_s:
@@ -377,6 +380,7 @@ def _queue_conditions(sender: Sender, now: float) -> tuple[QueueConditions, ...]
                 now - oldest.queued_at if oldest is not None else 0.0,
                 starved_s,
                 level.held_s,
+                waiting_bytes * 8 / capacity_bits_per_s if capacity_bits_per_s else None,
             )
         )
     return tuple(queues)

@@ -1,5 +1,6 @@
 """Strict priority, decided per fragment when a datagram is built."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -151,3 +152,42 @@ def test_a_starved_priority_level_is_reported() -> None:
     queues = {queue.priority: queue for queue in world.nodes["a"].conditions(world.now).peers[0].queues}
     assert queues[12].starved_s > 5
     assert queues[5].starved_s == 0
+
+
+def test_the_time_until_a_queue_is_sent_is_what_it_takes() -> None:
+    world = World()
+    topics = (Topic("urgent", priority=5), Topic("bulk", priority=12))
+    for name in ("a", "b"):
+        world.add(settings(name, *topics))
+    world.run(1.5)
+    # measured with messages before: the capacity is not known at once
+    for topic in ("urgent", "bulk", "bulk"):
+        world.send("a", topic, bytes(2_000_000), "b")
+    world.run(3.0)
+    peer = world.nodes["a"].conditions(world.now).peers[0]
+    waiting = {queue.priority: queue for queue in peer.queues if queue.messages}
+    estimated_s = waiting[12].drained_in_s
+    assert estimated_s is not None
+    assert peer.capacity_bits_per_s is not None
+    expected = sum(queue.bytes for queue in waiting.values()) * 8 / peer.capacity_bits_per_s
+    assert estimated_s == pytest.approx(expected)
+    started = world.now
+    while any(queue.messages for queue in world.nodes["a"].conditions(world.now).peers[0].queues):
+        world.run(0.1)
+        assert world.now - started < 10 * estimated_s
+    assert world.now - started == pytest.approx(estimated_s, rel=0.5)
+
+
+def test_the_time_until_a_queue_is_sent_is_unknown_while_the_peer_is_offline() -> None:
+    world = World()
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("bulk", priority=12)))
+    world.run(1.5)
+    world.send("a", "bulk", bytes(20_000_000), "b")
+    world.run(1.0)
+    for pipe in world.pipes.values():
+        pipe.up = False
+    world.run(30.0)
+    (peer,) = world.nodes["a"].conditions(world.now).peers
+    assert not peer.online
+    assert {queue.drained_in_s for queue in peer.queues} <= {None}
