@@ -46,6 +46,7 @@ from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
 from meshctl.monitor.shared_alarms import SharedAlarms
 from meshctl.monitor.store import FrameStore
+from meshctl.report.duration import duration
 from meshctl.robots.local_daemon import socket_path
 
 DEFAULT_PORT = 8765
@@ -55,6 +56,8 @@ HOOK_CLOSE_S = 2.0
 ONCE_HOOK_CLOSE_S = 60.0
 # A round that is under way when the monitor ends.
 SAMPLER_CLOSE_S = 2.0
+# Two machines' clocks differ by less.
+FUTURE_S = 60.0
 _SHELL_OPERATORS = frozenset("|&;<>()")
 DEFAULT_DAYS = 7.0
 DEFAULT_MB = 512
@@ -156,6 +159,7 @@ def monitor(
         )
         history = stack.enter_context(_open_history(view, store, keep_days, max_mb))
         history.claim()
+        _warn_of_future_frames(history)
         sampler = sampler_of(view, history, interval)
         hooks = AlarmHooks(hook_settings, view.fleet.name)
         stack.callback(hooks.close, ONCE_HOOK_CLOSE_S if once else HOOK_CLOSE_S)
@@ -206,6 +210,18 @@ def _open_history(view: FleetView, path: Path | None, keep_days: float, max_mb: 
     except OSError as error:
         raise InputError(f"{path.parent}: cannot be created: {error.strerror}") from error
     return FrameStore.open(path, keep_days * 86400, max_mb << 20)
+
+
+def _warn_of_future_frames(history: FrameStore) -> None:
+    """New frames follow the newest one, so a clock that was ahead once makes all later times wrong."""
+    newest = history.latest()
+    ahead_s = 0.0 if newest is None else newest.time_s - time.time()
+    if ahead_s > FUTURE_S:
+        echo(
+            f"warning: {history.path}: its newest snapshot is {duration(ahead_s)} ahead of this machine's clock, and "
+            "new ones get later times still: check the clock, or name another file with --store",
+            err=True,
+        )
 
 
 def _shared_options(inventory: Path, keys: Iterable[Path], lab: Path | None) -> list[str]:

@@ -8,6 +8,7 @@ import json
 import re
 import signal
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -175,6 +176,19 @@ def test_a_single_snapshot_reports_its_new_alarms_to_hook_and_textfile(tmp_path:
     # the alarms continue: the next one has nothing to report
     run(*words)
     assert len((tmp_path / "reported").read_text().split()) == 3
+
+
+def test_a_history_from_the_future_is_warned_of(tmp_path: Path) -> None:
+    trio(tmp_path)
+    path = tmp_path / "run.sqlite"
+    words = ("--once", "-i", str(tmp_path / "fleet.yaml"), "--store", str(path), "--no-robots", "--timeout", "0.5")
+    _, output = run(*words)
+    assert "ahead of this machine's clock" not in output
+    with FrameStore.open(path, 1e9, MIN_BYTES) as store:
+        # the laptop's clock was two days ahead
+        store.append(frame(time.time() + 2 * 86400))
+    _, output = run(*words)
+    assert f"warning: {path}: its newest snapshot is 48 h ahead of this machine's clock" in output
 
 
 @pytest.mark.parametrize("token", ["", "short", "with a space in it, which is long"])
