@@ -70,7 +70,7 @@ def _frame(document: Document) -> Iterator[MetricFamily]:
     verdict, airtime = document.get("verdict") or {}, document.get("airtime") or {}
     fleet = document.get("fleet")
     rows: tuple[tuple[str, str, object], ...] = (
-        ("meshctl_frame_timestamp_seconds", "When the fleet was last looked at (Unix time).", document.get("time_s")),
+        ("meshctl_frame_timestamp_seconds", "When the fleet was last queried (Unix time).", document.get("time_s")),
         ("meshctl_frame_duration_seconds", "How long that took.", document.get("took_s")),
         ("meshctl_go", "1 for go, 0 for no-go.", verdict.get("go")),
         ("meshctl_watch_bytes_per_second", "Bytes that watching sends and receives.", airtime.get("bytes_per_s")),
