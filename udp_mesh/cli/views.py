@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from udp_mesh.cli.output import duration, milliseconds, rate, size, table
+from udp_mesh.cli.thin_view import thin_view
 
 Json = dict[str, Any]
 
@@ -104,6 +105,8 @@ def status_view(status: Json) -> str:
     ]
     if status.get("relaying"):
         lines += relays_view(status["relaying"])
+    if status.get("thin"):
+        lines += thin_view(status["thin"])
     if status.get("positions"):
         rows = [
             [

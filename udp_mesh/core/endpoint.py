@@ -5,13 +5,12 @@ A driver repeats: `receive` what arrived, `handle_timer` when `next_timer` is du
 returns none, then `next_event` until None.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from udp_mesh.core import publish, reconfigure, transmit
-from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
-from udp_mesh.core.events import Event, MessageId, Receipt, Rejected
+from udp_mesh.core.conditions import Conditions
+from udp_mesh.core.events import Event, MessageDelivered, MessageId, Receipt, Rejected
 from udp_mesh.core.interfaces import Datagram, RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
@@ -19,32 +18,24 @@ from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.logs.messages import LOG_PREFIX
 from udp_mesh.core.logs.store import LogStore, MemoryLogStore
 from udp_mesh.core.logs.topics import with_log_topics
-from udp_mesh.core.meter import Meter
-from udp_mesh.core.peers.heartbeat import MISSED_HEARTBEATS
-from udp_mesh.core.peers.session import Peer, Session
+from udp_mesh.core.node_conditions import node_conditions
 from udp_mesh.core.receive import receive_datagram
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.relaying import Relaying
 from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.selective_sending import SelectiveSending
-from udp_mesh.core.sender.send_state import SendState
-from udp_mesh.core.sender.sender import Sender
-from udp_mesh.core.settings import RELAY_LINK, Address, LinkInfo, Settings
+from udp_mesh.core.settings import Address, LinkInfo, Settings
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
 from udp_mesh.core.subscriptions.messages import TABLE_TOPIC, with_subscription_topics
+from udp_mesh.core.thin.conditions import ThinConditions
+from udp_mesh.core.thin.thin_links import ThinLinks
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.wire.header import MARK
 from udp_mesh.wire.legacy import decapsulate
 from udp_mesh.wire.limits import BOOT_ID_BYTES
 from udp_mesh.wire.relay import RELAY_BYTE
-
-REPORTED_RATE_VALID_S = 2.0
-"""A rate reported in an acknowledgement is valid for the second it averages, and one more."""
-
-UNVERIFIED_AFTER_S = 3.0
-"""A node heard for this long without hearing us is listed as unverified; discovery takes a fraction of that."""
 
 
 class Endpoint:
@@ -70,6 +61,7 @@ class Endpoint:
         self._relaying = Relaying(self._state, now)
         self.selective = SelectiveSending(self._state, now)
         """What the programs here and at peers read."""
+        self.thin = ThinLinks(self._state, now) if settings.thin.links else None
         self._log_store = log_store
         self._logs: SharedLogs | None = None
         self._start_logs(settings, now)
@@ -88,6 +80,9 @@ class Endpoint:
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process one datagram. Bad bytes are counted and dropped; received data never makes this raise."""
+        if self.thin is not None and link in self.thin.links:
+            self.thin.receive(data, link, now)
+            return
         if len(data) and data[0] < MARK:
             inner = decapsulate(data)
             if inner is not None:
@@ -112,7 +107,7 @@ class Endpoint:
             self._legacy.send(now, out)
         if out:
             transmit.count_sent(self._state, out)
-        return out
+        return out if self.thin is None else out + self.thin.transmit(now)
 
     def next_timer(self) -> float | None:
         """When `handle_timer` is due next (None: never). Cheap; may be in the past."""
@@ -120,6 +115,8 @@ class Endpoint:
         if at is None:
             return None
         at = min(at, self._relaying.next_at(), self.selective.next_at)
+        if self.thin is not None:
+            at = min(at, self.thin.next_at())
         if self._legacy:
             at = min(at, self._legacy.next_at())
         return at if self._logs is None else min(at, self._logs.next_at)
@@ -129,6 +126,8 @@ class Endpoint:
         transmit.handle_timer(self._state, now)
         self._relaying.handle_timer(now)
         self.selective.handle_timer(now)
+        if self.thin is not None:
+            self.thin.handle_timer(now)
         if self._legacy:
             self._legacy.handle_timer(now)
 
@@ -141,6 +140,8 @@ class Endpoint:
 
     def is_due_before(self, at: float) -> bool:
         """Whether a call of `send` may have moved `next_timer` to before `at`; cheaper than reading that."""
+        if self.thin is not None and self.thin.next_at() < at:
+            return True
         soon = min(self._state.next_peer_at(), self._state.selection.next_at)
         return soon < at or bool(self._state.compression_queue or self._state.versions.jobs)
 
@@ -156,9 +157,10 @@ class Endpoint:
 
     def next_event(self) -> Event | None:
         """The oldest event not yet fetched."""
-        if self._logs is not None:
-            return self._logs.next_event()
-        return self._state.event_queue.next_event()
+        event = self._state.event_queue.next_event() if self._logs is None else self._logs.next_event()
+        if self.thin is not None and isinstance(event, MessageDelivered):
+            self.thin.sending.on_delivered(event)
+        return event
 
     def send(
         self, topic: str, payload: bytes, *, destination: str | None = None, now: float, type_name: str = ""
@@ -171,6 +173,8 @@ class Endpoint:
         """
         if self._logs is not None and self._logs.is_log(topic):
             return self._logs.send(topic, payload, destination, type_name, now)
+        if self.thin is not None and self.thin.sending.carries(topic):
+            return self.thin.sending.send(topic, payload, destination, type_name, now)
         return publish.send(self._state, topic, payload, destination, type_name, now)
 
     def link_up(self, link: LinkInfo, now: float) -> None:
@@ -184,12 +188,21 @@ class Endpoint:
     def apply(self, settings: Settings, now: float) -> list[str]:
         """Change topics, window, rates, limits, keys and neighbors. Returns one line per change made.
 
-        Drops no accepted message. Raises ValueError if the name or port changed: that requires a restart.
+        Drops no accepted message, but changed thin links end what only they carry. Raises ValueError if the name or
+        port changed: that requires a restart.
         """
+        thin_changed = settings.thin != self._state.settings.thin
         lines = reconfigure.apply(self._state, _with_reserved_topics(settings), now)
         self.selective.apply()
         self._legacy.apply()
         self._relaying.apply(now)
+        if thin_changed:
+            if self.thin is not None:
+                self.thin.sending.close()
+            self.thin = ThinLinks(self._state, now) if settings.thin.links else None
+            lines.append("thin links")
+        elif self.thin is not None:
+            self.thin.apply()
         self._start_logs(settings, now)
         if self._logs is not None:
             self._logs.apply(settings, now)
@@ -203,13 +216,17 @@ class Endpoint:
         """A snapshot of relays: who is reached through whom, what is passed on."""
         return snapshot(self._state, self._relaying, now)
 
+    def thin_conditions(self, now: float) -> ThinConditions | None:
+        """A snapshot of thin links (None: there are none)."""
+        return None if self.thin is None else self.thin.conditions(now)
+
     def versions(self) -> tuple[VersionConditions, ...]:
         """What was sent and received as versions, by topic."""
         return self._state.versions.conditions()
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
-        return _snapshot(self._state, now)
+        return node_conditions(self._state, now)
 
     def confirm(self, receipt: Receipt) -> None:
         """A received message is safe: the application took it, or it is on disk. Its sender reports it as delivered."""
@@ -255,142 +272,11 @@ class Endpoint:
         """Say goodbye; fetch the last datagrams and events afterwards. Pending reliable messages end as expired."""
         transmit.flush_packed(self._state, now)
         reconfigure.close(self._state, now)
+        if self.thin is not None:
+            self.thin.sending.close()
         if self._logs is not None:
             self._logs.process(now)
 
 
 def _with_reserved_topics(settings: Settings) -> Settings:
     return with_subscription_topics(with_log_topics(settings))
-
-
-def _snapshot(state: State, now: float) -> Conditions:
-    """See `Endpoint.conditions`."""
-    idle = Sender(state.settings)
-    peers = tuple(
-        _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
-    )
-    senders = [peer.sender for peer in state.peer_table.peers.values() if peer.sender is not None]
-    counters = state.event_queue.counters
-    sent_bits_per_s = _bits_per_s(state.sent, now)
-    receivers = [session.receiver for session in state.peer_table.sessions.values()]
-    return Conditions(
-        now,
-        state.settings.name,
-        peers,
-        replace(
-            counters,
-            fragments_received=sum(receiver.fragments for receiver in receivers),
-            duplicates_received=sum(receiver.duplicates for receiver in receivers),
-            fragments_retransmitted=sum(sender.retransmitted for sender in senders),
-            fragments_sent=sum(sender.sent_packets for sender in senders),
-            dropped_stale=counters.dropped_stale + sum(receiver.expired for receiver in receivers),
-            dropped_over_limit=counters.dropped_over_limit + sum(receiver.over_limit for receiver in receivers),
-        ),
-        sent_bits_per_s,
-        sent_bits_per_s + sum(peer.peer_sends_bits_per_s or 0.0 for peer in peers if peer.online),
-        sum(receiver.partial_bytes + receiver.inflating_bytes for receiver in receivers),
-        sum(sender.levels.queued_bytes for sender in senders) + state.compression_queue.bytes,
-        state.broadcasts.kept_bytes,
-        tuple(_unverified_nodes(state, now)),
-    )
-
-
-def _unverified_nodes(state: State, now: float) -> Iterator[UnverifiedNode]:
-    for session in sorted(state.peer_table.not_current(), key=lambda session: session.name):
-        met_at, path = session.met_at, session.path
-        if session.verified or met_at is None or now - met_at < UNVERIFIED_AFTER_S or not _recently_heard(session, now):
-            continue
-        yield UnverifiedNode(session.name, path.address, path.link, met_at, session.last_heard)
-
-
-def _recently_heard(session: Session, now: float) -> bool:
-    return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
-
-
-def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
-    session = peer.session
-    held_messages, held_bytes = state.outboxes.count(peer.name)
-    capacity = sender.congestion.capacity_packets_per_s()
-    fragment_bytes = session.path.fragment_bytes if session is not None else state.settings.fragment_bytes
-    capacity_bits_per_s = None if capacity is None else capacity * fragment_bytes * 8
-    meters = session.meters if session is not None else peer.legacy_meters
-    address, link, last_heard = _current_path(peer)
-    saved = state.selection.saved(peer.name)
-    return PeerConditions(
-        peer.name,
-        peer.online,
-        peer.legacy,
-        address,
-        link,
-        peer.online_since,
-        last_heard,
-        sender.rtt.smoothed_rtt,
-        sender.rtt.min_rtt,
-        sender.loss,
-        _bits_per_s(meters.sent, now) if meters is not None else 0.0,
-        _bits_per_s(meters.delivered, now) if meters is not None else 0.0,
-        _bits_per_s(meters.received, now) if meters is not None else 0.0,
-        _reported_bits_per_s(session.peer_receives, REPORTED_RATE_VALID_S, now) if session is not None else None,
-        _reported_bits_per_s(session.peer_sends, MISSED_HEARTBEATS * session.interval_s, now)
-        if session is not None
-        else None,
-        capacity_bits_per_s,
-        sender.congestion.cwnd,
-        sender.in_flight.outstanding,
-        sender.retransmitted,
-        _queue_conditions(sender, now, capacity_bits_per_s if peer.online else None),
-        held_messages,
-        held_bytes,
-        session is not None and session.one_way_since is not None and _recently_heard(session, now),
-        now - sender.last_progress if sender.state is SendState.UNRESPONSIVE and sender.pending else None,
-        sender.sent_bytes,
-        sender.delivered_bytes,
-        session.received_bytes if session is not None else meters.received.total if meters is not None else 0,
-        saved.messages,
-        saved.bytes,
-    )
-
-
-def _current_path(peer: Peer) -> tuple[Address | None, str | None, float | None]:
-    """Address, link, and when something last came from there."""
-    session = peer.session
-    if session is not None:
-        path = session.path
-        if path.link == RELAY_LINK:
-            # Its address there means nothing outside.
-            return None, path.link, session.last_heard
-        return (path.address, path.link, session.last_heard) if path.link else (None, None, session.last_heard)
-    return peer.legacy_path or (None, None, None)
-
-
-def _queue_conditions(sender: Sender, now: float, capacity_bits_per_s: float | None) -> tuple[QueueConditions, ...]:
-    queues = []
-    waiting_bytes = 0
-    for priority, level in enumerate(sender.levels):
-        waiting_bytes += level.bytes
-        oldest = level.oldest()
-        starved_s = level.starved_s + (now - level.starved_since if level.starved_since is not None else 0.0)
-        if not level.messages and not starved_s and not level.held_s:
-            continue
-        queues.append(
-            QueueConditions(
-                priority,
-                level.messages,
-                level.bytes,
-                now - oldest.queued_at if oldest is not None else 0.0,
-                starved_s,
-                level.held_s,
-                waiting_bytes * 8 / capacity_bits_per_s if capacity_bits_per_s else None,
-            )
-        )
-    return tuple(queues)
-
-
-def _reported_bits_per_s(rate: tuple[int, float], for_s: float, now: float) -> float | None:
-    """The rate in bits per second that a peer reported, unless the report is too old."""
-    bytes_per_s, reported_at = rate
-    return 8.0 * bytes_per_s if now - reported_at <= for_s else None
-
-
-def _bits_per_s(meter: Meter, now: float) -> float:
-    return 8 * meter.per_s(now)

@@ -43,6 +43,7 @@ class ExpiryReason(Enum):
     OUTBOX_FULL = "outbox full"
     LOG_FULL = "log full"
     TOO_OLD = "older than the log keeps"
+    TOO_LARGE = "too large for a thin link"
     DISK = "disk error"
     NOT_WANTED = "not wanted"
     """No program there reads the topic."""
@@ -213,6 +214,29 @@ class PathNarrowed:
     fragment_bytes: int
 
 
+@dataclass(frozen=True, slots=True)
+class ThinPeerHeard:
+    """A node is heard on a thin link, and hears this node."""
+
+    peer: str
+    link: str
+
+
+@dataclass(frozen=True, slots=True)
+class ThinPeerSilent:
+    """A node is no longer heard on thin links."""
+
+    peer: str
+
+
+@dataclass(frozen=True, slots=True)
+class ThinLinkRejecting:
+    """So many frames of a thin link could not be authenticated that it accepts nothing for the rest of an hour."""
+
+    link: str
+    failures: int
+
+
 Event = (
     PeerOnline
     | PeerOffline
@@ -230,4 +254,7 @@ Event = (
     | LogItemDropped
     | TopicStarved
     | PathNarrowed
+    | ThinPeerHeard
+    | ThinPeerSilent
+    | ThinLinkRejecting
 )

@@ -202,6 +202,12 @@ def deliver(state: State, session: Session, now: float) -> None:
             state.schedule_repair(session.boot_id, repairs)
         if state.on_subscriptions(session, message.topic, message.payload, now):
             continue
+        thin_number, confirm_id = message.thin_number, message.confirm_id
+        if thin_number is not None and not state.thin_copies.is_first(session.boot_id, thin_number):
+            # A thin link was faster.
+            if confirm_id is not None and receiver.confirm(confirm_id):
+                state.schedule_control(session)
+            continue
         state.event_queue.counters.messages_received += 1
         state.event_queue.emit(
             MessageReceived(
@@ -211,7 +217,7 @@ def deliver(state: State, session: Session, now: float) -> None:
                 message.payload,
                 message.priority,
                 message.to_all,
-                None if message.confirm_id is None else Receipt(session.boot_id, message.confirm_id),
+                None if confirm_id is None else Receipt(session.boot_id, confirm_id),
             )
         )
 

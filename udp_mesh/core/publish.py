@@ -21,7 +21,7 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.legacy.sender import can_publish
 from udp_mesh.core.outbox import HeldMessage
-from udp_mesh.core.peers.heartbeat import own_features
+from udp_mesh.core.peers.features import acceptable, all_accept
 from udp_mesh.core.peers.peer_state import PeerState
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
@@ -33,6 +33,7 @@ from udp_mesh.core.sender.send_quota import pack_until
 from udp_mesh.core.settings import Outbox, Topic, is_type_name
 from udp_mesh.core.state import State
 from udp_mesh.core.subscriptions.messages import is_about_subscriptions
+from udp_mesh.core.thin.numbering import numbered, unnumbered
 from udp_mesh.core.versions.outgoing import OutgoingVersion
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES
 from udp_mesh.wire.codec import ANNOUNCE_BYTES
@@ -52,9 +53,16 @@ MAX_CHANNELS = 65_536
 
 
 def send(
-    state: State, topic_name: str, payload: bytes, destination: str | None, type_name: str, now: float
+    state: State,
+    topic_name: str,
+    payload: bytes,
+    destination: str | None,
+    type_name: str,
+    now: float,
+    *,
+    thin_number: int | None = None,
 ) -> MessageId | Rejected:
-    """See `Endpoint.send`."""
+    """See `Endpoint.send`. `thin_number` is that of the copies on thin links, if there are any."""
     if state.closed:
         return Rejected(RejectReason.CLOSED, "the node is closed")
     topic = state.topics.get(topic_name)
@@ -91,7 +99,8 @@ def send(
         state.compression_queue.add(Uncompressed(message_id, channel, payload, tuple(names), now, keys, zstd))
     else:
         packed = compress(payload, zstd=zstd) if compression else None
-        _enqueue_all(state, _accept(message_id, channel, payload, packed, now, zstd=zstd), names, now)
+        accepted = numbered(_accept(message_id, channel, payload, packed, now, zstd=zstd), thin_number)
+        _enqueue_all(state, accepted, names, now)
     return message_id
 
 
@@ -188,7 +197,7 @@ def enqueue(state: State, name: str, accepted: AcceptedMessage, now: float, stor
     admitted = state.selection.admit(peer, accepted, now)
     if admitted is None:
         return
-    accepted = admitted if peer.session is None else acceptable(admitted, peer.session)
+    accepted = unnumbered(admitted) if peer.session is None else acceptable(admitted, peer.session)
     keeps = topic.outbox is not Outbox.NONE and peer.settling
     if (keeps or state.outboxes.holds(name, topic.name)) and topic.priority > state.settings.rates.urgent_priority:
         # Older messages of the topic still wait in the outbox; only urgent ones go ahead of stale ones.
@@ -223,34 +232,15 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
         state.arm(peer)
 
 
-def all_accept(state: State, names: Sequence[str], feature: int) -> bool:
-    """Whether these peers (none: all that are online) accept a feature, as far as they are known."""
-    peers = [state.peer_table.peers.get(name) for name in names] if names else state.peer_table.online()
-    sessions = [peer.session for peer in peers if peer is not None and peer.session is not None]
-    return bool(own_features(state.settings) & feature) and all(session.features & feature for session in sessions)
-
-
-def acceptable(accepted: AcceptedMessage, session: Session) -> AcceptedMessage:
-    """The message as it is, or uncompressed if the peer does not accept its compression."""
-    needed = Feature.ZSTD if accepted.flags & MessageFlag.ZSTD else Feature.ZLIB
-    return accepted if session.features & needed else uncompressed(accepted)
-
-
-def uncompressed(accepted: AcceptedMessage) -> AcceptedMessage:
-    """The message as it was accepted."""
-    if not accepted.flags & MessageFlag.COMPRESSED:
-        return accepted
-    flags = accepted.flags & ~(MessageFlag.COMPRESSED | MessageFlag.ZSTD)
-    return replace(accepted, body=accepted.payload, flags=flags)
-
-
 def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
     accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
-    for session in sessions:
+    # With peers of earlier versions each gets its own copy, so that the others have the number.
+    same_for_all = not accepted.flags & MessageFlag.NUMBERED or all_accept(state, (), Feature.THIN)
+    for session in sessions if same_for_all else ():
         accepted = acceptable(accepted, session)
-    fits = state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
+    fits = same_for_all and state.can_broadcast() and _broadcast_bytes(accepted) <= broadcast_room(state, sessions)
     if fits:
         broadcast_wanted(state, accepted, now)
     for peer in list(state.peer_table.peers.values()):
@@ -332,7 +322,7 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
                 state.arm(peer)
                 continue
             sender.cancel(started)
-        accepted = held.accepted if session is None else acceptable(held.accepted, session)
+        accepted = unnumbered(held.accepted) if session is None else acceptable(held.accepted, session)
         _queue(state, peer, accepted, now, held.store_key)
     if state.outboxes.holds(peer.name):
         state.maintenance_at = min(state.maintenance_at, now + RELEASE_INTERVAL_S)
@@ -340,16 +330,25 @@ def release_outbox(state: State, peer: Peer, now: float) -> None:
 
 def withdraw(state: State, name: str, message_id: MessageId, now: float) -> None:
     """Send no more of a message to a peer that does not need it: it ends as superseded, unless it has ended already."""
+    _finish(state, name, message_id, ExpiryReason.SUPERSEDED, now)
+
+
+def _finish(state: State, name: str, message_id: MessageId, outcome: Outcome | ExpiryReason, now: float) -> None:
     peer = state.peer_table.peers.get(name)
     if peer is None or peer.sender is None:
         return
     for message in peer.sender.pending:
         if message.accepted.message_id == message_id:
-            peer.sender.finish(message, ExpiryReason.SUPERSEDED)
+            peer.sender.finish(message, outcome)
             break
     report_ended(state, peer, now)
     state.ready[peer] = None
     state.arm(peer)
+
+
+def delivered_elsewhere(state: State, name: str, message_id: MessageId, now: float) -> None:
+    """A thin link delivered a message to a peer: it ends as delivered, unless it has ended or waits in an outbox."""
+    _finish(state, name, message_id, Outcome.DELIVERED, now)
 
 
 def report_ended(state: State, peer: Peer, now: float) -> None:

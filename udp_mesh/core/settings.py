@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
 
+from udp_mesh.core.thin.settings import ThinSettings, check_topics
 from udp_mesh.crypto import Key
 from udp_mesh.wire.limits import (
     MAX_LOG_TOPIC_BYTES,
@@ -130,7 +131,8 @@ class Topic:
     one replaces the oldest (None: no limit). `deadline_s` is a message's lifetime from its `send`. `destinations` lists
     the peers that get a message sent without a destination (empty: all). `repair` lets receivers request a lost
     broadcast again. `delta` sends a message as the difference to the last one that its receiver has, if both have at
-    most `delta_bytes`. With `always`, it is also sent to peers whose programs do not read it.
+    most `delta_bytes`. With `always`, it is also sent to peers whose programs do not read it. With `thin`, the thin links
+    in `links` (empty: all) carry it too, at most once in `thin_period_s`, the newest message only.
     """
 
     name: str
@@ -149,6 +151,9 @@ class Topic:
     delta: bool = False
     delta_bytes: int = 16 << 20
     always: bool = False
+    thin: bool = False
+    links: tuple[str, ...] = ()
+    thin_period_s: float | None = None
 
     @property
     def keeps_on_disk(self) -> bool:
@@ -171,6 +176,10 @@ class Topic:
             raise ValueError(f"topic {self.name}: expected delta_bytes of at least 1, found {self.delta_bytes}")
         if self.log is not None:
             self._check_log()
+        if self.thin and (self.compression or self.delta or self.log is not None):
+            raise ValueError(f"topic {self.name}: expected no compression, delta or log for a thin topic, found one")
+        if self.thin_period_s is not None and self.thin_period_s <= 0:
+            raise ValueError(f"topic {self.name}: expected a positive thin_period_s, found {self.thin_period_s}")
 
     def _check_log(self) -> None:
         """Raises ValueError for what contradicts a log: its items wait in it, for all its readers."""
@@ -365,6 +374,7 @@ class Settings:
     confirms: bool = False
     selective: bool = False
     relay: RelaySettings = field(default_factory=RelaySettings)
+    thin: ThinSettings = field(default_factory=ThinSettings)
     rates: Rates = field(default_factory=Rates)
     limits: Limits = field(default_factory=Limits)
 
@@ -385,3 +395,4 @@ class Settings:
         names = [topic.name for topic in self.topics]
         if len(set(names)) != len(names):
             raise ValueError(f"topics: {next(n for n in names if names.count(n) > 1)!r} is listed twice")
+        check_topics([topic.name for topic in self.topics if topic.thin])

@@ -25,6 +25,7 @@ from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import RELAY_LINK, LinkInfo, LinkKind, Neighbour, Settings, Topic
 from udp_mesh.core.subscriptions.selection import Selection
+from udp_mesh.core.thin.copies import MessageCopies
 from udp_mesh.core.versions.sent import SentVersions
 from udp_mesh.crypto import Key, Keyring, SendChannel
 
@@ -66,6 +67,10 @@ class State:
         """Which messages peers' programs want."""
         self.on_subscriptions: Callable[[Session, str, bytes, float], bool] = lambda *_: False
         """Takes messages about subscriptions, given session, topic, payload and now; False for any other message."""
+        self.thin_counter = 0
+        """Frames sent on thin links: each is sealed under a number of its own, also after the links were changed."""
+        self.thin_copies = MessageCopies()
+        """Messages of which thin links may bring another copy."""
         self.inflating: dict[Session, None] = {}
         """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)

@@ -37,6 +37,7 @@ from udp_mesh.daemon.status import (
     plain,
     relaying_json,
     show_address,
+    thin_json,
     topic_json,
     topics_json,
 )
@@ -178,6 +179,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
         "conditions": conditions_json(driver.conditions()),
         "relaying": relaying_json(driver.node.relaying(driver.now())),
+        "thin": thin_json(driver.node.thin_conditions(driver.now()), service.thin_ports.failures),
         "positions": service.positions.json(),
     }
 
@@ -227,6 +229,7 @@ def render_metrics(service: Service) -> str:
         extra,
         logs=driver.node.logs(),
         versions=driver.node.versions(),
+        thin=driver.node.thin_conditions(driver.now()),
         about=about,
         uptime_s=driver.now() - service.started,
         latencies=service.latencies.by_priority,

@@ -50,9 +50,11 @@ from udp_mesh.daemon.positions import (
     is_frame,
 )
 from udp_mesh.daemon.relay_settings import read_relay
+from udp_mesh.daemon.thin_settings import read_thin
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, parse
 from udp_mesh.daemon.topic_settings import or_default, problem_from, read_topic
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
+from udp_mesh.links.serial_port import SerialPortConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
 log = logging.getLogger(__name__)
@@ -70,7 +72,16 @@ RESERVED_TOPICS = (
     Topic(PONG_TOPIC, priority=0, deadline_s=10.0, always=True),
     Topic(BENCH_TOPIC, priority=15, reliable=True, always=True),
     # The next one comes in seconds: a lost one is not sent again, an old one not at all.
-    Topic(POSITION_TOPIC, priority=13, reliable=False, keep_last=1, deadline_s=5.0, always=True),
+    Topic(
+        POSITION_TOPIC,
+        priority=13,
+        reliable=False,
+        keep_last=1,
+        deadline_s=5.0,
+        always=True,
+        thin=True,
+        thin_period_s=30.0,
+    ),
 )
 
 
@@ -102,6 +113,7 @@ class Configuration:
     settings: Settings
     links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
+    thin_ports: tuple[SerialPortConfig, ...] = ()
     position: Position | None = None
     """The fixed position of a node that does not move."""
     file: Path | None = None
@@ -205,6 +217,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
     daemon = _read_daemon(top.table("daemon"))
     top.text("relay_key_file")
     relay = read_relay(top, relay_keys)
+    thin, thin_ports = read_thin(top.table("thin"))
     position = _read_position(top.table("position")) if top.has("position") else None
     top.finish()
     if source.problems:
@@ -213,6 +226,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
         settings = Settings(
             name=name,
             relay=relay,
+            thin=thin,
             port=port,
             keys=keys,
             unkeyed=unkeyed,
@@ -228,7 +242,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
         )
     except ValueError as error:
         raise ConfigurationError([problem_from(source, error)]) from error
-    return Configuration(settings, links, daemon, position)
+    return Configuration(settings, links, daemon, thin_ports, position)
 
 
 def _window(packets: int | None) -> Literal["adaptive"] | int:

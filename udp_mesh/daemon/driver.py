@@ -21,8 +21,8 @@ from udp_mesh.core.events import Event, MessageId, PeerAddressChanged, PeerOffli
 from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.logs.store import LogStore
-from udp_mesh.core.settings import LinkInfo, LinkKind, Settings
-from udp_mesh.daemon.link_output import LinkOutput
+from udp_mesh.core.settings import Settings
+from udp_mesh.daemon.link_output import LinkOutput, link_info
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
 from udp_mesh.links.hub import LinkHub
@@ -197,7 +197,7 @@ class Driver:
                 self.node.link_down(name, now)
         for link in changes.opened:
             log.info("link-up link=%s address=%s", link.attachment.name, link.attachment.address[0])
-            self.node.link_up(_link_info(link), now)
+            self.node.link_up(link_info(link), now)
         for name, reason in changes.failed.items():
             if self.link_failures.get(name) != reason:
                 log.error("link-failed link=%s reason=%s", name, reason)
@@ -263,6 +263,12 @@ class Driver:
         count = self._drain(link, link.receive_from_strangers, limit)
         self._after_drain()
         return count
+
+    def receive_frames(self, link: str, frames: Sequence[bytes]) -> None:
+        """Passes frames of a thin link to the core."""
+        for frame in frames:
+            self.node.receive(frame, link, ("", 0), self._advance_clock())
+        self._after_drain()
 
     def _after_drain(self) -> None:
         if self.node.is_quiet:
@@ -387,14 +393,3 @@ class Driver:
             self._on_event(event)
         if moved and not self.closed:
             self._update_known_senders()
-
-
-def _link_info(link: UdpLink) -> LinkInfo:
-    attachment = link.attachment
-    return LinkInfo(
-        name=attachment.name,
-        kind=LinkKind.NEIGHBOURS if attachment.broadcast is None else LinkKind.BROADCAST,
-        address=attachment.address,
-        broadcast=attachment.broadcast,
-        mtu=attachment.mtu,
-    )

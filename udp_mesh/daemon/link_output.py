@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Sequence
 
 from udp_mesh.core.interfaces import Datagram
+from udp_mesh.core.settings import LinkInfo, LinkKind
 from udp_mesh.daemon.send_errors import REVIEW_S, SendErrors
 from udp_mesh.links.hub import LinkHub
 from udp_mesh.links.udp import UdpLink
@@ -30,6 +31,8 @@ class LinkOutput:
         self._blocked: dict[str, list[Datagram]] = {}
         self._review_timer: asyncio.TimerHandle | None = None
         self._closed = False
+        self.others: dict[str, Callable[[str, Sequence[Datagram]], None]] = {}
+        """What sends over links that have no socket, by link."""
         self.send_errors = SendErrors()
         self.lost_on_full_socket = 0
 
@@ -53,6 +56,9 @@ class LinkOutput:
 
     def transmit(self, name: str, datagrams: list[Datagram]) -> None:
         """Send over the link, if it is open."""
+        if name in self.others:
+            self.others[name](name, datagrams)
+            return
         link = self._hub.links.get(name)
         if link is None:
             return
@@ -93,3 +99,15 @@ class LinkOutput:
         for one in over:
             log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
         self._review_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
+
+
+def link_info(link: UdpLink) -> LinkInfo:
+    """An open link as the core knows it."""
+    attachment = link.attachment
+    return LinkInfo(
+        name=attachment.name,
+        kind=LinkKind.NEIGHBOURS if attachment.broadcast is None else LinkKind.BROADCAST,
+        address=attachment.address,
+        broadcast=attachment.broadcast,
+        mtu=attachment.mtu,
+    )

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.subscriptions.conditions import SavedCounters
+from udp_mesh.core.thin.conditions import ThinConditions, ThinLinkConditions
+from udp_mesh.core.thin.link import ThinLinkCounters
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon.latencies import BOUNDS_S, Histogram
 from udp_mesh.daemon.status import TopicCount
@@ -62,6 +64,7 @@ def render(
     *,
     logs: Iterable[LogConditions] = (),
     versions: Iterable[VersionConditions] = (),
+    thin: ThinConditions | None = None,
     about: Mapping[str, str],
     uptime_s: float,
     latencies: Mapping[int, Histogram] | None = None,
@@ -111,6 +114,7 @@ def render(
         for name, total in (("messages", broadcasts_saved.messages), ("bytes", broadcasts_saved.bytes)):
             help_text = f"{name.capitalize()} to all, not sent because no peer's programs want them."
             _family(lines, f"broadcasts_saved_{name}_total", "counter", help_text, [({}, total)])
+    lines += [] if thin is None else _thin_lines(thin)
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"
@@ -136,6 +140,35 @@ def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
         for reader, count in log.missing_readers
     ]
     _family(lines, "log_missing_items", "gauge", "Items that a reader is not known to have.", missing)
+    return lines
+
+
+_THIN_GAUGES: tuple[tuple[str, str, Callable[[ThinLinkConditions], float]], ...] = (
+    ("thin_up", "1 if the thin link's port is open, else 0.", lambda link: float(link.up)),
+    ("thin_budget_seconds", "Airtime that the node may use in the window.", lambda link: link.budget_s),
+    ("thin_burst_seconds", "Airtime that may be used at once, if the budget is full.", lambda link: link.burst_s),
+    ("thin_available_seconds", "Airtime that may be used now.", lambda link: link.available_s),
+    ("thin_queued_messages", "Messages waiting for the thin link.", lambda link: float(link.queued_messages)),
+    ("thin_rejecting", "1 while the link accepts nothing.", lambda link: float(link.rejecting_s is not None)),
+)
+
+
+def _thin_lines(thin: ThinConditions) -> list[str]:
+    lines: list[str] = []
+    for name, help_text, read in _THIN_GAUGES:
+        _family(lines, name, "gauge", help_text, [({"link": link.name}, read(link)) for link in thin.links])
+    airtimes = [({"link": link.name}, link.airtime_s) for link in thin.links]
+    _family(lines, "thin_airtime_seconds_total", "counter", "Airtime used since the start.", airtimes)
+    for item in dataclasses.fields(ThinLinkCounters):
+        counts = [({"link": link.name}, float(getattr(link.counters, item.name))) for link in thin.links]
+        help_text = f"{item.name.replace('_', ' ').capitalize()}, of thin links."
+        _family(lines, f"thin_{item.name}_total", "counter", help_text, counts)
+    present = [({"peer": peer.name}, float(peer.present)) for peer in thin.peers]
+    _family(lines, "thin_peer_present", "gauge", "1 if the peer is heard on a thin link, and hears us.", present)
+    only = [({"peer": peer.name}, float(peer.present and peer.only_thin)) for peer in thin.peers]
+    _family(lines, "thin_peer_only", "gauge", "1 if only thin links reach the peer.", only)
+    copies: list[Sample] = [({}, float(thin.copies_dropped))]
+    _family(lines, "thin_copies_dropped_total", "counter", "Copies of messages that had arrived already.", copies)
     return lines
 
 

@@ -42,6 +42,7 @@ from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
 from udp_mesh.daemon.subscriptions import Subscriptions
+from udp_mesh.daemon.thin_ports import ThinPorts
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +79,7 @@ class Service:
             legacy_positions=self._legacy.saved,
             urgent_dscp=configuration.daemon.urgent_dscp,
         )
+        self.thin_ports = ThinPorts(self.driver, configuration.thin_ports)
         self.log_store.on_done = self.driver.send_soon
         self.inbox = Inbox(
             DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
@@ -106,6 +108,7 @@ class Service:
     def start(self) -> None:
         """Starts sending and receiving."""
         self.driver.start()
+        self.thin_ports.start()
         if any(one is not None and one.outbox_on_disk for one in (*self.settings.topics, self.settings.undeclared)):
             self.store.check_writable()
         self._publish_conditions()
@@ -121,6 +124,7 @@ class Service:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self.driver.close()
+        self.thin_ports.close()
         await self._legacy.save(self.driver.node.legacy_positions())
         await self.stop_recording()
         for close in (self.store.close, self.inbox.close, self.log_store.close):
@@ -257,6 +261,8 @@ class Service:
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)
             changes.append("links")
+        if (fresh.settings.thin, fresh.thin_ports) != (running.settings.thin, running.thin_ports):
+            self.thin_ports.apply(fresh.thin_ports)
         if fresh.position != running.position:
             self.positions.set_fixed(fresh.position)
             changes.append("position")

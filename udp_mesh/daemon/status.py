@@ -18,6 +18,7 @@ from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import Address, Settings, Topic
 from udp_mesh.core.subscriptions.conditions import SubscriptionConditions
 from udp_mesh.core.subscriptions.messages import Bounds, Subscription
+from udp_mesh.core.thin.conditions import ThinConditions
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
@@ -142,6 +143,15 @@ def relaying_json(relaying: RelayConditions) -> Json:
     fields = plain(relaying)
     assert isinstance(fields, dict)
     return fields
+
+
+def thin_json(thin: ThinConditions | None, failures: Mapping[str, str]) -> Json | None:
+    """Thin links as this node sees them (None: it has none); `failures` says why ports are not open."""
+    if thin is None:
+        return None
+    fields = plain(thin)
+    assert isinstance(fields, dict)
+    return {**fields, "failures": dict(failures)}
 
 
 @dataclasses.dataclass(slots=True)

@@ -51,6 +51,9 @@ def read_topic(name: str, table: Table) -> Topic:
         repair=table.boolean("repair", default.repair),
         delta=table.boolean("delta", default.delta),
         always=table.boolean("always", default.always),
+        thin=table.boolean("thin", default.thin),
+        links=table.texts("links"),
+        thin_period_s=table.number("thin_period_s", None, 0.1, 86_400.0),
         delta_bytes=or_default(table.integer("delta_bytes", default.delta_bytes, 1, 1 << 30), default.delta_bytes),
     )
     log = _read_log(table.table("log")) if table.has("log") else None
@@ -105,7 +108,7 @@ def topic_from_values(name: str, values: dict[str, object], current: Topic | Non
             value = getattr(current, entry.name)
             if entry.name != "name" and value is not None:
                 merged[entry.name] = _unparsed(value)
-        merged["destinations"] = list(current.destinations)
+        merged["destinations"], merged["links"] = list(current.destinations), list(current.links)
     merged.update(values)
     source = Source("command", {})
     topic = read_topic(name, Table({key: value for key, value in merged.items() if value is not None}, source, (name,)))

@@ -130,6 +130,14 @@ def _progress(scenario: Scenario) -> Callable[[float], None]:
     return show
 
 
+def _thin_lines(thin: dict[str, Any]) -> list[str]:
+    return [
+        f"thin link {name}: {link['frames']} frames, {link['collided']} collided, {link['lost']} lost; "
+        f"the busiest robot used {link['budget_share']:.0%} of its {link['budget_s']:g} s of airtime per window"
+        for name, link in thin.items()
+    ]
+
+
 def text(summary: dict[str, Any]) -> str:
     """The summary as text."""
     channel = summary["channel"]
@@ -140,6 +148,7 @@ def text(summary: dict[str, Any]) -> str:
         f"messages: {summary['accepted']} accepted, {summary['rejected']} refused{because}; per destination: "
         f"{summary['delivered']} delivered, {summary['expired']} expired, {summary['peer_lost']} lost with their peer",
         f"channel: busy {channel['airtime_share']:.0%} of the time, {channel['transmissions']} transmissions",
+        *_thin_lines(summary["thin"]),
         f"{'topic':<14}{'offered':>9}{'arrived':>9}{'MB':>9}{'p50 ms':>9}{'p99 ms':>10}",
     ]
     for name, topic in summary["topics"].items():

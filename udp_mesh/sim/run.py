@@ -24,10 +24,12 @@ from udp_mesh.core.events import (
 )
 from udp_mesh.core.settings import Settings
 from udp_mesh.report import recording
+from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.medium import ChannelCounters
 from udp_mesh.sim.mobility import Trajectory
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
+from udp_mesh.sim.thin_team import Deliver, ThinMedia
 
 # The send time, at the start of each payload.
 _SENT = struct.Struct("<d")
@@ -56,6 +58,8 @@ class RunResult:
     observer_bytes: dict[str, int]
     saved: tuple[int, int] = (0, 0)
     """Messages and bytes that robots did not send because no program wants them, since each last started."""
+    thin: dict[str, Any] = field(default_factory=dict)
+    """Frames and budgets of thin links, by link."""
 
     def summary(self) -> dict[str, Any]:
         """The totals as JSON values."""
@@ -78,6 +82,7 @@ class RunResult:
                 "bytes": self.counts.bytes,
                 "queue_drops": self.counts.queue_drops,
             },
+            "thin": self.thin,
             "topics": {
                 name: {
                     "offered": self.offered.get(name, 0), "arrived": total.messages, "bytes": total.bytes,
@@ -100,9 +105,14 @@ class _Run:
         self.trajectories: dict[str, Trajectory] = {**scenario.robots, **scenario.relays}
         self.settings = {
             name: Settings(
-                name, unkeyed=True, topics=scenario.topics, window=scenario.window, selective=bool(scenario.reads)
+                name,
+                unkeyed=True,
+                topics=scenario.topics,
+                window=scenario.window,
+                selective=bool(scenario.reads),
+                thin=scenario.thin.settings(number),
             )
-            for name in scenario.robots
+            for number, name in enumerate(scenario.robots, 1)
         }
         self.random_bytes = self.rng.randbytes(MAX_MESSAGE_BYTES)
         self.lines = [recording.header(scenario.observer, 0.0)]
@@ -111,7 +121,7 @@ class _Run:
         self.observer_bytes = {topic.name: 0 for topic in scenario.topics}
         self.team = Team(
             self.settings, relays=scenario.relays, channel=scenario.channel, loss=self._loss, seed=scenario.seed,
-            on_event=self._on_event,
+            on_event=self._on_event, thin=self._thin if scenario.thin.radios else None,
         )  # fmt: skip
         for robot in scenario.robots:
             self._subscribe(robot)
@@ -119,6 +129,9 @@ class _Run:
     def _subscribe(self, robot: str) -> None:
         if robot in self.scenario.reads:
             self.team.subscribe(robot, self.scenario.reads[robot])
+
+    def _thin(self, event_queue: SimEventQueue, deliver: Deliver, rng: random.Random) -> ThinMedia:
+        return ThinMedia(event_queue, self.scenario.thin.radios, self.scenario.robots, deliver, rng)
 
     def _loss(self, a: str, b: str, now: float) -> float:
         return self.scenario.air.loss(self.trajectories[a].at(now), self.trajectories[b].at(now))
@@ -211,4 +224,5 @@ def play(scenario: Scenario, progress: Callable[[float], None] = lambda now: Non
     return RunResult(
         scenario, run.lines, run.topics, run.offered, run.team.ledger, run.team.medium.counts, run.observer_bytes,
         (sum(messages for messages, _ in saved), sum(size for _, size in saved)),
+        {} if run.team.thin is None else run.team.thin.summary(),
     )  # fmt: skip

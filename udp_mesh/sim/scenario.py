@@ -18,6 +18,7 @@ from udp_mesh.core.settings import MAX_COPIES, Log, Outbox, Settings, Topic
 from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 from udp_mesh.sim.reads import Reads, read_reads
+from udp_mesh.sim.thin_scenario import ThinRadios, read_thin
 from udp_mesh.sim.yaml_entry import Entry
 
 _MAX_SHOWN_PROBLEMS = 20
@@ -93,6 +94,7 @@ class Scenario:
     observer: str
     window: Literal["adaptive"] | int
     reads: Reads = field(default_factory=dict)
+    thin: ThinRadios = ThinRadios()
 
 
 def load(path: Path) -> Scenario:
@@ -133,7 +135,7 @@ def parse(raw: bytes, file: str) -> Scenario:
 
 _KEYS = (
     "name", "seed", "duration_s", "observer", "window", "channel", "air", "robots", "relays", "topics", "flows",
-    "reads", "incidents",
+    "reads", "incidents", "thin",
 )  # fmt: skip
 
 
@@ -183,6 +185,7 @@ def _scenario(at: Entry, name: str) -> Scenario:
         observer=get("observer").text(next(iter(robots), ""), tuple(robots)),
         reads=read_reads(get("reads"), tuple(robots)),
         window="adaptive" if window == "adaptive" else get("window").integer(3, minimum=1, maximum=4096),
+        thin=read_thin(get("thin"), _path_loss),
     )
 
 
@@ -256,20 +259,22 @@ def _path_loss(at: Entry) -> PathLoss:
 def _topic(name: str, at: Entry, robots: tuple[str, ...]) -> Topic:
     keys = (
         "priority", "reliable", "keep_last", "deadline_s", "rate_limit_bytes_per_s", "compression", "destinations",
-        "outbox", "repair", "log", "delta", "delta_bytes", "always",
+        "outbox", "repair", "log", "delta", "delta_bytes", "always", "thin", "links", "thin_period_s",
     )  # fmt: skip
     entries = at.mapping(keys)
     values: dict[str, Any] = {}
     for key, entry in entries.items():
         match key:
-            case "reliable" | "compression" | "repair" | "delta" | "always":
+            case "reliable" | "compression" | "repair" | "delta" | "always" | "thin":
                 values[key] = entry.flag()
-            case "deadline_s":
+            case "deadline_s" | "thin_period_s":
                 values[key] = entry.number(1.0, minimum=1e-3)
             case "outbox":
                 values[key] = Outbox(entry.text("none", tuple(kind.value for kind in Outbox)))
             case "destinations":
                 values[key] = tuple(item.text(one_of=robots) for item in entry.items())
+            case "links":
+                values[key] = tuple(item.text() for item in entry.items())
             case "log":
                 values[key] = _log(entry, robots)
             case "priority":

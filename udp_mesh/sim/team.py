@@ -29,6 +29,7 @@ from udp_mesh.core.subscriptions.messages import Subscription
 from udp_mesh.crypto.signing import SEED_BYTES
 from udp_mesh.sim.event_queue import SimEventQueue
 from udp_mesh.sim.medium import Loss, Medium, RadioChannel, RadioFrame
+from udp_mesh.sim.thin_team import Deliver, ThinMedia
 
 LINK = "mesh0"
 BROADCAST = "10.255.255.255"
@@ -79,7 +80,7 @@ class _Robot:
 
 
 class Team:
-    """`robots` maps names to settings; `relays` forward frames and have no transport."""
+    """`robots` maps names to settings; `relays` forward frames and have no transport; `thin` makes the thin links."""
 
     def __init__(
         self,
@@ -90,6 +91,7 @@ class Team:
         loss: Loss,
         seed: int,
         on_event: OnEvent | None = None,
+        thin: Callable[[SimEventQueue, Deliver, random.Random], ThinMedia] | None = None,
     ) -> None:
         self.event_queue = SimEventQueue()
         self.ledger = Ledger()
@@ -97,6 +99,7 @@ class Team:
         self._on_event = on_event or (lambda now, robot, event: None)
         names = [*robots, *relays]
         self.medium = Medium(self.event_queue, channel, names, loss, self._deliver, random.Random(self._rng.random()))
+        self.thin = None if thin is None else thin(self.event_queue, self._deliver_thin, random.Random(seed))
         self._addresses: dict[str, str] = {}
         self._log_stores: dict[str, MemoryLogStore] = {}
         """The robots' disks, which outlast a crash."""
@@ -192,10 +195,18 @@ class Team:
         member.node.receive(frame.data, LINK, (source.address, source.link.address[1]), self.event_queue.now)
         self._pump(member)
 
+    def _deliver_thin(self, robot: str, link: str, frame: bytes) -> None:
+        member = self._members[robot]
+        if member.is_running:
+            member.node.receive(frame, link, ("", 0), self.event_queue.now)
+            self._pump(member)
+
     def _pump(self, member: _Robot) -> None:
         now = self.event_queue.now
         while datagrams := member.node.datagrams_to_send(now):
             for datagram in datagrams:
+                if self.thin is not None and self.thin.send(member.name, datagram.link, datagram.data):
+                    continue
                 to_all = datagram.destination is None or datagram.destination[0] == BROADCAST
                 to = None if datagram.destination is None else self._addresses.get(datagram.destination[0])
                 if to_all or to is not None:

@@ -43,6 +43,8 @@ class Feature:
     """Accepts relay datagrams: it can be reached through relays, and may be one."""
     SUBSCRIPTIONS = 512
     """Answers a question for what its programs read, and needs no other messages."""
+    THIN = 1024
+    """Accepts messages that have `MessageFlag.NUMBERED`, and delivers each number of a boot once."""
 
 
 class Waiting(NamedTuple):
@@ -101,6 +103,9 @@ class MessageFlag:
     CONFIRM = 16
     """The sender waits for a `Delivered`: the receiving program took the message, or the receiver has it on disk.
     Set only to peers that announce `Feature.CONFIRM`."""
+    NUMBERED = 32
+    """The bytes begin with the number (2) under which the sender's thin links carry the message as well. Set only to
+    peers that announce `Feature.THIN`."""
     ZSTD = 64
     """With `COMPRESSED`: the bytes are one zstd frame (RFC 8878) that states its content size."""
     VERSION = 128

@@ -78,3 +78,18 @@ MAX_LEGACY_FRAGMENT_BYTES = 1300
 
 MAX_LEGACY_FRAGMENTS = 1 << 16
 """Fragments of one legacy message (85 MB): the legacy code accepted any 32-bit number and allocated it."""
+
+MAX_THIN_NUMBER = 254
+"""Nodes on thin links: their number has one byte; 0 and 255 are kept free."""
+
+MAX_THIN_PARTS = 32
+"""Parts of a message on thin links: as many as an acknowledgment has bits; bounds what one message can reserve."""
+
+MAX_THIN_ITEMS = 32
+"""Items of one frame of a thin link: bounds the work one frame can cause."""
+
+MAX_THIN_HEARD = 48
+"""Nodes that a presence lists as heard (5 B each): what one frame of 255 bytes has room for."""
+
+MAX_THIN_FRAME_BYTES = 255
+"""One frame of a thin link: LoRa's length field has one byte, and the other radios carry little more."""

@@ -18,15 +18,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.udp_mesh.core.pair import Pair, pair, settings
+from tests.udp_mesh.core.thin.fleet import RADIO, ThinFleet
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
 from tests.udp_mesh.wire.subscription_vectors import SUBSCRIPTIONS
+from tests.udp_mesh.wire.thin_vectors import ITEMS
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour
 from udp_mesh.core.subscriptions.messages import decode_message, encode_ask, encode_table
 from udp_mesh.core.subscriptions.table import KnownTable
+from udp_mesh.core.thin.link import MAX_ACKS, MAX_QUEUED, ComposedFrame
+from udp_mesh.core.thin.reassembly import MAX_PARTIALS
 from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import encode_legacy, encode_mesh_data, fragment_legacy
+from udp_mesh.wire.limits import MAX_THIN_NUMBER
+from udp_mesh.wire.thin import encode_item
 
 RECORD = Path("build/fuzz.jsonl")
 CHUNK_INPUTS = 250_000
@@ -53,6 +59,16 @@ class Fuzzer:
             encode_ask() if table is None else encode_table(table) for table in SUBSCRIPTIONS.values()
         ]
         self.pair = self._new_pair()
+        self.thin = self._new_thin()
+
+    def _new_thin(self) -> ThinFleet:
+        fleet = ThinFleet("a", "b", seed=self.rng.getrandbits(32))
+        fleet.run(300, fleet.met)
+        self.thin_seeds = [encode_item(item) for item in ITEMS.values()]
+        return fleet
+
+    def receive_thin(self, frame: bytes) -> None:
+        self.thin.nodes["b"].receive(frame, RADIO.name, ("", 0), self.thin.now)
 
     def _new_pair(self) -> Pair:
         limits = Limits(partial_bytes=MAX_PARTIAL_BYTES, peers=MAX_PEERS, strangers=MAX_STRANGERS)
@@ -107,9 +123,11 @@ class Fuzzer:
             if self.inputs % FRESH_PAIR_EVERY == 0:
                 self.check_bounds()
                 self.pair = self._new_pair()
+                self.thin = self._new_thin()
 
     def _let_nodes_work(self) -> None:
         self.pair.now += 0.05
+        self.thin.run(0.05)
         for node in (self.pair.b, self.pair.a):
             node.handle_timer(self.pair.now)
             while node.datagrams_to_send(self.pair.now):
@@ -119,6 +137,10 @@ class Fuzzer:
 
     def check_bounds(self) -> None:
         """Raises AssertionError if the node holds more than its limits allow."""
+        thin = self.thin.thin("b")
+        assert len(thin.reassembly) <= MAX_PARTIALS
+        assert len(thin.peers.peers) <= MAX_THIN_NUMBER
+        assert all(len(link.acks) <= MAX_ACKS and len(link.queue) <= MAX_QUEUED for link in thin.links.values())
         table = self.pair.b._state.peer_table
         assert table.memory.bytes <= MAX_PARTIAL_BYTES
         assert len(table.peers) <= MAX_PEERS + 1
@@ -178,9 +200,40 @@ def subscriptions(fuzzer: Fuzzer) -> None:
         KnownTable(table, fuzzer.pair.now).bounds("artifacts/1")
 
 
+def thin_frames(fuzzer: Fuzzer) -> None:
+    """Real frames of a thin link modified in transit, and random ones."""
+    bits = fuzzer.rng.getrandbits(24)
+    frames = fuzzer.thin.frames
+    data = frames[bits % len(frames)][1] if bits & 3 else fuzzer.rng.randbytes(bits % 256)
+    # The limit of forgeries would close the link to all that follow.
+    fuzzer.thin.thin("b").links[RADIO.name].forgeries.failures = 0
+    fuzzer.receive_thin(fuzzer.mutated(data))
+
+
+def sealed_thin(fuzzer: Fuzzer) -> None:
+    """A key holder's items, in short frames and introductions."""
+    sender = fuzzer.thin.thin("a")
+    seeds, bits = fuzzer.thin_seeds, fuzzer.rng.getrandbits(24)
+    items = b"".join(seeds[bits >> shift & 7] for shift in range(0, 3 * (bits >> 21), 3))
+    if bits & 1 << 20:
+        items = fuzzer.mutated(items)
+    composed = ComposedFrame(items[:240], bool(bits & 1 << 19), False, ())
+    fuzzer.receive_thin(sender._seal(composed, fuzzer.thin.now))
+
+
 SURFACES = {
     surface.__name__: surface
-    for surface in (random_bytes, decoder, sealed_data, sealed_to_all, mutated_datagrams, legacy, subscriptions)
+    for surface in (
+        random_bytes,
+        decoder,
+        sealed_data,
+        sealed_to_all,
+        mutated_datagrams,
+        legacy,
+        subscriptions,
+        thin_frames,
+        sealed_thin,
+    )
 }
 
 

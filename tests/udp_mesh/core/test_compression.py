@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.pair import World, settings
-from udp_mesh.core import publish
 from udp_mesh.core.compression import (
     INFLATE_STEP_BYTES,
     STEP_BYTES,
@@ -19,6 +18,7 @@ from udp_mesh.core.compression import (
     start_decompression,
 )
 from udp_mesh.core.events import ExpiryReason, MessageDelivered, MessageExpired, MessageReceived, Rejected
+from udp_mesh.core.peers import features as peer_features
 from udp_mesh.core.peers import heartbeat
 from udp_mesh.core.receiver import receiver
 from udp_mesh.core.settings import Limits, Settings, Topic
@@ -71,7 +71,7 @@ def test_zstd_is_on_the_wire_between_two_nodes_that_announce_it(without: str, mo
         return start_decompression(body, flags, limit_bytes)
 
     monkeypatch.setattr(heartbeat, "own_features", features)
-    monkeypatch.setattr(publish, "own_features", features)
+    monkeypatch.setattr(peer_features, "own_features", features)
     monkeypatch.setattr(receiver.__name__ + ".start_decompression", start)
     made = world()
     # Compressed at once, and in steps.

@@ -50,7 +50,7 @@ def test_each_shipped_scenario_loads(name: str) -> None:
         ("seed: 3", "channel: {overhead_s: inf}", "channel.overhead_s: expected a number of at most 1, found 'inf'"),
         ("seed: 3", "air: {least_loss: 2}", "s.yaml:1: air.least_loss: expected a number of at most 1, found '2'"),
         ("seed: 3", "air: {good_m: 9, range_m: 5}", "s.yaml:1: air: expected range_m of at least good_m, 9, found 5.0"),
-        ("seed: 3", "duration: 3", "incidents (did you mean 'duration_s'?), found 'duration'"),
+        ("seed: 3", "duration: 3", "thin (did you mean 'duration_s'?), found 'duration'"),
         ("seed: 3", "seed: [", "s.yaml:3: expected YAML, found a syntax error: "),
         (
             "seed: 3",

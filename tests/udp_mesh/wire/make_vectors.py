@@ -1,8 +1,8 @@
 """Write the wire vectors: `python -m tests.udp_mesh.wire.make_vectors`. The tests compare the files with its output.
 
 Other implementations read `vectors/*.json`: frames as JSON with their bytes in hexadecimal, sealed datagrams with the
-keys and boot ids that open them, the same of relays, versions with their bases, and datagrams and messages of the
-legacy format.
+keys and boot ids that open them, the same of relays and thin links, versions with their bases, and datagrams and
+messages of the legacy format.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.udp_mesh.wire.subscription_vectors import make_subscriptions
+from tests.udp_mesh.wire.thin_vectors import make_thin
 from udp_mesh.core.relaying.hop_channel import HopChannels, hop_key, membership_proof
 from udp_mesh.crypto import Key, SendChannel
 from udp_mesh.wire.codec import encode
@@ -356,6 +357,7 @@ MAKERS = {
     "subscriptions.json": make_subscriptions,
     "versions.json": make_versions,
     "relay.json": make_relay,
+    "thin.json": make_thin,
     "legacy.json": make_legacy,
 }
 

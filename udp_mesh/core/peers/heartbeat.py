@@ -19,7 +19,7 @@ from udp_mesh.wire.frames import Feature, Heartbeat, Waiting
 from udp_mesh.wire.header import VERSION
 from udp_mesh.wire.limits import MAX_HEARD, MAX_HEARD_CLOCKS
 
-OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT
+OWN_FEATURES = Feature.ZLIB | Feature.REPAIR | Feature.TIMED | Feature.COMPACT | Feature.THIN
 ZSTD_FEATURES = Feature.ZSTD | Feature.VERSIONS if zstd.AVAILABLE else 0
 """With a Python that has zstd."""
 

@@ -14,6 +14,7 @@ from udp_mesh.core.receiver.memory_limit import TOPIC_BYTES, Account, MemoryBudg
 from udp_mesh.core.receiver.reassembly import CompleteMessage, FragmentStatus, Reassembly
 from udp_mesh.core.sender.sent_packets import REORDER_PACKETS
 from udp_mesh.core.settings import Limits, Rates
+from udp_mesh.core.thin.numbering import split_number
 from udp_mesh.core.versions.decoding import VersionDecoding
 from udp_mesh.core.versions.received import CounterTable, ReceivedVersions
 from udp_mesh.core.zstd import ZstdDecompression
@@ -53,6 +54,8 @@ class ReceivedMessage(NamedTuple):
     """Its broadcast number, if it has one."""
     confirm_id: int | None = None
     """Its message id, if its sender waits for a confirmation."""
+    thin_number: int | None = None
+    """The number that its copies on thin links have, if there may be any."""
 
 
 class Inflating(NamedTuple):
@@ -275,23 +278,28 @@ class Receiver:
         if topic is None:
             self._refuse(key, RefuseReason.FORGOTTEN)
             return False
+        split = split_number(head.flags, complete.body)
+        if split is None:
+            self._refuse_for_good(key, RefuseReason.CORRUPT)
+            return False
+        thin_number, body = split
         number = complete.message_id if by_broadcast else None
         to_all = by_broadcast or bool(head.flags & MessageFlag.TO_ALL)
         confirm_id = complete.message_id if head.flags & MessageFlag.CONFIRM and not by_broadcast else None
-        received = ReceivedMessage(*topic, complete.body, head.priority, to_all, number, confirm_id)
+        received = ReceivedMessage(*topic, body, head.priority, to_all, number, confirm_id, thin_number)
         work: Decompression | ZstdDecompression | VersionDecoding
         if head.flags & MessageFlag.VERSION:
-            begun = self.versions.begin(topic, complete.body, head.flags)
+            begun = self.versions.begin(topic, body, head.flags)
             if isinstance(begun, RefuseReason):
                 # The sender restarts it under another number; this one stays refused, should the refusal be lost.
                 self._refuse_for_good(key, begun)
                 return False
             work = begun
         elif head.flags & MessageFlag.COMPRESSED:
-            work = start_decompression(complete.body, head.flags, self._limits.message_bytes)
+            work = start_decompression(body, head.flags, self._limits.message_bytes)
         else:
             return self._complete(received)
-        inflating = Inflating(work, received, key, len(complete.body), [])
+        inflating = Inflating(work, received, key, len(body), [])
         if work.step():
             return self._finish_inflating(inflating)
         if self.inflating_bytes + work.held_bytes > self._limits.partial_bytes_per_peer or not self._account.has_room(

@@ -1,0 +1,195 @@
+"""Daemons with thin links: serial ports (pseudo-terminals) behind a radio channel with a rate, loss and collisions."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, collect, configuration, outcomes, poll, wait_online
+from tests.udp_mesh.daemon.serial_air import SerialAir, serial_air
+from tests.udp_mesh.links.sockets import free_port
+from udp_mesh.cli.views import status_view
+from udp_mesh.daemon.configuration import read
+from udp_mesh.daemon.toml_source import ConfigurationError, parse
+from udp_mesh.wire.serial_framing import encode_line
+
+BITS_PER_S = 20_000
+TOPICS = """
+estop = { priority = 0, thin = true }
+report = { priority = 8, thin = true }
+"""
+
+
+def thin(number: int, device: str) -> str:
+    return f"""
+[thin]
+number = {number}
+presence_s = 2
+[[thin.links]]
+name = "radio"
+device = "{device}"
+bits_per_s = {BITS_PER_S}
+frame_bytes = 100
+"""
+
+
+@contextmanager
+def team(names: tuple[str, ...], *, loss: float = 0.0) -> Iterator[tuple[SerialAir, list[RunningDaemon]]]:
+    """Daemons on one channel, not started yet; they also have datagrams."""
+    with (
+        tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
+        serial_air(len(names), bits_per_s=BITS_PER_S, loss=loss) as air,
+    ):
+        port, numbers = free_port(), range(1, len(names) + 1)
+        daemons = []
+        for number, name in enumerate(names, 1):
+            others = [other for other in numbers if other != number]
+            links = thin(number, air.devices[number - 1])
+            text = configuration(Path(path), name, number, others, port, topics=TOPICS, rates=links + RATES)
+            daemons.append(RunningDaemon(Path(path), name, text))
+        try:
+            yield air, daemons
+        finally:
+            for daemon in daemons:
+                daemon.stop()
+
+
+def without_datagrams(daemon: RunningDaemon) -> None:
+    """Another key file would end the thin link too: its neighbors are removed instead."""
+    text = daemon.file.read_text()
+    head, _, rest = text.partition("[[neighbours]]")
+    daemon.write(head + rest[rest.index("[topics]") :])
+
+
+def present(daemon: RunningDaemon, *names: str) -> None:
+    """Wait until the daemon hears these nodes on its thin link, and they hear it."""
+
+    def heard() -> bool:
+        with daemon.client() as client:
+            found = client.request("status")["thin"]["peers"]
+        return set(names) <= {peer["name"] for peer in found if peer["present"]}
+
+    poll(heard, f"{daemon.name} hears {names}: {daemon.log.read_text()}")
+
+
+def test_a_robot_without_wifi_reports_its_position_and_hears_the_stop() -> None:
+    with team(("base", "husky"), loss=0.1) as (_, [base, husky]):
+        for daemon in (base, husky):
+            without_datagrams(daemon)
+            daemon.start()
+        present(base, "husky")
+        present(husky, "base")
+        with husky.client() as robot, base.client() as operator:
+            robot.request("set-position", x_m=3.0, y_m=4.0)
+            robot.request("subscribe", topics=["estop"])
+            reply = operator.request("publish", b"stop", topic="estop", to="husky", notify=True)
+            [message] = collect(robot, 1)
+            assert (message.topic, message.payload, message.source) == ("estop", b"stop", "base")
+            assert outcomes(operator, 1) == {reply["message"]: "delivered"}
+            poll(
+                lambda: next((one for one in operator.request("status")["positions"] if one["name"] == "husky"), None),
+                "husky's position arrives",
+            )
+            status = operator.request("status")
+        assert [peer["name"] for peer in status["conditions"]["peers"] if peer["online"]] == []
+        view = status_view(status)
+        assert "ONLY HERE" in view
+        assert "husky" in view
+
+
+def test_beside_wifi_each_urgent_message_arrives_once() -> None:
+    with team(("base", "husky")) as (air, [base, husky]):
+        for daemon in (base, husky):
+            daemon.start()
+        wait_online(base, "husky")
+        present(base, "husky")
+        with husky.client() as robot, base.client() as operator:
+            robot.request("subscribe", topics=["estop", "report"])
+            for number in range(5):
+                operator.request("publish", bytes((number,)), topic="estop")
+            messages = collect(robot, 5)
+            assert sorted(message.payload for message in messages) == [bytes((number,)) for number in range(5)]
+            poll(
+                lambda: operator.request("status")["thin"]["links"][0]["queued_messages"] == 0 or None,
+                "the thin link has sent what it had",
+            )
+            operator.request("publish", b"last", topic="report")
+            [last] = collect(robot, 1)
+            assert last.payload == b"last"
+        assert air.delivered > 0
+
+
+def test_noise_and_a_radio_that_is_pulled_out_do_not_end_a_daemon() -> None:
+    with team(("base", "husky")) as (air, [base, husky]):
+        device = Path(air.devices[0])
+        for daemon in (base, husky):
+            without_datagrams(daemon)
+        base.write(base.file.read_text().replace(str(device), str(base.folder / "radio")))
+        base.start()
+        husky.start()
+
+        def failure() -> str | None:
+            with base.client() as client:
+                found: str | None = client.request("status")["thin"]["failures"].get("radio")
+            return found
+
+        assert "No such file" in poll(failure, "the missing device is reported")
+        (base.folder / "radio").symlink_to(device)
+        present(base, "husky")
+        air.inject(0, bytes(range(256)) * 20)
+        air.inject(0, b"".join(encode_line(bytes((number,)) * 30) for number in range(1, 60)))
+        with husky.client() as robot, base.client() as operator:
+            operator.request("subscribe", topics=["report"])
+            robot.request("publish", b"still here", topic="report", to="base")
+            [message] = collect(operator, 1)
+            assert message.payload == b"still here"
+
+
+def test_a_reload_opens_another_port() -> None:
+    with team(("base", "husky")) as (air, [base, husky]):
+        for daemon in (base, husky):
+            without_datagrams(daemon)
+        complete = base.file.read_text()
+        base.write(complete.replace(air.devices[0], "/dev/null"))
+        base.start()
+        husky.start()
+        with base.client() as client:
+            assert "not a serial port" in client.request("status")["thin"]["failures"]["radio"]
+            base.write(complete)
+            assert client.request("reload")["changes"] == []
+            assert client.request("status")["thin"]["failures"] == {}
+            present(base, "husky")
+            base.write(complete.replace("presence_s = 2", "presence_s = 3"))
+            assert client.request("reload")["changes"] == ["thin links"]
+            present(base, "husky")
+            present(husky, "base")
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("[thin]\nnumber = 0\n", "thin.number: expected an integer from 1 to 254, found 0"),
+        ('[[thin.links]]\ndevice = "/dev/x"\n', "thin.number: expected this node's number, 1 to 254, found none"),
+        ("[thin]\nnumber = 3\n[[thin.links]]\n", "thin.links.0.device: expected a serial port"),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nbaud = 1234\n',
+            "expected a speed that the kernel knows",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nbits_per_s = 1000\nduty_cycle = 0.001\n',
+            "expected frames of at most",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\n[[thin.links]]\ndevice = "/dev/y"\n',
+            "expected each name once",
+        ),
+    ],
+)
+def test_mistakes_in_the_configuration_are_reported(text: str, problem: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        read(parse(f'name = "a"\nunkeyed = true\n{text}', "file.toml"), ())
+    assert problem in str(caught.value)

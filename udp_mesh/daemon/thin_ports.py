@@ -1,0 +1,136 @@
+"""The serial ports of thin links: frames between them and the driver. A port that is missing is tried again."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+
+from udp_mesh.core.interfaces import Datagram
+from udp_mesh.daemon.driver import Driver
+from udp_mesh.links.serial_port import SerialPort, SerialPortConfig
+from udp_mesh.wire.serial_framing import LineDecoder, encode_line
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 2.0
+"""Delay before a port that could not be opened, or whose device is gone, is opened again."""
+
+
+class ThinPorts:
+    """The ports of a running daemon."""
+
+    def __init__(self, driver: Driver, configs: Sequence[SerialPortConfig]) -> None:
+        self._driver, self._configs = driver, configs
+        self._loop = asyncio.get_running_loop()
+        self._ports: dict[str, SerialPort] = {}
+        self._retry_timer: asyncio.TimerHandle | None = None
+        self.failures: dict[str, str] = {}
+        """Why ports are not open, by link."""
+        self._register()
+
+    def _register(self) -> None:
+        for config in self._configs:
+            self._driver.output.others[config.link] = self._transmit
+            self._set_up(config.link, False)
+
+    def apply(self, configs: Sequence[SerialPortConfig]) -> None:
+        """Replaces the ports after the core has its new links."""
+        self.close()
+        for config in self._configs:
+            del self._driver.output.others[config.link]
+        self._configs = configs
+        self.failures.clear()
+        self._register()
+        self.start()
+
+    def start(self) -> None:
+        """Opens the ports; those that are missing later."""
+        self._retry_timer = None
+        for config in self._configs:
+            if config.link not in self._ports:
+                self._open(config)
+        if self.failures:
+            self._retry_timer = self._loop.call_later(RETRY_S, self.start)
+
+    def close(self) -> None:
+        """Closes the ports."""
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
+        for name in list(self._ports):
+            self._close(name)
+
+    @property
+    def damaged(self) -> int:
+        """Frames that arrived damaged."""
+        return sum(port.decoder.damaged for port in self._ports.values())
+
+    def _set_up(self, link: str, up: bool) -> None:
+        """The port was opened or is gone: the core needs to know."""
+        thin = self._driver.node.thin
+        if thin is not None:
+            thin.set_up(link, up, self._driver.now())
+            self._driver.send_soon()
+
+    def _open(self, config: SerialPortConfig) -> None:
+        try:
+            port = SerialPort(config, encode_line, LineDecoder())
+        except OSError as error:
+            self._failed(config.link, error)
+            return
+        self.failures.pop(config.link, None)
+        self._ports[config.link] = port
+        self._loop.add_reader(port.fileno(), self._readable, config.link)
+        log.info("thin-link-up link=%s device=%s", config.link, config.device)
+        self._set_up(config.link, True)
+
+    def _failed(self, link: str, error: OSError) -> None:
+        reason = f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror)
+        if self.failures.get(link) != reason:
+            log.error("thin-link-failed link=%s reason=%s", link, reason)
+        self.failures[link] = reason
+
+    def _close(self, link: str) -> None:
+        port = self._ports.pop(link)
+        self._loop.remove_reader(port.fileno())
+        self._loop.remove_writer(port.fileno())
+        port.close()
+
+    def _gone(self, link: str, error: OSError) -> None:
+        self._close(link)
+        self._set_up(link, False)
+        self._failed(link, error)
+        if self._retry_timer is None:
+            self._retry_timer = self._loop.call_later(RETRY_S, self.start)
+
+    def _readable(self, link: str) -> None:
+        try:
+            frames = self._ports[link].receive()
+        except OSError as error:
+            self._gone(link, error)
+            return
+        if frames:
+            self._driver.receive_frames(link, frames)
+
+    def _transmit(self, link: str, datagrams: Sequence[Datagram]) -> None:
+        port = self._ports.get(link)
+        if port is None:
+            return
+        try:
+            for datagram in datagrams:
+                port.send(datagram.data)
+        except OSError as error:
+            self._gone(link, error)
+            return
+        if port.has_waiting:
+            self._loop.add_writer(port.fileno(), self._writable, link)
+
+    def _writable(self, link: str) -> None:
+        port = self._ports[link]
+        try:
+            port.write_more()
+        except OSError as error:
+            self._gone(link, error)
+            return
+        if not port.has_waiting:
+            self._loop.remove_writer(port.fileno())
