@@ -33,6 +33,7 @@ from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.thin import thin_links, thin_ports
 from meshctl.inventory.tree import MappingNode, descend, position_of
 from meshctl.model import (
     ApplyPolicy,
@@ -251,6 +252,7 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
         computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
         position=fixed_position(document.position),
         relay=document.relay,
+        thin=thin_ports(document.thin),
     )
 
 
@@ -356,6 +358,9 @@ def _topic(name: str, document: TopicDocument) -> Topic:
         delta_bytes=document.delta_bytes,
         reduce=_reduction(document.reduce) if document.reduce is not None else None,
         always=document.always,
+        thin=document.thin,
+        thin_links=document.thin_links,
+        thin_period_s=document.thin_period_s,
     )
 
 
@@ -392,6 +397,8 @@ def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:
         metrics_port=settings.metrics_port,
         relay_hops=settings.relay_hops,
         relay_keys=_transport_keys(settings.relay_keys, "relay_keys", root),
+        thin_links=thin_links(settings.thin_links),
+        thin_presence_s=settings.thin_presence_s,
         etc_hosts=settings.etc_hosts,
         selective=settings.selective,
     )

@@ -27,6 +27,7 @@ from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile,
 from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
 from meshctl.model.release import RELEASES, PackageTool, Release
 from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
+from meshctl.model.thin import ThinBand, ThinLink, ThinPorts
 from meshctl.model.topic import JpegEncoding, Outbox, Reduction, Topic, TopicClass, TopicLog
 
 __all__ = [
@@ -67,6 +68,9 @@ __all__ = [
     "SecretRef",
     "SshSettings",
     "SystemSettings",
+    "ThinBand",
+    "ThinLink",
+    "ThinPorts",
     "Topic",
     "TopicClass",
     "TopicLog",

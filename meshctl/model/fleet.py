@@ -14,6 +14,7 @@ from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 from meshctl.model.mesh import Mesh
 from meshctl.model.release import Release
 from meshctl.model.secret import SecretRef
+from meshctl.model.thin import ThinLink, ThinPorts
 from meshctl.model.topic import Topic
 
 
@@ -205,6 +206,7 @@ class Robot:
     computers: Mapping[str, Computer] = field(default_factory=lambda: MappingProxyType({}))
     position: FixedPosition | None = None
     relay: tuple[str, ...] = ()
+    thin: ThinPorts | None = None
 
     @property
     def other_addresses(self) -> tuple[str, ...]:
@@ -268,6 +270,8 @@ class UdpMesh:
     metrics_port: int | None = None
     relay_hops: int = 4
     relay_keys: tuple[SecretRef, ...] = ()
+    thin_links: Mapping[str, ThinLink] = field(default_factory=lambda: MappingProxyType({}))
+    thin_presence_s: float = 45.0
     etc_hosts: bool = False
     selective: bool = True
 

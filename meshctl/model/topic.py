@@ -63,7 +63,8 @@ class Reduction:
 class Topic:
     """`priority` 0 is the most urgent, 15 the least. `sources` and `destinations` name robots; empty sources means
     every robot, the destination `all` means broadcast. `sent_rate_hz` x `size_bytes` is the offered load per source:
-    the size is that of a message as sent, after `reduce`."""
+    the size is that of a message as sent, after `reduce`.
+    With `thin` the thin links in `thin_links` (empty: all) carry it, too, at most once in `thin_period_s`."""
 
     name: str
     priority: int
@@ -87,6 +88,9 @@ class Topic:
     delta_bytes: int = 16 << 20
     reduce: Reduction | None = None
     always: bool = False
+    thin: bool = False
+    thin_links: tuple[str, ...] = ()
+    thin_period_s: float | None = None
 
     @property
     def sent_rate_hz(self) -> float:

@@ -28,6 +28,7 @@ from meshctl.model import (
     TopicLog,
     UdpMesh,
 )
+from meshctl.render.thin import thin_lines, thin_problems, thin_topic_lines
 from meshctl.resolve import has_routed_lans
 
 # Values that the daemon would reject (docs/render.md).
@@ -64,6 +65,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         *_check_robot(fleet, robot),
         *_check_relay(fleet, robot),
         *_check_links(fleet, robot, computer),
+        *(_problem(fleet, *problem) for problem in thin_problems(fleet, robot)),
         *_check_transport(fleet),
         *_check_topics(fleet),
     ]
@@ -82,6 +84,7 @@ def daemon_config(fleet: Fleet, robot: str, *, key_name: str = KEY_NAME) -> byte
         *_position(fleet, robot),
         *_links(fleet, robot, computer),
         *_legacy_peers(fleet, robot),
+        *thin_lines(fleet, robot),
         *(line for topic in fleet.topics for line in _topic(topic, robot)),
     ]
     if transport.metrics_port is not None:
@@ -323,6 +326,7 @@ def _topic(topic: Topic, robot: str) -> Iterator[str]:
         yield f"delta_bytes = {topic.delta_bytes}"
     if topic.always:
         yield "always = true"
+    yield from thin_topic_lines(topic)
 
 
 def _log(topic: Topic, log: TopicLog) -> Iterator[str]:

@@ -13,6 +13,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.report.duration import duration
 from meshctl.robots.facts import RobotFacts
+from meshctl.status.thin_alarms import thin_alarms
 from meshctl.status.topics import is_urgent, urgent_priorities
 from meshctl.status.values import Alarm, Level, TopicStatus
 
@@ -222,6 +223,7 @@ _CONCERNS: tuple[Callable[[RobotAlarmInput], Iterator[Alarm]], ...] = (
     _drift,
     _keys,
     _peers,
+    lambda seen: thin_alarms(seen.facts),
     _queues,
     _topics,
     _computer,

@@ -131,8 +131,8 @@ class Topic:
     one replaces the oldest (None: no limit). `deadline_s` is a message's lifetime from its `send`. `destinations` lists
     the peers that get a message sent without a destination (empty: all). `repair` lets receivers request a lost
     broadcast again. `delta` sends a message as the difference to the last one that its receiver has, if both have at
-    most `delta_bytes`. With `always`, it is also sent to peers whose programs do not read it. With `thin`, the thin links
-    in `links` (empty: all) carry it too, at most once in `thin_period_s`, the newest message only.
+    most `delta_bytes`. With `always`, it is also sent to peers whose programs do not read it. With `thin`, the thin
+    links in `links` (empty: all) carry it too, at most once in `thin_period_s`, the newest message only.
     """
 
     name: str

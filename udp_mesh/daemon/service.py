@@ -61,12 +61,11 @@ class Service:
         self.configuration = configuration
         self.boot_id = boot_id
         self.wall_clock = wall_clock
-        self.store = DirectoryStore(
-            configuration.daemon.state_directory / "outbox", configuration.daemon.outbox_disk_bytes
-        )
+        state, disk_bytes = configuration.daemon.state_directory, configuration.daemon.outbox_disk_bytes
+        self.store = DirectoryStore(state / "outbox", disk_bytes)
         self._flusher = Flusher(self.store)
-        self.log_store = SqliteLogStore(configuration.daemon.state_directory / "logs" / "items.db", wall_clock)
-        self._legacy = LegacyPositions(configuration.daemon.state_directory / "legacy-positions.json")
+        self.log_store = SqliteLogStore(state / "logs" / "items.db", wall_clock)
+        self._legacy = LegacyPositions(state / "legacy-positions.json")
         self.latencies = Latencies(self._priority)
         self.driver = Driver(
             configuration.settings,
@@ -81,11 +80,7 @@ class Service:
         )
         self.thin_ports = ThinPorts(self.driver, configuration.thin_ports)
         self.log_store.on_done = self.driver.send_soon
-        self.inbox = Inbox(
-            DirectoryStore(configuration.daemon.state_directory / "inbox", configuration.daemon.outbox_disk_bytes),
-            self._confirm,
-            self._request_again,
-        )
+        self.inbox = Inbox(DirectoryStore(state / "inbox", disk_bytes), self._confirm, self._request_again)
         self.inbox.load()
         self.counts: dict[str, TopicCount] = {}
         self.positions = PositionExchange(
@@ -261,8 +256,7 @@ class Service:
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)
             changes.append("links")
-        if (fresh.settings.thin, fresh.thin_ports) != (running.settings.thin, running.thin_ports):
-            self.thin_ports.apply(fresh.thin_ports)
+        self.thin_ports.apply(fresh.thin_ports)
         if fresh.position != running.position:
             self.positions.set_fixed(fresh.position)
             changes.append("position")

@@ -30,12 +30,15 @@ class ThinPorts:
         self._register()
 
     def _register(self) -> None:
+        self._thin = self._driver.node.thin
         for config in self._configs:
             self._driver.output.others[config.link] = self._transmit
             self._set_up(config.link, False)
 
     def apply(self, configs: Sequence[SerialPortConfig]) -> None:
-        """Replaces the ports after the core has its new links."""
+        """Takes over a reloaded configuration, after the core did: only if it changed, ports are opened again."""
+        if tuple(configs) == tuple(self._configs) and self._driver.node.thin is self._thin:
+            return
         self.close()
         for config in self._configs:
             del self._driver.output.others[config.link]
@@ -67,9 +70,8 @@ class ThinPorts:
 
     def _set_up(self, link: str, up: bool) -> None:
         """The port was opened or is gone: the core needs to know."""
-        thin = self._driver.node.thin
-        if thin is not None:
-            thin.set_up(link, up, self._driver.now())
+        if self._thin is not None:
+            self._thin.set_up(link, up, self._driver.now())
             self._driver.send_soon()
 
     def _open(self, config: SerialPortConfig) -> None:

@@ -94,7 +94,7 @@ class Scenario:
     observer: str
     window: Literal["adaptive"] | int
     reads: Reads = field(default_factory=dict)
-    thin: ThinRadios = ThinRadios()
+    thin: ThinRadios = field(default_factory=ThinRadios)
 
 
 def load(path: Path) -> Scenario:

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import PositionDocument, SshLayer
+from meshctl.inventory.documents.thin import ThinLinkDocument, ThinPortsDocument
 from meshctl.inventory.fields import Address, Flag, Interface, IPv4Only, Name, Network, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
@@ -83,6 +84,8 @@ class RobotDocument(Document):
     """Robots whose datagrams its daemon passes on, to and from them; `all` for all."""
     position: PositionDocument = NOT_WRITTEN
     """Where it stands, if it does not move, as a base station."""
+    thin: ThinPortsDocument = NOT_WRITTEN
+    """Its number on thin links, and its serial ports for them."""
 
 
 class OperatorsDocument(Document):
@@ -152,6 +155,10 @@ class UdpMeshDocument(Document):
     relay_keys: tuple[SecretDocument, ...] = ()
     """Keys of the hops of relays, as `keys`: with them, relays without a fleet key pass on what they cannot read.
     Default: the fleet keys."""
+    thin_links: dict[Name, ThinLinkDocument] = Field(default_factory=dict)
+    """Thin links by name: slow radios on serial ports, for topics with `thin`."""
+    thin_presence_s: Real = Field(default=45.0, ge=1, le=170)
+    """About how often a robot shows on thin links that it is there."""
     etc_hosts: Flag = False
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
     selective: Flag = True
@@ -240,6 +247,12 @@ class TopicDocument(Document):
     """Maximum size of a message for that; a larger one is sent whole."""
     always: Flag = False
     """Send the topic also to robots whose programs do not read it."""
+    thin: Flag = False
+    """Let thin links carry the topic, too: at once if it is urgent, else while a receiver has no other link."""
+    thin_links: tuple[Text, ...] = ()
+    """Thin links that carry it; empty for all."""
+    thin_period_s: Real = Field(default=NOT_WRITTEN, gt=0, le=86_400)
+    """Minimum seconds between two messages on thin links; the newest one is sent."""
     log: TopicLogDocument = NOT_WRITTEN
     """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""
     reduce: ReductionDocument = NOT_WRITTEN

@@ -70,7 +70,7 @@ def test_the_robots_of_the_examples_load_with_their_lans_and_computers(tmp_path:
 
 
 def test_the_relays_of_the_example_load(tmp_path: Path) -> None:
-    (relays,) = (text for text in _examples() if text.startswith("udp_mesh:"))
+    (relays,) = (text for text in _examples() if text.startswith("udp_mesh:") and "relay" in text)
     fleet = load_text(tmp_path, HEAD + relays).fleet
     assert fleet is not None
     assert {robot.name: robot.relay for robot in fleet.robots.values()} == {"husky1": ("uav1",), "uav1": ()}
@@ -83,3 +83,13 @@ def test_each_documented_secret_reference_loads(number: int, tmp_path: Path) -> 
     reference = example.splitlines()[number].partition(": ")[2]
     loaded = load_text(tmp_path, f"{HEAD}udp_mesh:\n  keys:\n  - {reference}\n")
     assert loaded.fleet is not None, loaded.diagnostics
+
+
+def test_the_thin_links_of_the_example_load(tmp_path: Path) -> None:
+    (thin,) = (text for text in _examples() if text.startswith("udp_mesh:") and "thin_links" in text)
+    fleet = load_text(tmp_path, HEAD + thin).fleet
+    assert fleet is not None
+    assert fleet.udp_mesh.thin_links["lora"].allowed_duty_cycle == 0.01
+    numbers = {robot.name: robot.thin.number for robot in fleet.robots.values() if robot.thin is not None}
+    assert numbers == {"base-station": 1, "husky1": 2}
+    assert [topic.name for topic in fleet.topics if topic.thin] == ["estop"]
