@@ -276,7 +276,7 @@ def soak(folder: Path, radios: int, robots: int, rounds: int, samples: int = 12)
             alarms=len(store.alarms(active_only=False, now_s=end_s)),
             latest_ms=_median_ms(lambda: store.at(end_s)),
             timeline_ms=_median_ms(lambda: store.timeline(start_s, end_s, 600)),
-            between_ms=_median_ms(lambda: store.between(start_s, end_s, 120)),
+            between_ms=_median_ms(lambda: tuple(store.between(start_s, end_s, 120))),
         )
 
 

@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -25,7 +25,7 @@ from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab
 from meshctl.cli.fleet_view import CONNECT_S, FleetView, NoRobots, Timeout, collect, open_fleet_view
 from meshctl.cli.monitor_history import HistoryFile, history_path
 from meshctl.cli.monitor_web import WebOptions
-from meshctl.cli.output import echo, echo_json, write_file
+from meshctl.cli.output import echo, echo_json
 from meshctl.cli.robots_context import AskSudo
 from meshctl.errors import ExitCode, InputError
 from meshctl.monitor.access import TOKEN_VARIABLE
@@ -36,11 +36,12 @@ from meshctl.monitor.frame import Frame
 from meshctl.monitor.hooks import AlarmHooks, HookSettings
 from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
-from meshctl.monitor.page import recording_of, single_file
+from meshctl.monitor.page import is_replaceable, recording_of, save_page
 from meshctl.monitor.prometheus import TextfileWriter
 from meshctl.monitor.recording_page import documents_of
 from meshctl.monitor.replay import is_history, open_recordings
 from meshctl.monitor.sampler import FrameSampler
+from meshctl.monitor.scratch import scratch_directory
 from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
@@ -371,19 +372,33 @@ def _serve(
 
 def _replay(files: list[Path], out: Path | None, web: WebOptions, *, as_json: bool) -> None:
     """Serve recordings, or write them as one page."""
-    with TemporaryDirectory(prefix="meshctl-replay.") as directory, open_recordings(files, Path(directory)) as opened:
+    with _scratch(out) as directory, open_recordings(files, directory) as opened:
         for problem in opened.problems:
             echo(f"warning: {problem}", err=True)
-        report = documents_of(file for file in files if not is_history(file))
+        reports = documents_of(file for file in files if not is_history(file))
         settings = PageSettings(
-            opened.fleet, __version__, "replay", opened.interval_s, opened.topic_classes, has_report=bool(report)
+            opened.fleet, __version__, "replay", opened.interval_s, opened.topic_classes, has_report=len(reports) > 0
         )
         if out is not None:
-            page = single_file(recording_of(opened.store, settings.as_json(), report)).encode()
-            write_file(out, page)
-            size = f"{len(page) / 1e6:.1f} MB"
-            say({"event": "written", "file": str(out), "bytes": len(page)}, f"wrote {out} ({size})", as_json=as_json)
+            try:
+                size_bytes = save_page(recording_of(opened.store, settings.as_json(), reports), out, directory)
+            except OSError as error:
+                raise InputError(f"cannot write {out}: {error.strerror}") from error
+            size = f"{size_bytes / 1e6:.1f} MB"
+            say({"event": "written", "file": str(out), "bytes": size_bytes}, f"wrote {out} ({size})", as_json=as_json)
             return
         feed = Feed()
-        app = MonitorServer(opened.store, feed, settings, web.rules, report=report).app()
+        app = MonitorServer(opened.store, feed, settings, web.rules, report=list(reports)).app()
         raise typer.Exit(_serve(app, web, feed, as_json=as_json))
+
+
+@contextmanager
+def _scratch(out: Path | None) -> Iterator[Path]:
+    """For temporary files: beside the page, which is put in place at once, or where others are."""
+    parent = out.parent if out is not None and is_replaceable(out) else None
+    with ExitStack() as stack:
+        try:
+            directory = stack.enter_context(scratch_directory(parent))
+        except OSError as error:
+            raise InputError(f"cannot write {out or error.filename}: {error.strerror}") from error
+        yield directory

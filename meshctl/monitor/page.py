@@ -3,27 +3,32 @@
 The page is hand-written ES modules without a build step. For the single file they are joined in the order of their
 imports: each module imports by name, from files of its own directory, and no two define the same name (a test checks
 both). The recording is JSON, packed, in elements that no browser executes: one with all but the frames, and the frames
-in parts that the page unpacks as it needs them, so that hours of a large team stay usable. The policy in the file
-allows exactly its own scripts and styles, by hash, and no network.
+in parts that the page unpacks as it needs them, so that hours of a large team stay usable. Frames are read, packed and
+written one part at a time, so that they need not fit into memory. The policy in the file allows exactly its own scripts
+and styles, by hash, and no network.
 """
 
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
+import itertools
 import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from meshctl.monitor.series import charts_of, devices_of
+from meshctl.monitor.frame import Frame
+from meshctl.monitor.series import DeviceCharts
 from meshctl.monitor.store import FrameStore
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 _MAIN = "main.js"
+# zlib's window of 32 KiB, with a gzip header
+_GZIP = 31
 _JSON: dict[str, Any] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
 _IMPORT = re.compile(r'^import \{[^}]*\} from "\./([a-z]+\.js)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:function|const|class)\b)", re.MULTILINE)
@@ -34,10 +39,20 @@ _TAG = re.compile(
 MAX_FRAMES = 3600
 MAX_CHART_FRAMES = 600
 TIMELINE_BUCKETS = 480
-# Of all frames; packed they are about a tenth of it.
-MAX_FRAME_CHARACTERS = 256 << 20
+# Of all frames, in the file; as the first part of evenly spread ones packs.
+MAX_FRAMES_BYTES = 32 << 20
 # The browser unpacks so much at once.
 PART_CHARACTERS = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class PageRecording:
+    """What the page shows of a history. `values` are all but the frames, `reports` the documents of udp-mesh's
+    recordings, one after the other; `frames` are read while the page is written."""
+
+    values: Mapping[str, Any]
+    reports: Iterable[Mapping[str, Any]] = ()
+    frames: Iterable[Frame] = ()
 
 
 def modules(main: str = _MAIN) -> list[str]:
@@ -63,19 +78,29 @@ def joined_modules() -> str:
 def recording_of(
     store: FrameStore,
     settings: Mapping[str, Any],
-    report: Sequence[Mapping[str, Any]] = (),
+    reports: Iterable[Mapping[str, Any]] = (),
     limit: int = MAX_FRAMES,
-) -> dict[str, Any]:
-    """What the page shows of a history, as one document; `frames` are JSON texts, evenly thinned to `limit` and to
-    `MAX_FRAME_CHARACTERS`. `report` are the documents of udp-mesh's recordings. Raises ValueError for an empty history.
+) -> PageRecording:
+    """What the page shows of a history: its frames evenly thinned to `limit` and to `MAX_FRAMES_BYTES`. Raises
+    ValueError for an empty history.
     """
     span = store.span()
     if span is None:
         raise ValueError("the history has no frame")
-    charted = store.between(*span, MAX_CHART_FRAMES)
-    typical = max(1, sum(len(frame.json_text) for frame in charted) // len(charted))
-    frames = store.between(*span, max(2, min(limit, MAX_FRAME_CHARACTERS // typical)))
-    return {
+    charts = DeviceCharts()
+    sample: list[str] = []
+    characters = charted = 0
+    for frame in store.between(*span, MAX_CHART_FRAMES):
+        charts.add(frame)
+        charted += 1
+        characters += len(frame.json_text)
+        if sum(map(len, sample)) < PART_CHARACTERS:
+            sample.append(frame.json_text)
+    # evenly spread frames have less in common than those of one part, so this is rather too much
+    packed_bytes = len(_packed(["[", ",".join(sample), "]"])) * characters / charted / sum(map(len, sample))
+    limit = max(2, min(limit, int(MAX_FRAMES_BYTES / packed_bytes)))
+    recorded = store.count()
+    values = {
         "meta": {
             **settings,
             "mode": "replay",
@@ -83,20 +108,18 @@ def recording_of(
             "now_s": span[1],
             "actions": False,
             "can_acknowledge": False,
-            "frames": len(frames),
-            "recorded_frames": store.count(),
+            "frames": min(limit, recorded),
+            "recorded_frames": recorded,
         },
-        "times_s": [frame.time_s for frame in frames],
-        "frames": [frame.json_text for frame in frames],
         "alarms": [alarm.as_json() for alarm in store.alarms(active_only=False, now_s=span[1])],
         "timeline": {"buckets": [asdict(one) for one in store.timeline(span[0], span[1] + 0.001, TIMELINE_BUCKETS)]},
-        "series": {device: {"charts": charts_of(charted, device)} for device in devices_of(charted)},
-        "report": list(report),
+        "series": {device: {"charts": charts.of(device)} for device in charts.devices},
     }
+    return PageRecording(values, reports, store.between(*span, limit))
 
 
-def single_file(recording: Mapping[str, Any]) -> str:
-    """The page with a recording in it: opens from disk, without a server."""
+def single_file(recording: PageRecording) -> Iterator[str]:
+    """The page with a recording in it, in pieces: opens from disk, without a server."""
     scripts: list[str] = []
     styles: list[str] = []
     classic: list[str] = []
@@ -120,37 +143,59 @@ def single_file(recording: Mapping[str, Any]) -> str:
         " base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'"
     )
     head = f'<meta charset="utf-8">\n<meta http-equiv="Content-Security-Policy" content="{policy}">'
-    frames = recording.get("frames", ())
-    parts = _parts(frames)
-    rest = {**recording, "frames": [len(part) for part in parts]}
-    data = "\n".join(
-        [
-            f'<script type="application/json" id="recording">{_packed(json.dumps(rest, **_JSON))}</script>',
-            *(
-                f'<script type="application/json" class="frames">{_packed("[" + ",".join(part) + "]")}</script>'
-                for part in parts
-            ),
-        ]
-    )
-    return html.replace('<meta charset="utf-8">', head, 1).replace("<body>", f"<body>\n{data}", 1)
+    before, body, after = html.replace('<meta charset="utf-8">', head, 1).partition("<body>")
+    yield f"{before}{body}\n"
+    times_s: list[float] = []
+    counts: list[int] = []
+    for part in _parts(recording.frames):
+        times_s += [frame.time_s for frame in part]
+        counts.append(len(part))
+        text = ",".join(frame.json_text for frame in part)
+        yield f'<script type="application/json" class="frames">{_packed(["[", text, "]"])}</script>\n'
+    values = json.dumps({**recording.values, "times_s": times_s, "frames": counts}, **_JSON)
+    reports = (f"{',' if number else ''}{json.dumps(one, **_JSON)}" for number, one in enumerate(recording.reports))
+    packed = _packed(itertools.chain([values[:-1], ',"report":['], reports, ["]}"]))
+    yield f'<script type="application/json" id="recording">{packed}</script>\n{after}'
 
 
-def _parts(frames: Sequence[str]) -> list[list[str]]:
+def save_page(recording: PageRecording, page: Path, directory: Path) -> int:
+    """Write the page to `directory`, which is on the disk of `page`, then put it in the place of an older one; its
+    size in bytes. A device or a pipe is written to. Raises OSError."""
+    is_replaced = is_replaceable(page)
+    unfinished = directory / "page" if is_replaced else page
+    size = 0
+    with unfinished.open("wb") as file:
+        for piece in single_file(recording):
+            size += file.write(piece.encode())
+    if is_replaced:
+        unfinished.replace(page)
+    return size
+
+
+def is_replaceable(page: Path) -> bool:
+    """Whether the page is put in its place at once; a device or a pipe is written to."""
+    return page.is_file() or not page.exists()
+
+
+def _parts(frames: Iterable[Frame]) -> Iterator[list[Frame]]:
     """Consecutive frames together, up to `PART_CHARACTERS`."""
-    parts: list[list[str]] = []
-    characters = PART_CHARACTERS
+    part: list[Frame] = []
+    characters = 0
     for frame in frames:
-        if characters + len(frame) > PART_CHARACTERS:
-            parts.append([])
-            characters = 0
-        parts[-1].append(frame)
-        characters += len(frame)
-    return parts
+        if part and characters + len(frame.json_text) > PART_CHARACTERS:
+            yield part
+            part, characters = [], 0
+        part.append(frame)
+        characters += len(frame.json_text)
+    if part:
+        yield part
 
 
-def _packed(text: str) -> str:
+def _packed(pieces: Iterable[str]) -> str:
     """gzip in base64, which no text of a device can leave."""
-    return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
+    packer = zlib.compressobj(6, zlib.DEFLATED, _GZIP)
+    found = [packer.compress(piece.encode()) for piece in pieces]
+    return base64.b64encode(b"".join([*found, packer.flush()])).decode()
 
 
 def _hashes(texts: Sequence[str]) -> str:

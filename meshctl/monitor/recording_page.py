@@ -3,50 +3,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+import json
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from meshctl import __version__
 from meshctl.errors import InputError, MeshctlError
-from meshctl.monitor.page import recording_of, single_file
+from meshctl.monitor.page import recording_of, save_page
 from meshctl.monitor.replay import open_recordings
+from meshctl.monitor.scratch import scratch_directory
 from meshctl.monitor.server import PageSettings
 
 GROUP = "meshctl.recordings"
 
 
-def documents_of(files: Iterable[Path]) -> list[dict[str, Any]]:
+def documents_of(files: Iterable[Path]) -> PackedDocuments:
     """The tables, charts and events of recordings (udp_mesh/report/document.py). Raises InputError."""
-    found: list[dict[str, Any]] = []
-    for entry in entry_points(group=GROUP):
-        try:
-            found += entry.load()(files)
-        except ValueError as error:
-            raise InputError(str(error)) from error
-    return found
+    try:
+        return PackedDocuments(itertools.chain(*(entry.load()(list(files)) for entry in entry_points(group=GROUP))))
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
-def write_page(recordings: Sequence[Path], documents: Sequence[Mapping[str, Any]], page: Path, title: str) -> None:
-    """The monitor's page with recordings of udp-mesh in it, as one file that replaces an older one at once.
+def write_page(recordings: Sequence[Path], documents: Iterable[Mapping[str, Any]], page: Path, title: str) -> None:
+    """The monitor's page with recordings of udp-mesh in it, as one file that replaces an older one at once. The
+    documents are taken one at a time.
 
     Raises OSError with the page's name, or ValueError if the recordings cannot be shown.
     """
     try:
         # in the page's directory: a page that cannot be written fails before the work
-        with TemporaryDirectory(dir=page.parent, prefix=".report-") as directory:
+        with scratch_directory(page.parent) as directory:
+            packed = PackedDocuments(documents)
             try:
-                with open_recordings(recordings, Path(directory), title) as opened:
+                with open_recordings(recordings, directory, title) as opened:
                     settings = PageSettings(
                         title, __version__, "replay", opened.interval_s, opened.topic_classes, has_report=True
                     )
-                    text = single_file(recording_of(opened.store, settings.as_json(), documents))
+                    save_page(recording_of(opened.store, settings.as_json(), packed), page, directory)
             except MeshctlError as error:
                 raise ValueError(str(error)) from error
-            unfinished = Path(directory) / "page"
-            unfinished.write_text(text, "utf-8")
-            unfinished.replace(page)
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(page)) from error
+
+
+class PackedDocuments:
+    """Documents, kept packed: those of a large team are hundreds of megabytes as Python's values."""
+
+    def __init__(self, documents: Iterable[Mapping[str, Any]]) -> None:
+        self._packed = [zlib.compress(json.dumps(one).encode(), 1) for one in documents]
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (json.loads(zlib.decompress(one)) for one in self._packed)
+
+    def __len__(self) -> int:
+        return len(self._packed)

@@ -12,7 +12,7 @@ from pathlib import Path
 from meshctl.errors import InputError
 from meshctl.monitor.recorded_frames import frames_of, with_recorded
 from meshctl.monitor.store import FrameStore
-from meshctl.monitor.transport_recording import joined_by_name, read_recording
+from meshctl.monitor.transport_recording import SampleFile, joined_by_name, read_recording
 
 _SQLITE = b"SQLite format 3\x00"
 # The distances of so many frames tell how far apart they usually are.
@@ -41,22 +41,24 @@ def open_recordings(files: Sequence[Path], directory: Path, fleet: str = "record
     histories = [file for file in files if is_history(file)]
     if len(histories) > 1:
         raise InputError(f"expected one history, found {len(histories)}: {', '.join(map(str, histories))}")
-    problems: list[str] = []
-    robots = [robot for file in files if file not in histories for robot in read_recording(file, problems.append)]
-    if histories and not robots:
+    if len(histories) == len(files):
         with FrameStore.open_recording(histories[0]) as store:
             yield _opened(store, str(histories[0]))
         return
+    problems: list[str] = []
     # the same reader for all: frames of recordings become a history of their own
     with FrameStore.open(directory / "merged.sqlite", _FOREVER_S, _NO_LIMIT_BYTES) as merged:
-        if histories:
-            with FrameStore.open_recording(histories[0]) as store:
-                known = joined_by_name(robots)
-                for frame in store.after(0.0):
-                    merged.append(with_recorded(frame, known))
-        else:
-            for frame in frames_of(robots, fleet):
-                merged.append(frame)
+        with SampleFile(directory) as samples:
+            recordings = (file for file in files if file not in histories)
+            robots = [robot for file in recordings for robot in read_recording(file, samples, problems.append)]
+            if histories:
+                with FrameStore.open_recording(histories[0]) as store:
+                    known = joined_by_name(robots)
+                    for frame in store.after(0.0):
+                        merged.append(with_recorded(frame, known))
+            else:
+                for frame in frames_of(robots, fleet):
+                    merged.append(frame)
         yield replace(_opened(merged, ", ".join(map(str, files))), problems=tuple(problems))
 
 

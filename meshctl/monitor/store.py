@@ -240,21 +240,20 @@ class FrameStore:
             return unwritten
         return self._first("WHERE time_ms <= ? ORDER BY time_ms DESC LIMIT 1", (milliseconds(time_s),))
 
-    def between(self, start_s: float, end_s: float, limit: int) -> tuple[Frame, ...]:
-        """The frames from `start_s` to `end_s`, thinned evenly to at most `limit`, with the first and the last."""
+    def between(self, start_s: float, end_s: float, limit: int) -> Iterator[Frame]:
+        """The frames from `start_s` to `end_s`, thinned evenly to at most `limit`, with the first and the last. Each is
+        read when it is asked for."""
         if limit < 1:
-            return ()
+            return
         rows = self._reader.read(
             "SELECT time_ms FROM frames INDEXED BY timeline WHERE time_ms BETWEEN ? AND ? ORDER BY time_ms",
             (milliseconds(start_s), milliseconds(end_s)),
         )
-        found = []
         for key in thinned([row[0] for row in rows], limit):
             frame = self._first("WHERE time_ms = ?", (key,))
             # removed by retention meanwhile
             if frame is not None:
-                found.append(frame)
-        return tuple(found)
+                yield frame
 
     def after(self, time_s: float) -> Iterator[Frame]:
         """All frames newer than `time_s`, oldest first, as they are in the file now, then the one not written."""

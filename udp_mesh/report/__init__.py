@@ -1,7 +1,7 @@
 """Recordings of a run, simulated or real -> the monitor's page with the run in it, text, or JSON.
 
-recording lines -> `recording.Recording` -> `figures` (numbers) -> `document` (tables, charts, events) -> `page` or
-`text`.
+recording lines -> `recording` (items) -> `aggregate.Recording` (bounded) -> `figures` (numbers) -> `document` (tables,
+charts, events) -> `page` or `text`.
 """
 
 from __future__ import annotations
@@ -9,32 +9,32 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from udp_mesh.report.recording import Recording
+    from udp_mesh.report.aggregate import Recording
 
 MAX_SHOWN_PROBLEMS = 5
 """Maximum number of problems printed per recording; the page counts all of them."""
 DEFAULT_PAGE = Path("report.html")
 
 
-def documents_of(files: Iterable[Path]) -> list[dict[str, Any]]:
-    """The documents (`udp_mesh.report.document`) of recordings, for meshctl's page. Raises ValueError."""
+def documents_of(files: Iterable[Path]) -> Iterator[dict[str, Any]]:
+    """The documents (`udp_mesh.report.document`) of recordings, one by one, for meshctl's page. Raises ValueError."""
+    from udp_mesh.report.aggregate import read
     from udp_mesh.report.document import document_of
-    from udp_mesh.report.recording import read
 
-    return [document_of(read(file)) for file in files]
+    return (document_of(read(file)) for file in files)
 
 
 def main(arguments: Sequence[str]) -> int:
     """`udp-mesh report RECORDING... --out PAGE`; 0 success, 2 a recording is not readable or the page not writable."""
+    from udp_mesh.report.aggregate import read
     from udp_mesh.report.document import document_of
     from udp_mesh.report.figures import summary
     from udp_mesh.report.page import page_writer
-    from udp_mesh.report.recording import read
     from udp_mesh.report.terminal_escapes import clean
     from udp_mesh.report.text import text_of
 
@@ -51,29 +51,40 @@ def main(arguments: Sequence[str]) -> int:
     if options.out is not None and any(_is_same(options.out, path) for path in options.recording):
         print(f"udp-mesh: --out: expected another file, found the recording {options.out}", file=sys.stderr)
         return 2
+    problems: list[str] = []
+    summaries: list[dict[str, Any]] = []
+
+    def documents() -> Iterator[dict[str, Any]]:
+        """One recording after the other, so that one at a time is in memory."""
+        for path in options.recording:
+            recording = read(path)
+            problems.extend(_problems_of(recording))
+            if options.json:
+                summaries.append(summary(recording))
+            yield document_of(recording)
+
+    texts: list[str] = []
     try:
-        recordings = [read(path) for path in options.recording]
-        documents = [document_of(recording) for recording in recordings]
         if write_page is not None:
             page = options.out or DEFAULT_PAGE
-            write_page(options.recording, documents, page, options.title)
+            write_page(options.recording, documents(), page, options.title)
+        else:
+            texts = [text_of(document) for document in documents()]
     except ValueError as error:
         print(f"udp-mesh: {clean(str(error))}", file=sys.stderr)
         return 2
     except OSError as error:
         print(f"udp-mesh: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
-    _warn(recordings)
+    for problem in problems:
+        print(f"udp-mesh: warning: {clean(problem)}", file=sys.stderr)
     if options.json:
-        value = {
-            "page": None if page is None else str(page),
-            "recordings": [summary(recording) for recording in recordings],
-        }
+        value = {"page": None if page is None else str(page), "recordings": summaries}
         print(json.dumps(value, indent=2))
     elif page is not None:
         print(page)
     else:
-        print("\n\n".join(text_of(document) for document in documents))
+        print("\n\n".join(texts))
     return 0
 
 
@@ -99,12 +110,7 @@ def _options(arguments: Sequence[str]) -> argparse.Namespace:
     return parser.parse_args(list(arguments))
 
 
-def _warn(recordings: Iterable[Recording]) -> None:
-    from udp_mesh.report.terminal_escapes import clean
-
-    for recording in recordings:
-        for problem in recording.problems[:MAX_SHOWN_PROBLEMS]:
-            print(f"udp-mesh: warning: {clean(str(problem))}", file=sys.stderr)
-        more = len(recording.problems) - MAX_SHOWN_PROBLEMS
-        if more > 0:
-            print(f"udp-mesh: warning: ... and {more} more invalid lines", file=sys.stderr)
+def _problems_of(recording: Recording) -> list[str]:
+    shown = recording.problems[:MAX_SHOWN_PROBLEMS]
+    more = recording.invalid_lines - len(shown)
+    return [*shown, *([f"... and {more} more invalid lines"] if more > 0 else [])]

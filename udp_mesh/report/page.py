@@ -3,14 +3,14 @@ robot has udp_mesh alone, and reports as text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 GROUP = "udp_mesh.report"
-WritePage = Callable[[Sequence[Path], Sequence[Mapping[str, Any]], Path, str], None]
-"""Writes a page: (recordings, their documents, file, title). Raises OSError, or ValueError for recordings that it
-cannot show."""
+WritePage = Callable[[Sequence[Path], Iterable[Mapping[str, Any]], Path, str], None]
+"""Writes a page: (recordings, their documents, file, title); takes one document at a time. Raises OSError, or
+ValueError for recordings that it cannot show."""
 
 
 def page_writer() -> WritePage | None:

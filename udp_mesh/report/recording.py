@@ -21,8 +21,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 VERSION = 1
@@ -34,6 +33,7 @@ MAX_PLACE_M = 1e7
 MAX_BYTES = 1 << 50
 MAX_SAMPLE = 1e15
 _SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops", "outbox_messages", "capacity_bits_per_s")
+_VERSION_KEYS = ("whole_sent", "differences_sent", "payload_bytes_sent", "body_bytes_sent")
 MAX_EVENT_TEXT = 200
 
 
@@ -142,32 +142,62 @@ class RecordedEvent:
     text: str
 
 
-@dataclass(slots=True)
-class Recording:
-    """The contents of one recording, in order. `problems` are the invalid lines and why; `missing_lines` counts lines
-    that were dropped during recording."""
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A line with conditions; what it says of peers, versions and logs are items of their own, which follow."""
 
-    name: str = ""
-    started: float = 0.0
-    arrivals: list[RecordedArrival] = field(default_factory=list)
-    presences: list[Presence] = field(default_factory=list)
-    samples: list[Sample] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
-    sent: list[SentMessage] = field(default_factory=list)
-    outcomes: list[SentOutcome] = field(default_factory=list)
-    events: list[RecordedEvent] = field(default_factory=list)
-    versions: dict[str, tuple[VersionTotals, VersionTotals]] = field(default_factory=dict)
-    """By topic: at the beginning of the recording, and last."""
-    logs: dict[tuple[str, str], LogProgress] = field(default_factory=dict)
-    """By topic and source."""
-    saved: dict[str, tuple[SavedTotals, SavedTotals]] = field(default_factory=dict)
-    """By peer: at the beginning of the recording, and last."""
-    snapshots: int = 0
-    """Lines with conditions."""
-    missing_lines: int = 0
-    end_s: float = 0.0
-    """The latest time of a line."""
-    problems: list[str] = field(default_factory=list)
+    t: float
+
+
+@dataclass(frozen=True, slots=True)
+class VersionSample:
+    topic: str
+    totals: VersionTotals
+
+
+@dataclass(frozen=True, slots=True)
+class LogSample:
+    topic: str
+    source: str
+    progress: LogProgress
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSample:
+    peer: str
+    totals: SavedTotals
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Lines that were dropped during recording."""
+
+    t: float
+    lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class InvalidLine:
+    """`text` names file, line, what was expected and what was found."""
+
+    text: str
+
+
+Item = (
+    RecordedArrival
+    | SentMessage
+    | SentOutcome
+    | Presence
+    | Sample
+    | Place
+    | RecordedEvent
+    | Snapshot
+    | VersionSample
+    | LogSample
+    | SavedSample
+    | Gap
+    | InvalidLine
+)
 
 
 def header(name: str, started: float) -> str:
@@ -193,16 +223,7 @@ def line(item: RecordedArrival | Presence | Sample | Place) -> str:
     return json.dumps({"t": round(item.t, 6), "kind": kind, "at": item.at, **what})
 
 
-def read(path: Path) -> Recording:
-    """Reads a recording. Raises RecordingError if it is not one; a truncated or invalid line becomes a problem."""
-    try:
-        with path.open("rb") as file:
-            return parse(_lines(file), str(path))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
-
-
-def _lines(file: BinaryIO) -> Iterator[bytes]:
+def lines_of(file: BinaryIO) -> Iterator[bytes]:
     """The lines of a file; of a line that is too long only the beginning, which is still too long."""
     while line := file.readline(MAX_LINE_BYTES + 1):
         yield line
@@ -212,26 +233,89 @@ def _lines(file: BinaryIO) -> Iterator[bytes]:
                 return
 
 
-def parse(lines: Iterable[bytes], file: str) -> Recording:
-    """Like `read`, from the lines themselves."""
-    numbered = _objects(lines)
-    _, first = next(numbered, (1, "nothing"))
-    if not isinstance(first, dict) or "recording" not in first:
-        found = first if isinstance(first, str) else "another JSON value"
-        raise RecordingError(f'{file}:1: expected {{"recording": {VERSION}, ...}}, found {found}')
-    if first["recording"] != VERSION:
-        raise RecordingError(f"{file}:1: expected version {VERSION}, found {first['recording']!r}")
-    started = first.get("started")
-    recording = Recording(str(first.get("node", "")), float(started) if isinstance(started, int | float) else 0.0)
-    online: dict[str, bool] = {}
-    for number, entry in numbered:
-        try:
-            if isinstance(entry, str):
-                raise _UnreadableError("one JSON object", entry)
-            _add(recording, entry, online)
-        except _UnreadableError as error:
-            recording.problems.append(f"{file}:{number}: {error}")
-    return recording
+class RecordingReader:
+    """The items of a recording's lines, in order; `name` and `started` (Unix time) are those of its header.
+
+    Raises RecordingError if the lines are no recording. A truncated or invalid line becomes an InvalidLine.
+    """
+
+    def __init__(self, lines: Iterable[bytes], file: str) -> None:
+        self._file = file
+        self._numbered = _objects(lines)
+        _, first = next(self._numbered, (1, "nothing"))
+        if not isinstance(first, dict) or "recording" not in first:
+            found = first if isinstance(first, str) else "another JSON value"
+            raise RecordingError(f'{file}:1: expected {{"recording": {VERSION}, ...}}, found {found}')
+        if first["recording"] != VERSION:
+            raise RecordingError(f"{file}:1: expected version {VERSION}, found {first['recording']!r}")
+        started = first.get("started")
+        self.name = str(first.get("node", "")).encode(errors="replace").decode()
+        self.started = float(started) if isinstance(started, int | float) else 0.0
+        # Each peer's last known state: a recording may begin, or have a gap, while peers are online that no event
+        # announced.
+        self._online: dict[str, bool] = {}
+
+    def __iter__(self) -> Iterator[Item]:
+        for number, entry in self._numbered:
+            try:
+                if isinstance(entry, str):
+                    raise _UnreadableError("one JSON object", entry)
+                yield from self._items(entry)
+            except _UnreadableError as error:
+                yield InvalidLine(f"{self._file}:{number}: {error}")
+
+    def _items(self, entry: dict[str, Any]) -> Iterator[Item]:
+        """Of one line."""
+        t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
+        at = _text(entry, "at") if "at" in entry else self.name
+        match kind:
+            case "received":
+                source, topic = _text(entry, "source"), _text(entry, "topic")
+                yield RecordedArrival(t, at, source, topic, _integer(entry, "priority"), _size(entry))
+            case "sent":
+                yield SentMessage(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry))
+            case "message-delivered" | "message-expired" | "message-peer-lost":
+                latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
+                outcome = kind.removeprefix("message-")
+                yield SentOutcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s)
+            case "peer-online" | "peer-offline":
+                peer = _text(entry, "peer")
+                self._online[peer] = kind == "peer-online"
+                yield Presence(t, at, peer, self._online[peer])
+                yield RecordedEvent(t, at, kind, peer)
+            case "conditions":
+                yield Snapshot(t)
+                yield from self._conditions(t, at, entry)
+            case "place":
+                x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
+                yield Place(t, at, x, y)
+            case "gap":
+                yield Gap(t, _integer(entry, "lines"))
+            case str():
+                yield RecordedEvent(t, at, _text(entry, "kind"), _fields(entry))
+            case _:
+                raise _UnreadableError("a string as kind", kind)
+
+    def _conditions(self, t: float, at: str, entry: dict[str, Any]) -> Iterator[Item]:
+        for peer_entry in _rows(entry, "peers"):
+            name = _text(peer_entry, "name")
+            now_online = peer_entry.get("online")
+            # An offline peer's values are old ones.
+            keys = [key for key in _SAMPLED if peer_entry.get(key) is not None and now_online is not False]
+            known: dict[str, Any] = {key: _number(peer_entry, key, 0.0, MAX_SAMPLE) for key in keys}
+            yield Sample(t, at, name, **known)
+            if "saved_messages" in peer_entry:
+                counters = (_integer(peer_entry, key) for key in ("saved_messages", "saved_bytes"))
+                yield SavedSample(name, SavedTotals(*counters))
+            if isinstance(now_online, bool) and now_online != self._online.get(name, False):
+                self._online[name] = now_online
+                yield Presence(t, at, name, now_online)
+        for row in _rows(entry, "versions") if "versions" in entry else ():
+            counters = (_integer(row, key) for key in _VERSION_KEYS)
+            yield VersionSample(_text(row, "topic"), VersionTotals(*counters))
+        for row in _rows(entry, "logs") if "logs" in entry else ():
+            counters = (_integer(row, key) for key in ("received_items", "known_items", "held_bytes"))
+            yield LogSample(_text(row, "topic"), _text(row, "source"), LogProgress(*counters))
 
 
 class _UnreadableError(ValueError):
@@ -254,76 +338,6 @@ def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
             yield number, "invalid JSON (a truncated line?)"
             continue
         yield number, entry if isinstance(entry, dict) else "another JSON value"
-
-
-def _add(recording: Recording, entry: dict[str, Any], online: dict[str, bool]) -> None:
-    """Adds one line. `online` holds each peer's last known state: a recording may begin, or have a gap, while peers are
-    online that no event announced."""
-    t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
-    at = _text(entry, "at") if "at" in entry else recording.name
-    recording.end_s = max(recording.end_s, t)
-    match kind:
-        case "received":
-            recording.arrivals.append(
-                RecordedArrival(
-                    t, at, _text(entry, "source"), _text(entry, "topic"), _integer(entry, "priority"), _size(entry)
-                )
-            )
-        case "sent":
-            recording.sent.append(SentMessage(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry)))
-        case "message-delivered" | "message-expired" | "message-peer-lost":
-            latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
-            outcome = kind.removeprefix("message-")
-            recording.outcomes.append(SentOutcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s))
-        case "peer-online" | "peer-offline":
-            peer = _text(entry, "peer")
-            online[peer] = kind == "peer-online"
-            recording.presences.append(Presence(t, at, peer, online[peer]))
-            recording.events.append(RecordedEvent(t, at, kind, peer))
-        case "conditions":
-            recording.snapshots += 1
-            for peer_entry in _rows(entry, "peers"):
-                _sample(recording, t, at, peer_entry, online)
-            for row in _rows(entry, "versions") if "versions" in entry else ():
-                _add_versions(recording, row)
-            for row in _rows(entry, "logs") if "logs" in entry else ():
-                counts = (_integer(row, key) for key in ("received_items", "known_items", "held_bytes"))
-                recording.logs[_text(row, "topic"), _text(row, "source")] = LogProgress(*counts)
-        case "place":
-            x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
-            recording.places.append(Place(t, at, x, y))
-        case "gap":
-            recording.missing_lines += _integer(entry, "lines")
-        case str():
-            recording.events.append(RecordedEvent(t, at, _text(entry, "kind"), _fields(entry)))
-        case _:
-            raise _UnreadableError("a string as kind", kind)
-
-
-def _sample(recording: Recording, t: float, at: str, entry: dict[str, Any], online: dict[str, bool]) -> None:
-    name = _text(entry, "name")
-    now_online = entry.get("online")
-    # An offline peer's values are old ones.
-    keys = [key for key in _SAMPLED if entry.get(key) is not None and now_online is not False]
-    known: dict[str, Any] = {key: _number(entry, key, 0.0, MAX_SAMPLE) for key in keys}
-    recording.samples.append(Sample(t, at, name, **known))
-    if "saved_messages" in entry:
-        totals = SavedTotals(_integer(entry, "saved_messages"), _integer(entry, "saved_bytes"))
-        # A peer that is first seen later was sent nothing before.
-        begin = SavedTotals() if recording.snapshots > 1 else totals
-        recording.saved[name] = (recording.saved.get(name, (begin, totals))[0], totals)
-    if isinstance(now_online, bool) and now_online != online.get(name, False):
-        online[name] = now_online
-        recording.presences.append(Presence(t, at, name, now_online))
-
-
-def _add_versions(recording: Recording, row: dict[str, Any]) -> None:
-    keys = ("whole_sent", "differences_sent", "payload_bytes_sent", "body_bytes_sent")
-    topic, totals = _text(row, "topic"), VersionTotals(*(_integer(row, key) for key in keys))
-    # A topic that is first seen later was unused at the beginning.
-    begin = VersionTotals() if recording.snapshots > 1 else totals
-    first, _ = recording.versions.get(topic, (begin, totals))
-    recording.versions[topic] = (first, totals)
 
 
 def _rows(entry: dict[str, Any], key: str) -> list[dict[str, Any]]:

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from udp_mesh.report.aggregate import parse
 from udp_mesh.report.document import document_of
 from udp_mesh.report.page import page_writer
-from udp_mesh.report.recording import parse
 from udp_mesh.sim.run import RunResult, play
 from udp_mesh.sim.scenario import MAX_DURATION_S, Scenario, ScenarioError, load
 

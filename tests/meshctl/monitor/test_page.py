@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from benchmarks.monitor_fleet import TOPIC_CLASSES, TunnelRun
 from meshctl.monitor.frame import Frame
-from meshctl.monitor.page import recording_of, single_file
+from meshctl.monitor.page import recording_of, save_page
 from meshctl.monitor.server import PageSettings
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.browser import PATIENCE_MS, file_url, opened
@@ -276,7 +276,7 @@ def test_a_recording_is_one_file_that_needs_no_server(
     for frame in frames:
         store.append(frame)
     file = tmp_path / "run.html"
-    file.write_text(single_file(recording_of(store, SETTINGS.as_json())), encoding="utf-8")
+    save_page(recording_of(store, SETTINGS.as_json()), file, tmp_path)
     with opened(browser, file_url(file)) as page:
         assert shown_s(page) == frames[0].time_s
         expect(page.locator("#mode")).to_contain_text("recording")

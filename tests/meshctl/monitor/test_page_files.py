@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from meshctl.monitor.page import ASSETS, joined_modules, modules, single_file
+from meshctl.monitor.frame import Frame
+from meshctl.monitor.page import ASSETS, PageRecording, joined_modules, modules, single_file
 from tests.test_structure import MAX_LINES
 
 OWN = sorted(ASSETS.glob("*.js"))
@@ -53,7 +54,7 @@ def test_colors_of_classes_are_those_of_okabe_and_ito() -> None:
 
 
 def test_a_recording_cannot_leave_its_element() -> None:
-    text = single_file({"meta": {"fleet": "</script><script>alert(1)</script>"}})
+    text = "".join(single_file(PageRecording({"meta": {"fleet": "</script><script>alert(1)</script>"}})))
     assert "alert(1)" not in text
     assert text.count("<script") == text.count("</script>") == 7
     assert "default-src 'none'" in text
@@ -61,12 +62,15 @@ def test_a_recording_cannot_leave_its_element() -> None:
 
 
 def test_frames_are_in_parts_which_hold_them_all() -> None:
-    frames = [json.dumps({"time_s": number, "padding": "x" * 400_000}) for number in range(7)]
-    text = single_file({"meta": {}, "times_s": list(range(7)), "frames": frames})
+    frames = [Frame(number, json.dumps({"time_s": number, "padding": "x" * 400_000})) for number in range(7)]
+    text = "".join(single_file(PageRecording({"meta": {}}, [{"node": "a"}, {"node": "b"}], frames)))
     parts = [json.loads(unpacked(one)) for one in re.findall(r'class="frames">([^<]*)<', text)]
     assert [frame["time_s"] for part in parts for frame in part] == list(range(7))
     (rest,) = re.findall(r'id="recording">([^<]*)<', text)
-    assert json.loads(unpacked(rest))["frames"] == [len(part) for part in parts] == [2, 2, 2, 1]
+    values = json.loads(unpacked(rest))
+    assert values["frames"] == [len(part) for part in parts] == [2, 2, 2, 1]
+    assert values["times_s"] == list(range(7))
+    assert values["report"] == [{"node": "a"}, {"node": "b"}]
 
 
 def unpacked(text: str) -> bytes:

@@ -23,7 +23,8 @@ from udp_mesh.core.settings import Settings
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon import recording
 from udp_mesh.daemon.recording import Recorder
-from udp_mesh.report.recording import LogProgress, read
+from udp_mesh.report.aggregate import read
+from udp_mesh.report.recording import LogProgress
 
 
 def recorder(path: Path, limit_bytes: int = 1 << 20) -> Recorder:

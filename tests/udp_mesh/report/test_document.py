@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Iterable
 from typing import Any
@@ -10,9 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.report.bins import BinnedLines, Bins, thinned
-from udp_mesh.report.document import BINS, MAX_EVENTS, MAX_LAYERS, MAX_LINES, MAX_POINTS, MAX_SPANS, document_of
-from udp_mesh.report.recording import parse
+from udp_mesh.report import aggregate
+from udp_mesh.report.aggregate import BINS, MAX_EVENTS, MAX_POINTS, MAX_SPANS, Recording, parse
+from udp_mesh.report.bins import MAX_LABELS, BinnedLines, Bins, Thinned, thinned
+from udp_mesh.report.distribution import MAX_EXACT, Distribution
+from udp_mesh.report.document import MAX_LAYERS, MAX_LINES, document_of
 
 HOURS_S = 4 * 3600.0
 
@@ -133,19 +136,129 @@ def test_a_track_says_where_a_robot_was_online() -> None:
 
 
 @given(st.floats(0, 1e6), st.lists(st.tuples(st.floats(0, 1), st.floats(-1e6, 1e6)), min_size=1))
-def test_bins_keep_the_least_and_the_greatest_value(end_s: float, points: list[tuple[float, float]]) -> None:
+def test_bins_keep_the_least_the_greatest_and_the_sum(end_s: float, points: list[tuple[float, float]]) -> None:
     bins = Bins.at_most(10, end_s)
     assert bins.count <= 10
     assert bins.width_s * bins.count >= end_s * (1 - 1e-6)
-    lines = BinnedLines(bins)
+    lines = BinnedLines(10)
     for share, value in points:
         lines.add("one", share * end_s, value)
-    (line,) = lines.series()
+    (line,) = lines.series(bins, ["one"])
     shown = [value for value in (*line["values"], *line.get("high", ()), *line.get("low", ())) if value is not None]
-    assert max(shown) == pytest.approx(max(value for _, value in points), rel=1e-3)
-    assert min(shown) == pytest.approx(min(value for _, value in points), rel=1e-3)
+    assert max(shown) == pytest.approx(max(value for _, value in points), rel=1e-3, abs=1e-30)
+    assert min(shown) == pytest.approx(min(value for _, value in points), rel=1e-3, abs=1e-30)
+    assert sum(lines.totals(bins, "one")) == pytest.approx(sum(value for _, value in points), rel=1e-9, abs=1e-3)
+
+
+def test_a_point_is_in_the_bin_of_its_time_whatever_came_after_it() -> None:
+    lines = BinnedLines(240)
+    for t in range(36_000):
+        lines.add("one", float(t), float(t))
+    bins = Bins.at_most(240, 36_000.0)
+    (line,) = lines.series(bins, ["one"])
+    assert bins.width_s == 200
+    assert (line["low"][:2], line["high"][:2]) == ([0.0, 200.0], [199.0, 399.0])
+    assert lines.totals(bins, "one")[0] == sum(range(200))
+
+
+@given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0, 0.999))
+def test_quantiles_are_exact_for_few_values_and_close_for_many(values: list[float], share: float) -> None:
+    exact = sorted(values)[int(share * len(values))]
+    assert Distribution.of(values).quantile(share) == exact
+    many = Distribution.of(value for value in values for _ in range(1 + MAX_EXACT // len(values)))
+    found = many.quantile(share)
+    assert many.count > MAX_EXACT
+    assert found == pytest.approx(exact, rel=2e-3, abs=1e-6)
 
 
 def test_thinning_keeps_both_ends() -> None:
     assert thinned(range(1000), 4) == [0, 333, 666, 999]
     assert thinned([1, 2], 4) == [1, 2]
+
+
+@given(st.integers(1, 3000), st.integers(2, 50))
+def test_items_are_thinned_while_they_arrive(count: int, limit: int) -> None:
+    kept = Thinned[int](limit)
+    for number in range(count):
+        kept.add(number)
+    shown = kept.items()
+    assert (shown[0], shown[-1], kept.count) == (0, count - 1, count)
+    assert len(shown) == min(count, len(shown), limit)
+    assert len(shown) >= min(count, limit)
+    steps = [later - earlier for earlier, later in itertools.pairwise(shown)]
+    assert max(steps, default=0) <= max(1, 3 * count / limit)
+
+
+def test_a_rare_event_is_listed_among_thousands_of_frequent_ones() -> None:
+    def entries() -> Iterable[dict[str, Any]]:
+        for i in range(5000):
+            yield {"t": i * 2.0, "kind": "peer-online", "peer": "flapping"}
+            yield {"t": i * 2.0 + 1, "kind": "peer-offline", "peer": "flapping"}
+            if i == 3210:
+                yield {"t": i * 2.0 + 1, "kind": "peer-restarted", "peer": "spot1"}
+
+    found = document(entries())
+    assert [event["text"] for event in found["events"] if event["kind"] == "peer-restarted"] == ["peer spot1"]
+    assert len(found["events"]) <= MAX_EVENTS
+    assert "1000 of 10001 events" in " ".join(found["notes"])
+    times = [event["time_s"] for event in found["events"]]
+    assert times == sorted(times)
+
+
+def size_of(value: object) -> int:
+    """Numbers and texts in it, at any depth."""
+    if isinstance(value, dict):
+        return sum(size_of(key) + size_of(one) for key, one in value.items())
+    if isinstance(value, str | int | float | bool | None):
+        return 1
+    if isinstance(value, BinnedLines):
+        return size_of(value._lines) + len(value.left_out)
+    if hasattr(value, "__len__") and hasattr(value, "__iter__"):
+        return sum(map(size_of, value))
+    names = getattr(type(value), "__slots__", None) or getattr(value, "__dict__", {})
+    return sum(size_of(getattr(value, name)) for name in names if name != "__weakref__")
+
+
+def test_the_memory_of_a_recording_does_not_grow_with_its_length() -> None:
+    def entries(seconds: int) -> Iterable[bytes]:
+        yield b'{"recording": 1, "node": "base", "started": 0}'
+        for t in range(seconds):
+            for entry in (
+                conditions(float(t), spot1={"round_trip_s": 0.001 * (t % 50), "loss": 0.1, "outbox_messages": t}),
+                {"t": t, "kind": "received", "source": "s", "topic": "map", "priority": 1, "bytes": t},
+                {"t": t, "kind": "place", "at": "spot1", "x": t, "y": 0.0},
+                {"t": t, "kind": ("peer-online", "peer-offline")[t % 2], "peer": "spot2"},
+                {"t": t, "kind": "message-delivered", "peer": "a", "topic": "b", "latency_s": 0.01 * (t % 97)},
+            ):
+                yield json.dumps(entry).encode()
+
+    short, long = (size_of(parse(entries(seconds), "r")) for seconds in (12_000, 48_000))
+    # sawtooth: kept items are at most twice the limit
+    assert long < 2 * short
+
+
+def test_names_beyond_the_limit_are_counted_and_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aggregate, "MAX_NAMES", 300)
+    found: Recording = parse(
+        [
+            b'{"recording": 1, "node": "base", "started": 0}',
+            *(
+                json.dumps(
+                    {"t": 1, "kind": "received", "source": f"s{i}", "topic": f"t{i}", "priority": 1, "bytes": 1}
+                ).encode()
+                for i in range(400)
+            ),
+            *(json.dumps(conditions(2.0, **{f"p{i}": {"loss": 0.1} for i in range(400)})).encode() for _ in range(2)),
+            *(json.dumps({"t": 3, "kind": f"kind{i}"}).encode() for i in range(400)),
+        ],
+        "r",
+    )
+    assert len(found.received) == len(found.arrivals) == len(found.event_counts) == 300
+    assert len(found.events) == aggregate.MAX_EVENT_KINDS + 1
+    assert len(found.online) == 300
+    # topics twice (the throughput's are fewer), events once, peers of both lines
+    assert found.unnamed == 100 + 100 + 100
+    shown = document_of(found)
+    assert "300 values of further ones are not counted" in " ".join(shown["notes"])
+    assert f"At least {400 - MAX_LABELS} more were not compared" in chart(shown, "Loss to the peer")["note"]
+    assert len(json.dumps(shown)) < 500_000

@@ -11,19 +11,22 @@ from hypothesis import strategies as st
 
 from udp_mesh.report import main
 from udp_mesh.report import recording as report_recording
+from udp_mesh.report.aggregate import Recording, parse, read
+from udp_mesh.report.distribution import Distribution
 from udp_mesh.report.document import document_of
-from udp_mesh.report.figures import connections, histogram, intervals, sent_topics, summary, throughput
+from udp_mesh.report.figures import histogram, intervals, online_share, sent_topics, summary
 from udp_mesh.report.recording import (
+    Item,
     Place,
     Presence,
     RecordedArrival,
-    Recording,
+    RecordedEvent,
     RecordingError,
+    RecordingReader,
     Sample,
+    Snapshot,
     header,
     line,
-    parse,
-    read,
 )
 from udp_mesh.report.text import text_of
 
@@ -41,17 +44,15 @@ def lines(*items: RecordedArrival | Presence | Sample | Place) -> list[bytes]:
 
 
 def test_recordings_round_trip() -> None:
-    read_back = parse(lines(*ITEMS), "r.jsonl")
-    assert (*read_back.arrivals, *read_back.presences, *read_back.samples, *read_back.places) == (
-        ITEMS[1], ITEMS[0], ITEMS[4], ITEMS[2], ITEMS[3]
-    )  # fmt: skip
-    assert read_back.problems == []
-    assert read_back.end_s == 3.0
+    reader = RecordingReader(lines(*ITEMS), "r.jsonl")
+    # an event beside each presence, and the conditions that a sample belongs to
+    assert [item for item in reader if not isinstance(item, RecordedEvent | Snapshot)] == list[Item](ITEMS)
+    assert (reader.name, reader.started, parse(lines(*ITEMS), "r.jsonl").end_s) == ("base", 0.0, 3.0)
 
 
 def test_a_truncated_line_is_ignored_and_reported() -> None:
     recording = parse([*lines(*ITEMS), b'{"t": 4, "kind": "recei'], "r.jsonl")
-    assert len(recording.arrivals) == 1
+    assert recording.messages == 1
     assert recording.problems[0].startswith("r.jsonl:7:")
 
 
@@ -93,10 +94,13 @@ def test_a_recording_that_begins_while_peers_are_online_shows_them() -> None:
         [header("base", 0.0).encode(), conditions(0.0, True), conditions(2.0, True), offline, conditions(5.0, False)],
         "r",
     )
-    (spot,) = connections(recording)
-    assert (spot.spans_s, spot.share) == (((0.0, 4.0),), 0.8)
+    spot = recording.online["spot1"]
+    assert (spot.spans_s, online_share(spot, recording.end_s)) == ([(0.0, 4.0)], 0.8)
+    assert (spot.times_lost, spot.longest_gap_s) == (1, 1.0)
     # Values of an offline peer are old.
-    assert [sample.t for sample in recording.samples if sample.loss is not None] == [0.0, 2.0]
+    (loss,) = (one for one in document_of(recording)["charts"] if one["title"] == "Loss to the peer")
+    shown = [time_s for time_s, value in zip(loss["times_s"], loss["series"][0]["values"], strict=True) if value]
+    assert [int(time_s) for time_s in shown] == [0, 2]
 
 
 def test_outcomes_of_sent_messages_are_counted_per_topic() -> None:
@@ -109,9 +113,12 @@ def test_outcomes_of_sent_messages_are_counted_per_topic() -> None:
         {"t": 3, "kind": "message-peer-lost", "peer": "c", "topic": "map"},
     ]
     recording = parse([header("a", 0.0).encode(), *(json.dumps(entry).encode() for entry in entries)], "r")
-    estop, bulk = sent_topics(recording)
-    assert (estop.topic, estop.messages, estop.delivered, estop.latency_s(0.5)) == ("estop", 1, 2, 0.04)
-    assert (bulk.total_bytes, bulk.expired, bulk.peer_lost, bulk.latency_s(0.5)) == (500, 1, 1, None)
+    (first, estop), (_, bulk) = sent_topics(recording)
+    assert (first, estop.messages, estop.outcomes["delivered"], estop.latencies_s.quantile(0.5)) == (
+        "estop", 1, 2, 0.04
+    )  # fmt: skip
+    assert (bulk.total_bytes, bulk.outcomes["expired"], bulk.outcomes["peer-lost"]) == (500, 1, 1)
+    assert bulk.latencies_s.quantile(0.5) is None
     (table,) = (one for one in document_of(recording)["tables"] if one["title"] == "Sent")
     assert table["rows"][0] == ["estop", "1", "0.00", "2", "0", "0", "40.0", "40.0"]
 
@@ -126,7 +133,7 @@ def test_a_message_recorded_with_a_large_payload_is_counted(tmp_path: Path) -> N
     path = tmp_path / "r.jsonl"
     entry = {"t": 1, "kind": "received", "source": "a", "topic": "map", "priority": 7, "bytes": 3 << 19}
     path.write_text(header("a", 0.0) + "\n" + json.dumps({**entry, "payload": "A" * (2 << 20)}) + "\n")
-    assert [item.size for item in read(path).arrivals] == [3 << 19]
+    assert read(path).received["map"].total_bytes == 3 << 19
 
 
 def test_an_overlong_line_is_a_single_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +141,7 @@ def test_an_overlong_line_is_a_single_problem(tmp_path: Path, monkeypatch: pytes
     path = tmp_path / "r.jsonl"
     path.write_text("\n".join([header("a", 0.0), "x" * 1000, line(ITEMS[0])]) + "\n")
     recording = read(path)
-    assert (len(recording.problems), len(recording.presences)) == (1, 1)
+    assert (recording.invalid_lines, len(recording.online)) == (1, 1)
 
 
 def test_json_output_contains_the_figures_of_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,20 +230,16 @@ def test_intervals_have_median_deviation_and_gaps() -> None:
 
 def test_connections_have_online_spans_and_an_online_share() -> None:
     recording = parse(lines(*ITEMS, Presence(5.0, "base", "spot1", True), Place(9.0, "base", 0, 0)), "r")
-    (spot,) = connections(recording)
-    assert spot.spans_s == ((1.0, 3.0), (5.0, 9.0))
-    assert spot.share == 6 / 8
-
-
-def test_throughput_keeps_every_bit() -> None:
-    width_s, (topic,) = throughput(periodic(0.0), bins=10)
-    assert sum(topic.bits_per_s) * width_s == pytest.approx(100 * 100 * 8)
+    spot = recording.online["spot1"]
+    assert spot.spans_s == [(1.0, 3.0), (5.0, 9.0)]
+    assert online_share(spot, recording.end_s) == 6 / 8
+    assert (spot.times_lost, spot.longest_gap_s) == (1, 2.0)
 
 
 @given(st.lists(st.floats(0, 2), min_size=1))
 def test_a_histogram_is_a_density(values: list[float]) -> None:
     inside = sum(0 <= value < 2 for value in values)
-    assert sum(histogram(tuple(values), 0.0, 2.0, 8)) * 0.25 == pytest.approx(inside / len(values))
+    assert sum(histogram(Distribution.of(values), 0.0, 2.0, 8)) * 0.25 == pytest.approx(inside / len(values))
 
 
 def test_without_meshctl_the_report_is_text_and_a_page_is_refused(
