@@ -18,11 +18,12 @@ export function count(tab, items) {
 }
 
 export function showStrip(view) {
-  const verdict = view.frame.verdict ?? { go: null, text: "NOT ASSESSED", reasons: [] };
+  const isOfRobots = isRecordedByRobots(view.frame);
+  const verdict = view.frame.verdict ?? (isOfRobots ? contactOf(view) : { go: null, text: "NOT ASSESSED", reasons: [] });
   const box = byId("verdict");
-  box.dataset.go = String(verdict.go);
+  box.dataset.go = isOfRobots ? "contact" : String(verdict.go);
   const [word, rest] = splitVerdict(verdict);
-  setText(box.querySelector(".verdict-mark"), verdict.go === true ? "✓" : verdict.go === false ? "✕" : "?");
+  setText(box.querySelector(".verdict-mark"), verdict.go === true ? "✓" : verdict.go === false ? "✕" : isOfRobots ? "" : "?");
   const text = box.querySelector(".verdict-text");
   const signature = `${word}|${rest}`;
   if (text.dataset.signature !== signature) {
@@ -33,19 +34,8 @@ export function showStrip(view) {
   const reasons = verdict.reasons ?? [];
   setText(byId("reasons"), reasons.length > 0 ? reasons.join(" · ") : verdict.go === true ? "All checks pass." : "");
   byId("reasons").title = reasons.join("\n");
-  const nodes = [...view.devices.values()].filter((device) => device.health !== "off" && device.health !== "unknown");
-  const answering = (list) => list.filter((one) => one.health === "ok" || one.health === "degraded").length;
-  const robots = view.robots.filter((robot) => robot.health !== "off");
-  const open = alarmsAt(state.alarms, shown_s()).open;
-  const level = (name) => open.filter((alarm) => alarm.level === name).length;
   const total = (term, ...text) => el("div", {}, el("dt", {}, term), el("dd", {}, ...text));
-  const airtime = view.frame.airtime;
-  const totals = [
-    ["radios", `${answering(nodes)}`, `/${nodes.length}`], ["robots", robots.length === 0 ? "–" : `${answering(robots)}`, robots.length === 0 ? "" : `/${robots.length}`],
-    ["errors", `▲${level("error")}`, ""], ["warnings", `◆${level("warning")}`, ""],
-    // recordings of robots alone had no monitor that watched
-    ...(state.meta.mode === "replay" && !airtime ? [] : [["watching", airtime && isKnown(airtime.share) ? percentOf(airtime.share) : "–", " air"]]),
-  ];
+  const totals = isOfRobots ? totalsOfRobots(view) : totalsOf(view);
   const key = JSON.stringify(totals);
   if (byId("totals").dataset.signature !== key) {
     byId("totals").dataset.signature = key;
@@ -55,10 +45,44 @@ export function showStrip(view) {
   document.title = `${verdict.text} · ${view.frame.fleet ?? "meshctl"}`;
 }
 
+function totalsOf(view) {
+  const nodes = [...view.devices.values()].filter((device) => device.health !== "off" && device.health !== "unknown");
+  const answering = (list) => list.filter((one) => one.health === "ok" || one.health === "degraded").length;
+  const robots = view.robots.filter((robot) => robot.health !== "off");
+  const open = alarmsAt(state.alarms, shown_s()).open;
+  const level = (name) => open.filter((alarm) => alarm.level === name).length;
+  const airtime = view.frame.airtime;
+  return [
+    ["radios", `${answering(nodes)}`, `/${nodes.length}`], ["robots", robots.length === 0 ? "–" : `${answering(robots)}`, robots.length === 0 ? "" : `/${robots.length}`],
+    ["errors", `▲${level("error")}`, ""], ["warnings", `◆${level("warning")}`, ""],
+    ["watching", airtime && isKnown(airtime.share) ? percentOf(airtime.share) : "–", " air"],
+  ];
+}
+
+// Recordings of robots alone have no checks and no alarms: no monitor watched.
+const isRecordedByRobots = (frame) => state.meta.mode === "replay" && !frame.verdict && !frame.airtime;
+
+function totalsOfRobots(view) {
+  const recording = view.robots.filter((robot) => robot.raw.recorded === true).length;
+  return [["robots recorded", `${recording}`, `/${view.robots.length}`]];
+}
+
+// In place of go or no-go: how many robots the base had at that moment, or had each other.
+function contactOf(view) {
+  const base = view.robots.find((robot) => robot.isBase);
+  const linked = new Set(view.links.flatMap((link) => [link.a, link.b]));
+  const others = view.robots.filter((robot) => robot !== base);
+  const reached = others.filter((robot) => (base === undefined ? linked.has(robot.name) : isKnown(robot.hops)));
+  const missing = others.filter((robot) => !reached.includes(robot)).map((robot) => robot.name).sort();
+  const where = base === undefined ? "in contact" : "with the base";
+  const out = missing.length === 0 ? [] : [`Out of ${base === undefined ? "contact" : "its reach"}: ${missing.join(", ")}`];
+  return { go: null, text: `${reached.length}/${others.length} ${where}`, reasons: [...out, "As the robots recorded it; radios were not watched, so there is no go or no-go"] };
+}
+
 const percentOf = (share) => (share < 0.0995 ? `${(share * 100).toFixed(1)} %` : percent(share));
 
 function splitVerdict(verdict) {
-  const found = /^([A-Z-]+(?: ASSESSED)?)\s*(.*)$/.exec(verdict.text ?? "");
+  const found = /^([A-Z-]+(?: ASSESSED)?|\d+\/\d+)\s*(.*)$/.exec(verdict.text ?? "");
   return found === null ? [verdict.text ?? "?", ""] : [found[1], found[2]];
 }
 

@@ -337,6 +337,12 @@ def test_the_report_of_recordings_is_the_same_page(
         page.wait_for_selector(f'html[data-shown="{OFFLINE_S - 10:.0f}"]', state="attached")
         card = page.locator("#robots article", has_text="spot1")
         expect(card).to_contain_text("ok")
+        # instead of go or no-go, which no recording has: whom the base had then
+        expect(page.locator("#verdict")).to_have_text("3/3 with the base")
+        expect(page.locator("#totals")).to_have_text("robots recorded2/4")
+        page.locator("#slider").fill(str(OFFLINE_S + 5))
+        expect(page.locator("#verdict")).to_have_text("0/3 with the base")
+        expect(page.locator("#reasons")).to_contain_text(f"Out of its reach: husky1, spot1, stranger{HOSTILE}")
         # the other recording
         panel.locator("select").select_option(label="recorded by spot1")
         expect(panel.locator(".chart").first).to_be_visible()
