@@ -15,10 +15,21 @@ from meshctl.placement.planner import PlacementPlan
 
 WIDTH = 1200
 _EDGE = 40
+# above the map, for the summary and the first labels, and below it, for the scale
+_HEAD = 76
+_FOOT = 60
+_BEACON = 8.0
 _MAX_HEIGHT = 4000
 # readable by the color-blind: blue for enough margin, orange for less
 _COLORS = {"covered": (0, 114, 178), "short": (213, 94, 0), "rock": (200, 200, 200), "ink": (20, 20, 20)}
 Color = tuple[int, int, int]
+# Digits of 3 by 5 squares, row by row.
+_DIGITS = {
+    "0": "111101101101111", "1": "010110010010111", "2": "111001111100111", "3": "111001111001111",
+    "4": "101101111001001", "5": "111100111001111", "6": "111100111101111", "7": "111001010010010",
+    "8": "111101111101111", "9": "111101111001111",
+}  # fmt: skip
+_DIGIT_SIDE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +50,7 @@ class _Scale:
     def at(self, place: Point) -> tuple[float, float]:
         return (
             _EDGE + (place[0] - self.left_m) * self.pixels_per_m,
-            _EDGE + (self.top_m - place[1]) * self.pixels_per_m,
+            _HEAD + (self.top_m - place[1]) * self.pixels_per_m,
         )
 
 
@@ -52,12 +63,19 @@ def _scale(view: MapView, plan: PlacementPlan) -> _Scale:
     xs, ys = [x for x, _ in places], [y for _, y in places]
     wide, high = max(xs) - min(xs), max(ys) - min(ys)
     room = WIDTH - 2 * _EDGE
-    factor = min(room / max(wide, 1.0), (_MAX_HEIGHT - 2 * _EDGE) / max(high, 1.0))
-    return _Scale(min(xs), max(ys), factor, math.ceil(2 * _EDGE + high * factor))
+    factor = min(room / max(wide, 1.0), (_MAX_HEIGHT - _HEAD - _FOOT) / max(high, 1.0))
+    return _Scale(min(xs), max(ys), factor, math.ceil(_HEAD + high * factor + _FOOT))
+
+
+def _bar_m(scale: _Scale) -> int:
+    """The round number of meters that takes at most a fifth of the picture; at least 1."""
+    longest_m = max(1.0, WIDTH / 5 / scale.pixels_per_m)
+    decade = 10 ** math.floor(math.log10(longest_m))
+    return int(next(times * decade for times in (5, 2, 1) if times * decade <= longest_m))
 
 
 def svg(view: MapView, plan: PlacementPlan) -> str:
-    """The map, the route (thick where it has the margin, dashed where not), the base and the numbered beacons."""
+    """The map, the route (thick where it has the margin, thin where not), the base and the numbered beacons."""
     scale = _scale(view, plan)
 
     def hexadecimal(name: str) -> str:
@@ -79,14 +97,27 @@ def svg(view: MapView, plan: PlacementPlan) -> str:
     parts += [line(wall.a, wall.b, f'stroke="{hexadecimal("ink")}" stroke-width="2"') for wall in view.walls]
     for (_, a, before_db), (_, b, after_db) in pairwise(plan.steps):
         good = min(before_db, after_db) >= plan.margin_db
-        style = f'stroke="{hexadecimal("covered" if good else "short")}" stroke-width="5"'
-        parts.append(line(a, b, style if good else f'{style} stroke-dasharray="3 3"'))
-    base = plan.steps[0][1]
-    for name, place in (("base", base), *((str(index), one.at) for index, one in enumerate(plan.beacons, 1))):
-        x, y = scale.at(place)
-        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="7" fill="{hexadecimal("ink")}"/>')
-        parts.append(f'<text x="{x + 10:.1f}" y="{y - 10:.1f}" font-size="22">{name}</text>')
-    parts.append(f'<text x="{_EDGE}" y="{_EDGE - 14}" font-size="18">{summary(plan)}</text>')
+        color, wide = (hexadecimal("covered"), 5) if good else (hexadecimal("short"), 2)
+        parts.append(line(a, b, f'stroke="{color}" stroke-width="{wide}" stroke-linecap="round"'))
+    ink = hexadecimal("ink")
+    x, y = scale.at(plan.steps[0][1])
+    parts.append(f'<rect x="{x - 9:.1f}" y="{y - 9:.1f}" width="18" height="18" fill="{ink}"/>')
+    parts.append(f'<text x="{x + 12:.1f}" y="{y - 14:.1f}" font-size="20" font-weight="bold">base</text>')
+    for number, one in enumerate(plan.beacons, 1):
+        x, y = scale.at(one.at)
+        corners = f"M{x:.1f} {y - _BEACON:.1f}l{_BEACON} {_BEACON}l-{_BEACON} {_BEACON}l-{_BEACON} -{_BEACON}z"
+        parts.append(f'<path d="{corners}" fill="{ink}"/>')
+        parts.append(
+            f'<text x="{x + 12:.1f}" y="{y - 14:.1f}" font-size="20"><tspan font-weight="bold">{number}</tspan>'
+            f'<tspan dx="8" font-size="15">{one.margin_db:.0f} dB</tspan></text>'
+        )
+    parts.append(f'<text x="{_EDGE}" y="{_EDGE / 2 + 8:.0f}" font-size="18">{summary(plan)}</text>')
+    bar_m, floor = _bar_m(scale), scale.height - _FOOT / 4
+    end = _EDGE + bar_m * scale.pixels_per_m
+    parts.append(f'<path d="M{_EDGE} {floor - 5}v5H{end:.1f}v-5" fill="none" stroke="{ink}" stroke-width="2"/>')
+    parts.append(f'<text x="{end + 8:.1f}" y="{floor}" font-size="15">{bar_m} m</text>')
+    key = "beacons with the margin of the link to the one before; thin: below the margin"
+    parts.append(f'<text x="{WIDTH - _EDGE}" y="{floor}" font-size="15" text-anchor="end">{key}</text>')
     return "\n".join([*parts, "</svg>", ""])
 
 
@@ -119,7 +150,7 @@ def _blocks(occupancy: OccupancyMap, scale: _Scale) -> list[tuple[float, float, 
 
 
 def png(view: MapView, plan: PlacementPlan) -> bytes:
-    """The same without its texts; beacons are dots."""
+    """The same with digits as its only text."""
     scale = _scale(view, plan)
     canvas = bytearray(b"\xff" * (3 * WIDTH * scale.height))
 
@@ -148,8 +179,28 @@ def png(view: MapView, plan: PlacementPlan) -> bytes:
     for (_, a, before_db), (_, b, after_db) in pairwise(plan.steps):
         good = min(before_db, after_db) >= plan.margin_db
         line(a, b, 2.5 if good else 1.5, _COLORS["covered" if good else "short"])
-    for place in (plan.steps[0][1], *(one.at for one in plan.beacons)):
-        dot(*scale.at(place), 7.0, _COLORS["ink"])
+
+    def block(left: float, top: float, wide: float, high: float) -> None:
+        for row in range(max(0, round(top)), min(scale.height, round(top + high))):
+            start, end = max(0, round(left)), min(WIDTH, round(left + wide))
+            canvas[3 * (row * WIDTH + start) : 3 * (row * WIDTH + end)] = bytes(_COLORS["ink"]) * max(0, end - start)
+
+    def digits(text: str, left: float, top: float) -> None:
+        for place, digit in enumerate(text):
+            for index, is_set in enumerate(_DIGITS[digit]):
+                if is_set == "1":
+                    x = left + (4 * place + index % 3) * _DIGIT_SIDE
+                    block(x, top + index // 3 * _DIGIT_SIDE, _DIGIT_SIDE, _DIGIT_SIDE)
+
+    x, y = scale.at(plan.steps[0][1])
+    block(x - 9, y - 9, 18, 18)
+    for number, one in enumerate(plan.beacons, 1):
+        x, y = scale.at(one.at)
+        dot(x, y, _BEACON, _COLORS["ink"])
+        digits(str(number), x + 11, y - 26)
+    bar_m, floor = _bar_m(scale), scale.height - _FOOT / 4
+    block(_EDGE, floor - 2, bar_m * scale.pixels_per_m, 2)
+    digits(str(bar_m), _EDGE + bar_m * scale.pixels_per_m + 8, floor - 14)
     return _png(bytes(canvas), WIDTH, scale.height)
 
 

@@ -222,8 +222,20 @@ def test_the_command_prints_the_same_plan_as_table_json_and_csv(tmp_path: Path) 
     text = CliRunner().invoke(build("plan-placement"), words).output
     assert f"{len(document['beacons'])} beacons: 300 of 300 m with a margin of 10 dB" in text
     root = ElementTree.parse(tmp_path / "p.svg").getroot()
-    circles = [one for one in root if one.tag.endswith("circle")]
-    assert len(circles) == 1 + len(document["beacons"])
+    texts = ["".join(one.itertext()) for one in root if one.tag.endswith("text")]
+    labels = [f"{one['number']}{one['margin_db']:.0f} dB" for one in document["beacons"]]
+    assert texts[: 1 + len(labels)] == ["base", *labels]
+    assert "300 of 300 m" in texts[1 + len(labels)]
+    # no label stands on the summary
+    heights = [float(one.attrib["y"]) for one in root if one.tag.endswith("text")]
+    assert min(heights[: 1 + len(labels)]) - heights[1 + len(labels)] >= 20
+    # the scale has the length that it states
+    bar = next(one.attrib["d"] for one in root if one.attrib.get("fill") == "none")
+    start, end = (float(word) for word in re.findall(r"M([\d.]+) .*H([\d.]+)", bar)[0])
+    length_m = int(next(text for text in texts if re.fullmatch(r"\d+ m", text)).split()[0])
+    beacons = [float(one.attrib["d"][1:].split()[0]) for one in root if one.attrib.get("d", "").endswith("z")]
+    apart_m = document["beacons"][1]["x_m"] - document["beacons"][0]["x_m"]
+    assert (end - start) / length_m == pytest.approx((beacons[1] - beacons[0]) / apart_m, rel=1e-3)
     raw = (tmp_path / "p.png").read_bytes()
     width, height = int.from_bytes(raw[16:20]), int.from_bytes(raw[20:24])
     start = raw.index(b"IDAT") + 4
@@ -260,6 +272,6 @@ def test_an_occupancy_map_is_drawn_below_its_plan(tmp_path: Path) -> None:
     way = found.way((found.center(1, 1), found.center(8, 1)))
     planned = plan(Walls(()), AIR, way)
     view = MapView(occupancy=found)
-    # the page, the rock in runs, nothing else
-    assert svg(view, planned).count("<rect") == 1 + 10
+    # the page, the rock in runs, the base
+    assert svg(view, planned).count("<rect") == 1 + 10 + 1
     assert png(view, planned).startswith(b"\x89PNG")
