@@ -1,25 +1,31 @@
-"""Trained dictionaries against the last version as dictionary; and how long indexing a large base takes.
+"""Trained dictionaries against the last version as dictionary; and how long a large base holds up a node's loop.
 
     python -m benchmarks.dictionaries
 
 First table: body bytes per message of small messages of a kind (generated from a seed), by zstd at the transport's
 level: alone; with a dictionary of 8 KiB trained on 400 other messages of that kind; with the message before it as
-prefix, as `delta` does. Second table: processor time of the first step of a difference, which indexes the base, the
-least of five; that long the loop sends nothing else, urgent messages included.
+prefix, as `delta` does. Second table: the longest time in which a loop did nothing else, urgent messages included,
+while a version of 1 MiB was encoded as a difference to a base: with the base copied and indexed on the loop, and in the
+daemon's background thread. Of five runs the least, in turns; `idle` is the loop without any of this.
 """
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import json
 import math
 import random
 import struct
 import sys
-import time
 from collections.abc import Callable, Iterator
+from hashlib import blake2b
 
+from udp_mesh.core.interfaces import in_foreground
+from udp_mesh.core.versions.encoding import Version, VersionEncoding
 from udp_mesh.core.zstd import LEVEL, ZstdCompression
+from udp_mesh.daemon.background import BackgroundThread
+from udp_mesh.wire.version import HASH_BYTES
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -29,6 +35,8 @@ else:
 DICTIONARY_BYTES = 8192
 MESSAGES = 400
 BASE_MIB = (1, 4, 16, 64)
+RUNS = 5
+IDLE_S = 0.1
 OVERHEAD_BYTES = 58
 """Header, seal and fragment of a message that fits a datagram."""
 
@@ -96,16 +104,44 @@ def with_dictionary(content: bytes, dictionary: zstd.ZstdDict) -> int:
     return min(len(content), len(zstd.compress(content, level=LEVEL, zstd_dict=dictionary)))
 
 
-def indexing_s(mib: int) -> float:
-    """Processor time of the first step with a base of this size."""
-    base = random.Random(1).randbytes(mib << 20)
-    best = math.inf
-    for _ in range(5):
-        compression = ZstdCompression(base[: 1 << 20], 1 << 20, base)
-        started = time.process_time()
-        compression.step()
-        best = min(best, time.process_time() - started)
-    return best
+async def standstill_s(payload: bytes, base: Version | None, *, in_thread: bool) -> float:
+    """The longest time between two turns of a loop that encodes a version (without a base: that does nothing)."""
+    loop = asyncio.get_running_loop()
+    turns_s = [loop.time()]
+
+    async def turn() -> None:
+        while True:
+            await asyncio.sleep(0)
+            turns_s.append(loop.time())
+
+    turning = asyncio.create_task(turn())
+    thread = BackgroundThread(loop, lambda: None)
+    background = thread if in_thread else in_foreground
+    if base is None:
+        await asyncio.sleep(IDLE_S)
+    else:
+        encoding = VersionEncoding(payload, base, compression=False, background=background)
+        for _ in iter(encoding.step, True):
+            await asyncio.sleep(0)
+    thread.close()
+    turning.cancel()
+    return max(later - earlier for earlier, later in itertools.pairwise(turns_s))
+
+
+def standstills(mib: int) -> tuple[float, float, float]:
+    """Idle, on the loop, in the thread."""
+    content = random.Random(1).randbytes(mib << 20)
+    base, payload = Version(blake2b(content, digest_size=HASH_BYTES).digest(), content), content[: 1 << 20]
+    runs = [
+        (
+            asyncio.run(standstill_s(payload, None, in_thread=False)),
+            asyncio.run(standstill_s(payload, base, in_thread=False)),
+            asyncio.run(standstill_s(payload, base, in_thread=True)),
+        )
+        for _ in range(RUNS)
+    ]
+    idle_s, foreground_s, thread_s = (min(column) for column in zip(*runs, strict=True))
+    return idle_s, foreground_s, thread_s
 
 
 def main() -> None:
@@ -124,11 +160,10 @@ def main() -> None:
             f"| {trained + OVERHEAD_BYTES:.0f} | {delta + OVERHEAD_BYTES:.0f} |"
         )
     print()
-    print("| base, MiB | first step, ms | ms per MiB |")
-    print("| --- | --- | --- |")
+    print("| base, MiB | idle, ms | on the loop, ms | in the background, ms |")
+    print("| --- | --- | --- | --- |")
     for mib in BASE_MIB:
-        took_s = indexing_s(mib)
-        print(f"| {mib} | {1000 * took_s:.1f} | {1000 * took_s / mib:.2f} |")
+        print(f"| {mib} | {' | '.join(f'{1000 * value_s:.1f}' for value_s in standstills(mib))} |")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from udp_mesh.core import publish, reconfigure, transmit
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageDelivered, MessageId, Receipt, Rejected
-from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.interfaces import Background, Datagram, RandomSource, Store, in_foreground
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.legacy.peers import LegacyPeers
 from udp_mesh.core.logs.conditions import LogConditions
@@ -51,12 +51,14 @@ class Endpoint:
         store: Store | None = None,
         log_store: LogStore | None = None,
         legacy_positions: Mapping[str, ReceivePosition] = MappingProxyType({}),
+        background: Background = in_foreground,
     ) -> None:
         """`now` is seconds on any clock that never runs backwards. `store` holds outboxes on disk (None: in memory),
-        `log_store` the items of logs (None: in memory). `legacy_positions` are those of the previous run."""
+        `log_store` the items of logs (None: in memory). `legacy_positions` are those of the previous run. `background`
+        does the work that would hold up urgent messages."""
         if len(boot_id) != BOOT_ID_BYTES:
             raise ValueError(f"boot_id: expected {BOOT_ID_BYTES} bytes, found {len(boot_id)}")
-        self._state = State(_with_reserved_topics(settings), boot_id, rng, now, store)
+        self._state = State(_with_reserved_topics(settings), boot_id, rng, now, store, background)
         self._legacy = LegacyPeers(self._state, legacy_positions)
         self._relaying = Relaying(self._state, now)
         self.selective = SelectiveSending(self._state, now)
@@ -143,7 +145,7 @@ class Endpoint:
         if self.thin is not None and self.thin.next_at() < at:
             return True
         soon = min(self._state.next_peer_at(), self._state.selection.next_at)
-        return soon < at or bool(self._state.compression_queue or self._state.versions.jobs)
+        return soon < at or bool(self._state.compression_queue or self._state.versions.has_work)
 
     @property
     def is_quiet(self) -> bool:

@@ -1,7 +1,7 @@
-"""The interfaces between a node and its driver, apart from events and settings: datagrams, random numbers, the
-store."""
+"""The interfaces between a node and its driver, apart from events and settings: datagrams, random numbers, work beside
+the node, the store."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import repeat
@@ -39,6 +39,21 @@ class RandomSource(Protocol):
     def getrandbits(self, k: int, /) -> int:
         """An integer of k random bits."""
         ...
+
+
+class Background(Protocol):
+    """Where work of many milliseconds is done beside the node: the daemon has a thread for it."""
+
+    def __call__(self, work: Callable[[], None]) -> Callable[[], bool]:
+        """Start `work`, which touches nothing of the node. The answer says whether it is done, also if it failed; then
+        the driver calls `handle_timer` soon."""
+        ...
+
+
+def in_foreground(work: Callable[[], None]) -> Callable[[], bool]:
+    """A `Background` of tests and simulations, where computing takes no time: the work is done at once."""
+    work()
+    return lambda: True
 
 
 @dataclass(frozen=True, slots=True)

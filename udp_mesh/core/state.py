@@ -12,7 +12,7 @@ from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
 from udp_mesh.core.compression import CompressionQueue
 from udp_mesh.core.congestion.channel_share import ChannelShare
 from udp_mesh.core.event_queue import EventQueue
-from udp_mesh.core.interfaces import Datagram, RandomSource, Store
+from udp_mesh.core.interfaces import Background, Datagram, RandomSource, Store
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.outbox import Outboxes
 from udp_mesh.core.peers.heartbeat import HeartbeatScheduler
@@ -46,7 +46,15 @@ def live_keys(settings: Settings) -> tuple[Key, ...]:
 class State:
     """See the module's docstring. Used only by the parts of a node."""
 
-    def __init__(self, settings: Settings, boot_id: bytes, rng: RandomSource, now: float, store: Store | None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        boot_id: bytes,
+        rng: RandomSource,
+        now: float,
+        store: Store | None,
+        background: Background,
+    ) -> None:
         self.settings = settings
         self.boot_id = boot_id
         self.rng = rng
@@ -61,7 +69,7 @@ class State:
         self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
         self.broadcasts = BroadcastQueue()
         self.compression_queue = CompressionQueue()
-        self.versions = SentVersions(settings.limits.version_bytes, self.peer_table.version_counters)
+        self.versions = SentVersions(settings.limits.version_bytes, self.peer_table.version_counters, background)
         """What peers have of topics that are sent as differences."""
         self.selection = Selection()
         """Which messages peers' programs want."""

@@ -255,7 +255,7 @@ def next_timer(state: State) -> float | None:
     for bucket in state.rate_limits.values():
         if bucket.parked:
             at = min(at, bucket.ready_at())
-    if (state.compression_queue or state.inflating or state.versions.jobs) and not state.closed:
+    if (state.compression_queue or state.inflating or state.versions.has_work) and not state.closed:
         # Due at once, repeatedly; other timers are handled in between.
         return _ALWAYS
     return None if at == _INFINITY or state.closed else at
@@ -304,7 +304,7 @@ def handle_timer(state: State, now: float) -> None:
         compress_step(state, now)
     if state.inflating:
         inflate_step(state, now)
-    if state.versions.jobs and (prepared := state.versions.step()) is not None:
+    if state.versions.has_work and (prepared := state.versions.step()) is not None:
         _restore(state, *prepared)
     if state.maintenance_at <= now:
         state.maintenance_at = now + MAINTENANCE_INTERVAL_S

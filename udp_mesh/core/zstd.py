@@ -26,7 +26,7 @@ LEVEL = 3
 """zstd's default."""
 
 STEP_BYTES = 1 << 16
-"""Compressed per step: a millisecond at most, except that the first step also indexes the prefix (1 ms per MB)."""
+"""Compressed per step: a millisecond at most, except that the first step also indexes the prefix (1 to 4 ms per MB)."""
 
 DECOMPRESS_STEP_BYTES = 1 << 18
 """Decompressed per step."""

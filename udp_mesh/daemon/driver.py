@@ -22,6 +22,7 @@ from udp_mesh.core.interfaces import RandomSource, Store
 from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.settings import Settings
+from udp_mesh.daemon.background import BackgroundThread
 from udp_mesh.daemon.link_output import LinkOutput, link_info
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
@@ -70,15 +71,16 @@ class Driver:
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._clock = self._loop.time
-        now = self._clock()
+        self._background = BackgroundThread(self._loop, self.send_soon)
         self.node = Endpoint(
             settings,
             boot_id=boot_id,
             rng=rng,
-            now=now,
+            now=self._clock(),
             store=store,
             log_store=log_store,
             legacy_positions=legacy_positions,
+            background=self._background,
         )
         self.hub = LinkHub(links, settings.port, urgent_dscp=urgent_dscp)
         self.link_failures: dict[str, str] = {}
@@ -121,6 +123,7 @@ class Driver:
         self._transmit_all()
         self._report_events()
         self.closed = True
+        self._background.close()
         self.output.close()
         for handle in (self._timer, self._refresh_timer):
             if handle is not None:

@@ -1,8 +1,9 @@
 """Which versions the peers have, and what is yet to be encoded for them.
 
 1. `PeerVersions.prepare` encodes a message that is next to be sent: at once, or, if it is large, in steps.
-2. `SentVersions.step` does one such step and returns a message that is ready. The next message of its topic to this
-   peer waits until it is being sent, because a newer base may be known by then.
+2. `SentVersions.step` does one such step and returns a message that is ready; the first step of a large base is done
+   in the background. The next message of its topic to this peer waits until it is being sent, because a newer base may
+   be known by then.
 3. `PeerVersions.on_delivered` makes the newest acknowledged version the base of the next ones; `on_base_lost` forgets
    it.
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 from collections import OrderedDict, deque
 from dataclasses import replace
 
+from udp_mesh.core.interfaces import Background
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage, TopicChannel
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.versions.conditions import VersionConditions
@@ -92,7 +94,9 @@ class PeerVersions:
         size = len(accepted.payload) + (0 if base is None else len(base.payload))
         shared = self._node.shared(accepted, base)
         if shared is None and size > AT_ONCE_BYTES:
-            encoding = VersionEncoding(accepted.payload, base, compression=self._compresses(accepted))
+            encoding = VersionEncoding(
+                accepted.payload, base, compression=self._compresses(accepted), background=self._node.background
+            )
             channel.current = message
             self._node.jobs.append((self, channel, message, base, encoding))
             return False
@@ -181,8 +185,9 @@ class PeerVersions:
 class SentVersions:
     """The versions of all peers of a node, and the messages being encoded."""
 
-    def __init__(self, limit_bytes: int, counters: CounterTable) -> None:
+    def __init__(self, limit_bytes: int, counters: CounterTable, background: Background) -> None:
         self.limit_bytes = limit_bytes
+        self.background = background
         self.counters = counters
         self.bytes = 0
         self.jobs: deque[tuple[PeerVersions, _Channel, OutgoingMessage, Version | None, VersionEncoding]] = deque()
@@ -213,9 +218,14 @@ class SentVersions:
 
     # Encoding
 
+    @property
+    def has_work(self) -> bool:
+        """Whether `step` would do something: encodings whose base is being indexed in the background wait."""
+        return any(not job[4].is_waiting for job in self.jobs)
+
     def step(self) -> tuple[str, OutgoingMessage] | None:
-        """Do one step of the most urgent encoding. Returns a peer and its message that is ready to be sent."""
-        job = min(self.jobs, key=lambda job: job[2].priority)
+        """Do one step of the most urgent encoding that has one to do. Returns a peer and its message that is ready."""
+        job = min((job for job in self.jobs if not job[4].is_waiting), key=lambda job: job[2].priority)
         versions, channel, message, base, encoding = job
         if message.ended:
             self.jobs.remove(job)
