@@ -14,6 +14,7 @@ import time
 from typing import Any, Callable, Mapping, Sequence
 
 from udp_mesh.bridges.receiving import EVERYTHING, Receive
+from udp_mesh.bridges.types import MeshTopic
 from udp_mesh.client.mesh_client import Frame, Header, MeshClient, MeshError
 
 log = logging.getLogger(__name__)
@@ -120,8 +121,8 @@ class DaemonClient:
 
     # Requests
 
-    def ensure_topics(self, wanted: Mapping[str, Mapping[str, object]]) -> dict[str, tuple[str, ...]]:
-        """Declares topics unknown to the daemon; returns all declared topics with their destinations.
+    def ensure_topics(self, wanted: Mapping[str, Mapping[str, object]]) -> dict[str, MeshTopic]:
+        """Declares topics unknown to the daemon; returns all declared topics.
 
         The daemon's configuration takes precedence: topics listed there are not changed. Raises MeshError.
         """
@@ -129,13 +130,17 @@ class DaemonClient:
         for topic, values in wanted.items():
             if topic not in found:
                 self.request("set-topic", topic=topic, values=dict(values))
-                found[topic] = ()
+                found[topic] = MeshTopic()
         return found
 
-    def topics(self) -> dict[str, tuple[str, ...]]:
-        """Declared topics with their destinations. Raises MeshError."""
+    def topics(self) -> dict[str, MeshTopic]:
+        """Declared topics. Raises MeshError."""
         rows = self.request("topics")["topics"]
-        return {row["name"]: tuple(row.get("destinations", ())) for row in rows if row["configured"]}
+        return {
+            row["name"]: MeshTopic(tuple(row.get("destinations", ())), row.get("log") is not None)
+            for row in rows
+            if row["configured"]
+        }
 
     def accepts_undeclared(self) -> bool:
         """Whether the daemon accepts undeclared topics. Raises MeshError."""

@@ -6,6 +6,8 @@
 3. From other bridges: a `Hello` is answered with the missing latched messages, a `Want` with definitions.
 4. Peers that come online get a `Hello`. `tick` repeats unanswered requests.
 5. A message of the other version of ROS is converted if its type is declared (`mixed_team`), else left out.
+6. Items of shared logs may reach a robot that never meets their source. Their definition is an item of the same log,
+   before them; one that is missing all the same is requested from all.
 """
 
 from __future__ import annotations
@@ -20,10 +22,12 @@ from udp_mesh.bridges.mixed_team import ConversionError, to_ros1, to_ros2
 from udp_mesh.bridges.names import Route, inbound_name, ros_word
 from udp_mesh.bridges.protocol import Definition, Hello, ProtocolError, Want, decode, encode
 from udp_mesh.bridges.ros2.quality import history_depth
-from udp_mesh.bridges.types import Definitions, LatchMark, MessageKind, TypeKey, kind_text, parse_kind
+from udp_mesh.bridges.types import Definitions, LatchMark, MeshTopic, MessageKind, TypeKey, kind_text, parse_kind
 
 PROTOCOL_TOPICS = {1: "bridge/ros1", 2: "bridge/ros2"}
 """By version of ROS. A bridge sends on its own topic, and reads every `Hello`: robots of both versions share topics."""
+PROTOCOL_TYPE = "bridge"
+"""Type of messages between bridges, also of a definition in a log; older bridges leave that out."""
 MAX_WAITING_MESSAGES, MAX_WAITING_BYTES = 64, 32 << 20
 """Per source, while a definition is requested: a second's worth of messages; beyond it, the oldest is dropped."""
 MAX_LATCHED, MAX_LATCHED_BYTES = 4096, 64 << 20
@@ -102,18 +106,22 @@ class Relay:
         self._types = types
         self._definitions = Definitions()
         self._sent_definitions: set[tuple[TypeKey, str | None]] = set()
+        self._logged_definitions: set[tuple[TypeKey, str]] = set()
         self._latched: OrderedDict[tuple[Route, str], Deque[tuple[MessageKind, bytes]]] = OrderedDict()
         self._latched_bytes = 0
         self._last_numbers: dict[str, dict[str, OrderedDict[str, int]]] = {}
         self._recent_numbers: OrderedDict[tuple[str, str, str], Deque[int]] = OrderedDict()
         self._waiting: dict[str, Deque[_Waiting]] = {}
         self._requested_at: dict[tuple[str, TypeKey], float] = {}
-        self._destinations: Mapping[str, Iterable[str]] = {}
+        self._topics: Mapping[str, MeshTopic] = {}
         self._noted: set[Route | str] = set()
 
-    def set_destinations(self, destinations: Mapping[str, Iterable[str]]) -> None:
-        """Sets the daemon's topics, each with its destinations (none: all)."""
-        self._destinations = destinations
+    def set_topics(self, topics: Mapping[str, MeshTopic]) -> None:
+        """Sets the daemon's topics."""
+        self._topics = topics
+
+    def _is_log(self, topic: str) -> bool:
+        return topic in self._topics and self._topics[topic].is_log
 
     # From ROS
 
@@ -125,12 +133,13 @@ class Relay:
         if "/" not in key.name:
             # A publisher of any type (AnyMsg) has no type before its first message: receivers could not decode it.
             return self._note_once(route, "{}: unsupported type {!r} on {}".format(publisher, key.name, route.topic))
-        if self._needs_definitions:
-            if definition or key not in self._definitions:
-                self._definitions.put(key, definition)
-            if (key, route.peer) not in self._sent_definitions:
-                self._sent_definitions.add((key, route.peer))
-                effects.append(self._to_bridges(Definition(key, definition), route.peer))
+        if self._needs_definitions and (definition or key not in self._definitions):
+            self._definitions.put(key, definition)
+        if self._is_log(route.topic):
+            return self._to_log(route.topic, key, definition, payload)
+        if self._needs_definitions and (key, route.peer) not in self._sent_definitions:
+            self._sent_definitions.add((key, route.peer))
+            effects.append(self._to_bridges(Definition(key, definition), route.peer))
         kind = MessageKind(key)
         if latched:
             self._number += 1
@@ -139,6 +148,15 @@ class Relay:
             self._keep_latched(route, publisher, kind, payload)
         effects.append(ToMesh(route.topic, payload, route.peer, kind_text(kind)))
         return effects
+
+    def _to_log(self, topic: str, key: TypeKey, definition: str, payload: bytes) -> list[Effect]:
+        """A message to a shared log: to its readers, whatever peer its ROS name has. It is not latched, since the log
+        keeps it for late joiners, and a later item replaces none before it."""
+        effects: list[Effect] = []
+        if self._needs_definitions and (key, topic) not in self._logged_definitions:
+            self._logged_definitions.add((key, topic))
+            effects.append(ToMesh(topic, encode(Definition(key, definition)), None, PROTOCOL_TYPE))
+        return [*effects, ToMesh(topic, payload, None, kind_text(MessageKind(key)))]
 
     def _keep_latched(self, route: Route, publisher: str, kind: MessageKind, payload: bytes) -> None:
         """Stores a latched message, and of its publisher as many as late joiners get in ROS."""
@@ -163,6 +181,8 @@ class Relay:
         """Handles a message from the mesh."""
         if topic in PROTOCOL_TOPICS.values() or topic == self.protocol_topic:
             return self._from_bridge(source, topic, payload)
+        if type_text == PROTOCOL_TYPE and self._is_log(topic):
+            return self._definition_from_log(source, topic, payload)
         kind = parse_kind(type_text)
         if kind is None or kind.key.name.count("/") not in (1, 2):
             return []
@@ -183,7 +203,16 @@ class Relay:
         if not blocked and self._is_publishable(kind.key):
             return [self._publication(source, message)]
         self._enqueue(source, message)
-        return self._request_definition(source, kind.key, now)
+        return self._request_definition(source, kind.key, now, from_all=self._is_log(topic))
+
+    def _definition_from_log(self, source: str, topic: str, payload: bytes) -> list[Effect]:
+        try:
+            message = decode(payload)
+        except ProtocolError as error:
+            return [Note("invalid message from {} on {}: {}".format(source, topic, error))]
+        if not isinstance(message, Definition) or not self._definitions.put(message.key, message.text):
+            return []
+        return self._publish_waiting()
 
     def _converted(self, kind: MessageKind, payload: bytes) -> tuple[MessageKind, bytes]:
         """A message of the other version of ROS as one of this. Raises ConversionError."""
@@ -233,12 +262,13 @@ class Relay:
             waiting.popleft()
             self.dropped += 1
 
-    def _request_definition(self, source: str, key: TypeKey, now: float) -> list[Effect]:
+    def _request_definition(self, source: str, key: TypeKey, now: float, *, from_all: bool) -> list[Effect]:
+        """`from_all`: the source may be out of reach, and another bridge may have the type."""
         asked_at = self._requested_at.get((source, key))
         if self._is_publishable(key) or (asked_at is not None and now - asked_at < REQUEST_RETRY_S):
             return []
         self._requested_at[source, key] = now
-        return [self._to_bridges(Want([key]), source)]
+        return [self._to_bridges(Want([key]), None if from_all else source)]
 
     # From other bridges
 
@@ -267,7 +297,7 @@ class Relay:
         """Our latched messages that the peer does not have."""
         effects: list[Effect] = []
         for (route, _), held in self._latched.items():
-            allowed = list(self._destinations.get(route.topic, ()))
+            allowed = self._topics[route.topic].destinations if route.topic in self._topics else ()
             if route.peer not in (None, peer) or (route.peer is None and allowed and peer not in allowed):
                 continue
             for kind, payload in held:
@@ -302,7 +332,7 @@ class Relay:
         return self._to_bridges(Hello({topic: dict(numbers) for topic, numbers in held.items()}, answer), peer)
 
     def _to_bridges(self, message: Hello | Want | Definition, peer: str | None) -> ToMesh:
-        return ToMesh(self.protocol_topic, encode(message), peer, "bridge")
+        return ToMesh(self.protocol_topic, encode(message), peer, PROTOCOL_TYPE)
 
     # Peers and time
 
@@ -319,7 +349,8 @@ class Relay:
         effects = self._expire_waiting(now) if self._waiting else []
         for source, waiting in self._waiting.items():
             for key in OrderedDict.fromkeys(message.kind.key for message in waiting):
-                effects += self._request_definition(source, key, now)
+                from_all = any(self._is_log(message.topic) for message in waiting if message.kind.key == key)
+                effects += self._request_definition(source, key, now, from_all=from_all)
         return effects
 
     def _expire_waiting(self, now: float) -> list[Effect]:

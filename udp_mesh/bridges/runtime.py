@@ -16,7 +16,7 @@ from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS
 from udp_mesh.bridges.reduction import Reducer, ReductionError
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Effect, Note, Relay, ToMesh, ToRos
-from udp_mesh.bridges.types import TypeKey
+from udp_mesh.bridges.types import MeshTopic, TypeKey
 from udp_mesh.client.mesh_client import Frame, as_message
 
 log = logging.getLogger(__name__)
@@ -95,11 +95,11 @@ class BridgeRuntime:
             effects = self._relay.tick(now)
         self._run(effects)
 
-    def refresh_topics(self) -> dict[str, tuple[str, ...]]:
-        """Declares the wanted topics; returns the daemon's topics with their destinations. Raises MeshError."""
+    def refresh_topics(self) -> dict[str, MeshTopic]:
+        """Declares the wanted topics; returns the daemon's topics. Raises MeshError."""
         topics = self._daemon.ensure_topics(self._wanted)
         with self._lock:
-            self._relay.set_destinations(topics)
+            self._relay.set_topics(topics)
         return topics
 
     def _run(self, effects: list[Effect]) -> None:

@@ -29,6 +29,14 @@ class TypeKey(NamedTuple):
     checksum: str
 
 
+class MeshTopic(NamedTuple):
+    """What a bridge knows of a topic of the daemon. No destinations: all. A shared log has none; its items go to its
+    readers."""
+
+    destinations: tuple[str, ...] = ()
+    is_log: bool = False
+
+
 class LatchMark(NamedTuple):
     """Identifies a latched message: later ones of a publisher have larger numbers. `publisher` is a hex word, a new
     one after each start of the bridge."""

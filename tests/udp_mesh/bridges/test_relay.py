@@ -23,6 +23,7 @@ from udp_mesh.bridges.types import (
     MAX_DEFINITION_BYTES,
     Definitions,
     LatchMark,
+    MeshTopic,
     MessageKind,
     TypeKey,
     kind_text,
@@ -159,7 +160,7 @@ def test_a_publisher_without_a_definition_does_not_overwrite_a_known_definition(
 
 def test_latched_messages_are_sent_only_to_their_destinations() -> None:
     alice = relay("alice")
-    alice.set_destinations({"map": ("base",)})
+    alice.set_topics({"map": MeshTopic(("base",))})
     to_bob(alice, b"for bob", latched=True)
     alice.from_ros(Route("map", None), "/node", STRING, "", True, b"for base")
     hello = encode(Hello({}, False))
@@ -227,3 +228,70 @@ def test_definitions_are_bounded() -> None:
         assert definitions.put(TypeKey("a/B", str(number)), "x" * MAX_DEFINITION_BYTES)
     kept = [number for number in range(100) if TypeKey("a/B", str(number)) in definitions]
     assert kept == list(range(36, 100))
+
+
+LOGS = {"artifact": MeshTopic(is_log=True)}
+
+
+def with_log(own: str) -> Relay:
+    made = relay(own)
+    made.set_topics(LOGS)
+    return made
+
+
+def to_log(spot: Relay, text: bytes, *, peer: str | None = None, latched: bool = False) -> list[Effect]:
+    return spot.from_ros(Route("artifact", peer), "/node", STRING, "string data", latched, text)
+
+
+def test_the_definition_of_an_item_is_in_the_log_before_it() -> None:
+    """The base never meets Spot: its daemon passes what Husky carried, as Spot's."""
+    spot, base = with_log("spot"), with_log("base")
+    items = [*to_log(spot, b"1"), *to_log(spot, b"2")]
+    assert [(one.topic, one.peer) for one in items if isinstance(one, ToMesh)] == [("artifact", None)] * 3
+    name = "/spot/mesh_comm/base/artifact"
+    assert carry(items, "spot", base) == [ToRos(name, STRING, "string data", False, b"%d" % n) for n in (1, 2)]
+
+
+def test_items_of_a_log_may_come_before_their_definition() -> None:
+    spot, base = with_log("spot"), with_log("base")
+    definition, item = to_log(spot, b"1")
+    asked = carry([item], "spot", base)
+    # from all: the source may be out of reach
+    assert [(decode(one.payload), one.peer) for one in asked if isinstance(one, ToMesh)] == [(Want([STRING]), None)]
+    (again,) = base.tick(REQUEST_RETRY_S)
+    assert isinstance(again, ToMesh)
+    assert again.peer is None
+    assert carry([definition], "spot", base) == [
+        ToRos("/spot/mesh_comm/base/artifact", STRING, "string data", False, b"1")
+    ]
+
+
+def test_any_robot_that_has_the_type_answers_for_the_source_of_a_log() -> None:
+    spot, husky, base = with_log("spot"), with_log("husky"), with_log("base")
+    to_bob(husky, b"the same type")
+    _, item = to_log(spot, b"1")
+    answers = carry(carry([item], "spot", base), "base", husky)
+    assert carry(answers, "husky", base) == [ToRos("/spot/mesh_comm/base/artifact", STRING, "string data", False, b"1")]
+
+
+def test_a_message_to_a_log_goes_to_its_readers_whatever_robot_its_name_has() -> None:
+    spot = with_log("spot")
+    sent = [one for one in to_log(spot, b"1", peer="base") if isinstance(one, ToMesh)]
+    assert {one.peer for one in sent} == {None}
+
+
+def test_no_item_of_a_log_is_left_out_for_a_later_one_or_sent_again_to_late_joiners() -> None:
+    spot, base = with_log("spot"), with_log("base")
+    first, second = to_log(spot, b"1", latched=True), to_log(spot, b"2", latched=True)
+    shown = carry([*first[:1], *second, *first[1:]], "spot", base)
+    assert [one.payload for one in shown if isinstance(one, ToRos)] == [b"2", b"1"]
+    hello = encode(Hello({}, False))
+    assert spot.from_mesh("base", EXCHANGE, "bridge", hello, 0.0) == []
+
+
+def test_a_damaged_definition_in_a_log_is_reported() -> None:
+    (note,) = with_log("base").from_mesh("spot", "artifact", "bridge", b"\xff", 0.0)
+    assert isinstance(note, Note)
+    assert "invalid message from spot on artifact" in note.text
+    # an ordinary topic has none
+    assert with_log("base").from_mesh("spot", "status", "bridge", b"\xff", 0.0) == []
