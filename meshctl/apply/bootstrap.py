@@ -76,10 +76,16 @@ def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[st
     if said:
         node = fleet.nodes[said]
         if by_mac and by_mac[0].name != node.name:
-            raise NodeError(f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}")
+            raise NodeError(
+                f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}",
+                hint="exchange the cables, or name no nodes: devices are then identified by MAC",
+            )
         if _macs(node) and not by_mac:
             expected = ", ".join(sorted(_macs(node)))
-            raise NodeError(f"wrong device: {node.name} has MAC {expected}, this one has {shown}")
+            raise NodeError(
+                f"wrong device: {node.name} has MAC {expected}, this one has {shown}",
+                hint=f"connect {node.name}, or correct its `mac` in the inventory",
+            )
     elif by_mac:
         node = by_mac[0]
     else:
