@@ -22,7 +22,7 @@ services:
   /stuck: { timeout_s: 600 }
   /nobody: {}
 """
-ADD, SLOW, REFUSES, STUCK, NOBODY = (
+ADD, SLOW, REFUSES, STUCK, UNSERVED = (
     f"/alice/mesh_comm/bob/{name}" for name in ("add", "slow", "refuses", "stuck", "nobody")
 )
 
@@ -90,7 +90,7 @@ def test_a_call_ends_at_its_deadline_with_the_reason(team: tuple[Robot, Robot]) 
 
 def test_only_services_with_a_server_are_offered(team: tuple[Robot, Robot]) -> None:
     _, bob = team
-    assert not bob.node.exists(NOBODY)
+    assert not bob.node.exists(UNSERVED)
 
 
 def test_a_masters_restart_does_not_lose_the_other_robots_services(team: tuple[Robot, Robot]) -> None:
