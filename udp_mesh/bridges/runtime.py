@@ -95,9 +95,9 @@ class BridgeRuntime:
             effects = self._relay.tick(now)
         self._run(effects)
 
-    def refresh_topics(self) -> dict[str, MeshTopic]:
-        """Declares the wanted topics; returns the daemon's topics. Raises MeshError."""
-        topics = self._daemon.ensure_topics(self._wanted)
+    def refresh_topics(self, more: Mapping[str, Mapping[str, object]] | None = None) -> dict[str, MeshTopic]:
+        """Declares the wanted topics and `more`; returns the daemon's topics. Raises MeshError."""
+        topics = self._daemon.ensure_topics({**self._wanted, **(more or {})})
         with self._lock:
             self._relay.set_topics(topics)
         return topics

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import pytest
 
 from meshlab.qemu import control
-from tests.meshlab.qemu.conftest import Lab
+from tests.meshlab.qemu.conftest import Lab, until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
@@ -30,7 +30,7 @@ out.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"eth0")
 start, sent = time.monotonic(), 0
 while True:
     while sent < (time.monotonic() - start) * 1e7 / 8 / 1206:
-        out.sendto(bytes(1206), ("255.255.255.255", 2368))
+        out.sendto(bytes(1206), ("{destination}", 2368))
         sent += 1
     time.sleep(0.005)
 END
@@ -39,8 +39,9 @@ ip netns exec pc.husky python3 /run/lidar.py >/dev/null 2>&1 </dev/null & echo $
 
 
 @contextmanager
-def lidar(lab: Lab) -> Iterator[None]:
-    control.run(lab.fleet.directory, _LIDAR).check("start the lidar")
+def lidar(lab: Lab, destination: str = "255.255.255.255") -> Iterator[None]:
+    """Behind the Husky's radios; with its factory destination by default."""
+    control.run(lab.fleet.directory, _LIDAR.replace("{destination}", destination)).check("start the lidar")
     try:
         yield
     finally:
@@ -55,16 +56,26 @@ def round_trips_ms(lab: Lab) -> list[float]:
 
 
 def dropped(lab: Lab) -> list[int]:
-    """How many frames the filter of each radio has dropped, by meshctl's status; fails if one is not loaded."""
-    nodes = lab.meshctl("status", "--json", "--timeout", "30", *RADIOS, expect=None).json["nodes"]
-    return [node["lan_filter"]["dropped_packets"] for node in nodes]
+    """How many frames the filter of each radio has dropped, by meshctl's status."""
+    found: list[int] = []
+
+    def answered() -> bool:
+        done = lab.meshctl("status", "--json", "--timeout", "30", *RADIOS, expect=None)
+        filters = [node["lan_filter"] for node in done.json["nodes"]] if done.text else []
+        found[:] = [counts["dropped_packets"] for counts in filters if counts is not None]
+        return len(found) == len(RADIOS)
+
+    until(answered, "both radios to tell what their filters dropped")
+    return found
 
 
 def test_a_lidars_broadcasts_stay_off_the_air_and_urgent_messages_keep_their_latency(lab: Lab) -> None:
     lab.meshctl("lab", "link", "base", "b01", "--rate", str(_LINK_KBIT_S))
     try:
         before = dropped(lab)
-        quiet = round_trips_ms(lab)
+        # the same packets to one device on the robot: both measurements share the load of the emulated processor
+        with lidar(lab, "10.42.0.11"):
+            quiet = round_trips_ms(lab)
         with lidar(lab):
             filtered = round_trips_ms(lab)
         assert all(now - then > 500 for now, then in zip(dropped(lab), before, strict=True))

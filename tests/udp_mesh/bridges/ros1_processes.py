@@ -137,6 +137,18 @@ class Ros1Node(NodeProcess):
         """Calls made/Add; the answer follows as `added`."""
         self._command(add=service, a=a, b=b)
 
+    def serve_action(self, name: str) -> None:
+        """Serves actionlib's TestAction until the node ends."""
+        self._command(serve_action=name)
+        self.expect("serves_action", name)
+
+    def goal(self, name: str, number: int) -> None:
+        """Waits for the action's server and sends a goal; what follows is `feedback` and `ended`."""
+        self._command(goal=name, number=number)
+
+    def cancel(self, name: str) -> None:
+        self._command(cancel=name)
+
     def exists(self, service: str) -> bool:
         self._command(exists=service)
         return bool(self.expect("exists")["exists"])

@@ -2,6 +2,8 @@
 
 {"serve": SERVICE, "delay_s": how long a call takes, "refuse": BOOL}, of the type made/Add; {"add": SERVICE, "a", "b"}
 calls it: {"added": SERVICE, "sum" or "error"}; {"exists": SERVICE} -> {"exists": BOOL};
+{"serve_action": NAME} of actionlib's TestAction, which ends at once, or with a negative goal when it is canceled;
+{"goal": NAME, "number": N} -> "feedback", and "ended": NAME with "state" and "result"; {"cancel": NAME};
 {"subscribe": NAME, "type": TYPE or "*", "delay_s": how long each message keeps the subscriber busy};
 {"publish": NAME, "type": TYPE, "data": VALUE, "latch": BOOL, "repeat": how often}; {"stream": NAME, "type": TYPE,
 "rate_hz": HZ, "bytes": SIZE}; {"stop_streams": true}; {"call": SERVICE}.
@@ -26,6 +28,7 @@ import rospy
 publishers: dict[Any, Any] = {}
 subscribers: list[Any] = []
 services: list[Any] = []
+actions: dict[str, Any] = {}
 streams: dict[str, Any] = {}
 streamed: dict[str, int] = {}
 printing = threading.Lock()
@@ -171,6 +174,52 @@ def add(command: dict[str, Any]) -> None:
     threading.Thread(target=run, daemon=True).start()
 
 
+def serve_action(name: str) -> None:
+    import actionlib
+    from actionlib.msg import TestAction, TestFeedback, TestResult
+
+    def execute(goal: Any) -> None:
+        say(executing=goal.goal)
+        while goal.goal < 0:
+            if server.is_preempt_requested():
+                server.set_preempted(TestResult(-1))
+                return
+            server.publish_feedback(TestFeedback(7))
+            time.sleep(0.1)
+        server.set_succeeded(TestResult(goal.goal + 1))
+
+    server = actionlib.SimpleActionServer(name, TestAction, execute, auto_start=False)
+    server.start()
+    services.append(server)
+    say(serves_action=name)
+
+
+def goal(command: dict[str, Any]) -> None:
+    import actionlib
+    from actionlib.msg import TestAction, TestGoal
+
+    name = command["goal"]
+    if name not in actions:
+        actions[name] = actionlib.SimpleActionClient(name, TestAction)
+
+    def run() -> None:
+        client = actions[name]
+        say(available=client.wait_for_server(rospy.Duration(60)))
+        told: list[int] = []
+
+        def feedback(message: Any) -> None:
+            if not told:
+                told.append(message.feedback)
+                say(feedback=message.feedback)
+
+        client.send_goal(TestGoal(command["number"]), feedback_cb=feedback)
+        client.wait_for_result()
+        result = client.get_result()
+        say(ended=name, state=client.get_state(), result=None if result is None else result.result)
+
+    threading.Thread(target=run, daemon=True).start()
+
+
 def exists(name: str) -> bool:
     try:
         rospy.wait_for_service(name, timeout=0.2)
@@ -193,6 +242,12 @@ for line in sys.stdin:
         say(streamed=streamed)
     elif "serve" in command:
         serve(command)
+    elif "serve_action" in command:
+        serve_action(command["serve_action"])
+    elif "goal" in command:
+        goal(command)
+    elif "cancel" in command:
+        actions[command["cancel"]].cancel_goal()
     elif "add" in command:
         add(command)
     elif "exists" in command:

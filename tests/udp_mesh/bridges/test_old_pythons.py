@@ -43,7 +43,7 @@ from udp_mesh.bridges import envelope, names, relay, rmw_zenoh, types
 from udp_mesh.bridges import protocol, calls, configuration, message_codec, message_types, mixed_team
 from udp_mesh.bridges import reduction, transforms
 from udp_mesh.bridges import daemon_client
-from udp_mesh.bridges.ros1 import publications
+from udp_mesh.bridges.ros1 import actions, publications
 from udp_mesh.bridges.ros2 import quality
 from udp_mesh.client import mesh_client
 

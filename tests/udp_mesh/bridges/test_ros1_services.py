@@ -1,4 +1,4 @@
-"""Services of two robots with a real ROS 1 master each: calls across the mesh end with a response or with a reason."""
+"""Services and actions of two robots with a real ROS 1 master each: what is asked ends with an answer or a reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ services:
   /refuses: { timeout_s: 10 }
   /stuck: { timeout_s: 600 }
   /nobody: {}
+actions:
+  /test: { lost_s: 1 }
 """
+SUCCEEDED, PREEMPTED, LOST = 3, 2, 9
+ACTION = "/alice/mesh_comm/bob/test"
 ADD, SLOW, REFUSES, STUCK, UNSERVED = (
     f"/alice/mesh_comm/bob/{name}" for name in ("add", "slow", "refuses", "stuck", "nobody")
 )
@@ -60,6 +64,7 @@ def team() -> Iterator[tuple[Robot, Robot]]:
             ("/stuck", {"delay_s": 300}),
         ):
             alice.node.serve(service, **more)
+        alice.node.serve_action("/test")
         for name in (ADD, SLOW, REFUSES, STUCK):
             poll(lambda: bob.node.exists(name), name)  # noqa: B023
         yield alice, bob
@@ -93,6 +98,23 @@ def test_only_services_with_a_server_are_offered(team: tuple[Robot, Robot]) -> N
     assert not bob.node.exists(UNSERVED)
 
 
+def test_an_action_of_another_robot_gives_a_result(team: tuple[Robot, Robot]) -> None:
+    _, bob = team
+    bob.node.goal(ACTION, 41)
+    assert bob.node.expect("available")["available"]
+    ended = bob.node.expect("ended", ACTION)
+    assert (ended["state"], ended["result"]) == (SUCCEEDED, 42)
+
+
+def test_an_action_of_another_robot_gives_feedback_and_is_canceled(team: tuple[Robot, Robot]) -> None:
+    _, bob = team
+    bob.node.goal(ACTION, -1)
+    assert bob.node.expect("feedback")["feedback"] == 7
+    bob.node.cancel(ACTION)
+    ended = bob.node.expect("ended", ACTION)
+    assert (ended["state"], ended["result"]) == (PREEMPTED, -1)
+
+
 def test_a_masters_restart_does_not_lose_the_other_robots_services(team: tuple[Robot, Robot]) -> None:
     _, bob = team
     bob.master.stop()
@@ -105,9 +127,12 @@ def test_calls_end_and_services_go_when_the_peer_does_and_return_with_it(team: t
     alice, bob = team
     bob.node.add(STUCK, 1, 1)
     alice.node.expect("serving", "/stuck")
+    bob.node.goal(ACTION, -2)
+    alice.node.expect("executing", -2)
     alice.daemon.kill()
     found = bob.node.expect("added", STUCK)
     assert "alice is offline; the call may have been executed" in found["error"]
+    assert bob.node.expect("ended", ACTION)["state"] == LOST
     poll(lambda: not bob.node.exists(ADD), "the service to be gone")
     alice.daemon.start()
     wait_online(bob.daemon, "alice")

@@ -17,6 +17,7 @@ from typing import Callable
 import rosgraph
 import rospy
 
+from udp_mesh.bridges.call_messages import Offer
 from udp_mesh.bridges.configuration import (
     EMPTY,
     BridgeConfiguration,
@@ -37,9 +38,11 @@ from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
+from udp_mesh.bridges.ros1.actions import FEEDBACK, FROM_SERVER, RESULT, STATUS, STATUS_ARRAY, Actions, offer_of
 from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
 from udp_mesh.bridges.ros1.services import Ros1Calls
 from udp_mesh.bridges.runtime import BridgeRuntime
+from udp_mesh.bridges.types import TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
@@ -67,10 +70,13 @@ class Ros1Bridge:
         types = {**TYPES, **options.types}
         relay = Relay(own, PROTOCOL_TOPICS[1], ros_version=1, nonce=os.urandom(16), types=types)
         self._runtime = BridgeRuntime(daemon, relay, self._to_ros, wanted, Reducer(options.reductions, 1))
-        self._calls = Ros1Calls(daemon, own, options.services, os.urandom(8).hex())
+        self._actions, self._lost_s = Actions(own, options.actions), options.actions
+        self._actions_lock = threading.Lock()
+        run = os.urandom(8).hex()
+        self._calls = Ros1Calls(daemon, own, options.services, run, self._on_offer, self._on_withdrawn)
         self._master_gone = False
         self._positions = PositionInput(daemon, 1, given.odometry, [str(frame) for frame in given.tf_frames])
-        self._graph = Graph(self._runtime.from_ros, "/{}/".format(ros_word(own)), self._set_window)
+        self._graph = Graph(self._from_ros, "/{}/".format(ros_word(own)), self._set_window)
 
     def start(self, stop: threading.Event) -> None:
         """Starts publishing, until `stop` is set."""
@@ -79,7 +85,46 @@ class Ros1Bridge:
             self._graph.watch(name, self._positions.arrived)
 
     def _to_ros(self, message: ToRos) -> None:
-        self._graph.publish(message)
+        with self._actions_lock:
+            name = self._actions.local_name(message.name)
+        self._graph.publish(message._replace(name=name))
+
+    def _from_ros(
+        self, route: Route, publisher: str, key: TypeKey, definition: str, latched: bool, payload: bytes
+    ) -> None:
+        with self._actions_lock:
+            found = self._actions.from_ros(route, payload, time.monotonic())
+        for each in found:
+            self._runtime.from_ros(each, publisher, key, definition, latched, payload)
+
+    # Actions
+
+    def _on_offer(self, peer: str, offer: Offer) -> bool:
+        with self._actions_lock:
+            return self._actions.on_offered(peer, offer) is not None
+
+    def _on_withdrawn(self, peer: str, name: str) -> bool:
+        with self._actions_lock:
+            return self._actions.on_withdrawn(peer, name, time.monotonic())
+
+    def _action_offers(self) -> list[Offer]:
+        """The configured actions whose server is connected."""
+        offers = []
+        for name, options in self._lost_s.items():
+            types = {part: self._graph.publisher_type("{}/{}".format(name, part)) for part in FROM_SERVER}
+            known = {part: key for part, key in types.items() if key is not None}
+            if len(known) == len(types):
+                offers.append(offer_of(name, known, options.lost_s))
+        return offers
+
+    def _end_lost_goals(self) -> None:
+        with self._actions_lock:
+            ended = [(proxy, proxy.lost_statuses()) for proxy in self._actions.lost(time.monotonic())]
+        for proxy, statuses in ended:
+            log.warning("action-lost peer=%s action=%s its goals may have been executed", proxy.peer, proxy.offer.name)
+            for payload in statuses:
+                name, key = proxy.names[STATUS], proxy.types[STATUS]
+                self._graph.publish(ToRos(name, key, STATUS_ARRAY.text, True, payload))
 
     # Callbacks
 
@@ -124,7 +169,8 @@ class Ros1Bridge:
         """Registers with a restarted master, and subscribes to the names of the current topics and peers."""
         try:
             self._graph.reregister(self._calls.registrations())
-            self._calls.refresh()
+            self._calls.refresh(self._action_offers())
+            self._end_lost_goals()
             self._master_gone = False
         except MASTER_ERRORS as error:
             if not self._master_gone:
@@ -132,7 +178,9 @@ class Ros1Bridge:
             self._master_gone = True
             return
         try:
-            topics, undeclared = self._runtime.refresh_topics(), self._daemon.accepts_undeclared()
+            with self._actions_lock:
+                wanted = self._actions.settings
+            topics, undeclared = self._runtime.refresh_topics(wanted), self._daemon.accepts_undeclared()
             peers = {*self._daemon.peers(), *self._hosts}
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
@@ -141,7 +189,14 @@ class Ros1Bridge:
         table = routes(self._own, declared, peers)
         if undeclared:
             self._add_undeclared(table, peers)
+        with self._actions_lock:
+            self._actions.peers = frozenset(peers)
+            table.update(self._actions.routes())
+            reserved = {
+                proxy.names[part]: proxy.types[part] for proxy in self._actions.proxies() for part in (FEEDBACK, RESULT)
+            }
         self._graph.listen(table)
+        self._graph.reserve(reserved)
 
     def _add_undeclared(self, table: dict[str, Route], peers: set[str]) -> None:
         try:
@@ -173,8 +228,8 @@ def main() -> int:
         for line in str(error).splitlines():
             log.error("configuration-refused %s", line)
         return 2
-    if options.tf or options.actions:
-        log.warning("configuration-ignored tf and actions: only the ROS 2 bridge carries them")
+    if options.tf:
+        log.warning("configuration-ignored tf: only the ROS 2 bridge gathers transforms")
     received = with_needed((*given.receive, *options.receive), ["bridge/*"])
     daemon = DaemonClient(given.socket, [*received, Receive(CONDITIONS_TOPIC)])
     own: list[str] = []

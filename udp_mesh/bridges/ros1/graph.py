@@ -72,6 +72,10 @@ class _Opaque:
                 connection._queue_size = depth
                 del connection._queue[:-depth]
 
+    @property
+    def type(self) -> str:
+        return str(self._publisher.type)
+
     def withdraw(self) -> None:
         self._publisher.unregister()
 
@@ -101,6 +105,7 @@ class Graph:
         self._pid = _master().getPid()
         self._subscribers: dict[str, tuple[Route, Any]] = {}
         self._watched: list[Any] = []
+        self._reserved: dict[str, _Opaque] = {}
         self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
         self._conditions: Mapping[str, Any] | None = None
@@ -137,6 +142,21 @@ class Graph:
             header.get("latching") == "1",
             bytes(message._buff),
         )
+
+    def publisher_type(self, name: str) -> TypeKey | None:
+        """The type of a publisher that a subscriber of `listen` is connected to; None without one."""
+        route_and_subscriber = self._subscribers.get(name)
+        connections = [] if route_and_subscriber is None else route_and_subscriber[1].impl.connections
+        return next((TypeKey(str(one.type), str(one.md5sum)) for one in connections if one.type), None)
+
+    def reserve(self, types: Mapping[str, TypeKey]) -> None:
+        """Advertises exactly these names beside those with messages, for programs that wait for a publisher. Waits for
+        the master."""
+        for name in [name for name in self._reserved if name not in types]:
+            self._reserved.pop(name).withdraw()
+        for name, key in types.items():
+            if name not in self._reserved:
+                self._reserved[name] = _Opaque(RosPublication(name, key, "", False, b""))
 
     def watch(self, name: str, on_bytes: Callable[[str, bytes], None]) -> None:
         """Subscribes to a name for this bridge itself, not for the mesh. Waits for the master."""
@@ -197,7 +217,8 @@ class Graph:
         uri = rospy.get_node_uri()
         ourselves = xmlrpc.client.ServerProxy(uri)
         fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts, self._text)]
-        for name, message_type in [*fixed, *self._publications.advertised()]:
+        reserved = [(name, opaque.type) for name, opaque in self._reserved.items()]
+        for name, message_type in [*fixed, *self._publications.advertised(), *reserved]:
             master.registerPublisher(name, message_type, uri)
         watched = [subscriber.resolved_name for subscriber in self._watched]
         for name in [*self._subscribers, *watched, self._settings.resolved_name]:

@@ -64,7 +64,18 @@ class _Server(NamedTuple):
 class Ros1Calls:
     """Services that are offered here, and proxies for those of the peers."""
 
-    def __init__(self, daemon: DaemonClient, own: str, services: Dict[str, ServiceOptions], run: str) -> None:
+    def __init__(
+        self,
+        daemon: DaemonClient,
+        own: str,
+        services: Dict[str, ServiceOptions],
+        run: str,
+        on_offer: Callable[[str, Offer], bool] = lambda peer, offer: False,
+        on_withdrawn: Callable[[str, str], bool] = lambda peer, name: False,
+    ) -> None:
+        """`on_offer` and `on_withdrawn`: what a peer offers or no longer does, before it is taken for a service; True
+        if it is none."""
+        self._on_offer, self._on_withdrawn = on_offer, on_withdrawn
         self._daemon, self._own, self._services = daemon, own, dict(services)
         self._calls = Calls(run)
         self._lock = threading.Lock()
@@ -125,10 +136,10 @@ class Ros1Calls:
         """Ends calls whose time is over."""
         self._do(lambda: self._calls.tick(now))
 
-    def refresh(self) -> None:
-        """Offers those of the configured services that have a server now, and creates and removes proxies. Waits for
-        the master, and raises one of MASTER_ERRORS."""
-        offers = []
+    def refresh(self, more: Iterable[Offer] = ()) -> None:
+        """Offers `more` and those of the configured services that have a server now, and creates and removes proxies.
+        Waits for the master, and raises one of MASTER_ERRORS."""
+        offers = list(more)
         for name, options in self._services.items():
             found = self._server(name)
             if found is not None:
@@ -137,8 +148,9 @@ class Ros1Calls:
         while self._changes:
             change = self._changes.popleft()
             if isinstance(change, AddProxy):
-                self._add_proxy(change.peer, change.offer)
-            else:
+                if not self._on_offer(change.peer, change.offer):
+                    self._add_proxy(change.peer, change.offer)
+            elif not self._on_withdrawn(change.peer, change.name):
                 self._remove_proxy(change.peer, change.name)
 
     def _server(self, name: str) -> Optional[ServiceType]:
