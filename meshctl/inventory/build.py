@@ -21,12 +21,9 @@ from meshctl.inventory.documents import (
     LanDocument,
     MeshDocument,
     OtherComputerDocument,
-    ReductionDocument,
     RobotDocument,
     SecretDocument,
     SshLayer,
-    TopicDocument,
-    TopicLogDocument,
 )
 from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
@@ -34,6 +31,7 @@ from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.thin import thin_links, thin_ports
+from meshctl.inventory.topics import topic_of
 from meshctl.inventory.tree import MappingNode, descend, position_of
 from meshctl.model import (
     ApplyPolicy,
@@ -43,19 +41,15 @@ from meshctl.model import (
     Firmware,
     Fleet,
     HardwareProfile,
-    JpegEncoding,
     Mesh,
     OperatorParts,
     Operators,
     RadioHardware,
-    Reduction,
     Robot,
     SecretKind,
     SecretRef,
     SshSettings,
     SystemSettings,
-    Topic,
-    TopicLog,
     UdpMesh,
 )
 from meshctl.model.ip import IpAddress, IpInterface
@@ -94,7 +88,7 @@ def build(
         hardware=MappingProxyType(hardware),
         nodes=MappingProxyType(built.nodes),
         robots=MappingProxyType(robots),
-        topics=tuple(_topic(name, item) for name, item in document.topics.items()),
+        topics=tuple(topic_of(name, item) for name, item in document.topics.items()),
         udp_mesh=_udp_mesh(document, root),
         operators=Operators(
             ssh_keys=tuple(document.operators.ssh_keys),
@@ -332,52 +326,6 @@ def _computer(document: ComputerDocument) -> Computer:
             for link in document.links
         ),
     )
-
-
-def _topic(name: str, document: TopicDocument) -> Topic:
-    return Topic(
-        name=name,
-        priority=document.priority,
-        topic_class=document.topic_class,
-        type_name=document.type_name,
-        reliable=document.reliable,
-        sources=tuple(document.sources),
-        destinations=tuple(document.destinations),
-        rate_hz=document.rate_hz,
-        size_bytes=document.size_bytes,
-        keep_last=document.keep_last,
-        deadline_s=document.deadline_s,
-        rate_limit_bytes_per_s=document.rate_limit_bytes_per_s,
-        compression=document.compression,
-        outbox=document.outbox,
-        outbox_bytes=document.outbox_bytes,
-        outbox_on_disk=document.outbox_on_disk,
-        repair=document.repair,
-        log=_log(document.log) if document.log is not None else None,
-        delta=document.delta,
-        delta_bytes=document.delta_bytes,
-        reduce=_reduction(document.reduce) if document.reduce is not None else None,
-        always=document.always,
-        thin=document.thin,
-        thin_links=document.thin_links,
-        thin_period_s=document.thin_period_s,
-    )
-
-
-def _reduction(document: ReductionDocument) -> Reduction:
-    jpeg = document.encode
-    return Reduction(
-        rate_hz=document.rate_hz,
-        encode=None if jpeg is None else JpegEncoding(jpeg.quality, jpeg.min_quality, jpeg.scale),
-        voxel_m=document.voxel_m,
-        max_voxel_m=document.max_voxel_m,
-        fields=tuple(document.fields),
-        adapt=document.adapt,
-    )
-
-
-def _log(document: TopicLogDocument) -> TopicLog:
-    return TopicLog(document.max_items, document.max_bytes, document.max_age_s, document.copies)
 
 
 def _transport_keys(documents: tuple[SecretDocument, ...], key: str, root: MappingNode) -> tuple[SecretRef, ...]:
