@@ -1,6 +1,6 @@
 """Ten robots at random: artifacts to the base by a shared log, by direct delivery alone, and by flooding.
 
-    python -m benchmarks.shared_logs [--seeds N] [--seconds S] [--results FILE]
+    python -m benchmarks.shared_logs [--seeds N] [--seconds S] [--ways WAY,...] [--results FILE]
 
 Robots walk between random points of a square and rarely meet; the base stays in a corner. Each robot publishes an
 artifact now and then; the last part of a run has no new ones, so that what can still arrive does. `direct`: an
@@ -130,12 +130,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--seconds", type=float, default=1800.0)
+    parser.add_argument("--ways", default=",".join(WAYS), help="comma-separated")
     parser.add_argument("--results", type=Path, help="JSON lines")
     arguments = parser.parse_args()
+    ways = arguments.ways.split(",")
     runs = read_results(arguments.results)
     done = {(run["way"], run["seed"], run["seconds"]) for run in runs}
     for seed in range(1, arguments.seeds + 1):
-        for way in WAYS:
+        for way in ways:
             if (way, seed, arguments.seconds) in done:
                 continue
             run = play(way, seed, arguments.seconds)
@@ -145,15 +147,15 @@ def main() -> None:
                 with arguments.results.open("a", encoding="utf-8") as file:
                     file.write(f"{json.dumps(run)}\n")
     runs = [run for run in runs if run["seconds"] == arguments.seconds and run["seed"] <= arguments.seeds]
-    print("| way | arrived | twice | median delay (s) | airtime per artifact published (ms) |")
-    print("| --- | --- | --- | --- | --- |")
-    for way in WAYS:
+    print("| way | seeds | arrived | twice | median delay (s) | airtime per artifact published (ms) |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for way in ways:
         mine = [run for run in runs if run["way"] == way]
         arrived, published = sum(run["arrived"] for run in mine), sum(run["published"] for run in mine)
         delay_s = statistics.median(run["delay_p50_s"] for run in mine if run["delay_p50_s"] is not None)
         airtime_ms = 1000 * sum(run["airtime_s"] for run in mine) / published
         print(
-            f"| {way} | {arrived / published:.1%} of {published} | {sum(run['twice'] for run in mine)} "
+            f"| {way} | {len(mine)} | {arrived / published:.1%} of {published} | {sum(run['twice'] for run in mine)} "
             f"| {delay_s:.0f} | {airtime_ms:.0f} |"
         )
 

@@ -75,6 +75,19 @@ class ReplayWindow:
         self._blocks[block % WINDOW_BLOCKS] |= 1 << (number & 63)
         return True
 
+    def accepted_share(self, first: int, newest: int, least: int) -> float | None:
+        """Which share of the numbers up to the largest one was accepted, of at most the `newest` ones and of those from
+        `first` on; None if these are fewer than `least`."""
+        start = max(first, self.largest - min(newest, WINDOW_PACKETS) + 1)
+        count = self.largest - start + 1
+        if count < least:
+            return None
+        accepted = sum(
+            (self._blocks[(number >> 6) % WINDOW_BLOCKS] >> (number & 63)) & 1
+            for number in range(start, self.largest + 1)
+        )
+        return accepted / count
+
     def raise_floor(self, number: int) -> None:
         """Reject all numbers below `number` from now on."""
         self._floor = max(self._floor, number)

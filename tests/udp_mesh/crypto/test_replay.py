@@ -41,3 +41,13 @@ def test_numbers_older_than_the_window_count_as_seen() -> None:
     assert window.accept(1_000_000)
     assert window.accept(1_000_000 - WINDOW_PACKETS)
     assert not window.accept(1_000_000 - WINDOW_PACKETS - 128)
+
+
+@given(st.sets(st.integers(0, 300), min_size=1), st.integers(0, 300), st.integers(1, 200), st.integers(1, 20))
+def test_the_accepted_share_counts_the_newest_numbers(numbers: set[int], first: int, newest: int, least: int) -> None:
+    window = ReplayWindow()
+    for number in sorted(numbers):
+        window.accept(number)
+    counted = range(max(first, max(numbers) - newest + 1), max(numbers) + 1)
+    expected = len(numbers.intersection(counted)) / len(counted) if len(counted) >= least else None
+    assert window.accepted_share(first, newest, least) == expected

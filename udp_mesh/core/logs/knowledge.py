@@ -12,6 +12,8 @@ from udp_mesh.core.logs.item import LogKey
 from udp_mesh.core.logs.messages import MAX_ORDER, Have, HaveEntry, Holder, Ranges
 from udp_mesh.core.ranges import RangeSet
 
+WEAK_PATIENCE_S = 60.0
+"""A link that stays weak for this long does not become better soon: it is used."""
 MAX_LOGS = 4096
 """Logs that a node knows of: a key holder inventing sources."""
 MAX_KEPT_RANGES = 4096
@@ -107,6 +109,8 @@ class PeerView:
     """When all that this node holds was announced to it last."""
     asked: bool = False
     """It was asked what it holds."""
+    weak_since: float | None = None
+    """Since when much of what it sends to all is lost; None while it is not."""
     silent: bool = False
     """Nothing was heard from it for a while: it is online, but probably out of reach already."""
     heard_at: int = 0
@@ -115,6 +119,10 @@ class PeerView:
     """The newest complete one."""
     listed_at: dict[LogKey, int] = field(default_factory=dict)
     """The newest one that listed each log."""
+
+    def is_weak(self, now: float) -> bool:
+        """Whether the link to it is weak, and may become better soon."""
+        return self.weak_since is not None and now - self.weak_since < WEAK_PATIENCE_S
 
     def place(self, message: Have) -> int:
         """Where a message is in the order of those from this peer. One that does not count comes after all others. If

@@ -1,8 +1,9 @@
 """Which items this node requests now, and from which peer: the missing ones of every log, each from one peer at a time.
 
 A reader requests what it lacks at once. A node that only carries never requests what all readers have, nor what enough
-others in reach carry already; it leaves items to their readers for a while if one of them is in reach of the holder or
-of this node, and to other carriers if it is not among the first in an order that all of them compute alike.
+others in reach carry already. It requests nothing over a weak link for a while: the same items cost a fraction of the
+airtime once the robots are closer. It leaves items to their readers for a while if one of them is in reach of the
+holder or of this node, and to other carriers if it is not among the first in an order that all of them compute alike.
 """
 
 from __future__ import annotations
@@ -151,6 +152,7 @@ class Pulling:
             skip = skips.get(key) or RangeSet()
             reads = policy.is_reader(key.topic)
             if not reads:
+                holders = [(peer, held) for peer, held in holders if not peers[peer].is_weak(now)]
                 skip = self._carried(state, peers, policy, skip)
             lacks = False
             for peer, held in holders:

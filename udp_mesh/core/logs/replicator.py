@@ -155,6 +155,15 @@ class Replicator:
             self._pulling.requests.forget(peer)
             self._run_soon = True
 
+    def peer_weak(self, peer: str, weak: bool, now: float) -> None:
+        """Much of what the peer sends is lost, or no longer: what this node only carries is requested from others."""
+        view = self.peers[peer]
+        if (view.weak_since is not None) is not weak:
+            view.weak_since = now if weak else None
+            # What waits there is requested from others, or again.
+            self._pulling.requests.forget(peer)
+            self._run_soon = True
+
     def on_control(self, peer: str, payload: bytes, now: float) -> None:
         """A `Have` or `ItemRequest` of a peer. Malformed ones are counted."""
         view = self.peers.get(peer)
@@ -275,6 +284,11 @@ class Replicator:
         """Whether a peer can act at once on what is new of a log."""
         return self.holdings.is_own_log(key) or peer == key.source or peer in self.policy.readers(key.topic)
 
+    def _waits(self, peer: str, item: ItemId, now: float) -> bool:
+        """Whether an item for a carrier waits for a better link."""
+        view, readers = self.peers.get(peer), self.policy.readers(item.log.topic)
+        return view is not None and bool(readers) and peer not in readers and view.is_weak(now)
+
     # What is due
 
     def run(self, now: float) -> None:
@@ -293,6 +307,6 @@ class Replicator:
         for peer, message in self._pulling.plan(self.holdings.logs, self.peers, self.policy, now):
             if isinstance(self._send(CONTROL_TOPIC, encode_control(message), peer, now), Rejected):
                 self._pulling.not_sent(peer, now)
-        self._serving.run(now, self.holdings.lost)
+        self._serving.run(now, self.holdings.lost, lambda peer, item: self._waits(peer, item, now))
         while self._completed:
             self._completed.popleft()(now)

@@ -33,6 +33,10 @@ Withdraw = Callable[[str, MessageId, float], None]
 """(peer, message, now): the transport sends no more of it."""
 
 
+def _never(_peer: str, _item: ItemId) -> bool:
+    return False
+
+
 @dataclass(slots=True, eq=False)
 class _Service:
     """One peer's requests."""
@@ -89,8 +93,10 @@ class Serving:
             if is_needless(peer, item):
                 self._withdraw(peer, message, now)
 
-    def run(self, now: float, lost: Callable[[ItemId, float], None]) -> None:
-        """Read and send what may go now."""
+    def run(
+        self, now: float, lost: Callable[[ItemId, float], None], waits: Callable[[str, ItemId], bool] = _never
+    ) -> None:
+        """Read and send what may go now; what `waits` (peer, item) stays in the queue."""
         for peer, service in list(self._peers.items()):
             if now < service.retry_at < float("inf"):
                 continue
@@ -100,6 +106,7 @@ class Serving:
                 and service.retry_at == float("inf")
                 and len(service.sending) < MAX_SENDING
                 and sum(service.sending.values()) < MAX_SENDING_BYTES
+                and not waits(peer, service.queue[0])
             ):
                 item = service.queue.popleft()
                 service.sending[item] = 0

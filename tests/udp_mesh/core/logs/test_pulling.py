@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.udp_mesh.core.logs.team import ARTIFACT, LogTeam
 from udp_mesh.core.logs.item import ItemId, LogKey
-from udp_mesh.core.logs.knowledge import LogState, PeerView, as_set
+from udp_mesh.core.logs.knowledge import WEAK_PATIENCE_S, LogState, PeerView, as_set
 from udp_mesh.core.logs.policy import Policy
 from udp_mesh.core.logs.pulling import CUSTODY_DELAY_S, FULL_PAUSE_S, Pulling, in_at_least, rank
 from udp_mesh.core.logs.retention import Shelf
@@ -81,3 +83,38 @@ def test_a_request_that_the_transport_refused_is_planned_again_soon() -> None:
     later = CUSTODY_DELAY_S + FULL_PAUSE_S
     requests = [carrier.requested(later + step / 2, newest=1) for step in range(10)]
     assert requests.count([("spot", ((1, 1),))]) == 1
+
+
+def test_a_carrier_leaves_a_weak_link_alone_until_it_is_better_or_stays_so() -> None:
+    carrier = Carrier()
+    del carrier.peers["base"]
+    carrier.peers["spot"].weak_since = 10.0
+    assert carrier.requested(10.0, newest=1) == []
+    assert carrier.requested(10.0 + WEAK_PATIENCE_S - 1, newest=1) == []
+    assert carrier.requested(10.0 + WEAK_PATIENCE_S, newest=1) == [("spot", ((1, 1),))]
+    carrier.peers["spot"].weak_since = 100.0
+    assert carrier.requested(100.0, newest=2) == []
+    carrier.peers["spot"].weak_since = None
+    assert carrier.requested(101.0, newest=2) == [("spot", ((2, 2),))]
+
+
+def test_a_reader_requests_over_a_weak_link_at_once() -> None:
+    reader = Carrier()
+    reader.policy.name = "base"
+    reader.peers["spot"].weak_since = 0.0
+    assert reader.requested(0.0, newest=1) == [("spot", ((1, 1),))]
+
+
+def test_the_link_is_weak_while_every_second_datagram_to_all_is_lost() -> None:
+    team = LogTeam("base", "spot", "husky", topics=[ARTIFACT])
+    turns = itertools.count()
+    pipe = team.pipes["spot", "husky"]
+    pipe.lost = lambda rng, now: next(turns) % 2 == 0
+    team.connect("spot", "husky")
+    team.run(15.0)
+    team.publish("spot", b"x" * 1000)
+    team.run(20.0)
+    assert team.stores["husky"].items == {}
+    pipe.lost = None
+    team.run(12.0)
+    assert len(team.stores["husky"].items) == 1
