@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -36,12 +36,11 @@ from meshctl.monitor.frame import Frame
 from meshctl.monitor.hooks import AlarmHooks, HookSettings
 from meshctl.monitor.meters import MeterReadings
 from meshctl.monitor.metrics import render_metrics
-from meshctl.monitor.page import is_replaceable, recording_of, save_page
+from meshctl.monitor.page import recording_of, save_page
 from meshctl.monitor.prometheus import TextfileWriter
-from meshctl.monitor.recording_page import documents_of
+from meshctl.monitor.recording_page import documents_of, scratch_for
 from meshctl.monitor.replay import is_history, open_recordings
 from meshctl.monitor.sampler import FrameSampler
-from meshctl.monitor.scratch import scratch_directory
 from meshctl.monitor.serve import address_of, serve
 from meshctl.monitor.serve import listen as listen_on
 from meshctl.monitor.server import MonitorServer, PageSettings
@@ -372,7 +371,7 @@ def _serve(
 
 def _replay(files: list[Path], out: Path | None, web: WebOptions, *, as_json: bool) -> None:
     """Serve recordings, or write them as one page."""
-    with _scratch(out) as directory, open_recordings(files, directory) as opened:
+    with scratch_for(out) as directory, open_recordings(files, directory) as opened:
         for problem in opened.problems:
             echo(f"warning: {problem}", err=True)
         reports = documents_of(file for file in files if not is_history(file))
@@ -390,15 +389,3 @@ def _replay(files: list[Path], out: Path | None, web: WebOptions, *, as_json: bo
         feed = Feed()
         app = MonitorServer(opened.store, feed, settings, web.rules, report=list(reports)).app()
         raise typer.Exit(_serve(app, web, feed, as_json=as_json))
-
-
-@contextmanager
-def _scratch(out: Path | None) -> Iterator[Path]:
-    """For temporary files: beside the page, which is put in place at once, or where others are."""
-    parent = out.parent if out is not None and is_replaceable(out) else None
-    with ExitStack() as stack:
-        try:
-            directory = stack.enter_context(scratch_directory(parent))
-        except OSError as error:
-            raise InputError(f"cannot write {out or error.filename}: {error.strerror}") from error
-        yield directory

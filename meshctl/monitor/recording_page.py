@@ -7,13 +7,14 @@ import itertools
 import json
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from meshctl import __version__
 from meshctl.errors import InputError, MeshctlError
-from meshctl.monitor.page import recording_of, save_page
+from meshctl.monitor.page import is_replaceable, recording_of, save_page
 from meshctl.monitor.replay import open_recordings
 from meshctl.monitor.scratch import scratch_directory
 from meshctl.monitor.server import PageSettings
@@ -49,6 +50,19 @@ def write_page(recordings: Sequence[Path], documents: Iterable[Mapping[str, Any]
                 raise ValueError(str(error)) from error
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(page)) from error
+
+
+@contextmanager
+def scratch_for(out: Path | None) -> Iterator[Path]:
+    """A directory for temporary files: beside the page, which is put in place at once, or where others are. Raises
+    InputError."""
+    parent = out.parent if out is not None and is_replaceable(out) else None
+    with ExitStack() as stack:
+        try:
+            directory = stack.enter_context(scratch_directory(parent))
+        except OSError as error:
+            raise InputError(f"cannot write {out or error.filename}: {error.strerror}") from error
+        yield directory
 
 
 class PackedDocuments:
