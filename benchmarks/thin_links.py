@@ -32,7 +32,6 @@ LINKS = (
     ThinLinkSettings("RS-485-57600", 46_080.0, 200, 6),
     ThinLinkSettings("SF7-10%", 5_470.0, 120, 0, 0.0125, 0.1),
     ThinLinkSettings("SF7-1%", 5_470.0, 120, 0, 0.0125, 0.01),
-    ThinLinkSettings("SF11-10%", 1_074.0, 120, 0, 0.1, 0.1),
 )
 TEAMS = (4, 10)
 LOSSES = (0.0, 0.3)

@@ -15,7 +15,12 @@ from typing import NamedTuple
 from udp_mesh.core.interfaces import RandomSource
 from udp_mesh.core.thin.airtime import AirtimeBudget
 from udp_mesh.core.thin.forgeries import ForgeryLimit
-from udp_mesh.core.thin.outgoing import MAX_URGENT_ATTEMPTS, LinkQueueEntry, ThinMessage
+from udp_mesh.core.thin.outgoing import (
+    MAX_URGENT_ATTEMPTS,
+    UNHEARD_ATTEMPTS,
+    LinkQueueEntry,
+    ThinMessage,
+)
 from udp_mesh.core.thin.settings import ThinLinkSettings
 from udp_mesh.wire.limits import MAX_THIN_HEARD
 from udp_mesh.wire.thin import (
@@ -195,7 +200,7 @@ class ThinLink:
             if message.ended or now >= message.ends_at:
                 continue
             if not entry.to_send and entry.retry_at <= now:
-                if message.is_answered:
+                if message.is_answered and not (message.is_for_strangers and entry.attempts < UNHEARD_ATTEMPTS):
                     continue
                 if entry.attempts >= message.max_attempts:
                     self.counters.messages_given_up += bool(message.lacking)

@@ -66,6 +66,11 @@ class ThinMessage:
         return True
 
     @property
+    def is_for_strangers(self) -> bool:
+        """Whether nodes may lack it that are not known here yet, as in the first minutes of a large team."""
+        return self.urgent and self.destination is None
+
+    @property
     def max_attempts(self) -> int:
         """How often a link sends it."""
         if not self.lacking:
