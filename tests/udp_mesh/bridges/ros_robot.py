@@ -205,11 +205,11 @@ def goal(command: dict[str, Any]) -> None:
     def run() -> None:
         client = actions[name]
         say(available=client.wait_for_server(rospy.Duration(60)))
-        told: list[int] = []
+        reported: list[int] = []
 
         def feedback(message: Any) -> None:
-            if not told:
-                told.append(message.feedback)
+            if not reported:
+                reported.append(message.feedback)
                 say(feedback=message.feedback)
 
         client.send_goal(TestGoal(command["number"]), feedback_cb=feedback)
