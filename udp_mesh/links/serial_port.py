@@ -58,12 +58,9 @@ class SerialPort:
         self._descriptor = os.open(config.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             self._configure(config.baud)
-        except termios.error as error:
+        except (termios.error, OSError) as error:
             os.close(self._descriptor)
             raise OSError(error.args[0], f"not a serial port: {error.args[1]}", config.device) from error
-        except OSError:
-            os.close(self._descriptor)
-            raise
 
     def _configure(self, baud: int) -> None:
         fcntl.ioctl(self._descriptor, termios.TIOCEXCL)
