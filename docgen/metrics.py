@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import typing
+from enum import Enum
 from types import NoneType
 from typing import Any
 
@@ -64,4 +65,6 @@ def _sample(kind: Any) -> Any:
         return tuple(_sample(each) for each in arguments)
     if arguments:
         return _sample(arguments[0])
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return next(iter(kind))
     return kind(1)

@@ -22,17 +22,20 @@ def peers_view(peers: list[Json]) -> str:
             peer["name"] + (" (legacy)" if peer["legacy"] else ""),
             *_state(peer),
             peer["address"] or "-",
-            peer["link"] or "-",
+            _path(peer),
             milliseconds(peer["round_trip_s"]),
             f"{peer['loss'] * 100:.1f} %",
             rate(peer["sent_bits_per_s"]),
             rate(peer["received_bits_per_s"]),
             rate(peer["capacity_bits_per_s"]),
+            # daemons of earlier versions do not tell
+            (peer.get("trend") or {}).get("direction", "-"),
             str(sum(queue["messages"] for queue in peer["queues"]) + peer["outbox_messages"]),
         ]
         for peer in peers
     ]
-    head = ["peer", "state", "for", "address", "link", "rtt", "loss", "sends", "receives", "capacity", "waiting"]
+    head = ["peer", "state", "for", "address", "link", "rtt", "loss", "sends", "receives", "capacity"]
+    head += ["trend", "waiting"]
     lines = [table(head, rows)]
     waiting = [
         [
@@ -43,7 +46,6 @@ def peers_view(peers: list[Json]) -> str:
             duration(queue["oldest_s"]),
             duration(queue["starved_s"]),
             duration(queue["held_s"]),
-            # daemons of earlier versions do not tell
             "-" if queue.get("drained_in_s") is None else duration(queue["drained_in_s"]),
         ]
         for peer in peers
@@ -55,7 +57,29 @@ def peers_view(peers: list[Json]) -> str:
             "",
             table(["waiting for", "priority", "messages", "bytes", "oldest", "starved", "held", "sent in"], waiting),
         ]
+    left = [[peer["name"], *step] for peer in peers for step in _available(peer)]
+    if left:
+        lines += ["", table(["left for", "priority", "rate"], left)]
     return "\n".join(lines)
+
+
+def _path(peer: Json) -> str:
+    """The link, and the relays on the way."""
+    via = peer.get("via") or ()
+    return f"{peer['link'] or '-'}{' through ' if via else ''}{' > '.join(via)}"
+
+
+def _available(peer: Json) -> list[tuple[str, str]]:
+    """(priorities, rate) where the rate that a message would get depends on its priority; else it is the capacity."""
+    available = peer.get("available_bits_per_s") or ()
+    starts = [priority for priority, bits_per_s in enumerate(available) if bits_per_s not in available[:priority][-1:]]
+    if len(starts) < 2:
+        return []
+    ends = [start - 1 for start in starts[1:]] + [len(available) - 1]
+    return [
+        (str(start) if start == end else f"{start} to {end}", rate(available[start]))
+        for start, end in zip(starts, ends, strict=True)
+    ]
 
 
 def _state(peer: Json) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from udp_mesh.core.link_trend import Trend
 from udp_mesh.core.settings import Address
 
 
@@ -81,6 +82,13 @@ class PeerConditions:
     saved_messages: int = 0
     """Messages not sent because its programs do not want them, since the node's start."""
     saved_bytes: int = 0
+    via: tuple[str, ...] = ()
+    """The relays on the way to it, the nearest first, as far as known; empty if it is reached directly."""
+    available_bits_per_s: tuple[float, ...] | None = None
+    """By priority: what its messages would get now, the capacity less what more urgent levels take. None if the
+    capacity is unknown, or the peer is offline."""
+    trend: Trend | None = None
+    """Whether the link gets better or worse. None if too little was sent lately, or the peer is offline."""
 
 
 @dataclass(slots=True)

@@ -228,7 +228,8 @@ class Endpoint:
 
     def conditions(self, now: float) -> Conditions:
         """A snapshot for the autonomy, the status page and the metrics."""
-        return node_conditions(self._state, now)
+        via = {route.name: route.via for route in self.relaying(now).routes if route.in_use}
+        return node_conditions(self._state, now, via)
 
     def confirm(self, receipt: Receipt) -> None:
         """A received message is safe: the application took it, or it is on disk. Its sender reports it as delivered."""

@@ -1,6 +1,6 @@
 """A snapshot of a node for the autonomy, the status page and the metrics: its state -> `Conditions`."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from udp_mesh.core.conditions import Conditions, PeerConditions, QueueConditions, UnverifiedNode
@@ -19,11 +19,12 @@ UNVERIFIED_AFTER_S = 3.0
 """A node heard for this long without hearing us is listed as unverified; discovery takes a fraction of that."""
 
 
-def node_conditions(state: State, now: float) -> Conditions:
-    """See `Endpoint.conditions`."""
+def node_conditions(state: State, now: float, via: Mapping[str, tuple[str, ...]]) -> Conditions:
+    """See `Endpoint.conditions`. `via`: the relays on the way to peers that are reached through some."""
     idle = Sender(state.settings)
     peers = tuple(
-        _peer_conditions(state, peer, peer.sender or idle, now) for _, peer in sorted(state.peer_table.peers.items())
+        _peer_conditions(state, peer, peer.sender or idle, via.get(peer.name, ()), now)
+        for _, peer in sorted(state.peer_table.peers.items())
     )
     senders = [peer.sender for peer in state.peer_table.peers.values() if peer.sender is not None]
     counters = state.event_queue.counters
@@ -63,7 +64,7 @@ def _recently_heard(session: Session, now: float) -> bool:
     return now - session.last_heard < MISSED_HEARTBEATS * session.interval_s
 
 
-def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> PeerConditions:
+def _peer_conditions(state: State, peer: Peer, sender: Sender, via: tuple[str, ...], now: float) -> PeerConditions:
     session = peer.session
     held_messages, held_bytes = state.outboxes.count(peer.name)
     capacity = sender.congestion.capacity_packets_per_s()
@@ -104,6 +105,9 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, now: float) -> Pe
         session.received_bytes if session is not None else meters.received.total if meters is not None else 0,
         saved.messages,
         saved.bytes,
+        via,
+        _available_bits_per_s(sender, capacity_bits_per_s, now) if peer.online else None,
+        peer.trend.trend if peer.online and peer.trend is not None else None,
     )
 
 
@@ -140,6 +144,19 @@ def _queue_conditions(sender: Sender, now: float, capacity_bits_per_s: float | N
             )
         )
     return tuple(queues)
+
+
+def _available_bits_per_s(sender: Sender, capacity_bits_per_s: float | None, now: float) -> tuple[float, ...] | None:
+    """By priority, what remains of the capacity. That counts what arrives, and so does what is subtracted."""
+    if capacity_bits_per_s is None:
+        return None
+    left_bits_per_s = capacity_bits_per_s
+    available = []
+    for level in sender.levels:
+        available.append(float(round(max(0.0, left_bits_per_s))))
+        if level.sent is not None:
+            left_bits_per_s -= _bits_per_s(level.sent, now) * (1 - sender.loss)
+    return tuple(available)
 
 
 def _reported_bits_per_s(rate: tuple[int, float], for_s: float, now: float) -> float | None:

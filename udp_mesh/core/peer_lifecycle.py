@@ -352,6 +352,11 @@ def _maintain_peer(state: State, peer: Peer, now: float) -> None:
         update_pmtu(state, peer, sender, session, now)
         session.meters.sent.feed(sender.sent_bytes, now)
         session.meters.delivered.feed(sender.delivered_bytes, now)
+        sender.levels.measure(now)
+        if peer.trend is not None:
+            congestion = sender.congestion
+            capacity = congestion.capacity_packets_per_s() if congestion.is_capacity_current(now) else None
+            peer.trend.feed(capacity, sender.rtt.smoothed_rtt, sender.delivered_packets, now)
 
 
 def _report_starved(state: State, name: str, sender: Sender, now: float) -> None:

@@ -176,6 +176,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             _set_relayed_aside(state, priority, out, before)
             if used:
                 sender.served |= bit
+                sender.levels.record_sent(priority, used, now)
             room -= used
             if room <= 0:
                 # A peer that used up the room is served last next time.

@@ -9,6 +9,7 @@ from tests.udp_mesh.core.pair import pair
 from udp_mesh.cli import output
 from udp_mesh.cli.inspect import screen_text
 from udp_mesh.cli.views import peers_view, topics_view
+from udp_mesh.core.link_trend import Direction, Measure, Trend
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon.status import peer_json, topics_json
@@ -77,3 +78,30 @@ def test_terminal_control_sequences_in_names_are_escaped(capsys: pytest.CaptureF
         assert sequence not in drawn
     output.print_json_line({"name": HOSTILE})
     assert json.loads(capsys.readouterr().out) == {"name": HOSTILE}
+
+
+def test_peers_view_shows_relays_trend_and_what_is_left_for_a_priority() -> None:
+    both = pair()
+    (found,) = both.a.conditions(both.now).peers
+    trend = Trend(Direction.WORSENING, Measure.CAPACITY, -0.02)
+    left = (8e6,) * 3 + (5e6,) * 4 + (0.0,) * 9
+    peer = replace(found, link="relay", via=("r1", "r2"), trend=trend, available_bits_per_s=left)
+    text = peers_view([peer_json(peer, both.now)])
+    assert "relay through r1 > r2" in text
+    assert " worsening " in text
+    assert [line.split() for line in text.splitlines()[-3:]] == [
+        ["b", "0", "to", "2", "8", "Mbit/s"],
+        ["b", "3", "to", "6", "5", "Mbit/s"],
+        ["b", "7", "to", "15", "0", "bit/s"],
+    ]
+    assert peer_json(peer, both.now)["trend"] == {
+        "direction": "worsening",
+        "measure": "capacity",
+        "change_per_s": -0.02,
+    }
+    # nothing more to tell than the capacity, and a daemon of an earlier version
+    even = peer_json(replace(peer, available_bits_per_s=(8e6,) * 16), both.now)
+    assert "left for" not in peers_view([even])
+    for key in ("via", "trend", "available_bits_per_s"):
+        del even[key]
+    assert "through" not in peers_view([even])

@@ -53,6 +53,10 @@ class CongestionController(Protocol):
         """The estimated capacity of the path."""
         ...
 
+    def is_capacity_current(self, now: float) -> bool:
+        """Whether the capacity was measured just now, not while more was sent earlier."""
+        ...
+
     def assume_delivery(self) -> bool:
         """Whether the link can be assumed to keep delivering while acknowledgements are late."""
         ...
@@ -95,6 +99,9 @@ class FixedWindow:
 
     def capacity_packets_per_s(self) -> float | None:
         return None
+
+    def is_capacity_current(self, now: float) -> bool:
+        return False
 
     def assume_delivery(self) -> bool:
         return False

@@ -166,6 +166,9 @@ class DelayBasedController:
     def capacity_packets_per_s(self) -> float | None:
         return self._rate.maximum()
 
+    def is_capacity_current(self, now: float) -> bool:
+        return self._rate.is_current(now)
+
     def assume_delivery(self) -> bool:
         # A queue that our window does not explain keeps the link busy anyway, and a drain wants the queue empty.
         return bool(self._rate) and self.phase in (Phase.STARTUP, Phase.CRUISE) and not self._unexplained_queue()

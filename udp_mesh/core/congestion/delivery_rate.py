@@ -21,6 +21,10 @@ class DeliveryRate:
         """The capacity of the path; None before the first sample."""
         return self._samples[0][1] if self._samples else None
 
+    def is_current(self, now: float) -> bool:
+        """Whether the maximum is a sample within the window: of an application-limited sender the last one stays."""
+        return bool(self._samples) and self._samples[0][0] >= now - RATE_WINDOW_S
+
     def add(self, rate: float, *, app_limited: bool, now: float) -> None:
         """Add a sample; an application-limited one counts only if it is larger."""
         samples = self._samples

@@ -6,6 +6,7 @@ next boot, or dropped. Before verification only its heartbeat is believed.
 
 from typing import NamedTuple
 
+from udp_mesh.core.link_trend import LinkTrend
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.peers.peer_state import TRANSITIONS, PeerEvent, PeerState
 from udp_mesh.core.peers.session_state import (
@@ -101,12 +102,15 @@ class Peer:
         "settling",
         "state",
         "timer_at",
+        "trend",
     )
 
     def __init__(self, name: str, settings: Settings) -> None:
         self.name = name
         self._settings = settings
         self.sender: Sender | None = None
+        self.trend: LinkTrend | None = None
+        """Of what is sent: set with `sender`."""
         self.session: Session | None = None
         self.state = PeerState.LOST
         self.legacy = False
@@ -131,6 +135,7 @@ class Peer:
         """The sender, created if there is none yet."""
         if self.sender is None:
             self.sender = Sender(self._settings)
+            self.trend = LinkTrend()
         return self.sender
 
     @property

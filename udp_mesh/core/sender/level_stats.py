@@ -8,6 +8,7 @@ how long.
 from collections import deque
 from collections.abc import Iterable, Iterator
 
+from udp_mesh.core.meter import Meter
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
@@ -15,7 +16,17 @@ from udp_mesh.wire.limits import PRIORITY_LEVELS
 class LevelStats:
     """The pending messages and starvation of one priority level."""
 
-    __slots__ = ("bytes", "held_s", "messages", "order", "starved_reported", "starved_s", "starved_since")
+    __slots__ = (
+        "bytes",
+        "held_s",
+        "messages",
+        "order",
+        "sent",
+        "sent_bytes",
+        "starved_reported",
+        "starved_s",
+        "starved_since",
+    )
 
     def __init__(self) -> None:
         self.order: deque[OutgoingMessage] = deque()
@@ -26,6 +37,10 @@ class LevelStats:
         self.starved_since: float | None = None
         self.starved_reported = False
         self.held_s = 0.0
+        self.sent_bytes = 0
+        """Bytes of this level's datagrams, without IP and UDP headers."""
+        self.sent: Meter | None = None
+        """Their rate; None before the first."""
 
     def oldest(self) -> OutgoingMessage | None:
         order = self.order
@@ -86,6 +101,19 @@ class PriorityLevels:
         for priority, level in enumerate(self._levels):
             level.order = deque(message for message in everything if message.priority == priority)
         return True
+
+    def record_sent(self, priority: int, sent_bytes: int, now: float) -> None:
+        """Count the bytes of datagrams that a level just sent."""
+        level = self._levels[priority]
+        if level.sent is None:
+            level.sent = Meter(now)
+        level.sent_bytes += sent_bytes
+
+    def measure(self, now: float) -> None:
+        """Update the rates. Call at least every second."""
+        for level in self._levels:
+            if level.sent is not None:
+                level.sent.feed(level.sent_bytes, now)
 
     def record_served(self, served: int, waiting: int, now: float) -> None:
         """Levels in the mask `served` sent something; less urgent ones in the mask `waiting` did not."""

@@ -21,6 +21,8 @@ def test_the_ends_of_a_chain_of_four_meet_and_each_message_arrives_once() -> Non
     topology.send("n1", "map", bytes(200_000), destination="n4")
     topology.run(3)
     assert via(topology, "n1", "n4") == ("n2", "n3")
+    relays = {peer.name: peer.via for peer in topology.conditions("n1").peers}
+    assert relays == {"n2": (), "n3": ("n2",), "n4": ("n2", "n3")}
     assert len(reported(topology, "n4", MessageReceived)) == 1
     assert len(reported(topology, "n1", MessageDelivered)) == 1
     assert relaying(topology, "n2").counters.dropped_loop == 0

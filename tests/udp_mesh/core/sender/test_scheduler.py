@@ -191,3 +191,45 @@ def test_the_time_until_a_queue_is_sent_is_unknown_while_the_peer_is_offline() -
     (peer,) = world.nodes["a"].conditions(world.now).peers
     assert not peer.online
     assert {queue.drained_in_s for queue in peer.queues} <= {None}
+
+
+def test_a_level_would_get_what_more_urgent_ones_leave() -> None:
+    world = World()
+    topics = (Topic("urgent", priority=2), Topic("video", priority=6), Topic("bulk", priority=12))
+    for name in ("a", "b"):
+        world.add(settings(name, *topics))
+    world.run(1.5)
+    assert world.nodes["a"].conditions(world.now).peers[0].available_bits_per_s is None
+    world.send("a", "bulk", bytes(20_000_000), "b")
+    for _ in range(200):
+        world.send("a", "urgent", bytes(2_500), "b")
+        world.send("a", "video", bytes(10_000), "b")
+        world.run(0.05)
+    (peer,) = world.nodes["a"].conditions(world.now).peers
+    available = peer.available_bits_per_s
+    assert available is not None
+    assert available[:3] == (round(peer.capacity_bits_per_s or 0),) * 3
+    # 20 messages per second of each topic, with some percent of headers
+    assert available[2] - available[3] == pytest.approx(20 * 2_500 * 8, rel=0.15)
+    assert available[3] == available[6]
+    assert available[6] - available[7] == pytest.approx(20 * 10_000 * 8, rel=0.15)
+    assert available[7] == available[12] > 5 * available[13]
+    assert min(available) >= 0
+
+
+def test_a_level_gets_the_rate_that_was_reported() -> None:
+    world = World()
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("video", priority=6), Topic("bulk", priority=12)))
+    world.run(1.5)
+    world.send("a", "bulk", bytes(2_000_000), "b")
+    for step in range(80):
+        if step == 40:
+            (before,) = world.nodes["a"].conditions(world.now).peers
+            world.send("a", "bulk", bytes(20_000_000), "b")
+        world.send("a", "video", bytes(25_000), "b")
+        world.run(0.1)
+    (after,) = world.nodes["a"].conditions(world.now).peers
+    assert before.available_bits_per_s is not None
+    bulk_bits_per_s = after.delivered_bits_per_s - 10 * 25_000 * 8
+    assert bulk_bits_per_s == pytest.approx(before.available_bits_per_s[12], rel=0.1)
