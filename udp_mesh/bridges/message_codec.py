@@ -164,7 +164,7 @@ def _read(reader: MessageReader, definition: MessageDefinition, name: str, depth
     return {
         field.name: _read_field(reader, definition, field, depth)
         for field in fields
-        if not _is_missing(name, field, reader.ros_version)
+        if not is_missing(name, field, reader.ros_version)
     }
 
 
@@ -199,7 +199,8 @@ def _time_form(type_name: str, ros_version: int) -> str:
     return "iI" if ros_version == 2 else "ii"
 
 
-def _is_missing(name: str, field: Field, ros_version: int) -> bool:
+def is_missing(name: str, field: Field, ros_version: int) -> bool:
+    """Whether this version of ROS does not have this field of the message `name`."""
     return ros_version == 2 and name == HEADER and field.name == "seq"
 
 
@@ -233,7 +234,7 @@ def _write(writer: _Writer, definition: MessageDefinition, name: str, message: M
     if not fields and writer.ros_version == 2:
         writer.number("B", 0)
     for field in fields:
-        if not _is_missing(name, field, writer.ros_version):
+        if not is_missing(name, field, writer.ros_version):
             _write_field(writer, definition, field, message.get(field.name))
 
 

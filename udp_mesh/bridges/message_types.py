@@ -7,7 +7,7 @@ the same name need not have the same fields. The md5sums that follow from these 
 
 from __future__ import annotations
 
-from typing import Dict
+from typing import Dict, Optional
 
 from udp_mesh.bridges.message_definition import MessageDefinition
 
@@ -36,8 +36,13 @@ _CLOUD = (
 )
 
 
+def contained(name: str, text: Optional[str] = None) -> str:
+    """A message inside another, as it follows the other's own fields. Without `text`: one that is known here."""
+    return "{}{}\n{}".format(_NEXT, name, _PARTS[name] if text is None else text)
+
+
 def _defined(name: str, text: str, *parts: str) -> MessageDefinition:
-    return MessageDefinition(name, text + "".join(_NEXT + part + "\n" + _PARTS[part] for part in parts))
+    return MessageDefinition(name, text + "".join(contained(part) for part in parts))
 
 
 TYPES: Dict[str, MessageDefinition] = {

@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.udp_mesh.bridges.ros1_processes import Master, Ros1Bridge, Ros1Node
 from tests.udp_mesh.daemon.processes import poll, two_daemons
+from udp_mesh.bridges.conditions_message import DEFINITION as CONDITIONS
 from udp_mesh.bridges.message_codec import decode as decode_message
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.protocol import TOPIC_SETTINGS, Definition, decode, encode
@@ -54,6 +55,12 @@ def test_a_real_ros_node_sends_and_receives_mesh_messages_of_known_and_unknown_t
         assert Definition(STRING, "string data\n") in [
             each._replace(text=each.text.rstrip() + "\n") for each in received if isinstance(each, Definition)
         ]
+        node.subscribe("/alice/mesh_conditions_typed", "*")
+        typed = node.expect("name", "/alice/mesh_conditions_typed")
+        assert (typed["type"], typed["md5sum"]) == (CONDITIONS.name, CONDITIONS.md5sum)
+        conditions = decode_message(CONDITIONS, bytes.fromhex(typed["hex"]), 1)
+        assert [(peer["name"], peer["online"]) for peer in conditions["peers"]] == [("bob", True)]
+        assert conditions["header"]["stamp"][0] > 0
         node.subscribe("/bob/mesh_comm/alice/status")
         client.publish("status", message.payload, to="alice", type=message.type)
         assert node.expect("data", "ready")["name"] == "/bob/mesh_comm/alice/status"

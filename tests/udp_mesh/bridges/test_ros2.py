@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -184,6 +185,13 @@ def test_a_best_effort_publisher_stays_one_on_the_other_robot(team: tuple[Side, 
             return next((message.type for message in client.messages(0.2)), None)
 
         assert poll(kind, "the type").startswith("std_msgs/msg/String best_effort:volatile:10:RIHS01_")
+
+
+def test_network_conditions_are_published_as_json(team: tuple[Side, Side]) -> None:
+    alice, _ = team
+    alice.node.subscribe("/alice/mesh_conditions")
+    conditions = json.loads(alice.node.expect("name", "/alice/mesh_conditions")["data"])
+    assert [(peer["name"], peer["online"]) for peer in conditions["peers"]] == [("bob", True)]
 
 
 def test_a_remapped_topic_is_sent_under_its_mesh_name(team: tuple[Side, Side]) -> None:

@@ -7,7 +7,6 @@ thread waits for the master, so that existing traffic continues while the master
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import threading
@@ -141,7 +140,7 @@ class Ros1Bridge:
         header = frame[0]
         event = header.get("event")
         if event == "conditions":
-            self._graph.publish_conditions(header["conditions"], json.dumps(header["conditions"], sort_keys=True))
+            self._graph.publish_conditions(header["conditions"])
         elif event == "peer-online":
             self._refresh_requested.set()
 

@@ -19,8 +19,8 @@ from typing import Any, Callable, Iterable, Mapping, NamedTuple, Sequence
 import rosgraph
 import roslib.message
 import rospy
-from std_msgs.msg import String
 
+from udp_mesh.bridges.conditions_message import to_ros
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.receiving import Receive, parse_receive
 from udp_mesh.bridges.relay import ToRos
@@ -109,9 +109,9 @@ class Graph:
         self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
         self._conditions: Mapping[str, Any] | None = None
+        self._prefix = prefix
         self._stats = rospy.Publisher(prefix + "mesh_status", legacy.NetworkStats, queue_size=1)
         self._hosts = rospy.Publisher(prefix + "hosts", legacy.HostEntry, queue_size=100)
-        self._text = rospy.Publisher(prefix + "mesh_conditions", String, queue_size=1)
         self._service = rospy.Service(prefix + "getHosts", legacy.GetHosts, self._get_hosts)
         self._settings = rospy.Subscriber(prefix + "mesh_settings", rospy.AnyMsg, self._settings_arrived, on_window)
 
@@ -194,13 +194,15 @@ class Graph:
             RosPublication(message.name, key, definition or "", message.latched, message.payload)
         )
 
-    def publish_conditions(self, conditions: Mapping[str, Any], text: str) -> None:
-        """Publishes the network conditions: as legacy messages, and as complete JSON (`text`)."""
+    def publish_conditions(self, conditions: Mapping[str, Any]) -> None:
+        """Publishes the network conditions: as legacy messages, as complete JSON, and typed."""
         self._conditions = conditions
         self._stats.publish(legacy.network_stats(conditions))
         for entry in legacy.host_entries(conditions):
             self._hosts.publish(entry)
-        self._text.publish(String(text))
+        now = rospy.Time.now()
+        for message in to_ros(conditions, self._prefix.rstrip("/"), 1, (now.secs, now.nsecs)):
+            self.publish(message)
 
     def _get_hosts(self, _request: object) -> Any:
         return legacy.hosts_response(self._conditions)
@@ -216,7 +218,7 @@ class Graph:
             return False
         uri = rospy.get_node_uri()
         ourselves = xmlrpc.client.ServerProxy(uri)
-        fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts, self._text)]
+        fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts)]
         reserved = [(name, opaque.type) for name, opaque in self._reserved.items()]
         for name, message_type in [*fixed, *self._publications.advertised(), *reserved]:
             master.registerPublisher(name, message_type, uri)

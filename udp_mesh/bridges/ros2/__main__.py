@@ -9,14 +9,16 @@ subscriptions.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import logging
 import os
 import sys
 import threading
 import time
 from collections import deque
-from typing import Any, Callable, Deque, Sequence
+from typing import Any, Callable, Deque, Mapping, Sequence
 
+from udp_mesh.bridges.conditions_message import PACKAGE, to_ros
 from udp_mesh.bridges.configuration import (
     EMPTY,
     BridgeConfiguration,
@@ -24,12 +26,12 @@ from udp_mesh.bridges.configuration import (
     TopicOptions,
     load_configuration,
 )
-from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, DaemonClient
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route, ros_word, routes
 from udp_mesh.bridges.position_input import PositionInput
-from udp_mesh.bridges.receiving import with_needed
+from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import MAX_DEPTH, Quality, common, parse_quality, quality_text, ros2_name
@@ -107,6 +109,7 @@ class Ros2Bridge:
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers: dict[str, tuple[TypeKey, Any]] = {}
         self._warned: set[str] = set()
+        self._has_conditions_package = importlib.util.find_spec(PACKAGE) is not None
         self._wake = node.create_guard_condition(self.publish_arrived)
         node.create_timer(REFRESH_S, self.refresh)
         positions = PositionInput(daemon, 2, odometry, tf_frames)
@@ -163,6 +166,18 @@ class Ros2Bridge:
         """Called by the daemon client for each frame."""
         self._runtime.on_frame(frame)
         self._calls.on_frame(frame)
+        if frame[0].get("event") == "conditions":
+            self._publish_conditions(frame[0]["conditions"])
+
+    def _publish_conditions(self, conditions: Mapping[str, Any]) -> None:
+        stamp = divmod(self._node.get_clock().now().nanoseconds, 1_000_000_000)
+        messages = to_ros(conditions, "/" + ros_word(self._own), 2, stamp)
+        self._arrived.extend(message for message in messages if self._has_package(message))
+        self._wake.trigger()
+
+    def _has_package(self, message: ToRos) -> bool:
+        """Whether rclpy can publish it: the package of the typed conditions is optional."""
+        return not message.key.name.startswith(PACKAGE) or self._has_conditions_package
 
     # The executor's thread
 
@@ -273,7 +288,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
     merged = [TF, TF_STATIC] if configuration.tf is not None and configuration.tf.merge else []
-    daemon = DaemonClient(options.socket, with_needed(configuration.receive, ["bridge/*", *merged]))
+    received = with_needed(configuration.receive, ["bridge/*", *merged])
+    daemon = DaemonClient(options.socket, [*received, Receive(CONDITIONS_TOPIC)])
     stop = threading.Event()
     rclpy.init(args=ros_arguments)
     try:
