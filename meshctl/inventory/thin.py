@@ -19,9 +19,10 @@ def _link(document: ThinLinkDocument) -> ThinLink:
         document.bits_per_s,
         document.band,
         document.baud,
-        document.frame_bytes,
+        document.framing.frame_bytes if document.frame_bytes is None else document.frame_bytes,
         document.frame_s,
         document.duty_cycle,
+        document.framing,
     )
 
 

@@ -31,10 +31,28 @@ class ThinBand(Enum):
         return 0.4 if self is ThinBand.US915 else None
 
 
+class ThinFraming(Enum):
+    """How frames are written to the serial port of a thin link's radio."""
+
+    COBS = "cobs"
+    XBEE = "xbee"
+    XBEE_ESCAPED = "xbee-escaped"
+
+    @property
+    def overhead_bytes(self) -> int:
+        """What a frame costs on the air besides its bytes: COBS and CRC; headers of an XBee at most."""
+        return 6 if self is ThinFraming.COBS else 60
+
+    @property
+    def frame_bytes(self) -> int:
+        """The usual largest frame."""
+        return 200 if self is ThinFraming.COBS else 72
+
+
 @dataclass(frozen=True, slots=True)
 class ThinLink:
     """The radio of one thin link, the same on all robots. A frame of n bytes is on the air for `frame_s` +
-    8 (n + `OVERHEAD_BYTES`) / `bits_per_s`."""
+    8 (n + `framing.overhead_bytes`) / `bits_per_s`."""
 
     bits_per_s: float
     band: ThinBand = ThinBand.NONE
@@ -42,6 +60,7 @@ class ThinLink:
     frame_bytes: int = 200
     frame_s: float = 0.0
     duty_cycle: float | None = None
+    framing: ThinFraming = ThinFraming.COBS
 
     @property
     def allowed_duty_cycle(self) -> float:
@@ -50,7 +69,7 @@ class ThinLink:
 
     def airtime_s(self, frame_bytes: int) -> float:
         """How long a frame occupies the channel."""
-        return self.frame_s + 8 * (frame_bytes + OVERHEAD_BYTES) / self.bits_per_s
+        return self.frame_s + 8 * (frame_bytes + self.framing.overhead_bytes) / self.bits_per_s
 
     @property
     def largest_frame_bytes(self) -> int:
@@ -58,7 +77,7 @@ class ThinLink:
         if self.band.dwell_s is None:
             return self.frame_bytes
         room = (self.band.dwell_s - self.frame_s) * self.bits_per_s / 8
-        return min(self.frame_bytes, int(room + 1e-9) - OVERHEAD_BYTES)
+        return min(self.frame_bytes, int(room + 1e-9) - self.framing.overhead_bytes)
 
     @property
     def largest_message_bytes(self) -> int:
@@ -66,9 +85,9 @@ class ThinLink:
         return MAX_PARTS * (self.largest_frame_bytes - PART_OVERHEAD_BYTES)
 
 
-OVERHEAD_BYTES = 6
-"""What the serial framing of udp_mesh adds to a frame."""
 MIN_FRAME_BYTES, MAX_FRAME_BYTES = 40, 255
+MAX_2400_MHZ_FRAME_BYTES = 100
+"""Payload that IEEE 802.15.4 leaves an XBee at 2.4 GHz (its NP); Zigbee and DigiMesh leave less."""
 MAX_PARTS = 32
 PART_OVERHEAD_BYTES = 17
 """Of a frame with one part of a message: header and tag 8, header of the part 9."""

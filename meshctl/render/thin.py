@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
-from meshctl.model import Fleet, ThinLink, Topic
+from meshctl.model import Fleet, ThinFraming, ThinLink, Topic
 from meshctl.model.thin import BURST_SHARE, MIN_FRAME_BYTES, URGENT_SHARE, WINDOW_S
 
 # Speeds that Linux knows by name (termios.h), which the daemon accepts.
@@ -60,6 +60,8 @@ def thin_lines(fleet: Fleet, robot: str) -> Iterator[str]:
         link = fleet.udp_mesh.thin_links[name]
         yield from ("", "[[thin.links]]", f"name = {json.dumps(name)}", f"device = {json.dumps(device)}")
         yield f"baud = {link.baud}"
+        if link.framing is not ThinFraming.COBS:
+            yield f'framing = "{link.framing.value}"'
         yield f"bits_per_s = {float(link.bits_per_s)!r}"
         yield f"frame_bytes = {link.frame_bytes}"
         yield f"frame_s = {float(link.frame_s)!r}"

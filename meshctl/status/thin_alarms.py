@@ -16,6 +16,9 @@ def thin_alarms(facts: RobotFacts) -> Iterator[Alarm]:
         return
     for name, reason in _items(thin.get("failures")):
         yield Alarm(Level.ERROR, "thin-link", f"thin link {name} is down: {reason}", "check the radio and its port")
+    for name, reason in _items(thin.get("refusals")):
+        text = f"the radio of thin link {name} refuses frames: {reason}"
+        yield Alarm(Level.WARNING, "thin-link", text, "check the radio's settings, and frame_bytes of the link")
     for link in _objects(thin.get("links")):
         if link.get("rejecting_s") is not None:
             text = f"thin link {link.get('name')} accepts nothing: too many frames were forged"

@@ -179,7 +179,9 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
         "conditions": conditions_json(driver.conditions()),
         "relaying": relaying_json(driver.node.relaying(driver.now())),
-        "thin": thin_json(driver.node.thin_conditions(driver.now()), service.thin_ports.failures),
+        "thin": thin_json(
+            driver.node.thin_conditions(driver.now()), service.thin_ports.failures, service.thin_ports.refusals
+        ),
         "positions": service.positions.json(),
     }
 

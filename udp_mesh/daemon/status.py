@@ -145,13 +145,16 @@ def relaying_json(relaying: RelayConditions) -> Json:
     return fields
 
 
-def thin_json(thin: ThinConditions | None, failures: Mapping[str, str]) -> Json | None:
-    """Thin links as this node sees them (None: it has none); `failures` says why ports are not open."""
+def thin_json(
+    thin: ThinConditions | None, failures: Mapping[str, str], refusals: Mapping[str, str] | None = None
+) -> Json | None:
+    """Thin links as this node sees them (None: it has none); `failures` says why ports are not open, `refusals` why
+    radios do not send."""
     if thin is None:
         return None
     fields = plain(thin)
     assert isinstance(fields, dict)
-    return {**fields, "failures": dict(failures)}
+    return {**fields, "failures": dict(failures), "refusals": dict(refusals or {})}
 
 
 @dataclasses.dataclass(slots=True)

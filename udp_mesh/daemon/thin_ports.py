@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.daemon.driver import Driver
 from udp_mesh.links.serial_port import SerialPort, SerialPortConfig
-from udp_mesh.wire.serial_framing import LineDecoder, encode_line
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +26,8 @@ class ThinPorts:
         self._retry_timer: asyncio.TimerHandle | None = None
         self.failures: dict[str, str] = {}
         """Why ports are not open, by link."""
+        self.refusals: dict[str, str] = {}
+        """Why radios do not send what they get, by link."""
         self._register()
 
     def _register(self) -> None:
@@ -63,11 +64,6 @@ class ThinPorts:
         for name in list(self._ports):
             self._close(name)
 
-    @property
-    def damaged(self) -> int:
-        """Frames that arrived damaged."""
-        return sum(port.decoder.damaged for port in self._ports.values())
-
     def _set_up(self, link: str, up: bool) -> None:
         """The port was opened or is gone: the core needs to know."""
         if self._thin is not None:
@@ -76,7 +72,7 @@ class ThinPorts:
 
     def _open(self, config: SerialPortConfig) -> None:
         try:
-            port = SerialPort(config, encode_line, LineDecoder())
+            port = SerialPort(config)
         except OSError as error:
             self._failed(config.link, error)
             return
@@ -94,6 +90,7 @@ class ThinPorts:
 
     def _close(self, link: str) -> None:
         port = self._ports.pop(link)
+        self.refusals.pop(link, None)
         self._loop.remove_reader(port.fileno())
         self._loop.remove_writer(port.fileno())
         port.close()
@@ -111,8 +108,19 @@ class ThinPorts:
         except OSError as error:
             self._gone(link, error)
             return
+        self._note_refusal(link, self._ports[link].decoder.refusal)
         if frames:
             self._driver.receive_frames(link, frames)
+
+    def _note_refusal(self, link: str, refusal: str | None) -> None:
+        if refusal == self.refusals.get(link):
+            return
+        if refusal is None:
+            del self.refusals[link]
+            log.info("thin-link-radio-sends link=%s", link)
+        else:
+            self.refusals[link] = refusal
+            log.warning("thin-link-radio-refuses link=%s reason=%s", link, refusal)
 
     def _transmit(self, link: str, datagrams: Sequence[Datagram]) -> None:
         port = self._ports.get(link)

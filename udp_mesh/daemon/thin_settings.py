@@ -11,8 +11,8 @@ from udp_mesh.core.thin.settings import (
 )
 from udp_mesh.daemon.toml_source import Table
 from udp_mesh.links.serial_port import BAUD_RATES, SerialPortConfig
+from udp_mesh.wire.framings import FRAMINGS, TRANSPARENT
 from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES, MAX_THIN_NUMBER
-from udp_mesh.wire.serial_framing import FRAMING_BYTES
 
 BITS_PER_CHARACTER = 10
 """On a serial line: start bit, eight data bits, stop bit."""
@@ -43,8 +43,10 @@ def _read_link(table: Table) -> tuple[ThinLinkSettings, SerialPortConfig]:
     name = table.text("name", "thin") or ""
     baud = table.integer("baud", 57_600, 1, 10_000_000) or 57_600
     bits_per_s = table.number("bits_per_s", None, 10.0, MAX_BITS_PER_S)
-    frame_bytes = table.integer("frame_bytes", default.frame_bytes, MIN_FRAME_BYTES, MAX_THIN_FRAME_BYTES)
-    overhead_bytes = table.integer("frame_overhead_bytes", FRAMING_BYTES, 0, 1000)
+    framing = table.choice("framing", TRANSPARENT, FRAMINGS)
+    usual = FRAMINGS[framing]
+    frame_bytes = table.integer("frame_bytes", usual.frame_bytes, MIN_FRAME_BYTES, MAX_THIN_FRAME_BYTES)
+    overhead_bytes = table.integer("frame_overhead_bytes", usual.overhead_bytes, 0, 1000)
     frame_s = table.number("frame_s", default.frame_s, 0.0, 10.0)
     duty_cycle = table.number("duty_cycle", default.duty_cycle, 1e-5, 1.0)
     window_s = table.number("window_s", default.window_s, 1.0, 86_400.0)
@@ -54,15 +56,17 @@ def _read_link(table: Table) -> tuple[ThinLinkSettings, SerialPortConfig]:
         table.source.report((*table.path, "device"), "a serial port (/dev/serial/by-id/...)", "none")
     if baud not in BAUD_RATES:
         table.report("baud", "a speed that the kernel knows (9600, 57600, 115200)", baud)
+    if framing != TRANSPARENT and bits_per_s is None:
+        table.source.report((*table.path, "bits_per_s"), "the radio's rate on the air", "none")
     # Without a radio behind it, the line itself is the channel.
     rate = baud * 8 / BITS_PER_CHARACTER if bits_per_s is None else bits_per_s
-    config = SerialPortConfig(name, device or "", baud)
+    config = SerialPortConfig(name, device or "", baud, framing)
     try:
         link = ThinLinkSettings(
             name,
             rate,
-            frame_bytes or default.frame_bytes,
-            FRAMING_BYTES if overhead_bytes is None else overhead_bytes,
+            frame_bytes or usual.frame_bytes,
+            usual.overhead_bytes if overhead_bytes is None else overhead_bytes,
             frame_s or 0.0,
             duty_cycle or default.duty_cycle,
             window_s or default.window_s,

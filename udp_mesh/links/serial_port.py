@@ -12,34 +12,22 @@ import os
 import termios
 import tty
 from dataclasses import dataclass
-from typing import Protocol
+
+from udp_mesh.wire.framings import FRAMINGS, TRANSPARENT
 
 READ_BYTES = 4096
 MAX_WAITING_BYTES = 4096
 """Bytes that the kernel does not take are kept up to this; a device that takes nothing then loses frames."""
 
 
-class FrameDecoder(Protocol):
-    """Bytes of a line -> frames."""
-
-    damaged: int
-
-    def feed(self, data: bytes) -> list[bytes]: ...
-
-
-class FrameEncoder(Protocol):
-    """A frame -> bytes of a line."""
-
-    def __call__(self, frame: bytes) -> bytes: ...
-
-
 @dataclass(frozen=True, slots=True)
 class SerialPortConfig:
-    """One port: the thin link's name, the device, and its speed in baud."""
+    """One port: the thin link's name, the device, its speed in baud, and how frames are written to it."""
 
     link: str
     device: str
     baud: int
+    framing: str = TRANSPARENT
 
 
 BAUD_RATES = {int(name[1:]): getattr(termios, name) for name in dir(termios) if name[:1] == "B" and name[1:].isdigit()}
@@ -49,10 +37,11 @@ BAUD_RATES = {int(name[1:]): getattr(termios, name) for name in dir(termios) if 
 class SerialPort:
     """An open port."""
 
-    def __init__(self, config: SerialPortConfig, encode: FrameEncoder, decoder: FrameDecoder) -> None:
+    def __init__(self, config: SerialPortConfig) -> None:
         """Opens the device for this process alone. Raises OSError."""
         self.config = config
-        self._encode, self.decoder = encode, decoder
+        framing = FRAMINGS[config.framing]
+        self._encode, self.decoder = framing.encode, framing.decoder()
         self._waiting = bytearray()
         self.frames_lost = 0
         self._descriptor = os.open(config.device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)

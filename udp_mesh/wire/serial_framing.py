@@ -67,6 +67,8 @@ class LineDecoder:
         self._unfinished = bytearray()
         self._overlong = False
         self.damaged = 0
+        self.refusal: str | None = None
+        """A transparent radio does not say what becomes of a frame."""
 
     def feed(self, data: bytes) -> list[bytes]:
         """The frames that end in these bytes."""

@@ -1,4 +1,4 @@
-"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC776)."""
+"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC777)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
-from meshctl.model import Fleet, ThinLink, Topic
-from meshctl.model.thin import BURST_SHARE, PART_OVERHEAD_BYTES
+from meshctl.model import Fleet, ThinBand, ThinFraming, ThinLink, Topic
+from meshctl.model.thin import BURST_SHARE, MAX_2400_MHZ_FRAME_BYTES, PART_OVERHEAD_BYTES
 from meshctl.render.thin import frame_problems
 
 # Of a presence with some heard nodes; an acknowledgment in a frame of its own.
@@ -184,3 +184,25 @@ def topic_beyond_thin_links(fleet: Fleet, _context: LintContext) -> Iterator[Fin
                 path = ("topics", topic.name, "size_bytes")
                 expected = f"at most {_limit(topic, link)} B"
                 yield Finding(path, f"too large for {name}", expected, f"{topic.size_bytes} B")
+
+
+@fleet_rule(
+    "MC777",
+    Severity.WARNING,
+    "Frames of a thin link are larger than its XBee radios take",
+    why="""An XBee refuses payloads above its NP: 100 B at 2.4 GHz, 84 B with Zigbee, 73 B with DigiMesh, 256 B in some
+    radios below 1 GHz. Broadcasts are not split. Short frames pass, so the link looks alive, and every longer message
+    is lost.""",
+    fix="Read NP with XCTU and set `frame_bytes` to it, or set the `band` of a radio below 1 GHz.",
+    failing="udp_mesh: {thin_links: {xbee: {framing: xbee, bits_per_s: 250000, frame_bytes: 200}}}",
+    passing="udp_mesh: {thin_links: {xbee: {framing: xbee, bits_per_s: 250000}}}",
+)
+def frame_beyond_xbee(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name, link in fleet.udp_mesh.thin_links.items():
+        # The bands that are known are those below 1 GHz.
+        if link.framing is ThinFraming.COBS or link.band is not ThinBand.NONE:
+            continue
+        if link.frame_bytes > MAX_2400_MHZ_FRAME_BYTES:
+            path = ("udp_mesh", "thin_links", name, "frame_bytes")
+            expected = f"the radio's NP, at most {MAX_2400_MHZ_FRAME_BYTES} B at 2.4 GHz"
+            yield Finding(path, "an XBee refuses larger payloads", expected, f"{link.frame_bytes} B")

@@ -1,4 +1,4 @@
-"""Findings about thin links stand at the entry in question (MC771 to MC776)."""
+"""Findings about thin links stand at the entry in question (MC771 to MC777)."""
 
 from __future__ import annotations
 
@@ -57,6 +57,18 @@ def _thin(found: list[Diagnostic]) -> list[tuple[str, str, str]]:
             f"udp_mesh: {{thin_links: {{{LORA}}}}}\n"
             "topics: {pose: {priority: 8, rate_hz: 1, size_bytes: 40, thin: true}}",
             [("MC775", "udp_mesh.thin_links.lora", "15 %")],
+        ),
+        (
+            "udp_mesh: {thin_links: {x: {framing: xbee-escaped, bits_per_s: 250000, frame_bytes: 101}}}",
+            [("MC777", "udp_mesh.thin_links.x.frame_bytes", "101 B")],
+        ),
+        (
+            "udp_mesh: {thin_links: {x: {framing: xbee, bits_per_s: 10000, band: us915, frame_bytes: 255}}}",
+            [],
+        ),
+        (
+            "udp_mesh: {thin_links: {x: {framing: xbee, bits_per_s: 250000}, cable: {bits_per_s: 46080}}}",
+            [],
         ),
         (
             f"udp_mesh: {{thin_links: {{{LORA}}}}}\n"

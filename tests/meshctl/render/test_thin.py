@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.diagnostics import InvalidInput
-from meshctl.model import Fleet, ThinBand, ThinLink, ThinPorts, Topic, TopicClass
+from meshctl.model import Fleet, ThinBand, ThinFraming, ThinLink, ThinPorts, Topic, TopicClass
 from meshctl.model import thin as model
 from meshctl.render.daemon import daemon_config
 from meshctl.render.thin import BAUD_RATES, frame_problems
@@ -16,13 +16,14 @@ from tests.meshctl.render.test_daemon import fleet, loaded
 from udp_mesh.core.thin import settings as core
 from udp_mesh.links import serial_port
 from udp_mesh.links.serial_port import SerialPortConfig
-from udp_mesh.wire import limits, serial_framing
+from udp_mesh.wire import framings, limits
 from udp_mesh.wire import thin as wire
 
 ESTOP = Topic("estop", 0, TopicClass.EMERGENCY_STOP, thin=True)
 POSE = Topic("pose", 9, thin=True, thin_links=("lora",), thin_period_s=60.0)
 LORA = ThinLink(5470.0, ThinBand.EU868, 57_600, 120, 0.0125)
 HOPPING = ThinLink(5470.0, ThinBand.US915, frame_bytes=255)
+XBEE = ThinLink(10_000.0, ThinBand.EU869, frame_bytes=240, framing=ThinFraming.XBEE_ESCAPED)
 
 
 def thin(*topics: Topic, ports: dict[str, str], **links: ThinLink) -> Fleet:
@@ -32,16 +33,18 @@ def thin(*topics: Topic, ports: dict[str, str], **links: ThinLink) -> Fleet:
 
 
 def test_a_robots_ports_and_the_bands_limits_reach_its_daemon(tmp_path: Path) -> None:
-    source = thin(ESTOP, POSE, ports={"lora": "/dev/ttyUSB0", "far": "/dev/ttyUSB1"}, lora=LORA, far=HOPPING)
+    ports = {"lora": "/dev/ttyUSB0", "far": "/dev/ttyUSB1", "x": "/dev/x"}
+    source = thin(ESTOP, POSE, ports=ports, lora=LORA, far=HOPPING, x=XBEE)
     configuration = loaded(source, "uav", tmp_path)
     settings = configuration.settings.thin
     assert (settings.number, settings.presence_s) == (3, 30.0)
-    lora, far = settings.links
+    lora, far, _ = settings.links
     assert (lora.duty_cycle, lora.max_airtime_s, lora.frame_bytes) == (0.01, None, 120)
     assert (far.duty_cycle, far.max_airtime_s) == (1.0, 0.4)
     assert configuration.thin_ports == (
         SerialPortConfig("lora", "/dev/ttyUSB0", 57_600),
         SerialPortConfig("far", "/dev/ttyUSB1", 57_600),
+        SerialPortConfig("x", "/dev/x", 57_600, "xbee-escaped"),
     )
     topics = {topic.name: topic for topic in configuration.settings.topics}
     assert (topics["estop"].thin, topics["estop"].links) == (True, ())
@@ -78,7 +81,7 @@ def test_a_port_of_an_unknown_link_is_refused() -> None:
         daemon_config(thin(ESTOP, ports={"xbee": "/dev/ttyUSB0"}, lora=LORA), "uav")
 
 
-@pytest.mark.parametrize("link", [LORA, HOPPING, replace(LORA, bits_per_s=1000.0, frame_bytes=60)])
+@pytest.mark.parametrize("link", [LORA, HOPPING, XBEE, replace(LORA, bits_per_s=1000.0, frame_bytes=60)])
 def test_both_compute_the_same(link: ThinLink, tmp_path: Path) -> None:
     assert list(frame_problems(link)) == []
     [own] = loaded(thin(ESTOP, ports={"lora": "/dev/x"}, lora=link), "uav", tmp_path).settings.thin.links
@@ -87,9 +90,18 @@ def test_both_compute_the_same(link: ThinLink, tmp_path: Path) -> None:
 
 
 def test_the_constants_are_those_of_the_transport() -> None:
-    assert model.OVERHEAD_BYTES == serial_framing.FRAMING_BYTES
+    assert {framing.value for framing in ThinFraming} == set(framings.FRAMINGS)
+    for framing in ThinFraming:
+        own = framings.FRAMINGS[framing.value]
+        assert (framing.overhead_bytes, framing.frame_bytes) == (own.overhead_bytes, own.frame_bytes)
     assert (model.MIN_FRAME_BYTES, model.MAX_FRAME_BYTES) == (core.MIN_FRAME_BYTES, limits.MAX_THIN_FRAME_BYTES)
     assert model.MAX_PARTS == limits.MAX_THIN_PARTS
     assert model.PART_OVERHEAD_BYTES == wire.THIN_OVERHEAD_BYTES + wire.PART_BYTES
     assert (model.BURST_SHARE, model.URGENT_SHARE) == (core.BURST_SHARE, core.URGENT_SHARE)
     assert set(BAUD_RATES) <= set(serial_port.BAUD_RATES)
+
+
+def test_a_link_without_a_framing_has_no_key_that_earlier_daemons_reject() -> None:
+    ports = {"lora": "/dev/ttyUSB0", "x": "/dev/x"}
+    text = daemon_config(thin(ESTOP, ports=ports, lora=LORA, x=XBEE), "uav").decode()
+    assert text.count("framing = ") == text.count('framing = "xbee-escaped"') == 1

@@ -25,7 +25,7 @@ def conditions() -> ThinConditions:
 
 
 def fields(conditions: ThinConditions, **failures: str) -> dict[str, Any]:
-    found = thin_json(conditions, failures)
+    found = thin_json(conditions, failures, {"xbee": "the channel is busy"} if failures else {})
     assert found is not None
     return found
 
@@ -51,10 +51,17 @@ def test_each_alarm_says_what_is_wrong_and_what_to_do(conditions: ThinConditions
         own_number_used_by="uav",
     )
     found = alarms(fields(wrong, lora="/dev/ttyUSB0: No such file or directory"))
-    assert len(found) == 5
+    assert len(found) == 6
     for text, expected in zip(
         found,
-        ("lora FAILED: /dev/ttyUSB0", "REJECTS EVERYTHING", "USED ITS AIRTIME", "ALSO USED BY uav", "spot and husky"),
+        (
+            "lora FAILED: /dev/ttyUSB0",
+            "xbee: the RADIO REFUSES frames: the channel is busy",
+            "REJECTS EVERYTHING",
+            "USED ITS AIRTIME",
+            "ALSO USED BY uav",
+            "spot and husky",
+        ),
         strict=True,
     ):
         assert expected in text

@@ -21,7 +21,7 @@ from tests.udp_mesh.core.pair import Pair, pair, settings
 from tests.udp_mesh.core.thin.fleet import RADIO, ThinFleet
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
 from tests.udp_mesh.wire.subscription_vectors import SUBSCRIPTIONS
-from tests.udp_mesh.wire.thin_vectors import ITEMS
+from tests.udp_mesh.wire.thin_vectors import ITEMS, thin_frame_vectors
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour
 from udp_mesh.core.subscriptions.messages import decode_message, encode_ask, encode_table
 from udp_mesh.core.subscriptions.table import KnownTable
@@ -31,14 +31,17 @@ from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.legacy import encode_legacy, encode_mesh_data, fragment_legacy
-from udp_mesh.wire.limits import MAX_THIN_NUMBER
+from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES, MAX_THIN_NUMBER
 from udp_mesh.wire.thin import encode_item
+from udp_mesh.wire.xbee import XBeeDecoder
 
 RECORD = Path("build/fuzz.jsonl")
 CHUNK_INPUTS = 250_000
 FRESH_PAIR_EVERY = 20_000
 """Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
 TIMERS_EVERY = 200
+MAX_API_LINE_BYTES = 2 * (3 + 18 + 256)
+"""An unfinished API frame of an XBee, each of its bytes escaped."""
 MAX_PARTIAL_BYTES, MAX_PEERS, MAX_STRANGERS = 2_000_000, 64, 16
 
 LEGACY_ADDRESS = ("10.0.0.9", 8700)
@@ -57,6 +60,11 @@ class Fuzzer:
         self.legacy_seeds += fragment_legacy(encode_mesh_data(MESH_DATA))
         self.subscription_seeds = [
             encode_ask() if table is None else encode_table(table) for table in SUBSCRIPTIONS.values()
+        ]
+        vectors = [(XBeeDecoder(escaped=False), "xbee"), (XBeeDecoder(escaped=True), "xbee_escaped")]
+        self.xbee = [
+            (decoder, [bytes.fromhex(line) for frame in thin_frame_vectors() for line in frame[key].values()])
+            for decoder, key in vectors
         ]
         self.pair = self._new_pair()
         self.thin = self._new_thin()
@@ -221,6 +229,15 @@ def sealed_thin(fuzzer: Fuzzer) -> None:
     fuzzer.receive_thin(sender._seal(composed, fuzzer.thin.now))
 
 
+def xbee_lines(fuzzer: Fuzzer) -> None:
+    """Lines from a radio modified on their way, and noise, at decoders that continue from what came before."""
+    bits = fuzzer.rng.getrandbits(24)
+    decoder, seeds = fuzzer.xbee[bits & 1]
+    data = fuzzer.mutated(seeds[(bits >> 1) % len(seeds)]) if bits & 0x30000 else fuzzer.rng.randbytes(bits >> 2 & 0xFF)
+    assert all(0 < len(frame) <= MAX_THIN_FRAME_BYTES for frame in decoder.feed(data))
+    assert len(decoder._unfinished) <= MAX_API_LINE_BYTES
+
+
 SURFACES = {
     surface.__name__: surface
     for surface in (
@@ -233,6 +250,7 @@ SURFACES = {
         subscriptions,
         thin_frames,
         sealed_thin,
+        xbee_lines,
     )
 }
 

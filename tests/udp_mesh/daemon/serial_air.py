@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
-class _Port:
+class Port:
     master: int
     slave: int
     device: str
@@ -30,15 +30,19 @@ class _Port:
 
 @dataclass(slots=True)
 class _Transmission:
-    port: _Port
+    port: Port
     starts: float
     ends: float
-    line: bytes
+    frame: bytes
     delivered: bool = False
 
 
 class SerialAir:
-    """`count` ports; `devices` are the paths for the daemons. `cut` has the ports that are out of range."""
+    """`count` ports; `devices` are the paths for the daemons. `cut` has the ports that are out of range. The radios
+    pass bytes through."""
+
+    overhead_bytes = 0
+    """What they add to a frame on the air."""
 
     def __init__(self, count: int, *, bits_per_s: float, loss: float = 0.0, seed: int = 1) -> None:
         self.bits_per_s, self.loss = bits_per_s, loss
@@ -52,12 +56,12 @@ class SerialAir:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     @staticmethod
-    def _open() -> _Port:
+    def _open() -> Port:
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
         # The slave stays open here: a master without one reads EIO.
-        return _Port(master, slave, os.ttyname(slave))
+        return Port(master, slave, os.ttyname(slave))
 
     def airtimes(self, port: int) -> list[tuple[float, float]]:
         """When each frame of this port began, and how long it occupied the channel."""
@@ -86,19 +90,28 @@ class SerialAir:
                     self._read(key.data)
                 self._deliver(time.monotonic())
 
-    def _read(self, port: _Port) -> None:
+    def _read(self, port: Port) -> None:
         try:
             port.line += os.read(port.master, 4096)
         except BlockingIOError:
             return
+        for frame in self._taken(port):
+            starts = max(time.monotonic(), port.sends_until)
+            airtime_s = 8 * (len(frame) + self.overhead_bytes) / self.bits_per_s
+            port.sends_until = starts + airtime_s
+            port.sent_s.append((starts, airtime_s))
+            self._transmissions.append(_Transmission(port, starts, starts + airtime_s, frame))
+
+    def _taken(self, port: Port) -> Iterator[bytes]:
+        """The frames that the radio now has completely; they leave `port.line`."""
         while (end := port.line.find(b"\0", 1)) > 0:
             line, port.line = bytes(port.line[: end + 1]), port.line[end + 1 :]
             if line.strip(b"\0"):
-                starts = max(time.monotonic(), port.sends_until)
-                airtime_s = 8 * len(line) / self.bits_per_s
-                port.sends_until = starts + airtime_s
-                port.sent_s.append((starts, airtime_s))
-                self._transmissions.append(_Transmission(port, starts, starts + airtime_s, line))
+                yield line
+
+    def _written(self, frame: bytes) -> bytes:
+        """What a radio that received the frame writes to its port."""
+        return frame
 
     def _deliver(self, now: float) -> None:
         for one in self._transmissions:
@@ -115,7 +128,7 @@ class SerialAir:
                     self.lost += 1
                 else:
                     self.delivered += 1
-                    os.write(port.master, one.line)
+                    os.write(port.master, self._written(one.frame))
         # Those that ended stay for a while: they overlap with some that end later.
         self._transmissions = [one for one in self._transmissions if one.ends > now - 5.0]
 
@@ -125,8 +138,7 @@ def _overlap(a: _Transmission, b: _Transmission) -> bool:
 
 
 @contextmanager
-def serial_air(count: int, *, bits_per_s: float, loss: float = 0.0) -> Iterator[SerialAir]:
-    air = SerialAir(count, bits_per_s=bits_per_s, loss=loss)
+def running(air: SerialAir) -> Iterator[SerialAir]:
     air.start()
     try:
         yield air

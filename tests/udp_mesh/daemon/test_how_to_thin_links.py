@@ -11,12 +11,14 @@ import sys
 import tempfile
 from pathlib import Path
 
+import pytest
+
 from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, collect, poll
-from tests.udp_mesh.daemon.serial_air import serial_air
+from tests.udp_mesh.daemon.serial_air import SerialAir, running
+from tests.udp_mesh.daemon.xbee_air import XBeeAir
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
 
 GUIDE = Path(__file__).parents[3] / "docs" / "how-to" / "thin-links.md"
-DEVICE = "/dev/serial/by-id/usb-lora"
 
 
 def udp_mesh(daemon: RunningDaemon, *words: str) -> str:
@@ -25,21 +27,24 @@ def udp_mesh(daemon: RunningDaemon, *words: str) -> str:
     return done.stdout
 
 
-def test_the_configuration_of_the_guide_carries_a_stop_to_a_robot_without_wifi() -> None:
+@pytest.mark.parametrize("xbee", [False, True], ids=["transparent radios", "XBees"])
+def test_the_configuration_of_the_guide_carries_a_stop_to_a_robot_without_wifi(xbee: bool) -> None:
     text = GUIDE.read_text(encoding="utf-8")
-    [block] = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    block, link = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    if xbee:
+        block = block[: block.index("[[thin.links]]")] + link
     [rate] = re.findall(r"^bits_per_s = (\d+)", block, re.MULTILINE)
+    [device] = re.findall(r'^device = "(.*)"', block, re.MULTILINE)
+    [duty_cycle] = re.findall(r"^duty_cycle = [\d.]+", block, re.MULTILINE)
     [publish] = re.findall(r"^\$ udp-mesh (pub .*)$", text, re.MULTILINE)
-    with (
-        tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
-        serial_air(2, bits_per_s=float(rate)) as air,
-    ):
+    radios = XBeeAir(2, bits_per_s=float(rate), escaped=True) if xbee else SerialAir(2, bits_per_s=float(rate))
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, running(radios) as air:
         folder, port = Path(path), free_port()
         (folder / "fleet.key").write_text(KEY)
         daemons = []
         for number, name in enumerate(("base", "husky1"), 1):
             own = block.replace('"base"', f'"{name}"').replace("number = 1", f"number = {number}")
-            own = own.replace(DEVICE, air.devices[number - 1]).replace("duty_cycle = 0.01", "duty_cycle = 0.5")
+            own = own.replace(device, air.devices[number - 1]).replace(duty_cycle, "duty_cycle = 0.5")
             # No wifi: a link without other nodes.
             alone = f'\n[[links]]\naddress = "127.0.3.{number}"\nkind = "neighbours"\n'
             more = f'[daemon]\nsocket = "{folder / name}.sock"\nstate_directory = "{folder / name}"\n'

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, collect, configuration, outcomes, poll, wait_online
-from tests.udp_mesh.daemon.serial_air import SerialAir, serial_air
+from tests.udp_mesh.daemon.serial_air import SerialAir, running
 from tests.udp_mesh.links.sockets import free_port
 from udp_mesh.cli.views import status_view
 from udp_mesh.daemon.configuration import read
@@ -24,7 +24,7 @@ report = { priority = 8, thin = true }
 """
 
 
-def thin(number: int, device: str) -> str:
+def thin(number: int, device: str, more: str = "") -> str:
     return f"""
 [thin]
 number = {number}
@@ -34,21 +34,23 @@ name = "radio"
 device = "{device}"
 bits_per_s = {BITS_PER_S}
 frame_bytes = 100
-"""
+{more}"""
 
 
 @contextmanager
-def team(names: tuple[str, ...], *, loss: float = 0.0) -> Iterator[tuple[SerialAir, list[RunningDaemon]]]:
-    """Daemons on one channel, not started yet; they also have datagrams."""
+def team(
+    names: tuple[str, ...], *, loss: float = 0.0, radios: SerialAir | None = None, more: str = ""
+) -> Iterator[tuple[SerialAir, list[RunningDaemon]]]:
+    """Daemons on one channel, not started yet; they also have datagrams. `more` are keys of the thin link."""
     with (
         tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
-        serial_air(len(names), bits_per_s=BITS_PER_S, loss=loss) as air,
+        running(radios or SerialAir(len(names), bits_per_s=BITS_PER_S, loss=loss)) as air,
     ):
         port, numbers = free_port(), range(1, len(names) + 1)
         daemons = []
         for number, name in enumerate(names, 1):
             others = [other for other in numbers if other != number]
-            links = thin(number, air.devices[number - 1])
+            links = thin(number, air.devices[number - 1], more)
             text = configuration(Path(path), name, number, others, port, topics=TOPICS, rates=links + RATES)
             daemons.append(RunningDaemon(Path(path), name, text))
         try:
@@ -178,6 +180,14 @@ def test_a_reload_opens_another_port() -> None:
         (
             '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nbaud = 1234\n',
             "expected a speed that the kernel knows",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "xbee"\n',
+            "thin.links.0.bits_per_s: expected the radio's rate on the air",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "slip"\n',
+            'expected "cobs" or "xbee" or "xbee-escaped"',
         ),
         (
             '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nbits_per_s = 1000\nduty_cycle = 0.001\n',

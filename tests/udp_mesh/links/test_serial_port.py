@@ -27,7 +27,7 @@ def line() -> Iterator[tuple[int, str]]:
 
 
 def port(device: str) -> SerialPort:
-    return SerialPort(SerialPortConfig("radio", device, 57_600), encode_line, LineDecoder())
+    return SerialPort(SerialPortConfig("radio", device, 57_600))
 
 
 def test_frames_pass_in_both_directions(line: tuple[int, str]) -> None:
@@ -79,9 +79,13 @@ def test_a_device_that_goes_away_is_an_error(line: tuple[int, str]) -> None:
 def test_what_is_no_serial_port_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     before = len(os.listdir("/proc/self/fd"))
-    for name in ("file", "missing"):
-        with pytest.raises(OSError):
-            port(str(tmp_path / name))
+    for name, reason in (
+        (tmp_path / "file", "not a serial port"),
+        (tmp_path / "missing", "No such file"),
+        (Path("/dev/null"), "not a serial port"),
+    ):
+        with pytest.raises(OSError, match=f"{reason}.*{name}"):
+            port(str(name))
     assert len(os.listdir("/proc/self/fd")) == before
 
 

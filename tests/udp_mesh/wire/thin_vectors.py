@@ -1,6 +1,11 @@
-"""Vectors of thin links: items, sealed frames, and the bytes of a serial line."""
+"""Vectors of thin links: items, sealed frames, and the bytes of serial lines."""
 
 from __future__ import annotations
+
+from typing import Any
+
+from digi.xbee.models.address import XBee16BitAddress, XBee64BitAddress
+from digi.xbee.packets.common import ReceivePacket
 
 from udp_mesh.crypto import Key
 from udp_mesh.crypto.thin import ThinChannel, thin_hint
@@ -17,6 +22,7 @@ from udp_mesh.wire.thin import (
     encode_item,
     topic_hash,
 )
+from udp_mesh.wire.xbee import encode_transmit_request
 
 THIN_KEY = Key(bytes(range(32)))
 BOOT_TAG = bytes(range(8))
@@ -45,11 +51,22 @@ def _plain(value: object) -> object:
     return value
 
 
-def make_thin() -> object:
-    """Everything that another implementation needs to check itself."""
+def _xbee_lines(frame: bytes, *, escaped: bool) -> dict[str, str]:
+    """The line to the sender's radio, and the one from a receiver's, which adds the sender's address. Digi's library
+    checks both (test_xbee.py)."""
+    address = XBee64BitAddress.from_hex_string("0013A20040A1B2C3")
+    packet = ReceivePacket(address, XBee16BitAddress.UNKNOWN_ADDRESS, 0x02, bytearray(frame))
+    return {
+        "transmit_request": encode_transmit_request(frame, escaped=escaped).hex(),
+        "receive_packet": bytes(packet.output(escaped=escaped)).hex(),
+    }
+
+
+def thin_frame_vectors() -> list[dict[str, Any]]:
+    """Sealed frames of one boot, and their lines."""
     channel = ThinChannel(THIN_KEY, BOOT_TAG, 3)
     items = b"".join(encode_item(ITEMS[name]) for name in ("presence of a node that hears two", "a message to all"))
-    frames = []
+    frames: list[dict[str, Any]] = []
     for counter, tag in ((0x00010002, BOOT_TAG), (0x00010003, None)):
         header = encode_header(thin_hint(THIN_KEY), 3, counter, tag)
         frame = channel.seal(header, items, counter)
@@ -62,8 +79,15 @@ def make_thin() -> object:
                 "items": items.hex(),
                 "frame": frame.hex(),
                 "serial_line": encode_line(frame).hex(),
+                "xbee": _xbee_lines(frame, escaped=False),
+                "xbee_escaped": _xbee_lines(frame, escaped=True),
             }
         )
+    return frames
+
+
+def make_thin() -> object:
+    """Everything that another implementation needs to check itself."""
     return {
         "items": {
             name: {"kind": type(item).__name__, "item": _plain(item), "hex": encode_item(item).hex()}
@@ -73,5 +97,5 @@ def make_thin() -> object:
         "topics": {name: topic_hash(name).hex() for name in ("estop", "report", "~mesh/position")},
         "fleet_key": THIN_KEY.secret.hex(),
         "hint": thin_hint(THIN_KEY),
-        "frames": frames,
+        "frames": thin_frame_vectors(),
     }
