@@ -123,7 +123,10 @@ def test_a_node_that_a_change_takes_out_of_the_mesh_returns_to_it_by_itself(team
     (outcome,) = (event["outcome"] for event in done.events if event["event"] == "finished")
     # on a starved host it may be seen too late, although it is back
     assert outcome["result"] in ("rolled back", "uncertain")
-    assert outcome["result"] == "uncertain" or "unreachable" in outcome["reason"]
+    # whether it was unreachable, or reached again only after its window, is up to the host
+    assert outcome["result"] == "uncertain" or any(
+        reason in outcome["reason"] for reason in ("unreachable", "not confirmed in time")
+    )
     until(lambda: team.neighbors("husky") == {"b02"}, "its radios to be in the mesh again")
     assert team.on("husky", masters).split() == ["bat0", "bat0"]
     assert team.node("husky").boot_id == boot
