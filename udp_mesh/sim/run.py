@@ -30,6 +30,7 @@ from udp_mesh.sim.mobility import Trajectory
 from udp_mesh.sim.scenario import MAX_MESSAGE_BYTES, Flow, Incident, Scenario
 from udp_mesh.sim.team import Ledger, Team
 from udp_mesh.sim.thin_team import Deliver, ThinMedia
+from udp_mesh.sim.turning_back import DECISION_S, DrivenPath
 
 # The send time, at the start of each payload.
 _SENT = struct.Struct("<d")
@@ -102,7 +103,8 @@ class _Run:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.rng = random.Random(scenario.seed)
-        self.trajectories: dict[str, Trajectory] = {**scenario.robots, **scenario.relays}
+        self.driven = {name: DrivenPath(scenario.robots[name], wanted) for name, wanted in scenario.turn_back.items()}
+        self.courses: dict[str, Trajectory | DrivenPath] = {**scenario.robots, **scenario.relays, **self.driven}
         self.settings = {
             name: Settings(
                 name,
@@ -134,7 +136,7 @@ class _Run:
         return ThinMedia(event_queue, self.scenario.thin.radios, self.scenario.robots, deliver, rng)
 
     def _loss(self, a: str, b: str, now: float) -> float:
-        return self.scenario.air.loss(self.trajectories[a].at(now), self.trajectories[b].at(now))
+        return self.scenario.air.loss(self.courses[a].at(now), self.courses[b].at(now))
 
     def run(self, progress: Callable[[float], None]) -> None:
         event_queue = self.team.event_queue
@@ -146,8 +148,15 @@ class _Run:
         for flow in self.scenario.flows:
             for source in flow.sources:
                 event_queue.at(flow.start_s + self.rng.random() * flow.period_s, partial(self._send, flow, source))
+        for robot in self.driven:
+            event_queue.at(DECISION_S, partial(self._decide, robot))
         event_queue.at(0.0, partial(self._sample, progress))
         event_queue.run_until(self.scenario.duration_s)
+
+    def _decide(self, robot: str) -> None:
+        if self.team.is_running(robot):
+            self.driven[robot].decide(self.team.conditions(robot).peers, self.team.event_queue.now)
+        self.team.event_queue.after(DECISION_S, partial(self._decide, robot))
 
     def _apply_incident(self, incident: Incident) -> None:
         match incident.what:
@@ -210,7 +219,7 @@ class _Run:
                         now, observer, peer.name, peer.round_trip_s, peer.loss, peer.received_bits_per_s, hops
                     )
                 )
-        for name, course in self.trajectories.items():
+        for name, course in self.courses.items():
             if self.scenario.appear_s.get(name, 0.0) <= now:
                 self._record(recording.Place(now, name, *course.at(now)))
         self.team.event_queue.after(SAMPLE_S, partial(self._sample, progress))

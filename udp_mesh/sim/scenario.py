@@ -19,6 +19,7 @@ from udp_mesh.sim.medium import RadioChannel
 from udp_mesh.sim.mobility import PathLoss, Trajectory, Wall, stationary, trajectory
 from udp_mesh.sim.reads import Reads, read_reads
 from udp_mesh.sim.thin_scenario import ThinRadios, read_thin
+from udp_mesh.sim.turning_back import TurnBack, read_turn_back
 from udp_mesh.sim.yaml_entry import Entry
 
 _MAX_SHOWN_PROBLEMS = 20
@@ -95,6 +96,8 @@ class Scenario:
     window: Literal["adaptive"] | int
     reads: Reads = field(default_factory=dict)
     thin: ThinRadios = field(default_factory=ThinRadios)
+    turn_back: Mapping[str, TurnBack] = field(default_factory=dict)
+    """Robots that drive their path back and forth, so that they keep a link."""
 
 
 def load(path: Path) -> Scenario:
@@ -135,7 +138,7 @@ def parse(raw: bytes, file: str) -> Scenario:
 
 _KEYS = (
     "name", "seed", "duration_s", "observer", "window", "channel", "air", "robots", "relays", "topics", "flows",
-    "reads", "incidents", "thin",
+    "reads", "incidents", "turn_back", "thin",
 )  # fmt: skip
 
 
@@ -186,6 +189,7 @@ def _scenario(at: Entry, name: str) -> Scenario:
         reads=read_reads(get("reads"), tuple(robots)),
         window="adaptive" if window == "adaptive" else get("window").integer(3, minimum=1, maximum=4096),
         thin=read_thin(get("thin"), _path_loss),
+        turn_back=read_turn_back(get("turn_back"), tuple(robots)),
     )
 
 

@@ -1,91 +1,118 @@
-"""A robot explores at 1.5 m/s away from its base: with the example behavior it keeps its link, without it loses it."""
+"""A robot explores away from its base: with the example behavior it keeps its link, without it loses it."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
 
 import pytest
 
-from udp_mesh.client.turn_back import Need, decide
-from udp_mesh.core.events import Event, MessageReceived, PeerOffline
-from udp_mesh.core.settings import Settings, Topic
-from udp_mesh.daemon.status import conditions_json
-from udp_mesh.sim.medium import RadioChannel
-from udp_mesh.sim.mobility import PathLoss
-from udp_mesh.sim.team import Team
+from tests.udp_mesh.core.pair import pair
+from udp_mesh.client.turn_back import Need
+from udp_mesh.core.conditions import PeerConditions
+from udp_mesh.core.link_trend import Direction, Measure, Trend
+from udp_mesh.daemon.status import peer_json
+from udp_mesh.sim.command import SHIPPED
+from udp_mesh.sim.mobility import trajectory
+from udp_mesh.sim.run import RunResult, play
+from udp_mesh.sim.scenario import ScenarioError, load, parse
+from udp_mesh.sim.turning_back import DrivenPath, TurnBack, as_shown
 
-AIR = PathLoss(good_m=60.0, range_m=150.0, least_loss=0.02)
-MAP = Topic("map", priority=9)
-STEP_S = 0.5
-SPEED_M_PER_S = 1.5
-MAP_BYTES = 20_000
-NEED = Need(bits_per_s=MAP_BYTES * 8 / STEP_S, priority=MAP.priority)
-
-
-@dataclass
-class Mission:
-    """What became of it."""
-
-    farthest_m: float = 0.0
-    turns: int = 0
-    sent: int = 0
-    arrived: int = 0
-    lost_at_s: list[float] = field(default_factory=list)
-    """When the robot was offline for the base."""
+SCENARIO = replace(load(SHIPPED / "turn-back.yaml"), duration_s=300.0)
+BEHAVIOR = TurnBack("b", Need(1e6, 9))
 
 
-def explore(behaves: bool, seed: int, duration_s: float = 400.0) -> Mission:
-    """The robot drives away, and back while the behavior says so; it sends a piece of its map every `STEP_S`."""
-    mission, x_m, turn_back = Mission(), 5.0, False
+@cache
+def played(behaves: bool, seed: int) -> RunResult:
+    return play(replace(SCENARIO, seed=seed, turn_back=SCENARIO.turn_back if behaves else {}))
 
-    def on_event(now: float, robot: str, event: Event) -> None:
-        if robot != "base":
-            return
-        if isinstance(event, PeerOffline):
-            mission.lost_at_s.append(now)
-        mission.arrived += isinstance(event, MessageReceived)
 
-    settings = {name: Settings(name, unkeyed=True, topics=(MAP,)) for name in ("base", "husky")}
-    team = Team(
-        settings,
-        channel=RadioChannel(),
-        loss=lambda a, b, now: AIR.loss((0.0, 0.0), (x_m, 0.0)),
-        seed=seed,
-        on_event=on_event,
-    )
-    for step in range(int(duration_s / STEP_S)):
-        team.event_queue.run_until(step * STEP_S)
-        if step * STEP_S < 2.0:
-            continue
-        # as a program gets them from its daemon
-        conditions = json.loads(json.dumps(conditions_json(team.conditions("husky"))))
-        base = next((peer for peer in conditions["peers"] if peer["name"] == "base"), None)
-        decision = decide(base, NEED, turn_back)
-        if behaves and decision.turn_back != turn_back:
-            turn_back = decision.turn_back
-            mission.turns += 1
-        x_m = max(5.0, x_m + SPEED_M_PER_S * STEP_S * (-1.0 if turn_back else 1.0))
-        mission.farthest_m = max(mission.farthest_m, x_m)
-        team.send("husky", MAP.name, bytes(MAP_BYTES), "base")
-        mission.sent += 1
-    return mission
+def places(result: RunResult) -> list[float]:
+    """The robot's distance from the base in meters, once per second."""
+    found = [json.loads(line) for line in result.lines]
+    return [line["x"] for line in found if line.get("kind") == "place" and line["at"] == "husky"]
+
+
+def lost(result: RunResult) -> int:
+    """How often the robot went offline for the base."""
+    return sum(json.loads(line).get("kind") == "peer-offline" for line in result.lines)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_with_the_behavior_the_robot_explores_to_the_edge_and_keeps_its_link(seed: int) -> None:
-    mission = explore(behaves=True, seed=seed)
-    assert mission.lost_at_s == []
-    # far out, but not to where nothing arrives; and out again after it came back
-    assert AIR.good_m < mission.farthest_m < AIR.range_m
-    assert mission.turns >= 3
+    result = played(behaves=True, seed=seed)
+    assert lost(result) == 0
+    # far out, but not to where nothing arrives
+    assert SCENARIO.air.good_m < max(places(result)) < SCENARIO.air.range_m
+    # out again after it came back
+    steps = [later - earlier for earlier, later in pairwise(places(result))]
+    turns = [earlier * later < 0 for earlier, later in pairwise(steps)]
+    assert sum(turns) >= 3
     # but for what was just sent
-    assert mission.arrived >= mission.sent - 3
+    assert result.topics["map"].messages >= result.offered["map"] - 3
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_without_it_the_link_is_lost_for_good(seed: int) -> None:
-    mission = explore(behaves=False, seed=seed)
-    assert len(mission.lost_at_s) == 1
-    assert mission.farthest_m > AIR.range_m
-    assert mission.arrived < mission.sent / 2
+    result = played(behaves=False, seed=seed)
+    assert lost(result) == 1
+    assert max(places(result)) > SCENARIO.air.range_m
+    assert result.topics["map"].messages < played(behaves=True, seed=seed).topics["map"].messages / 1.5
+
+
+def known_peer() -> PeerConditions:
+    both = pair()
+    (found,) = both.a.conditions(both.now).peers
+    return replace(
+        found,
+        available_bits_per_s=(9e6,) * 16,
+        trend=Trend(Direction.WORSENING, Measure.CAPACITY, -0.001),
+        unanswered_for_s=0.5,
+        loss=0.02,
+    )
+
+
+def test_the_simulator_decides_from_what_the_daemon_shows() -> None:
+    peer = known_peer()
+    shown = peer_json(peer, 0.0)
+    assert json.loads(json.dumps(as_shown(peer))) == {key: shown[key] for key in as_shown(peer)}
+    assert as_shown(replace(peer, trend=None))["trend"] is None
+
+
+def test_a_driven_robot_goes_back_the_way_it_came_and_waits_at_its_start() -> None:
+    driven = DrivenPath(trajectory([(0.0, (0.0, 0.0)), (100.0, (200.0, 0.0))]), BEHAVIOR)
+    assert driven.at(30.0) == (60.0, 0.0)
+    # its peer is not known: it is offline
+    driven.decide((), 30.0)
+    assert driven.at(40.0) == (40.0, 0.0)
+    driven.decide((), 40.0)
+    assert driven.at(70.0) == (0.0, 0.0)
+    good = replace(known_peer(), trend=None)
+    driven.decide((good,), 70.0)
+    assert driven.at(80.0) == (20.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("a: {peer: b}", "turn_back.a: expected the key bits_per_s"),
+        ("a: {bits_per_s: 5}", "turn_back.a: expected the key peer"),
+        ("a: {peer: a, bits_per_s: 5}", "turn_back.a.peer: expected another robot"),
+        ("a: {peer: c, bits_per_s: 5}", "turn_back.a.peer: expected one of a, b, found 'c'"),
+        ("a: {peer: b, bits_per_s: 0}", "turn_back.a.bits_per_s: expected a number of at least 1"),
+        ("a: {peer: b, bits_per_s: 5, priority: 16}", "turn_back.a.priority: expected a number of at most 15"),
+        ("c: {peer: b, bits_per_s: 5}", "turn_back: expected one of a, b"),
+    ],
+)
+def test_a_problem_of_the_behavior_is_reported(entry: str, message: str) -> None:
+    text = f"robots: {{a: [0, 0], b: [5, 0]}}\nturn_back: {{{entry}}}\n"
+    with pytest.raises(ScenarioError) as raised:
+        parse(text.encode(), "s.yaml")
+    assert f"s.yaml:2: {message}" in str(raised.value)
+
+
+def test_priority_and_reserve_have_defaults() -> None:
+    scenario = parse(b"robots: {a: [0, 0], b: [5, 0]}\nturn_back: {a: {peer: b, bits_per_s: 1e6}}\n", "s.yaml")
+    assert scenario.turn_back == {"a": BEHAVIOR}
