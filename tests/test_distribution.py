@@ -29,6 +29,8 @@ def test_the_distribution_is_named_meshctl_fleet_and_installs_both_commands() ->
 
 def test_all_versions_are_the_same() -> None:
     assert PROJECT["version"] == meshctl.__version__ == udp_mesh.__version__
+    packages = [path.read_text(encoding="utf-8") for path in sorted((ROOT / "udp_mesh").rglob("package.xml"))]
+    assert [re.findall("<version>(.*)</version>", text) for text in packages] == [[PROJECT["version"]]] * 2
 
 
 def test_no_document_installs_another_project_s_package() -> None:

@@ -61,6 +61,8 @@ def test_the_wheel_carries_templates_examples_pages_scripts_and_scenarios(wheel:
         "mesh_sweep/command.py",
         "udp_mesh/sim/scenarios/final-run.yaml",
         "udp_mesh/daemon/units/",
+        "udp_mesh/bridges/udp_mesh_msgs/msg/Conditions.msg",
+        "udp_mesh/bridges/udp_mesh_msgs/package.xml",
     ):
         assert any(name.startswith(start) for name in names), start
     for page in ("meshctl.1", "udp-mesh.1"):
