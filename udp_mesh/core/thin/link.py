@@ -46,6 +46,8 @@ MAX_URGENT_DOUBLINGS = 1
 """An urgent message is sent again after at most twice the first pause."""
 FIRST_PAUSE_FRAMES = 30
 """Airtime of so many short frames passes between the first two presences; each pause is twice the one before."""
+BLOCKED_FRAMES = 8
+"""Nodes whose budgets suffice again at one moment send within the airtime of so many short frames, or more."""
 _NEVER = float("inf")
 
 
@@ -240,6 +242,9 @@ class ThinLink:
         airtime_s = self.settings.airtime_s(size)
         self.blocked_until = self.budget.ready_at(airtime_s, now, urgent=is_urgent)
         if self.blocked_until > now:
+            # At random: nodes that started together have equal budgets, and would collide each time these suffice.
+            wait_s = 0.0 if is_urgent else self.blocked_until - now
+            self.blocked_until += max(BLOCKED_FRAMES * self.short_s(), wait_s / 2) * self.rng.random()
             return None
         self.budget.spend(airtime_s, now, urgent=is_urgent)
         self._on_sent(frame, airtime_s, now)
