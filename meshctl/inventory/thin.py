@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from meshctl.inventory.documents.thin import ThinLinkDocument, ThinPortsDocument
-from meshctl.model import ThinLink, ThinPorts
+from meshctl.model import ThinFraming, ThinLink, ThinPorts, ThinPreset
 
 
 def thin_links(documents: Mapping[str, ThinLinkDocument]) -> Mapping[str, ThinLink]:
@@ -15,14 +15,20 @@ def thin_links(documents: Mapping[str, ThinLinkDocument]) -> Mapping[str, ThinLi
 
 
 def _link(document: ThinLinkDocument) -> ThinLink:
+    preset, bits_per_s, frame_s = None, document.bits_per_s, document.frame_s
+    if document.framing is ThinFraming.MESHTASTIC:
+        preset = ThinPreset[document.preset]
+        bits_per_s, frame_s = preset.bits_per_s, preset.frame_s
     return ThinLink(
-        document.bits_per_s,
+        bits_per_s,
         document.band,
         document.baud,
         document.framing.frame_bytes if document.frame_bytes is None else document.frame_bytes,
-        document.frame_s,
+        frame_s,
         document.duty_cycle,
         document.framing,
+        preset,
+        document.hop_limit,
     )
 
 

@@ -27,7 +27,7 @@ from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile,
 from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
 from meshctl.model.release import RELEASES, PackageTool, Release
 from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
-from meshctl.model.thin import ThinBand, ThinFraming, ThinLink, ThinPorts
+from meshctl.model.thin import ThinBand, ThinFraming, ThinLink, ThinPorts, ThinPreset
 from meshctl.model.topic import JpegEncoding, Outbox, Reduction, Topic, TopicClass, TopicLog
 
 __all__ = [
@@ -72,6 +72,7 @@ __all__ = [
     "ThinFraming",
     "ThinLink",
     "ThinPorts",
+    "ThinPreset",
     "Topic",
     "TopicClass",
     "TopicLog",

@@ -37,16 +37,56 @@ class ThinFraming(Enum):
     COBS = "cobs"
     XBEE = "xbee"
     XBEE_ESCAPED = "xbee-escaped"
+    MESHTASTIC = "meshtastic"
+
+    @property
+    def is_xbee(self) -> bool:
+        return self in (ThinFraming.XBEE, ThinFraming.XBEE_ESCAPED)
 
     @property
     def overhead_bytes(self) -> int:
-        """What a frame costs on the air besides its bytes: COBS and CRC; headers of an XBee at most."""
-        return 6 if self is ThinFraming.COBS else 60
+        """What a frame costs on the air besides its bytes: COBS and CRC; headers of the radio at most."""
+        return 60 if self.is_xbee else 24 if self is ThinFraming.MESHTASTIC else 6
 
     @property
     def frame_bytes(self) -> int:
         """The usual largest frame."""
-        return 200 if self is ThinFraming.COBS else 72
+        return 72 if self.is_xbee else 200
+
+
+class ThinPreset(Enum):
+    """Modem presets of Meshtastic: spreading factor, bandwidth in Hz, symbols per group (5 for a code rate of 4/5)."""
+
+    SHORT_TURBO = (7, 500e3, 5)
+    SHORT_FAST = (7, 250e3, 5)
+    SHORT_SLOW = (8, 250e3, 5)
+    MEDIUM_FAST = (9, 250e3, 5)
+    MEDIUM_SLOW = (10, 250e3, 5)
+    LONG_TURBO = (11, 500e3, 8)
+    LONG_FAST = (11, 250e3, 5)
+    LONG_MODERATE = (11, 125e3, 8)
+    LONG_SLOW = (12, 125e3, 8)
+
+    @property
+    def symbol_s(self) -> float:
+        spreading, bandwidth_hz, _ = self.value
+        return float(2**spreading / bandwidth_hz)
+
+    @property
+    def group_bits(self) -> int:
+        """Bits of a frame in one group of symbols; symbols of 16 ms or more carry two less (Semtech AN1200.13)."""
+        return 4 * (int(self.value[0]) - 2 * (self.symbol_s >= 0.016))
+
+    @property
+    def bits_per_s(self) -> float:
+        """Rate on the air."""
+        return float(self.group_bits / (self.value[2] * self.symbol_s))
+
+    @property
+    def frame_s(self) -> float:
+        """Time on the air besides the bytes: preamble (20.25 symbols), 8 fixed symbols, header and CRC, last group."""
+        spreading, _, coding = self.value
+        return float(self.symbol_s * (28.25 + coding * ((44 - 4 * spreading) / self.group_bits + 1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +101,10 @@ class ThinLink:
     frame_s: float = 0.0
     duty_cycle: float | None = None
     framing: ThinFraming = ThinFraming.COBS
+    preset: ThinPreset | None = None
+    """Of Meshtastic; `bits_per_s` and `frame_s` are then its."""
+    hop_limit: int = 0
+    """How often other radios of Meshtastic repeat a frame."""
 
     @property
     def allowed_duty_cycle(self) -> float:
@@ -86,6 +130,7 @@ class ThinLink:
 
 
 MIN_FRAME_BYTES, MAX_FRAME_BYTES = 40, 255
+MAX_MESHTASTIC_FRAME_BYTES = 233
 MAX_2400_MHZ_FRAME_BYTES = 100
 """Payload that IEEE 802.15.4 leaves an XBee at 2.4 GHz (its NP); Zigbee and DigiMesh leave less."""
 MAX_PARTS = 32

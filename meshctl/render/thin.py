@@ -59,12 +59,14 @@ def thin_lines(fleet: Fleet, robot: str) -> Iterator[str]:
     for name, device in own.ports.items():
         link = fleet.udp_mesh.thin_links[name]
         yield from ("", "[[thin.links]]", f"name = {json.dumps(name)}", f"device = {json.dumps(device)}")
-        yield f"baud = {link.baud}"
         if link.framing is not ThinFraming.COBS:
             yield f'framing = "{link.framing.value}"'
-        yield f"bits_per_s = {float(link.bits_per_s)!r}"
+        if link.preset is not None:
+            yield from (f'preset = "{link.preset.name}"', f"hop_limit = {link.hop_limit}")
+        else:
+            yield from (f"baud = {link.baud}", f"bits_per_s = {float(link.bits_per_s)!r}")
+            yield f"frame_s = {float(link.frame_s)!r}"
         yield f"frame_bytes = {link.frame_bytes}"
-        yield f"frame_s = {float(link.frame_s)!r}"
         yield f"duty_cycle = {float(link.allowed_duty_cycle)!r}"
         if link.band.dwell_s is not None:
             yield f"max_airtime_s = {link.band.dwell_s!r}"

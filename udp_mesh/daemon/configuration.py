@@ -50,11 +50,10 @@ from udp_mesh.daemon.positions import (
     is_frame,
 )
 from udp_mesh.daemon.relay_settings import read_relay
-from udp_mesh.daemon.thin_settings import read_thin
+from udp_mesh.daemon.thin_settings import ThinPortConfig, read_thin
 from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, parse
 from udp_mesh.daemon.topic_settings import or_default, problem_from, read_topic
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
-from udp_mesh.links.serial_port import SerialPortConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
 
 log = logging.getLogger(__name__)
@@ -113,7 +112,7 @@ class Configuration:
     settings: Settings
     links: tuple[LinkConfig, ...] = EVERY_INTERFACE
     daemon: DaemonSettings = field(default_factory=DaemonSettings)
-    thin_ports: tuple[SerialPortConfig, ...] = ()
+    thin_ports: tuple[ThinPortConfig, ...] = ()
     position: Position | None = None
     """The fixed position of a node that does not move."""
     file: Path | None = None

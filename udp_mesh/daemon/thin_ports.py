@@ -8,6 +8,8 @@ from collections.abc import Sequence
 
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.thin_settings import ThinPortConfig
+from udp_mesh.links.meshtastic_port import MeshtasticPort
 from udp_mesh.links.serial_port import SerialPort, SerialPortConfig
 
 log = logging.getLogger(__name__)
@@ -19,10 +21,11 @@ RETRY_S = 2.0
 class ThinPorts:
     """The ports of a running daemon."""
 
-    def __init__(self, driver: Driver, configs: Sequence[SerialPortConfig]) -> None:
+    def __init__(self, driver: Driver, configs: Sequence[ThinPortConfig]) -> None:
         self._driver, self._configs = driver, configs
         self._loop = asyncio.get_running_loop()
-        self._ports: dict[str, SerialPort] = {}
+        self._ports: dict[str, SerialPort | MeshtasticPort] = {}
+        self._up: set[str] = set()
         self._retry_timer: asyncio.TimerHandle | None = None
         self.failures: dict[str, str] = {}
         """Why ports are not open, by link."""
@@ -36,7 +39,7 @@ class ThinPorts:
             self._driver.output.others[config.link] = self._transmit
             self._set_up(config.link, False)
 
-    def apply(self, configs: Sequence[SerialPortConfig]) -> None:
+    def apply(self, configs: Sequence[ThinPortConfig]) -> None:
         """Takes over a reloaded configuration, after the core did: only if it changed, ports are opened again."""
         if tuple(configs) == tuple(self._configs) and self._driver.node.thin is self._thin:
             return
@@ -70,17 +73,25 @@ class ThinPorts:
             self._thin.set_up(link, up, self._driver.now())
             self._driver.send_soon()
 
-    def _open(self, config: SerialPortConfig) -> None:
+    def _open(self, config: ThinPortConfig) -> None:
         try:
-            port = SerialPort(config)
+            port = SerialPort(config) if isinstance(config, SerialPortConfig) else MeshtasticPort(config)
         except OSError as error:
             self._failed(config.link, error)
             return
-        self.failures.pop(config.link, None)
         self._ports[config.link] = port
         self._loop.add_reader(port.fileno(), self._readable, config.link)
-        log.info("thin-link-up link=%s device=%s", config.link, config.device)
-        self._set_up(config.link, True)
+        self._note_ready(config.link)
+
+    def _note_ready(self, link: str) -> None:
+        """The port takes frames from now on: a radio that has to be connected first, later than it is opened."""
+        port = self._ports[link]
+        if not port.ready or link in self._up:
+            return
+        self._up.add(link)
+        self.failures.pop(link, None)
+        log.info("thin-link-up link=%s device=%s", link, port.config.device)
+        self._set_up(link, True)
 
     def _failed(self, link: str, error: OSError) -> None:
         reason = f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror)
@@ -90,6 +101,7 @@ class ThinPorts:
 
     def _close(self, link: str) -> None:
         port = self._ports.pop(link)
+        self._up.discard(link)
         self.refusals.pop(link, None)
         self._loop.remove_reader(port.fileno())
         self._loop.remove_writer(port.fileno())
@@ -108,7 +120,8 @@ class ThinPorts:
         except OSError as error:
             self._gone(link, error)
             return
-        self._note_refusal(link, self._ports[link].decoder.refusal)
+        self._note_ready(link)
+        self._note_refusal(link, self._ports[link].refusal)
         if frames:
             self._driver.receive_frames(link, frames)
 

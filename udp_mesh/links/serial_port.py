@@ -60,6 +60,16 @@ class SerialPort:
         termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
         termios.tcflush(self._descriptor, termios.TCIOFLUSH)
 
+    @property
+    def ready(self) -> bool:
+        """Whether frames can be sent: as soon as it is open."""
+        return True
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the radio does not send what it gets."""
+        return self.decoder.refusal
+
     def fileno(self) -> int:
         return self._descriptor
 

@@ -8,7 +8,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
-from meshctl.model import Fleet, ThinBand, ThinFraming, ThinLink, Topic
+from meshctl.model import Fleet, ThinBand, ThinLink, Topic
 from meshctl.model.thin import BURST_SHARE, MAX_2400_MHZ_FRAME_BYTES, PART_OVERHEAD_BYTES
 from meshctl.render.thin import frame_problems
 
@@ -200,7 +200,7 @@ def topic_beyond_thin_links(fleet: Fleet, _context: LintContext) -> Iterator[Fin
 def frame_beyond_xbee(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for name, link in fleet.udp_mesh.thin_links.items():
         # The bands that are known are those below 1 GHz.
-        if link.framing is ThinFraming.COBS or link.band is not ThinBand.NONE:
+        if not link.framing.is_xbee or link.band is not ThinBand.NONE:
             continue
         if link.frame_bytes > MAX_2400_MHZ_FRAME_BYTES:
             path = ("udp_mesh", "thin_links", name, "frame_bytes")

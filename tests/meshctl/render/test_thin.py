@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from meshctl.diagnostics import InvalidInput
-from meshctl.model import Fleet, ThinBand, ThinFraming, ThinLink, ThinPorts, Topic, TopicClass
+from meshctl.model import Fleet, ThinBand, ThinFraming, ThinLink, ThinPorts, ThinPreset, Topic, TopicClass
 from meshctl.model import thin as model
 from meshctl.render.daemon import daemon_config
 from meshctl.render.thin import BAUD_RATES, frame_problems
 from tests.meshctl.render.test_daemon import fleet, loaded
+from udp_mesh.core.thin import lora
 from udp_mesh.core.thin import settings as core
-from udp_mesh.links import serial_port
+from udp_mesh.links import meshtastic_port, serial_port
+from udp_mesh.links.meshtastic_port import MeshtasticPortConfig
 from udp_mesh.links.serial_port import SerialPortConfig
 from udp_mesh.wire import framings, limits
 from udp_mesh.wire import thin as wire
@@ -24,6 +27,10 @@ POSE = Topic("pose", 9, thin=True, thin_links=("lora",), thin_period_s=60.0)
 LORA = ThinLink(5470.0, ThinBand.EU868, 57_600, 120, 0.0125)
 HOPPING = ThinLink(5470.0, ThinBand.US915, frame_bytes=255)
 XBEE = ThinLink(10_000.0, ThinBand.EU869, frame_bytes=240, framing=ThinFraming.XBEE_ESCAPED)
+
+
+def meshtastic(preset: ThinPreset, **keys: Any) -> ThinLink:
+    return ThinLink(preset.bits_per_s, frame_s=preset.frame_s, framing=ThinFraming.MESHTASTIC, preset=preset, **keys)
 
 
 def thin(*topics: Topic, ports: dict[str, str], **links: ThinLink) -> Fleet:
@@ -81,7 +88,9 @@ def test_a_port_of_an_unknown_link_is_refused() -> None:
         daemon_config(thin(ESTOP, ports={"xbee": "/dev/ttyUSB0"}, lora=LORA), "uav")
 
 
-@pytest.mark.parametrize("link", [LORA, HOPPING, XBEE, replace(LORA, bits_per_s=1000.0, frame_bytes=60)])
+@pytest.mark.parametrize(
+    "link", [LORA, HOPPING, XBEE, replace(LORA, bits_per_s=1000.0, frame_bytes=60), *map(meshtastic, ThinPreset)]
+)
 def test_both_compute_the_same(link: ThinLink, tmp_path: Path) -> None:
     assert list(frame_problems(link)) == []
     [own] = loaded(thin(ESTOP, ports={"lora": "/dev/x"}, lora=link), "uav", tmp_path).settings.thin.links
@@ -90,8 +99,13 @@ def test_both_compute_the_same(link: ThinLink, tmp_path: Path) -> None:
 
 
 def test_the_constants_are_those_of_the_transport() -> None:
-    assert {framing.value for framing in ThinFraming} == set(framings.FRAMINGS)
-    for framing in ThinFraming:
+    assert {framing.value for framing in ThinFraming} == {*framings.FRAMINGS, meshtastic_port.MESHTASTIC}
+    assert ThinFraming.MESHTASTIC.overhead_bytes == lora.MESHTASTIC_OVERHEAD_BYTES
+    assert model.MAX_MESHTASTIC_FRAME_BYTES == meshtastic_port.MAX_PAYLOAD_BYTES
+    assert {preset.name: preset.value for preset in ThinPreset} == {
+        name: astuple(preset) for name, preset in lora.PRESETS.items()
+    }
+    for framing in set(ThinFraming) - {ThinFraming.MESHTASTIC}:
         own = framings.FRAMINGS[framing.value]
         assert (framing.overhead_bytes, framing.frame_bytes) == (own.overhead_bytes, own.frame_bytes)
     assert (model.MIN_FRAME_BYTES, model.MAX_FRAME_BYTES) == (core.MIN_FRAME_BYTES, limits.MAX_THIN_FRAME_BYTES)
@@ -105,3 +119,11 @@ def test_a_link_without_a_framing_has_no_key_that_earlier_daemons_reject() -> No
     ports = {"lora": "/dev/ttyUSB0", "x": "/dev/x"}
     text = daemon_config(thin(ESTOP, ports=ports, lora=LORA, x=XBEE), "uav").decode()
     assert text.count("framing = ") == text.count('framing = "xbee-escaped"') == 1
+
+
+def test_a_meshtastic_radio_reaches_its_daemon(tmp_path: Path) -> None:
+    link = meshtastic(ThinPreset.LONG_FAST, band=ThinBand.EU869, frame_bytes=233, hop_limit=3)
+    configuration = loaded(thin(ESTOP, ports={"m": "/dev/ttyACM0"}, m=link), "uav", tmp_path)
+    assert configuration.thin_ports == (MeshtasticPortConfig("m", "/dev/ttyACM0", 3),)
+    [own] = configuration.settings.thin.links
+    assert (own.frame_bytes, own.duty_cycle) == (233, 0.1)

@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.udp_mesh.daemon.meshtastic_air import MeshtasticAir
 from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, collect, poll
 from tests.udp_mesh.daemon.serial_air import SerialAir, running
 from tests.udp_mesh.daemon.xbee_air import XBeeAir
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
+from udp_mesh.core.thin.lora import PRESETS
 
 GUIDE = Path(__file__).parents[3] / "docs" / "how-to" / "thin-links.md"
 
@@ -27,17 +29,22 @@ def udp_mesh(daemon: RunningDaemon, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("xbee", [False, True], ids=["transparent radios", "XBees"])
-def test_the_configuration_of_the_guide_carries_a_stop_to_a_robot_without_wifi(xbee: bool) -> None:
+@pytest.mark.parametrize("radio", ["transparent", "XBee", "Meshtastic"])
+def test_the_configuration_of_the_guide_carries_a_stop_to_a_robot_without_wifi(radio: str) -> None:
     text = GUIDE.read_text(encoding="utf-8")
-    block, link = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    if xbee:
-        block = block[: block.index("[[thin.links]]")] + link
-    [rate] = re.findall(r"^bits_per_s = (\d+)", block, re.MULTILINE)
+    block, xbee, meshtastic = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    if radio != "transparent":
+        block = block[: block.index("[[thin.links]]")] + (xbee if radio == "XBee" else meshtastic)
     [device] = re.findall(r'^device = "(.*)"', block, re.MULTILINE)
     [duty_cycle] = re.findall(r"^duty_cycle = [\d.]+", block, re.MULTILINE)
     [publish] = re.findall(r"^\$ udp-mesh (pub .*)$", text, re.MULTILINE)
-    radios = XBeeAir(2, bits_per_s=float(rate), escaped=True) if xbee else SerialAir(2, bits_per_s=float(rate))
+    radios: SerialAir
+    if radio == "Meshtastic":
+        [preset] = re.findall(r'^preset = "(.*)"', block, re.MULTILINE)
+        radios = MeshtasticAir(2, bits_per_s=PRESETS[preset].bits_per_s)
+    else:
+        [rate] = map(float, re.findall(r"^bits_per_s = (\d+)", block, re.MULTILINE))
+        radios = XBeeAir(2, bits_per_s=rate, escaped=True) if radio == "XBee" else SerialAir(2, bits_per_s=rate)
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, running(radios) as air:
         folder, port = Path(path), free_port()
         (folder / "fleet.key").write_text(KEY)

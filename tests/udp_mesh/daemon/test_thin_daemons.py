@@ -187,7 +187,23 @@ def test_a_reload_opens_another_port() -> None:
         ),
         (
             '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "slip"\n',
-            'expected "cobs" or "xbee" or "xbee-escaped"',
+            'expected "cobs" or "xbee" or "xbee-escaped" or "meshtastic"',
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "meshtastic"\nframe_bytes = 240\n',
+            "expected an integer from 40 to 233, found 240",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "meshtastic"\nhop_limit = 4\n',
+            "hop_limit: expected an integer from 0 to 3, found 4",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nframing = "meshtastic"\nbaud = 9600\n',
+            "baud",
+        ),
+        (
+            '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\npreset = "LONG_FAST"\n',
+            "preset",
         ),
         (
             '[thin]\nnumber = 3\n[[thin.links]]\ndevice = "/dev/x"\nbits_per_s = 1000\nduty_cycle = 0.001\n',
