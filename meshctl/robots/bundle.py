@@ -133,7 +133,7 @@ def configuration(
         File("bin/udp-mesh", shipped("launcher.sh").encode(), 0o755),
         File(f"etc/{CONFIG_NAME}", daemon_config(fleet, robot)),
         File("topics", topics),
-        File(UNIT_NAME, service_unit(units[UNIT_NAME], start).encode()),
+        File(UNIT_NAME, _with_serial_ports(fleet, robot, service_unit(units[UNIT_NAME], start)).encode()),
     ]
     for name, keys in ((KEY_NAME, daemon_keys(fleet, secrets)), (RELAY_KEY_NAME, relay_keys(fleet, secrets))):
         if keys is not None:
@@ -164,6 +164,28 @@ def has_bridge(fleet: Fleet, robot: str) -> bool:
         hint = did_you_mean(ros, (ROS_1, *ROS_2)) or "remove `ros`: no bridge is deployed then"
         raise InputError(f"{place}: expected {ROS_1} or a ROS 2 release, found {ros!r}", hint=hint)
     return ros == ROS_1
+
+
+# Instead of hiding all devices: serial ports of the kinds that radios have, also if they are plugged in later. On Debian
+# and Ubuntu the group owns them. systemd leaves out a kind that the kernel does not know (systemd.resource-control).
+_NO_DEVICES = "PrivateDevices=yes"
+_SERIAL_PORTS = "\n".join(
+    (
+        "DevicePolicy=closed",
+        *(f"DeviceAllow=char-{kind} rw" for kind in ("ttyUSB", "ttyACM", "ttyS", "ttyAMA")),
+        "SupplementaryGroups=dialout",
+    )
+)
+
+
+def _with_serial_ports(fleet: Fleet, robot: str, unit: str) -> str:
+    """The daemon's unit, with serial ports if the robot has thin links. Raises ValueError unless it hides devices."""
+    ports = fleet.robots[robot].thin
+    if ports is None or not ports.ports:
+        return unit
+    if unit.count(_NO_DEVICES) != 1:
+        raise ValueError(f"expected one {_NO_DEVICES} in the unit, found {unit.count(_NO_DEVICES)}")
+    return unit.replace(_NO_DEVICES, _SERIAL_PORTS)
 
 
 def service_unit(stock: str, start: str) -> str:

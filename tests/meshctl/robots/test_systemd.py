@@ -16,6 +16,7 @@ pytestmark = pytest.mark.timeout(600)
 
 # `systemd-analyze security`, in tenths of a point from 0 (locked up) to 100 (does what it likes).
 MAX_EXPOSURE = 20
+PORT = "    thin: {number: 2, ports: {lora: /dev/ttyUSB0}}\n"
 
 
 def _show(fleet: RobotFleet, *properties: str, unit: str = "udp-mesh.service") -> dict[str, str]:
@@ -60,6 +61,30 @@ def test_the_daemon_service_is_sandboxed_and_restarts_after_hang_and_boot(
     eventually(lambda: bool(fleet.status()["husky1"]["well"]))
     found = fleet.status()["husky1"]
     assert (found["release"], found["service"]["restarts"]) == (release, 0)
+    assert "husky1: unchanged" in fleet.deploy()
+
+
+def test_a_robot_with_a_thin_link_may_open_serial_ports_and_nothing_more(fleet: RobotFleet) -> None:
+    fleet.add("husky1")
+    fleet.write()
+    fleet.deploy()
+    assert _show(fleet, "PrivateDevices") == {"PrivateDevices": "yes"}
+    # a radio that is not plugged in does not keep the daemon from its other links
+    text = fleet.file.read_text()
+    link = "  thin_links: {lora: {bits_per_s: 5470, band: eu868, frame_bytes: 120}}\n"
+    text = text.replace("udp_mesh:\n", f"udp_mesh:\n{link}").replace(
+        "    nodes: [base]\n", f"    nodes: [base]\n{PORT}"
+    )
+    fleet.file.write_text(text.replace("class: emergency_stop}", "class: emergency_stop, thin: true}"))
+    fleet.deploy()
+    found = _show(fleet, "PrivateDevices", "DevicePolicy", "DeviceAllow", "SupplementaryGroups", "ActiveState")
+    assert (found["ActiveState"], found["PrivateDevices"], found["DevicePolicy"]) == ("active", "no", "closed")
+    assert found["SupplementaryGroups"] == "dialout"
+    assert "char-ttyUSB rw" in found["DeviceAllow"]
+    pid = _show(fleet, "MainPID")["MainPID"]
+    groups = fleet.shell("husky1", f"grep ^Groups: /proc/{pid}/status").split()
+    assert fleet.shell("husky1", "getent group dialout").split(":")[2] in groups
+    fleet.shell("husky1", f"systemd-analyze security --no-pager --threshold={MAX_EXPOSURE} udp-mesh.service")
     assert "husky1: unchanged" in fleet.deploy()
 
 
