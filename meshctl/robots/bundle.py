@@ -166,8 +166,9 @@ def has_bridge(fleet: Fleet, robot: str) -> bool:
     return ros == ROS_1
 
 
-# Instead of hiding all devices: serial ports of the kinds that radios have, also if they are plugged in later. On Debian
-# and Ubuntu the group owns them. systemd leaves out a kind that the kernel does not know (systemd.resource-control).
+# Instead of hiding all devices: serial ports of the kinds that radios have, also if they are plugged in later. On
+# Debian and Ubuntu the group owns them. systemd leaves out a kind that the kernel does not know
+# (systemd.resource-control).
 _NO_DEVICES = "PrivateDevices=yes"
 _SERIAL_PORTS = "\n".join(
     (
