@@ -18,7 +18,8 @@ TF, TF_STATIC = "tf", "tf_static"
 """Mesh topics; also the names in ROS, after a slash."""
 TOPIC_SETTINGS: Dict[str, Dict[str, object]] = {
     TF: {"priority": 4, "reliable": False, "keep_last": 1},
-    TF_STATIC: {"priority": 4, "reliable": True, "keep_last": 1},
+    # a robot that comes later needs the latest ones, too: they are sent again only when they change
+    TF_STATIC: {"priority": 4, "reliable": True, "keep_last": 1, "outbox": "last"},
 }
 MAX_FRAMES = 1000
 """Frames kept, of this robot and of all others together."""

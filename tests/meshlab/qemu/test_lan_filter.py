@@ -18,7 +18,8 @@ from tests.meshlab.qemu.conftest import Lab, until
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 RADIOS = ("husky-front", "husky-rear")
-_LINK_KBIT_S = 4000
+# a tenth of what the lidar sends: an emulated robot on a busy host does not get all of it out
+_LINK_KBIT_S = 1000
 _PINGS = 25
 # a VLP-16's packets to its factory destination: 1206 bytes, at 10 Mbit/s
 _LIDAR = """
