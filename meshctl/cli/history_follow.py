@@ -7,7 +7,7 @@ are of all of them.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 
 from meshctl.cli.output import echo, echo_json
@@ -47,12 +47,6 @@ class Happening:
         return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Look:
-    run: RunRecord
-    results: Mapping[str, Result]
-
-
 def follow(journal: Journal, matches: Callable[[RunRecord], bool], node: str | None, *, as_json: bool) -> None:
     """Print what happens until interrupted."""
     for happening in happenings(journal, matches, node):
@@ -69,10 +63,10 @@ def happenings(
     journal.wait_for_change(0.0)
     latest = journal.runs(limit=_RUNS)
     last = max((run.id for run in latest), default=0)
-    looks: dict[int, _Look] = {}
+    looks: dict[int, Mapping[str, Result]] = {}
     for run in reversed(latest):
         if matches(run) and not run.is_over:
-            looks[run.id] = _Look(run, _results(journal, run, node))
+            looks[run.id] = _results(_outcomes(journal, run, node))
             yield Happening("began", run)
     while True:
         journal.wait_for_change(LOOK_S)
@@ -80,19 +74,22 @@ def happenings(
             if not matches(run) or (run.id <= last and run.id not in looks):
                 continue
             if run.id not in looks:
-                looks[run.id] = _Look(run, {})
+                looks[run.id] = {}
                 yield Happening("began", run)
-            before = looks[run.id]
-            outcomes = [each for each in journal.outcomes(run.id) if node in (None, each.node)]
+            outcomes = _outcomes(journal, run, node)
             for outcome in outcomes:
-                if outcome.result not in (Result.PENDING, before.results.get(outcome.node)):
+                if outcome.result not in (Result.PENDING, looks[run.id].get(outcome.node)):
                     yield Happening("node", run, outcome)
-            looks[run.id] = _Look(run, {each.node: each.result for each in outcomes})
+            looks[run.id] = _results(outcomes)
             if run.is_over:
                 del looks[run.id]
                 last = max(last, run.id)
                 yield Happening("ended", run)
 
 
-def _results(journal: Journal, run: RunRecord, node: str | None) -> dict[str, Result]:
-    return {each.node: each.result for each in journal.outcomes(run.id) if node in (None, each.node)}
+def _outcomes(journal: Journal, run: RunRecord, node: str | None) -> list[Outcome]:
+    return [each for each in journal.outcomes(run.id) if node in (None, each.node)]
+
+
+def _results(outcomes: Iterable[Outcome]) -> dict[str, Result]:
+    return {each.node: each.result for each in outcomes}

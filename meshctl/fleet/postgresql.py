@@ -1,9 +1,9 @@
 """A PostgreSQL database as a journal for several operators: connection, tables and their migrations, claims, changes.
 
-`Database.open` connects and brings the tables up to date; `read` and `transaction` translate the journal's statements;
-`lock` and `connected_runs` are advisory locks of this session, which end with it; `wait_for_change` listens for
-the notification that every transaction of the journal sends. Every error is a MeshctlError, and a lost connection is a
-`DatabaseLost`. The password never appears in a message.
+`Database` connects and brings the tables up to date; `read` and `transaction` translate the journal's statements;
+`lock_nodes`, `lock_run` and `connected_runs` are about advisory locks of this session, which end with it;
+`wait_for_change` listens for the notification that every transaction of the journal sends. Every error is a
+MeshctlError, and a lost connection is a `DatabaseLost`. The password never appears in a message.
 
 Needs psycopg 3 (the extra `postgresql`), and PostgreSQL 12 or newer. Docs: postgresql.org/docs/current, "Explicit
 Locking" for advisory locks, "NOTIFY", and "Database Connection Control Functions" for the parameters of a connection.

@@ -1,6 +1,6 @@
 """The journal of several operators: in PostgreSQL, and on this computer while the database is out of reach.
 
-`open_store` connects -> `_merge` brings what was kept here into the database, in order: entries of runs that lost it,
+`merge` brings what was kept here into the database, in order: entries of runs that lost it,
 then whole runs that began without it -> reads and writes go to the database. When the connection is lost, `put` keeps
 statements in the spool, a SQLite file in the state directory, so a run in progress continues; `read` answers with what
 this process read last. A database that is out of reach from the start leaves the file journal of this computer,
@@ -78,11 +78,6 @@ class Spool:
             "SELECT id, statement, data FROM entries WHERE target = ? ORDER BY id LIMIT ?", (target, _MERGE_BATCH)
         )
         return [(number, (statement, tuple(json.loads(data)))) for number, statement, data in rows]
-
-    def count(self, target: str) -> int:
-        if not self._path.exists():
-            return 0
-        return int(self._opened.read("SELECT count(*) FROM entries WHERE target = ?", (target,))[0][0])
 
     def remove(self, last: int, target: str) -> None:
         with self._opened.write() as database:
