@@ -8,24 +8,21 @@ Only the main thread, in `refresh`, talks to the master: it looks for servers, a
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
-from typing import Any, Callable, Deque, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple, Union
+from typing import Any, Callable, Deque, Dict, Iterable, List, NamedTuple, Optional, Tuple, Union
 
 import rosgraph
 import rospy
 
-from udp_mesh.bridges.call_messages import SETTINGS, Offer
-from udp_mesh.bridges.calls import AddProxy, CallEffect, Calls, Finish, Invoke, RemoveProxy, SendCall, Warn
+from udp_mesh.bridges.call_messages import Offer
+from udp_mesh.bridges.calls import AddProxy, CallEffect, Finish, Invoke, RemoveProxy, SendCall, Warn
 from udp_mesh.bridges.configuration import ServiceOptions
 from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.names import inbound_name
 from udp_mesh.bridges.ros1.service_client import ServiceError, ServiceType, call_service, service_type
-from udp_mesh.client.mesh_client import Frame, as_message
-
-log = logging.getLogger(__name__)
 
 TOPIC = "bridge/ros1-calls"
 PROBE_S = 0.5
@@ -61,7 +58,7 @@ class _Server(NamedTuple):
     seen_at: float
 
 
-class Ros1Calls:
+class Ros1Calls(MeshCalls):
     """Services that are offered here, and proxies for those of the peers."""
 
     def __init__(
@@ -76,38 +73,18 @@ class Ros1Calls:
         """`on_offer` and `on_withdrawn`: what a peer offers or no longer does, before it is taken for a service; True
         if it is none."""
         self._on_offer, self._on_withdrawn = on_offer, on_withdrawn
-        self._daemon, self._own, self._services = daemon, own, dict(services)
-        self._calls = Calls(run)
+        super().__init__(daemon, TOPIC, run)
+        self._own, self._services = own, dict(services)
         self._lock = threading.Lock()
         self._waiting: Dict[int, _Waiting] = {}
         self._changes: Deque[Union[AddProxy, RemoveProxy]] = deque()
         self._proxies: Dict[Tuple[str, str], Any] = {}
         self._servers: Dict[str, _Server] = {}
         self._invoked = 0
-        self._warned: Set[str] = set()
-
-    # The daemon client's thread
-
-    def on_daemon_up(self) -> None:
-        """Raises MeshError."""
-        self._daemon.ensure_topics({TOPIC: SETTINGS})
-        online = [peer for peer, is_online in self._daemon.peers().items() if is_online]
-        self._do(lambda: self._calls.on_daemon_up(online))
-
-    def on_frame(self, frame: Frame) -> None:
-        message, header = as_message(frame), frame[0]
-        now = time.monotonic()
-        if message is not None and message.topic == TOPIC:
-            source, payload = message.source, message.payload
-            self._do(lambda: self._calls.from_mesh(source, payload))
-        elif header.get("event") == "peer-online":
-            self._do(lambda: self._calls.on_peer_online(str(header["peer"])))
-        elif header.get("event") == "peer-offline":
-            self._do(lambda: self._calls.on_peer_offline(str(header["peer"]), now))
 
     # Any thread
 
-    def _do(self, work: Callable[[], List[CallEffect]]) -> None:
+    def _take(self, work: Callable[[], List[CallEffect]]) -> None:
         with self._lock:
             self._execute(work())
 
@@ -125,16 +102,11 @@ class Ros1Calls:
             elif isinstance(effect, Warn):
                 self._warn_once(effect.text)
 
-    def _warn_once(self, text: str) -> None:
-        if text not in self._warned and len(self._warned) < 1000:
-            self._warned.add(text)
-            log.warning("%s", text)
-
     # The main thread
 
     def tick(self, now: float) -> None:
         """Ends calls whose time is over."""
-        self._do(lambda: self._calls.tick(now))
+        self._take(lambda: self._calls.tick(now))
 
     def refresh(self, more: Iterable[Offer] = ()) -> None:
         """Offers `more` and those of the configured services that have a server now, and creates and removes proxies.
@@ -144,7 +116,7 @@ class Ros1Calls:
             found = self._server(name)
             if found is not None:
                 offers.append(Offer(name, found.name, found.md5sum, options.timeout_s))
-        self._do(lambda: self._calls.offer(offers))
+        self._take(lambda: self._calls.offer(offers))
         while self._changes:
             change = self._changes.popleft()
             if isinstance(change, AddProxy):

@@ -16,14 +16,14 @@ from typing import Any, Callable, Deque, Dict, Iterable, List, Tuple
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
-from udp_mesh.bridges.call_messages import SETTINGS, Offer
-from udp_mesh.bridges.calls import AddProxy, CallEffect, Calls, Deliver, Finish, Invoke, RemoveProxy, SendCall
+from udp_mesh.bridges.call_messages import Offer
+from udp_mesh.bridges.calls import AddProxy, CallEffect, Deliver, Finish, Invoke, RemoveProxy, SendCall
 from udp_mesh.bridges.configuration import BridgeConfiguration
 from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.names import inbound_name
 from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class
 from udp_mesh.bridges.ros2.quality import ros2_name
-from udp_mesh.client.mesh_client import Frame, as_message
 
 log = logging.getLogger(__name__)
 
@@ -79,12 +79,12 @@ class _Proxy:
         node.destroy_service(self._service)
 
 
-class Ros2Calls:
+class Ros2Calls(MeshCalls):
     """Services and actions that are offered here, and proxies for those of the peers."""
 
     def __init__(self, node: Any, daemon: DaemonClient, own: str, options: BridgeConfiguration, run: str) -> None:
-        self._node, self._daemon, self._own, self._options = node, daemon, own, options
-        self._calls = Calls(run)
+        super().__init__(daemon, TOPIC, run)
+        self._node, self._own, self._options = node, own, options
         self._inbox: Deque[Callable[[], List[CallEffect]]] = deque()
         self._proxies: Dict[Tuple[str, str], _Proxy] = {}
         self._callers: Dict[int, _Proxy] = {}
@@ -92,31 +92,11 @@ class Ros2Calls:
         self._clients: Dict[str, Tuple[str, Any]] = {}
         self._events: Dict[str, Any] = {}
         self._asked: List[Tuple[float, Any, Any]] = []
-        self._warned: set[str] = set()
         self._ticks = 0
         self._wake = node.create_guard_condition(self._work)
         node.create_timer(TICK_S, self._tick)
 
-    # The daemon client's thread
-
-    def on_daemon_up(self) -> None:
-        """Raises MeshError."""
-        self._daemon.ensure_topics({TOPIC: SETTINGS})
-        online = [peer for peer, is_online in self._daemon.peers().items() if is_online]
-        self._queue(lambda: self._calls.on_daemon_up(online))
-
-    def on_frame(self, frame: Frame) -> None:
-        message, header = as_message(frame), frame[0]
-        now = time.monotonic()
-        if message is not None and message.topic == TOPIC:
-            source, payload = message.source, message.payload
-            self._queue(lambda: self._calls.from_mesh(source, payload))
-        elif header.get("event") == "peer-online":
-            self._queue(lambda: self._calls.on_peer_online(str(header["peer"])))
-        elif header.get("event") == "peer-offline":
-            self._queue(lambda: self._calls.on_peer_offline(str(header["peer"]), now))
-
-    def _queue(self, work: Callable[[], List[CallEffect]]) -> None:
+    def _take(self, work: Callable[[], List[CallEffect]]) -> None:
         self._inbox.append(work)
         self._wake.trigger()
 
@@ -200,11 +180,6 @@ class Ros2Calls:
                     publisher.publish(effect.payload)
             else:
                 self._warn_once(effect.text)
-
-    def _warn_once(self, text: str) -> None:
-        if text not in self._warned and len(self._warned) < 1000:
-            self._warned.add(text)
-            log.warning("%s", text)
 
     # Callers here
 
