@@ -1,12 +1,11 @@
 """The LAN filter on the kernel's bridges: a lidar that broadcasts behind the Husky's two radios stays off the air.
 
-The base's link carries less than the lidar sends, as a real channel at the multicast rate would.
+What reaches the base station's computer, three hops away, is counted: nothing of it with the filter, and without it.
+`benchmarks/lan_filter.py` measures what that does to urgent messages.
 """
 
 from __future__ import annotations
 
-import re
-import statistics
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -18,9 +17,6 @@ from tests.meshlab.qemu.conftest import Lab, until
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab-real"), pytest.mark.timeout(1800)]
 
 RADIOS = ("husky-front", "husky-rear")
-# a tenth of what the lidar sends: an emulated robot on a busy host does not get all of it out
-_LINK_KBIT_S = 1000
-_PINGS = 25
 # a VLP-16's packets to its factory destination: 1206 bytes, at 10 Mbit/s
 _LIDAR = """
 cat >/run/lidar.py <<'END'
@@ -31,29 +27,43 @@ out.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"eth0")
 start, sent = time.monotonic(), 0
 while True:
     while sent < (time.monotonic() - start) * 1e7 / 8 / 1206:
-        out.sendto(bytes(1206), ("{destination}", 2368))
+        out.sendto(bytes(1206), ("255.255.255.255", 2368))
         sent += 1
     time.sleep(0.005)
 END
 ip netns exec pc.husky python3 /run/lidar.py >/dev/null 2>&1 </dev/null & echo $! >/run/lidar.pid
 """
+# counts what arrives until it is killed; the file appears when it listens
+_LISTENER = """
+rm -f /run/heard
+cat >/run/heard.py <<'END'
+import pathlib, socket
+heard = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+heard.bind(("", 2368))
+count, written = 0, pathlib.Path("/run/heard.new")
+while True:
+    written.write_text(str(count))
+    written.replace("/run/heard")  # whole for every reader
+    heard.recv(2048)
+    count += 1
+END
+ip netns exec pc.base-station python3 /run/heard.py >/dev/null 2>&1 </dev/null & echo $! >/run/heard.pid
+"""
 
 
 @contextmanager
-def lidar(lab: Lab, destination: str = "255.255.255.255") -> Iterator[None]:
-    """Behind the Husky's radios; with its factory destination by default."""
-    control.run(lab.fleet.directory, _LIDAR.replace("{destination}", destination)).check("start the lidar")
+def process(lab: Lab, start: str, name: str) -> Iterator[None]:
+    """A program in the machine, whose start writes its process ID to `/run/NAME.pid`."""
+    control.run(lab.fleet.directory, start).check(f"start {name}")
     try:
         yield
     finally:
-        control.run(lab.fleet.directory, "kill $(cat /run/lidar.pid)").check("stop the lidar")
+        control.run(lab.fleet.directory, f"kill $(cat /run/{name}.pid)").check(f"stop {name}")
 
 
-def round_trips_ms(lab: Lab) -> list[float]:
-    """Of small urgent messages from the Husky's computer to the base station; a lost one counts as a whole second."""
-    command = f"ip netns exec pc.husky ping -Q 0xb8 -c {_PINGS} -i 0.1 -W 1 10.42.0.2"
-    found = re.findall(r"time=([\d.]+) ms", control.run(lab.fleet.directory, command, timeout_s=60.0).stdout)
-    return [float(one) for one in found] + [1000.0] * (_PINGS - len(found))
+def heard_at_base(lab: Lab) -> int | None:
+    """How many of the lidar's packets have reached the base station's computer; None: nothing listens yet."""
+    return int(text) if (text := control.run(lab.fleet.directory, "cat /run/heard").stdout) else None
 
 
 def dropped(lab: Lab) -> list[int]:
@@ -66,29 +76,26 @@ def dropped(lab: Lab) -> list[int]:
         found[:] = [counts["dropped_packets"] for counts in filters if counts is not None]
         return len(found) == len(RADIOS)
 
-    until(answered, "both radios to tell what their filters dropped")
+    until(answered, "both radios to report what their filters dropped")
     return found
 
 
-def test_a_lidars_broadcasts_stay_off_the_air_and_urgent_messages_keep_their_latency(lab: Lab) -> None:
-    lab.meshctl("lab", "link", "base", "b01", "--rate", str(_LINK_KBIT_S))
+def test_a_lidars_broadcasts_stay_on_the_robot_and_unicast_passes(lab: Lab) -> None:
+    before = dropped(lab)
     try:
-        before = dropped(lab)
-        # the same packets to one device on the robot: both measurements share the load of the emulated processor
-        with lidar(lab, "10.42.0.11"):
-            quiet = round_trips_ms(lab)
-        with lidar(lab):
-            filtered = round_trips_ms(lab)
-        assert all(now - then > 500 for now, then in zip(dropped(lab), before, strict=True))
-        for name in RADIOS:
-            lab.on(name, "nft delete table bridge meshctl_lan")
-        with lidar(lab):
-            flooded = round_trips_ms(lab)
+        with process(lab, _LISTENER, "heard"):
+            until(lambda: heard_at_base(lab) is not None, "the base station's computer to listen")
+            with process(lab, _LIDAR, "lidar"):
+                until(
+                    lambda: all(now - then > 500 for now, then in zip(dropped(lab), before, strict=True)),
+                    "both filters to drop 500 frames",
+                )
+                until(lambda: lab.answers("husky", "10.42.0.2"), "the base station to answer beside the lidar")
+                assert heard_at_base(lab) == 0
+                for name in RADIOS:
+                    lab.on(name, "nft delete table bridge meshctl_lan")
+                until(lambda: (heard_at_base(lab) or 0) > 50, "the lidar to be heard without the filters")
     finally:
         for name in RADIOS:
             lab.on(name, "sh /etc/meshctl/lan-filter.sh")
-        lab.meshctl("lab", "mend", "base-b01")
-    quiet_ms, filtered_ms, flooded_ms = map(statistics.median, (quiet, filtered, flooded))
-    # half the way to the flood, on a logarithmic scale
-    assert filtered_ms / quiet_ms < (flooded_ms / quiet_ms) ** 0.5
     lab.settle()
