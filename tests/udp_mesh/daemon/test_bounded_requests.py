@@ -124,7 +124,7 @@ def test_status_is_answered_even_if_all_connections_are_in_use(alice: RunningDae
                     assert client.request("status")["ok"]
                 break
             except MeshError:
-                assert time.monotonic() < asked + 5.0
+                assert time.monotonic() < asked + 60.0
         with MeshClient(str(alice.socket), timeout_s=10.0) as client:
             with pytest.raises(MeshError) as refused:
                 client.request("peers")
@@ -132,7 +132,7 @@ def test_status_is_answered_even_if_all_connections_are_in_use(alice: RunningDae
     finally:
         for one in idle:
             one.close()
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 60.0
     while True:
         try:
             with alice.client() as client:
