@@ -15,24 +15,15 @@ import argparse
 import json
 import os
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.page import fill
+from benchmarks.practice_fleet import PracticeFleet, log, practice_fleet
 from benchmarks.reconvergence_udp_mesh import airtime_us
-from meshctl.errors import MeshctlError
-from meshctl.model import Fleet
-from meshlab.fleet import QemuFleet
-from meshlab.from_inventory import spec_of
-from meshlab.inventory_copy import copy_inventory
-from meshlab.qemu import control
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "arp_airtime.jsonl"
@@ -43,12 +34,6 @@ SCENARIO_S = 60
 PING_EVERY_S = 5
 # powered off in the last scenario: there is a path around it, so that only its own address is unanswered
 POWERED_OFF_NODE = "b02"
-# under emulation on a busy host; loop avoidance alone holds a new bat0 for half a minute
-_START_S, _COMMAND_S, _SETTLE_S = 600.0, 900.0, 240.0
-_POLL_S = 0.5
-_WINDOW_S = 600
-# a connection into a starved machine may break; all commands are safe to repeat
-_ATTEMPTS = 3
 
 
 def main() -> None:
@@ -71,7 +56,9 @@ def main() -> None:
 
 def measure(results: Path, runs: int) -> None:
     """Append the missing runs of every scenario to the results, each as soon as it was measured."""
-    with tempfile.TemporaryDirectory() as folder, bench(Path(folder)) as made:
+    with tempfile.TemporaryDirectory() as folder, practice_fleet(Path(folder)) as lab:
+        lab.machine(f"cat >/run/overhear_arp.py <<'END'\n{PROGRAM.read_text()}END")
+        made = Bench(lab)
         for _ in range(runs):
             for is_on in (False, True):
                 todo = [scene for scene in SCENARIOS if len(runs_of(recorded(results), scene, is_on=is_on)) < runs]
@@ -83,97 +70,49 @@ def measure(results: Path, runs: int) -> None:
                         "table": is_on,
                         "scene": scene,
                         "seconds": SCENARIO_S,
-                        "nodes": len(made.nodes),
+                        "nodes": len(lab.nodes),
                     }
                     line |= {**made.run_scenario(scene), "load": round(os.getloadavg()[0], 1)}
                     with results.open("a", encoding="utf-8") as file:
                         file.write(f"{json.dumps(line)}\n")
-                    _log(f"table {'on' if is_on else 'off'}, {scene}: {line['requests']} broadcasts")
+                    log(f"table {'on' if is_on else 'off'}, {scene}: {line['requests']} broadcasts")
 
 
-@contextmanager
-def bench(place: Path) -> Iterator[Bench]:
-    """The example fleet, provisioned and unplugged."""
-    copy = copy_inventory(ROOT / "inventory" / "lab", place / "lab")
-    # confirming a change takes seconds, but minutes in an emulated machine on a starved host
-    file = copy.inventory / "fleet.yaml"
-    text = file.read_text(encoding="utf-8")
-    file.write_text(text.replace("confirm_window_s: 90", f"confirm_window_s: {_WINDOW_S}"), encoding="utf-8")
-    fleet = QemuFleet(spec_of(copy.fleet, links=copy.links), place / "lab").up(wait_s=_START_S)
-    try:
-        made = Bench(fleet, copy.fleet, copy.inventory, place / "state")
-        made.provision()
-        yield made
-    finally:
-        fleet.down()
-
-
+@dataclass(frozen=True, slots=True)
 class Bench:
     """The running fleet, seen from the operator's computer."""
 
-    def __init__(self, fleet: QemuFleet, inventory: Fleet, path: Path, state: Path) -> None:
-        self._fleet = fleet
-        self._inventory = inventory
-        self._path = path
-        self._state = state
-        self.nodes = fleet.spec.names
-        robots = inventory.robots.values()
-        self._operator = next(robot.name for robot in robots if robot.is_base)
-        computers = [robot.computer.address.ip for robot in robots if robot.computer and not robot.is_base]
-        self._addresses = [str(one) for one in (*(inventory.nodes[name].address.ip for name in self.nodes), *computers)]
-
-    def provision(self) -> None:
-        environment = {
-            **os.environ,
-            "MESHCTL_LAB": str(self._fleet.directory),
-            "MESHCTL_INVENTORY": str(self._path),
-            "XDG_STATE_HOME": str(self._state),
-        }
-        left = list(self.nodes)
-        for _ in range(_ATTEMPTS):
-            words = (sys.executable, "-m", "meshctl", "bootstrap", "--yes", *left)
-            subprocess.run(words, env=environment, check=False, timeout=_COMMAND_S, stdout=subprocess.DEVNULL)
-            # on a starved machine, nodes that were proven too late have rolled back
-            left = [
-                name for name in left if self._fleet.node(name).address != str(self._inventory.nodes[name].address.ip)
-            ]
-            if not left:
-                break
-        else:
-            raise RuntimeError(f"cannot provision {', '.join(left)}")
-        for name in self.nodes:
-            self._fleet.node(name).plug(False)
-        control.run(self._fleet.directory, f"cat >/run/overhear_arp.py <<'END'\n{PROGRAM.read_text()}END").check("put")
+    lab: PracticeFleet
 
     def set_table(self, *, is_on: bool) -> None:
         """Set the table on every node, which recreates bat0 with empty tables; then wait for the mesh."""
         words = f"uci set network.bat0.distributed_arp_table={is_on:d} && uci commit network && reload_config"
-        self._on_all(words)
-        for name in self.nodes:
-            setting = self._on(name, "batctl meshif bat0 distributed_arp_table").strip()
+        self.lab.on_all(words)
+        for name in self.lab.nodes:
+            setting = self.lab.on(name, "batctl meshif bat0 distributed_arp_table").strip()
             if setting != ("enabled" if is_on else "disabled"):
                 raise RuntimeError(f"{name}: its distributed ARP table is {setting}")
-        self._settle()
+        self.lab.settle()
 
     def run_scenario(self, scene: str) -> dict[str, Any]:
         """The captured traffic: `overheard`, rows of kind, rate, bytes and count, and the number of `requests`."""
         if scene == "one gone":
-            self._fleet.inject_fault(POWERED_OFF_NODE, "off")
-        self._on_all("ip neigh flush all", but=POWERED_OFF_NODE if scene == "one gone" else "")
-        for robot in self._inventory.robots:
-            self._machine(f"ip netns exec pc.{robot} ip neigh flush all")
+            self.lab.fleet.inject_fault(POWERED_OFF_NODE, "off")
+        self.lab.on_all("ip neigh flush all", but=POWERED_OFF_NODE if scene == "one gone" else "")
+        for robot in self.lab.inventory.robots:
+            self.lab.machine(f"ip netns exec pc.{robot} ip neigh flush all")
         try:
             # start the capture before any traffic
-            self._machine(f"python3 /run/overhear_arp.py {SCENARIO_S} >/run/arp.out 2>&1 </dev/null &")
-            self._until(lambda: self._capture().startswith("listening"), "the capture to start")
+            self.lab.machine(f"python3 /run/overhear_arp.py {SCENARIO_S} >/run/arp.out 2>&1 </dev/null &")
+            self.lab.until(lambda: self._capture().startswith("listening"), "the capture to start")
             if scene != "quiet":
-                self._machine("; ".join(self._ping(address) for address in self._addresses))
-            self._until(lambda: "requests" in self._capture(), "the scenario to end")
+                self.lab.machine("; ".join(self._ping(address) for address in self.lab.addresses))
+            self.lab.until(lambda: "requests" in self._capture(), "the scenario to end")
             text = self._capture()
         finally:
             if scene == "one gone":
-                self._fleet.repair(POWERED_OFF_NODE)
-                self._settle()
+                self.lab.fleet.repair(POWERED_OFF_NODE)
+                self.lab.settle()
         _, *lines, last = text.splitlines()
         overheard = [
             {"kind": kind, "rate": int(rate), "bytes": int(length), "count": int(count)}
@@ -184,48 +123,10 @@ class Bench:
     def _ping(self, address: str) -> str:
         # with its own deadline ping would end at the first address that does not answer
         words = f"timeout {SCENARIO_S} ping -q -i {PING_EVERY_S} {address}"
-        return f"(ip netns exec pc.{self._operator} {words} >/dev/null 2>&1 </dev/null &)"
+        return f"(ip netns exec pc.{self.lab.operator} {words} >/dev/null 2>&1 </dev/null &)"
 
     def _capture(self) -> str:
-        return self._machine("cat /run/arp.out")
-
-    def _settle(self) -> None:
-        def answers(address: str) -> bool:
-            words = f"ip netns exec pc.{self._operator} ping -c 1 -W 2 {address}"
-            return control.run(self._fleet.directory, words, timeout_s=60.0).exit_status == 0
-
-        self._until(lambda: all(self._fleet.node(name).is_up() for name in self.nodes), "every node to be up")
-        for address in self._addresses:
-            self._until(lambda address=address: answers(address), f"{address} to answer")  # type: ignore[misc]
-
-    def _until(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + _SETTLE_S
-        while not condition():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"waited {_SETTLE_S:.0f} s for {what}")
-            time.sleep(_POLL_S)
-
-    def _on_all(self, command: str, *, but: str = "") -> None:
-        names = [name for name in self.nodes if name != but]
-        with ThreadPoolExecutor(len(names)) as pool:
-            list(pool.map(lambda name: self._on(name, command), names))
-
-    def _on(self, name: str, command: str) -> str:
-        for left in reversed(range(_ATTEMPTS)):
-            try:
-                return self._fleet.node(name).exec(command, timeout_s=120.0).check(f"{name}: {command}").stdout
-            except MeshctlError as error:
-                if not left:
-                    raise
-                _log(f"{name}: {error}; again")
-        raise AssertionError("no attempt was made")
-
-    def _machine(self, command: str, *, timeout_s: float = 60.0) -> str:
-        return control.run(self._fleet.directory, command, timeout_s=timeout_s).check(command[:80]).stdout
-
-
-def _log(text: str) -> None:
-    print(f"{time.strftime('%H:%M:%S', time.gmtime())} {text}", file=sys.stderr, flush=True)
+        return self.lab.machine("cat /run/arp.out")
 
 
 # -- results --
