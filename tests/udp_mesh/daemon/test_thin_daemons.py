@@ -12,12 +12,15 @@ import pytest
 from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, collect, configuration, outcomes, poll, wait_online
 from tests.udp_mesh.daemon.serial_air import SerialAir, running
 from tests.udp_mesh.links.sockets import free_port
+from tests.waiting import until
 from udp_mesh.cli.views import status_view
 from udp_mesh.daemon.configuration import read
 from udp_mesh.daemon.toml_source import ConfigurationError, parse
 from udp_mesh.wire.serial_framing import encode_line
 
 BITS_PER_S = 20_000
+POSITION_WAIT_S = 300.0
+"""Time for ten positions, of which each is lost with the link's 10 %."""
 TOPICS = """
 estop = { priority = 0, thin = true }
 report = { priority = 8, thin = true }
@@ -86,16 +89,18 @@ def test_a_robot_without_wifi_reports_its_position_and_hears_the_stop() -> None:
         present(base, "husky")
         present(husky, "base")
         with husky.client() as robot, base.client() as operator:
+            # Before the stop, which could collide with it: positions are not repeated, and come every 30 s.
             robot.request("set-position", x_m=3.0, y_m=4.0)
+            until(
+                lambda: next((one for one in operator.request("status")["positions"] if one["name"] == "husky"), None),
+                "husky's position arrives",
+                wait_s=POSITION_WAIT_S,
+            )
             robot.request("subscribe", topics=["estop"])
             reply = operator.request("publish", b"stop", topic="estop", to="husky", notify=True)
             [message] = collect(robot, 1)
             assert (message.topic, message.payload, message.source) == ("estop", b"stop", "base")
             assert outcomes(operator, 1) == {reply["message"]: "delivered"}
-            poll(
-                lambda: next((one for one in operator.request("status")["positions"] if one["name"] == "husky"), None),
-                "husky's position arrives",
-            )
             status = operator.request("status")
         assert [peer["name"] for peer in status["conditions"]["peers"] if peer["online"]] == []
         view = status_view(status)
