@@ -10,6 +10,7 @@ from importlib.metadata import version
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.meshctl.cli.speech_program import NEEDS_SPEECH, expects_speech
 from tests.meshctl.fleet.postgresql_server import NEEDS_POSTGRESQL, expects_postgresql
 from tests.meshctl.monitor.browser import CHROMIUM, NEEDS_BROWSER, expects_browser
 from tests.meshctl.monitor.prometheus_program import NEEDS_PROMETHEUS, expects_prometheus
@@ -53,7 +54,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("tried again")
         for reason in reasons:
             terminalreporter.line(reason)
-    if not all((expects_ros(), expects_ros2(), expects_prometheus(), expects_browser(), expects_postgresql())):
+    expected = (expects_ros, expects_ros2, expects_prometheus, expects_browser, expects_postgresql, expects_speech)
+    if not all(expects() for expects in expected):
         terminalreporter.section("not tested here")
     if not expects_ros2():
         terminalreporter.line(
@@ -75,6 +77,11 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
             "Prometheus: there is no prometheus in PATH, so tests/meshctl/monitor/test_prometheus.py was not"
             f" collected. scripts/setup-prometheus installs it (Debian, Ubuntu); {NEEDS_PROMETHEUS}=1 makes it fail"
             " instead."
+        )
+    if not expects_speech():
+        terminalreporter.line(
+            "Speech: there is no espeak-ng in PATH, so tests/meshctl/cli/test_voice.py was not collected."
+            f" scripts/setup-speech installs it (Debian, Ubuntu); {NEEDS_SPEECH}=1 makes it fail instead."
         )
     if not expects_postgresql():
         terminalreporter.line(

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +19,7 @@ from meshctl.cli.context import AsJson
 from meshctl.cli.fleet_view import FleetView, collect, paint_of, with_fleet_view
 from meshctl.cli.live_screen import live_screen
 from meshctl.cli.output import echo, echo_json
+from meshctl.cli.voice import Voice
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.nodes.link_looks import HopMargins, LinkWatch, assemble, carried_beacons, own_radios
@@ -85,8 +84,7 @@ def meter(
     """
     if deploy and deploy not in _DEPLOY:
         raise InputError(f"--deploy: expected ros1 or ros2, found {deploy!r}")
-    if speak and shutil.which("espeak-ng") is None:
-        raise InputError("--speak: espeak-ng is not installed", hint="install the package espeak-ng")
+    voice = Voice() if speak else None
     # a path of beacons soon has as many hops
     needed_db = required_snr_db(load, MAX_SHARED_HOPS)
     watch = _watch_of(fleet_view, robot)
@@ -100,11 +98,17 @@ def meter(
         spacing,
         fleet_view.opened.access.meter.totals,
         deploy,
-        speak,
+        voice,
     )
     if as_json or count is not None or not sys.stdout.isatty():
+        shown = ""
         for reading in source.readings(count):
             echo_json(json.dumps(source.json(reading))) if as_json else echo(line(robot, reading))
+            if source.sound_problem != shown:
+                shown = source.sound_problem
+                echo(shown or "the sound works again", err=True)
+        if voice is not None:
+            voice.wait()
         raise typer.Exit
     live_screen(source.step, partial(_draw, source), 1.0, sys.stdout)
     raise typer.Exit(ExitCode.INTERRUPTED)
@@ -179,12 +183,11 @@ class _ReadingSource:
     spacing_m: float | None
     traffic: Callable[[], dict[str, int]]
     deploy: str
-    speak: bool
+    voice: Voice | None
     bytes_per_s: float | None = None
     _seen_s: float = 0.0
     _counted: tuple[float, int] | None = None
     _spoken: Reading | None = None
-    _voice: subprocess.Popen[bytes] | None = None
     _was: Advice = Advice.GO
     _steps: int = 0
     _note: str = field(default="")
@@ -235,7 +238,7 @@ class _ReadingSource:
     def footer(self) -> str:
         """What the looks cost, and what is wrong."""
         cost = "?" if self.bytes_per_s is None else f"{self.bytes_per_s / 1000:.1f}"
-        problem = self.watch.problem() or self._note
+        problem = self.watch.problem() or self._note or self.sound_problem
         return f"queries cost {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
 
     def _count_bytes(self) -> None:
@@ -261,15 +264,16 @@ class _ReadingSource:
             # without --deploy, it is enough that the reading is shown here
             self._note = str(error) if self.deploy else ""
 
+    @property
+    def sound_problem(self) -> str:
+        """Why the operator hears nothing; empty if the advice is heard, or is not to be spoken."""
+        return "" if self.voice is None else self.voice.problem
+
     def _speak(self, reading: Reading) -> None:
-        if not self.speak or not is_due_to_speak(reading, self._spoken):
-            return
-        if self._voice is not None and self._voice.poll() is None:
+        if self.voice is None or not is_due_to_speak(reading, self._spoken) or self.voice.is_speaking:
             return
         self._spoken = reading
-        self._voice = subprocess.Popen(
-            ["espeak-ng", words(reading)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        self.voice.say(words(reading))
 
 
 def _draw(source: _ReadingSource, reading: Reading | None, size: os.terminal_size) -> list[str]:
