@@ -19,6 +19,9 @@ MAX_HOP_BYTES = 1 << 20
 MAX_QUEUED_S = 2.0
 """Older datagrams are dropped: their sender has sent them again."""
 
+CARRY_OVERHEAD_BYTES = 512
+"""Memory of a waiting datagram beyond its bytes: without it, empty ones would wait without bound."""
+
 _BEFORE_ALL = float("-inf")
 """At this time nothing is too old."""
 
@@ -33,9 +36,13 @@ class QueuedCarry(NamedTuple):
     def size(self) -> int:
         return len(self.carry.datagram)
 
+    @property
+    def memory_bytes(self) -> int:
+        return self.size + CARRY_OVERHEAD_BYTES
+
 
 class QueueBudget:
-    """Bytes waiting by origin and by previous hop, over all queues of a node."""
+    """Memory of what waits, by origin and by previous hop, over all queues of a node."""
 
     __slots__ = ("_origins", "_previous", "own")
 
@@ -45,20 +52,24 @@ class QueueBudget:
         self._previous: dict[bytes, int] = {}
 
     def has_room(self, item: QueuedCarry) -> bool:
-        if self._origins.get(item.carry.origin, 0) + item.size > MAX_ORIGIN_BYTES:
-            return False
-        return item.previous == self.own or self._previous.get(item.previous, 0) + item.size <= MAX_HOP_BYTES
+        return self.origin_has_room(item) and self.hop_has_room(item)
+
+    def origin_has_room(self, item: QueuedCarry) -> bool:
+        return self._origins.get(item.carry.origin, 0) + item.memory_bytes <= MAX_ORIGIN_BYTES
+
+    def hop_has_room(self, item: QueuedCarry) -> bool:
+        return item.previous == self.own or self._previous.get(item.previous, 0) + item.memory_bytes <= MAX_HOP_BYTES
 
     def add(self, item: QueuedCarry) -> None:
-        _change(self._origins, item.carry.origin, item.size)
-        _change(self._previous, item.previous, item.size)
+        _change(self._origins, item.carry.origin, item.memory_bytes)
+        _change(self._previous, item.previous, item.memory_bytes)
 
     def remove(self, item: QueuedCarry) -> None:
-        _change(self._origins, item.carry.origin, -item.size)
-        _change(self._previous, item.previous, -item.size)
+        _change(self._origins, item.carry.origin, -item.memory_bytes)
+        _change(self._previous, item.previous, -item.memory_bytes)
 
     @property
-    def bytes(self) -> int:
+    def memory_bytes(self) -> int:
         return sum(self._origins.values())
 
 
@@ -92,10 +103,10 @@ class HopQueue:
         return (self._waiting & -self._waiting).bit_length() - 1
 
     def push(self, item: QueuedCarry) -> None:
-        """Add a datagram; without room, the newest of its origin's least urgent ones goes, or this one."""
+        """Add a datagram; without room, a less urgent one of its origin or previous hop goes, or this one."""
         while not self._budget.has_room(item):
             self.dropped += 1
-            if not self._evict(item.carry.origin, item.carry.priority):
+            if not self._evict_for(item):
                 return
         self._budget.add(item)
         self.bytes += item.size
@@ -103,14 +114,20 @@ class HopQueue:
         level.setdefault(item.carry.origin, deque()).append(item)
         self._waiting |= 1 << item.carry.priority
 
-    def _evict(self, origin: bytes, priority: int) -> bool:
-        """Drop the newest datagram of this origin that is less urgent; False if there is none."""
-        for level in range(PRIORITY_LEVELS - 1, priority, -1):
-            waiting = self._levels[level].get(origin)
-            if waiting:
-                self._removed(waiting.pop())
-                self._tidy(level, origin)
-                return True
+    def _evict_for(self, item: QueuedCarry) -> bool:
+        """Drop the newest less urgent datagram of the item's origin, or of its previous hop where that has no room.
+
+        Urgent datagrams of one origin so pass those of the others behind the same relay. False if there is none.
+        """
+        origin_has_room = self._budget.origin_has_room(item)
+        for level in range(PRIORITY_LEVELS - 1, item.carry.priority, -1):
+            origins = self._levels[level]
+            for origin in list(origins) if origin_has_room else (item.carry.origin,):
+                waiting = origins.get(origin)
+                if waiting and (not origin_has_room or waiting[-1].previous == item.previous):
+                    self._removed(waiting.pop())
+                    self._tidy(level, origin)
+                    return True
         return False
 
     def pop(self, now: float) -> QueuedCarry | None:

@@ -329,4 +329,4 @@ class Relaying:
 
     @property
     def queued_bytes(self) -> int:
-        return self.forwarding.budget.bytes
+        return sum(neighbour.queue.bytes for neighbour in self.neighbours.values())

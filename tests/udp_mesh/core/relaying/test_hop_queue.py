@@ -5,7 +5,14 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.core.relaying.hop_queue import MAX_HOP_BYTES, MAX_ORIGIN_BYTES, HopQueue, QueueBudget, QueuedCarry
+from udp_mesh.core.relaying.hop_queue import (
+    CARRY_OVERHEAD_BYTES,
+    MAX_HOP_BYTES,
+    MAX_ORIGIN_BYTES,
+    HopQueue,
+    QueueBudget,
+    QueuedCarry,
+)
 from udp_mesh.wire.relay import Carry
 
 OWN = bytes(16)
@@ -35,7 +42,7 @@ def test_a_flood_fills_only_its_own_share_and_its_urgent_datagrams_replace_its_o
     queue = HopQueue(budget)
     for _ in range(1000):
         queue.push(item(9, 1))
-    assert budget.bytes <= MAX_ORIGIN_BYTES
+    assert budget.memory_bytes <= MAX_ORIGIN_BYTES
     full = queue.bytes
     queue.push(item(0, 1))
     assert queue.bytes == full
@@ -50,7 +57,45 @@ def test_a_member_that_invents_origins_is_bounded_as_a_previous_hop() -> None:
     for origin in range(1, 101):
         for _ in range(20):
             queue.push(item(9, origin))
-    assert budget.bytes <= MAX_HOP_BYTES
+    assert budget.memory_bytes <= MAX_HOP_BYTES
+
+
+def test_empty_datagrams_are_bounded_by_their_memory() -> None:
+    budget = QueueBudget(OWN)
+    queue = HopQueue(budget)
+    for origin in range(1, 101):
+        for _ in range(200):
+            queue.push(item(9, origin, size=4))
+    waiting = len(queue.drain())
+    assert 0 < waiting <= MAX_HOP_BYTES // CARRY_OVERHEAD_BYTES
+    assert queue.dropped == 20_000 - waiting
+    assert budget.memory_bytes == 0
+
+
+def test_an_urgent_datagram_replaces_those_of_others_behind_the_same_relay() -> None:
+    queue = HopQueue(QueueBudget(OWN))
+    for origin in range(1, 10):
+        for _ in range(300):
+            queue.push(item(9, origin))
+    queue.push(item(9, 20, previous=2))
+    full = queue.bytes
+    queue.push(item(0, 10))
+    assert queue.bytes == full
+    left = queue.drain()
+    assert (left[0].carry.priority, left[0].carry.origin[0]) == (0, 10)
+    # Nothing that came from elsewhere made room for it.
+    assert [each.carry.origin[0] for each in left if each.previous[0] == 2] == [20]
+
+
+def test_nothing_as_urgent_makes_room() -> None:
+    queue = HopQueue(QueueBudget(OWN))
+    for origin in range(1, 10):
+        for serial in range(300):
+            queue.push(item(9, origin, serial=serial))
+    full = queue.bytes
+    queue.push(item(9, 10))
+    assert queue.bytes == full
+    assert 10 not in {each.carry.origin[0] for each in queue.drain()}
 
 
 def test_origins_of_one_level_take_turns() -> None:
