@@ -7,7 +7,6 @@ halfway.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -41,7 +40,8 @@ def _never(_peer: str, _item: ItemId) -> bool:
 class _Service:
     """One peer's requests."""
 
-    queue: deque[ItemId] = field(default_factory=deque)
+    queue: dict[ItemId, None] = field(default_factory=dict)
+    """What waits, in order: a request may name hundreds of items, and each is looked up."""
     sending: dict[ItemId, int] = field(default_factory=dict)
     """Items being read or sent, with their size once read."""
     retry_at: float = float("inf")
@@ -68,7 +68,7 @@ class Serving:
         if len(service.queue) >= MAX_QUEUED:
             return False
         if item not in service.sending and item not in service.queue:
-            service.queue.append(item)
+            service.queue[item] = None
         return True
 
     def peer_offline(self, peer: str) -> None:
@@ -85,7 +85,7 @@ class Serving:
         """Send none of these (peer, item) any more: what waits, what is being read, and what the transport has."""
         for peer, service in self._peers.items():
             if any(is_needless(peer, item) for item in service.queue):
-                service.queue = deque(item for item in service.queue if not is_needless(peer, item))
+                service.queue = {item: None for item in service.queue if not is_needless(peer, item)}
             for item in [item for item, size_bytes in service.sending.items() if not size_bytes]:
                 if is_needless(peer, item):
                     del service.sending[item]
@@ -106,9 +106,9 @@ class Serving:
                 and service.retry_at == float("inf")
                 and len(service.sending) < MAX_SENDING
                 and sum(service.sending.values()) < MAX_SENDING_BYTES
-                and not waits(peer, service.queue[0])
+                and not waits(peer, item := next(iter(service.queue)))
             ):
-                item = service.queue.popleft()
+                del service.queue[item]
                 service.sending[item] = 0
                 self._read(peer, item, lost)
             if not service.queue and not service.sending:
@@ -136,7 +136,7 @@ class Serving:
             service.retry_at = now + RETRY_S
             if outcome.reason is RejectReason.QUEUE_FULL:
                 # It waits for the item, and does not request it again soon.
-                service.queue.appendleft(item)
+                service.queue = {item: None, **service.queue}
             return
         service.sending[item] = len(data)
         self._messages[outcome] = (peer, item)
