@@ -21,6 +21,7 @@ from pathlib import Path
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.events import Event, MessageDelivered, MessageExpired, MessagePeerLost, MessageReceived
 from udp_mesh.core.logs.conditions import LogConditions
+from udp_mesh.core.thin.conditions import ThinConditions
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 from udp_mesh.daemon.positions import Position, position_json
@@ -33,6 +34,22 @@ BATCH_BYTES = 64 << 10
 """Lines submitted together: submitting costs as much as ten lines."""
 MAX_BACKLOG_BYTES = 32 << 20
 """Lines waiting for a disk that hangs: half a minute of recording at 10 Mbit/s."""
+
+
+def _thin_fields(thin: ThinConditions) -> Json:
+    return {
+        "links": [
+            {
+                "name": link.name,
+                "up": link.up,
+                "airtime_s": round(link.airtime_s, 6),
+                "queued_messages": link.queued_messages,
+                **asdict(link.counters),
+            }
+            for link in thin.links
+        ],
+        "peers": [{"name": peer.name, "present": peer.present, "only_thin": peer.only_thin} for peer in thin.peers],
+    }
 
 
 class Recorder:
@@ -110,9 +127,15 @@ class Recorder:
         self._write({"t": self._at(now), "kind": "place", **line, "frame": fields["frame"], "age_s": fields["age_s"]})
 
     def conditions(
-        self, conditions: Conditions, versions: Iterable[VersionConditions] = (), logs: Iterable[LogConditions] = ()
+        self,
+        conditions: Conditions,
+        versions: Iterable[VersionConditions] = (),
+        logs: Iterable[LogConditions] = (),
+        thin: ThinConditions | None = None,
     ) -> None:
         fields: Json = {"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)}
+        if thin is not None:
+            fields["thin"] = _thin_fields(thin)
         if rows := [{"topic": entry.topic, **asdict(entry.counters)} for entry in versions]:
             fields["versions"] = rows
         if rows := [log_json(log) for log in logs]:

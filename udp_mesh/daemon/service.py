@@ -298,7 +298,8 @@ class Service:
     def _record_totals(self, recorder: Recorder) -> None:
         """Records the conditions, and what only the first and the last of them contain."""
         node = self.driver.node
-        recorder.conditions(self.driver.conditions(), node.versions(), node.logs())
+        conditions = self.driver.conditions()
+        recorder.conditions(conditions, node.versions(), node.logs(), node.thin_conditions(conditions.now))
 
     def _announce_subscriptions(self, read: list[Subscription]) -> None:
         self.driver.node.selective.set_subscriptions(read, self.driver.now())
@@ -369,7 +370,7 @@ class Service:
             return
         conditions = self.driver.conditions()
         if self.recorder is not None:
-            self.recorder.conditions(conditions)
+            self.recorder.conditions(conditions, thin=self.driver.node.thin_conditions(conditions.now))
         if clients:
             header: Header = {
                 "event": "conditions",

@@ -35,6 +35,7 @@ from udp_mesh.report.recording import (
     VersionTotals,
     lines_of,
 )
+from udp_mesh.report.thin_links import ThinLinkSample, ThinLinkUse, ThinPeerSample
 
 BINS = 240
 """Of a chart: about one per two pixels."""
@@ -152,6 +153,11 @@ class Recording:
     """By topic and source."""
     saved: dict[str, tuple[SavedTotals, SavedTotals]] = field(default_factory=dict)
     """By peer: at the beginning of the recording, and last."""
+    thin_links: dict[str, ThinLinkUse] = field(default_factory=dict)
+    thin_present: dict[str, OnlineTimes] = field(default_factory=dict)
+    """By peer: when it was heard on thin links, and heard this node."""
+    thin_airtime: BinnedLines = field(default_factory=lambda: BinnedLines(BINS))
+    """By link: the share of the time in which it sent, in percent."""
     event_counts: dict[tuple[str, str], int] = field(default_factory=dict)
     """By node and kind."""
     events: dict[str, Thinned[RecordedEvent]] = field(default_factory=dict)
@@ -211,6 +217,13 @@ class Recording:
             case LogSample(topic, source, progress):
                 if self._has_room(self.logs, (topic, source)):
                     self.logs[topic, source] = progress
+            case ThinLinkSample():
+                self._thin_link(item)
+            case ThinPeerSample():
+                if item.present and item.peer not in self.thin_present and self._has_room(self.thin_present, item.peer):
+                    self.thin_present[item.peer] = OnlineTimes(item.t)
+                if (present := self.thin_present.get(item.peer)) is not None:
+                    present.begin(item.t) if item.present else present.stop(item.t)
             case Gap():
                 self.missing_lines += item.lines
             case InvalidLine(text):
@@ -220,7 +233,7 @@ class Recording:
 
     def end(self) -> None:
         """After the last item."""
-        for times in self.online.values():
+        for times in (*self.online.values(), *self.thin_present.values()):
             times.end(self.end_s)
 
     def _has_room(self, known: Mapping[Any, object], key: Hashable) -> bool:
@@ -228,6 +241,16 @@ class Recording:
             return True
         self.unnamed += 1
         return False
+
+    def _thin_link(self, sample: ThinLinkSample) -> None:
+        use = self.thin_links.get(sample.link)
+        if use is None:
+            if not self._has_room(self.thin_links, sample.link):
+                return
+            use = self.thin_links[sample.link] = ThinLinkUse(sample, sample)
+        share = use.add(sample)
+        if share is not None:
+            self.thin_airtime.add(sample.link, sample.t, 100 * share)
 
     def _arrived(self, item: RecordedArrival) -> None:
         topic = self.received.get(item.topic)

@@ -18,9 +18,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from udp_mesh.report import figures
-from udp_mesh.report.aggregate import BINS, MAX_EVENTS, MAX_NAMES, MAX_SPANS, Recording
+from udp_mesh.report.aggregate import BINS, MAX_EVENTS, MAX_NAMES, MAX_SPANS, OnlineTimes, Recording
 from udp_mesh.report.bins import BinnedLines, Bins, largest, rounded
 from udp_mesh.report.recording import RecordedEvent
+from udp_mesh.report.thin_links import ThinLinkUse
 
 VERSION = 1
 MAX_LINES = 12
@@ -148,14 +149,21 @@ def _state_tables(recording: Recording) -> list[dict[str, Any]]:
         _table(
             "Online",
             "peer|#share of the time|#times lost|#longest gap s",
-            (
-                (
-                    *(peer, f"{figures.online_share(times, recording.end_s):.1%}", str(times.times_lost)),
-                    f"{times.longest_gap_s:.1f}" if times.times_lost else MISSING,
-                )
-                for peer, times in sorted(recording.online.items())
-            ),
+            (_online_row(peer, times, recording.end_s) for peer, times in sorted(recording.online.items())),
             "Of the time since the peer was first seen.",
+        ),
+        _table(
+            "Thin links",
+            "link|#port open|#airtime s|#share of the time|#frames sent|#kB sent|#frames received|#rejected"
+            "|#parts repeated|#messages given up|#dropped|#most queued",
+            (_thin_row(name, use) for name, use in sorted(recording.thin_links.items())),
+            "Rejected: forged, or not opened because too many before were forged.",
+        ),
+        _table(
+            "Present on thin links",
+            "peer|#share of the time|#times lost|#longest gap s",
+            (_online_row(peer, times, recording.end_s) for peer, times in sorted(recording.thin_present.items())),
+            "Of the time since the peer was first heard there.",
         ),
         _table(
             "Intervals between messages",
@@ -183,6 +191,22 @@ def _state_tables(recording: Recording) -> list[dict[str, Any]]:
             ((at, kind, str(count)) for (at, kind), count in sorted(recording.event_counts.items())),
         ),
     ]
+
+
+def _online_row(peer: str, times: OnlineTimes, end_s: float) -> tuple[str, ...]:
+    longest = f"{times.longest_gap_s:.1f}" if times.times_lost else MISSING
+    return peer, f"{figures.online_share(times, end_s):.1%}", str(times.times_lost), longest
+
+
+def _thin_row(link: str, use: ThinLinkUse) -> tuple[str, ...]:
+    totals, passed_s = use.totals, use.last.t - use.first.t
+    share = f"{totals.airtime_s / passed_s:.2%}" if passed_s > 0 else MISSING
+    return (
+        *(link, f"{use.up_share:.1%}", f"{totals.airtime_s:.1f}", share),
+        *(str(totals.frames_sent), f"{totals.bytes_sent / 1e3:.1f}", str(totals.frames_received)),
+        *(str(totals.frames_forged + totals.frames_rejected), str(totals.parts_repeated)),
+        *(str(totals.messages_given_up), str(totals.messages_dropped), str(use.most_queued)),
+    )
 
 
 def _milliseconds(seconds: float | None) -> str:
@@ -221,6 +245,7 @@ def _charts(recording: Recording, bins: Bins) -> list[dict[str, Any]]:
         chart("Throughput by priority", "Mbit/s", "stacked", _layers(by_priority), note),
         lines("Latency to the acknowledgment", "ms", recording.latencies_ms),
         *(lines(title, unit, recording.sampled[name]) for name, title, unit in _SAMPLED),
+        lines("Airtime used on thin links", "%", recording.thin_airtime),
     ]
 
 

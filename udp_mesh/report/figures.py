@@ -4,6 +4,7 @@ scripts."""
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -129,14 +130,18 @@ def summary(recording: Recording) -> dict[str, Any]:
             {"topic": topic, "source": source, **asdict(progress)}
             for (topic, source), progress in sorted(recording.logs.items())
         ],
-        "online": [
+        "thin_links": [
             {
-                "peer": peer,
-                "share": round(online_share(times, recording.end_s), 6),
-                "spans_s": [list(span) for span in times.spans_s],
+                "link": name,
+                "seconds": round(use.last.t - use.first.t, 6),
+                "up": round(use.up_share, 6),
+                "most_queued": use.most_queued,
+                **asdict(use.totals),
             }
-            for peer, times in sorted(recording.online.items())
+            for name, use in sorted(recording.thin_links.items())
         ],
+        "thin_present": _presence(recording.thin_present, recording.end_s),
+        "online": _presence(recording.online, recording.end_s),
         "intervals": [
             {
                 "source": each.source,
@@ -149,6 +154,17 @@ def summary(recording: Recording) -> dict[str, Any]:
             for each in intervals(recording)
         ],
     }
+
+
+def _presence(peers: Mapping[str, OnlineTimes], end_s: float) -> list[dict[str, Any]]:
+    return [
+        {
+            "peer": peer,
+            "share": round(online_share(times, end_s), 6),
+            "spans_s": [list(span) for span in times.spans_s],
+        }
+        for peer, times in sorted(peers.items())
+    ]
 
 
 def histogram(values: Distribution, low: float, high: float, bins: int = 60) -> list[float]:

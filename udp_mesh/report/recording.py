@@ -10,7 +10,7 @@ start), `kind`, and `at` (the node whose view it is) unless that is the node of 
   `capacity_bits_per_s`, `outbox_messages`, `hops`, `saved_messages` and `saved_bytes` (totals; all but the name are
   optional); optional `versions` (by `topic`:
   `whole_sent`, `differences_sent`, `payload_bytes_sent`, `body_bytes_sent`, totals) and `logs` (by `topic` and
-  `source`: `received_items`, `known_items`, `held_bytes`),
+  `source`: `received_items`, `known_items`, `held_bytes`), and `thin` (see `thin_links`),
 - `place`: `x`, `y` in meters (simulated runs),
 - `gap`: `lines`, the number of lines dropped here during recording.
 
@@ -24,13 +24,15 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
+from udp_mesh.report.fields import UnreadableError, integer, number, rows, text
+from udp_mesh.report.thin_links import ThinLinkSample, ThinPeerSample, thin_items
+
 VERSION = 1
 MAX_LINE_BYTES = 128 << 20
 """Maximum line length: the largest usual message (64 MiB) fits, recorded with its payload in base64."""
 MAX_T_S = 1e9
 """Thirty years: a later time is damage, and would compress every chart to a point."""
 MAX_PLACE_M = 1e7
-MAX_BYTES = 1 << 50
 MAX_SAMPLE = 1e15
 _SAMPLED = ("round_trip_s", "loss", "received_bits_per_s", "hops", "outbox_messages", "capacity_bits_per_s")
 _VERSION_KEYS = ("whole_sent", "differences_sent", "payload_bytes_sent", "body_bytes_sent")
@@ -195,6 +197,8 @@ Item = (
     | VersionSample
     | LogSample
     | SavedSample
+    | ThinLinkSample
+    | ThinPeerSample
     | Gap
     | InvalidLine
 )
@@ -256,30 +260,30 @@ class RecordingReader:
         self._online: dict[str, bool] = {}
 
     def __iter__(self) -> Iterator[Item]:
-        for number, entry in self._numbered:
+        for line_number, entry in self._numbered:
             try:
                 if isinstance(entry, str):
-                    raise _UnreadableError("one JSON object", entry)
+                    raise UnreadableError("one JSON object", entry)
                 yield from self._items(entry)
-            except _UnreadableError as error:
-                yield InvalidLine(f"{self._file}:{number}: {error}")
+            except UnreadableError as error:
+                yield InvalidLine(f"{self._file}:{line_number}: {error}")
 
     def _items(self, entry: dict[str, Any]) -> Iterator[Item]:
         """Of one line."""
-        t, kind = _number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
-        at = _text(entry, "at") if "at" in entry else self.name
+        t, kind = number(entry, "t", 0.0, MAX_T_S), entry.get("kind")
+        at = text(entry, "at") if "at" in entry else self.name
         match kind:
             case "received":
-                source, topic = _text(entry, "source"), _text(entry, "topic")
-                yield RecordedArrival(t, at, source, topic, _integer(entry, "priority"), _size(entry))
+                source, topic = text(entry, "source"), text(entry, "topic")
+                yield RecordedArrival(t, at, source, topic, integer(entry, "priority"), integer(entry, "bytes"))
             case "sent":
-                yield SentMessage(t, _text(entry, "topic"), _integer(entry, "priority"), _size(entry))
+                yield SentMessage(t, text(entry, "topic"), integer(entry, "priority"), integer(entry, "bytes"))
             case "message-delivered" | "message-expired" | "message-peer-lost":
-                latency_s = _number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
+                latency_s = number(entry, "latency_s", 0.0, MAX_T_S) if kind == "message-delivered" else None
                 outcome = kind.removeprefix("message-")
-                yield SentOutcome(t, _text(entry, "peer"), _text(entry, "topic"), outcome, latency_s)
+                yield SentOutcome(t, text(entry, "peer"), text(entry, "topic"), outcome, latency_s)
             case "peer-online" | "peer-offline":
-                peer = _text(entry, "peer")
+                peer = text(entry, "peer")
                 self._online[peer] = kind == "peer-online"
                 yield Presence(t, at, peer, self._online[peer])
                 yield RecordedEvent(t, at, kind, peer)
@@ -287,64 +291,53 @@ class RecordingReader:
                 yield Snapshot(t)
                 yield from self._conditions(t, at, entry)
             case "place":
-                x, y = (_number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
+                x, y = (number(entry, key, -MAX_PLACE_M, MAX_PLACE_M) for key in ("x", "y"))
                 yield Place(t, at, x, y)
             case "gap":
-                yield Gap(t, _integer(entry, "lines"))
+                yield Gap(t, integer(entry, "lines"))
             case str():
-                yield RecordedEvent(t, at, _text(entry, "kind"), _fields(entry))
+                yield RecordedEvent(t, at, text(entry, "kind"), _fields(entry))
             case _:
-                raise _UnreadableError("a string as kind", kind)
+                raise UnreadableError("a string as kind", kind)
 
     def _conditions(self, t: float, at: str, entry: dict[str, Any]) -> Iterator[Item]:
-        for peer_entry in _rows(entry, "peers"):
-            name = _text(peer_entry, "name")
+        for peer_entry in rows(entry, "peers"):
+            name = text(peer_entry, "name")
             now_online = peer_entry.get("online")
             # An offline peer's values are old ones.
             keys = [key for key in _SAMPLED if peer_entry.get(key) is not None and now_online is not False]
-            known: dict[str, Any] = {key: _number(peer_entry, key, 0.0, MAX_SAMPLE) for key in keys}
+            known: dict[str, Any] = {key: number(peer_entry, key, 0.0, MAX_SAMPLE) for key in keys}
             yield Sample(t, at, name, **known)
             if "saved_messages" in peer_entry:
-                counters = (_integer(peer_entry, key) for key in ("saved_messages", "saved_bytes"))
+                counters = (integer(peer_entry, key) for key in ("saved_messages", "saved_bytes"))
                 yield SavedSample(name, SavedTotals(*counters))
             if isinstance(now_online, bool) and now_online != self._online.get(name, False):
                 self._online[name] = now_online
                 yield Presence(t, at, name, now_online)
-        for row in _rows(entry, "versions") if "versions" in entry else ():
-            counters = (_integer(row, key) for key in _VERSION_KEYS)
-            yield VersionSample(_text(row, "topic"), VersionTotals(*counters))
-        for row in _rows(entry, "logs") if "logs" in entry else ():
-            counters = (_integer(row, key) for key in ("received_items", "known_items", "held_bytes"))
-            yield LogSample(_text(row, "topic"), _text(row, "source"), LogProgress(*counters))
-
-
-class _UnreadableError(ValueError):
-    def __init__(self, expected: str, found: object) -> None:
-        text = found if isinstance(found, str) else repr(found)
-        super().__init__(f"expected {expected}, found {text if len(text) <= 60 else text[:57] + '...'}")
+        for row in rows(entry, "versions") if "versions" in entry else ():
+            counters = (integer(row, key) for key in _VERSION_KEYS)
+            yield VersionSample(text(row, "topic"), VersionTotals(*counters))
+        for row in rows(entry, "logs") if "logs" in entry else ():
+            counters = (integer(row, key) for key in ("received_items", "known_items", "held_bytes"))
+            yield LogSample(text(row, "topic"), text(row, "source"), LogProgress(*counters))
+        if "thin" in entry:
+            yield from thin_items(t, entry["thin"])
 
 
 def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:
     """Each non-empty line with its number: an object, or a description of what it is instead."""
-    for number, raw in enumerate(lines, 1):
+    for line_number, raw in enumerate(lines, 1):
         if not raw.strip():
             continue
         if len(raw) > MAX_LINE_BYTES:
-            yield number, f"a line of more than {MAX_LINE_BYTES} bytes"
+            yield line_number, f"a line of more than {MAX_LINE_BYTES} bytes"
             continue
         try:
             entry = json.loads(raw)
         except (ValueError, RecursionError):
-            yield number, "invalid JSON (a truncated line?)"
+            yield line_number, "invalid JSON (a truncated line?)"
             continue
-        yield number, entry if isinstance(entry, dict) else "another JSON value"
-
-
-def _rows(entry: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    rows = entry.get(key)
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise _UnreadableError(f"a list of objects as {key}", rows)
-    return rows
+        yield line_number, entry if isinstance(entry, dict) else "another JSON value"
 
 
 def _fields(entry: dict[str, Any]) -> str:
@@ -352,29 +345,3 @@ def _fields(entry: dict[str, Any]) -> str:
     known = ((key, value) for key, value in entry.items() if key not in ("t", "kind", "at"))
     shown = ", ".join(f"{key} {value}" for key, value in known if isinstance(value, str | int | float))
     return shown[:MAX_EVENT_TEXT].encode(errors="replace").decode()
-
-
-def _text(entry: dict[str, Any], key: str) -> str:
-    value = entry.get(key)
-    if not isinstance(value, str):
-        raise _UnreadableError(f"a string as {key}", value)
-    # JSON can encode a lone surrogate, which cannot be encoded as UTF-8.
-    return value.encode(errors="replace").decode()
-
-
-def _number(entry: dict[str, Any], key: str, minimum: float, maximum: float) -> float:
-    value = entry.get(key)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not minimum <= value <= maximum:
-        raise _UnreadableError(f"a number from {minimum:g} to {maximum:g} as {key}", value)
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise _UnreadableError(f"a number from {minimum:g} to {maximum:g} as {key}", "a larger one") from error
-
-
-def _integer(entry: dict[str, Any], key: str) -> int:
-    return int(_number(entry, key, 0, MAX_BYTES))
-
-
-def _size(entry: dict[str, Any]) -> int:
-    return _integer(entry, "bytes")

@@ -16,6 +16,7 @@ from tests.waiting import until
 from udp_mesh.cli.views import status_view
 from udp_mesh.daemon.configuration import read
 from udp_mesh.daemon.toml_source import ConfigurationError, parse
+from udp_mesh.report.aggregate import read as read_recording
 from udp_mesh.wire.serial_framing import encode_line
 
 BITS_PER_S = 20_000
@@ -89,6 +90,7 @@ def test_a_robot_without_wifi_reports_its_position_and_hears_the_stop() -> None:
         present(base, "husky")
         present(husky, "base")
         with husky.client() as robot, base.client() as operator:
+            operator.request("record-start", path=str(base.file.with_name("run.jsonl")))
             # Before the stop, which could collide with it: positions are not repeated, and come every 30 s.
             robot.request("set-position", x_m=3.0, y_m=4.0)
             until(
@@ -102,6 +104,14 @@ def test_a_robot_without_wifi_reports_its_position_and_hears_the_stop() -> None:
             assert (message.topic, message.payload, message.source) == ("estop", b"stop", "base")
             assert outcomes(operator, 1) == {reply["message"]: "delivered"}
             status = operator.request("status")
+            operator.request("record-stop")
+        recording = read_recording(base.file.with_name("run.jsonl"))
+        assert recording.problems == []
+        radio = recording.thin_links["radio"]
+        assert radio.up_share == 1.0
+        assert radio.totals.frames_received > 0
+        assert 0 < radio.totals.airtime_s < radio.last.t
+        assert list(recording.thin_present) == ["husky"]
         assert [peer["name"] for peer in status["conditions"]["peers"] if peer["online"]] == []
         view = status_view(status)
         assert "ONLY HERE" in view

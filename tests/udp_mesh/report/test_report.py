@@ -342,7 +342,65 @@ def test_shared_logs_are_shown_as_they_were_last() -> None:
     assert title not in {table["title"] for table in document_of(parse(lines(*ITEMS), "r.jsonl"))["tables"]}
 
 
-@pytest.mark.parametrize("rows", [{"versions": 5}, {"logs": [1]}, {"versions": [{"topic": "map"}]}, {"logs": [{}]}])
+def thin(t: float, *, sent: int, present: bool = True, up: bool = True, queued: int = 0) -> bytes:
+    counters = {
+        "bytes_sent": 100 * sent,
+        "frames_sent": sent,
+        "frames_received": 2 * sent,
+        "frames_forged": 1,
+        "frames_rejected": sent // 10,
+        "parts_repeated": 0,
+        "messages_given_up": 0,
+        "messages_dropped": 0,
+    }
+    link = {"name": "<lora>", "up": up, "airtime_s": 0.5 * sent, "queued_messages": queued, **counters}
+    peers = [{"name": "husky", "present": present, "only_thin": True}, {"name": "never", "present": False}]
+    return snapshot(t, thin={"links": [link], "peers": peers})
+
+
+def test_thin_links_are_shown_with_their_airtime_and_who_was_present() -> None:
+    recording = parse(
+        [
+            header("base", 0.0).encode(),
+            thin(0.0, sent=100, present=False),
+            thin(10.0, sent=102, queued=7),
+            thin(20.0, sent=110, present=False, up=False),
+            thin(40.0, sent=110),
+        ],
+        "r.jsonl",
+    )
+    assert recording.problems == []
+    (link,) = summary(recording)["thin_links"]
+    assert (link["link"], link["seconds"], link["up"], link["most_queued"]) == ("<lora>", 40.0, 0.75, 7)
+    assert (link["airtime_s"], link["frames_sent"], link["frames_received"], link["frames_rejected"]) == (
+        5.0,
+        10,
+        20,
+        1,
+    )
+    assert link["frames_forged"] == 0
+    (present,) = summary(recording)["thin_present"]
+    assert (present["peer"], present["spans_s"]) == ("husky", [[10.0, 20.0], [40.0, 40.0]])
+    document = document_of(recording)
+    tables = {table["title"]: table["rows"] for table in document["tables"]}
+    assert tables["Thin links"] == [
+        ["<lora>", "75.0%", "5.0", "12.50%", "10", "1.0", "20", "1", "0", "0", "0", "7"],
+    ]
+    assert tables["Present on thin links"] == [["husky", "33.3%", "1", "20.0"]]
+    (chart,) = (chart for chart in document["charts"] if chart["title"] == "Airtime used on thin links")
+    (line,) = chart["series"]
+    assert line["label"] == "<lora>"
+    assert max(value for value in line["values"] if value is not None) == 40.0
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        *({"versions": 5}, {"logs": [1]}, {"versions": [{"topic": "map"}]}, {"logs": [{}]}),
+        *({"thin": 5}, {"thin": {}}, {"thin": {"links": [{"name": "lora"}], "peers": []}}),
+        {"thin": {"links": [], "peers": [{"name": "husky", "present": 1}]}},
+    ],
+)
 def test_invalid_counters_are_reported_with_their_line(rows: dict[str, object]) -> None:
     recording = parse([header("base", 0.0).encode(), snapshot(0.0, **rows)], "r.jsonl")
     assert [problem.split()[0] for problem in recording.problems] == ["r.jsonl:2:"]
