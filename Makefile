@@ -41,10 +41,11 @@ proof: setup
 	scripts/setup-ros
 	$(BIN)/pytest -m proof
 
+# `make bench QUICK=1` runs only the most informative cells.
 bench: setup
 	test -x $(VENV)-bench/bin/python || python3 -m venv $(VENV)-bench
 	$(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
-	$(VENV)-bench/bin/python -m benchmarks
+	$(VENV)-bench/bin/python -m benchmarks $(if $(QUICK),--quick)
 
 # A fleet on the kernel's own radios to practice on; `meshctl lab up` without --real starts in a second and needs no QEMU.
 lab: setup

@@ -243,8 +243,8 @@ def main() -> int:
     if not ANSIBLE.exists():
         parser.error(f"{ANSIBLE} is not there: install the extra `bench` beside this interpreter")
     failed = 0
-    sizes = [(measure_model, count) for count in _sizes(arguments.model)]
-    sizes += [(measure, count) for count in _sizes(arguments.nodes)]
+    sizes = [(measure_model, count) for count in sizes_of(arguments.model)]
+    sizes += [(measure, count) for count in sizes_of(arguments.nodes)]
     for run, count in sizes:
         try:
             result = run(count, arguments.forks, arguments.parallel)
@@ -260,7 +260,7 @@ def main() -> int:
     return 1 if failed else 0
 
 
-def _sizes(text: str) -> list[int]:
+def sizes_of(text: str) -> list[int]:
     return [int(word) for word in text.split(",") if word]
 
 

@@ -1,21 +1,29 @@
-"""A chain changed in order and together: `python -m benchmarks.together [--nodes 2,10] [--results FILE] [--tables]`.
+"""A chain changed in order and together: `python -m benchmarks.together [--nodes 6] [--model 50] [--results FILE]
+[--tables] [--fill]`.
 
-Virtual nodes in a chain (each hears the one before and the one after it) are changed from configuration `a` to `b` in
-order, and back with `--together`, by `meshctl provision` with its defaults. All nodes run on this machine, so wall time
-includes them. The plan's own estimate of both ways, made before, is printed beside.
+The nodes of a chain (each hears the one before and the one after it) are changed from configuration `a` to `b` in
+order, and back with `--together`, by `meshctl provision` with its defaults. The plan's own estimate of both ways, made
+between the two, is printed beside.
+
+`--nodes`: virtual nodes of these numbers; all of them run on this machine and wall time includes them. `--model`: model
+nodes (`benchmarks.model_node`), which answer at the pace of a router and cost this machine almost nothing. A model node
+stays reachable while others change.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.provisioning import limit_s, ran
+from benchmarks.model_node.fleet import ModelFleet
+from benchmarks.page import fill
+from benchmarks.provisioning import limit_s, ran, sizes_of
 from tests.meshctl.proof.rig import Rig
 
 RESULTS = Path(__file__).with_name("results") / "together.jsonl"
@@ -23,7 +31,7 @@ WINDOW_S = 120
 
 
 def measure(count: int) -> dict[str, Any]:
-    """Both ways on a chain of `count` nodes, the base included."""
+    """Both ways on a chain of `count` virtual nodes, the base included."""
     with (
         tempfile.TemporaryDirectory(prefix="together-") as directory,
         Rig(Path(directory), count - 1, window_s=WINDOW_S, parallel=None, is_chain=True) as rig,
@@ -31,23 +39,38 @@ def measure(count: int) -> dict[str, Any]:
         taken = rig.take_in("a")
         if taken.code:
             raise RuntimeError(f"cannot bootstrap the chain:\n{taken.out}{taken.err}")
-        in_order = _provision(rig, "b", count)
-        planned = json.loads(rig.meshctl("plan", "a", "--json").out)
-        together = _provision(rig, "a", count, "--together")
-    estimates = {way["name"]: way["estimated_s"] for way in planned["ways"]}
-    recommended = [way["name"] for way in planned["ways"] if way["recommended"]]
+        return _both_ways("virtual", count, rig.inventory, rig.directory / "key", rig.environ)
+
+
+def measure_model(count: int) -> dict[str, Any]:
+    """Both ways on a chain of `count` model nodes."""
+    with tempfile.TemporaryDirectory(prefix="together-") as directory:
+        fleet = ModelFleet(Path(directory), count, is_chain=True)
+        with fleet.running():
+            return _both_ways("model", count, fleet.inventory, fleet.key, fleet.environ)
+
+
+def _both_ways(
+    fleet: str, count: int, inventory: Callable[[str], Path], key: Path, environ: Mapping[str, str]
+) -> dict[str, Any]:
+    def meshctl(verb: str, variant: str, *options: str) -> list[str]:
+        command = [sys.executable, "-m", "meshctl", verb, *options, "--json", "-i", str(inventory(variant))]
+        return [*command, "--key", str(key)]
+
+    in_order = ran(meshctl("provision", "b", "--yes"), environ, limit_s(count))
+    planned = subprocess.run(
+        meshctl("plan", "a"), env=dict(environ), capture_output=True, text=True, check=False, timeout=limit_s(count)
+    )
+    ways = json.loads(planned.stdout)["ways"]
+    together = ran(meshctl("provision", "a", "--yes", "--together"), environ, limit_s(count))
+    estimates = {way["name"]: way["estimated_s"] for way in ways}
     return {
+        "fleet": fleet,
         "nodes": count,
         "in_order": {**in_order, "estimated_s": estimates["in order"]},
         "together": {**together, "estimated_s": estimates["together"]},
-        "recommended": recommended[0],
+        "recommended": next(way["name"] for way in ways if way["recommended"]),
     }
-
-
-def _provision(rig: Rig, variant: str, count: int, *options: str) -> dict[str, float]:
-    command = [sys.executable, "-m", "meshctl", "provision", "--yes", "--json", *options]
-    command += ["-i", str(rig.inventory(variant)), "--key", str(rig.directory / "key")]
-    return ran(command, rig.environ, limit_s(count))
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
@@ -60,28 +83,35 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
             took = result[way]
             mark = " (recommended)" if result["recommended"] == name else ""
             lines.append(
-                f"| {result['nodes']} | {name}{mark} | {took['seconds']:.1f} | {took['estimated_s']:.0f} "
-                f"| {took['cpu_s'] / result['nodes']:.3f} |"
+                f"| {result['nodes']} {result['fleet']} | {name}{mark} | {took['seconds']:.1f} "
+                f"| {took['estimated_s']:.0f} | {took['cpu_s'] / result['nodes']:.3f} |"
             )
     return "\n".join(lines)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.together", description=__doc__)
-    parser.add_argument("--nodes", default="2,10", help="lengths of the chains")
+    parser.add_argument("--nodes", default="6", help="lengths of the chains of virtual nodes; empty for none")
+    parser.add_argument("--model", default="50", help="lengths of the chains of model nodes; empty for none")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--tables", action="store_true", help="only print the table of existing results")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     arguments = parser.parse_args()
     if not arguments.tables:
-        for count in map(int, arguments.nodes.split(",")):
-            result = measure(count)
+        sizes = [(measure_model, count) for count in sizes_of(arguments.model)]
+        sizes += [(measure, count) for count in sizes_of(arguments.nodes)]
+        for run, count in sizes:
+            result = run(count)
             arguments.results.parent.mkdir(parents=True, exist_ok=True)
             with arguments.results.open("a") as file:
                 file.write(json.dumps(result) + "\n")
             print(table([result]), flush=True)
     lines = arguments.results.read_text().splitlines() if arguments.results.exists() else []
-    latest = {result["nodes"]: result for result in map(json.loads, lines)}
-    print(table([latest[count] for count in sorted(latest)]))
+    latest = {(result["fleet"], result["nodes"]): result for result in map(json.loads, lines)}
+    text = table([latest[key] for key in sorted(latest)])
+    print(text)
+    if arguments.fill:
+        fill("together", text)
     return 0
 
 

@@ -72,10 +72,12 @@ class RunningNodes:
 
 
 class ModelFleet:
-    """`count` model nodes n001, n002, ... that run inventory `a`; see `running`."""
+    """`count` model nodes n001, n002, ... that run inventory `a`; see `running`. Without `is_chain` none hears another;
+    in a chain each hears the one before and the one after it, and n001 is the base."""
 
-    def __init__(self, directory: Path, count: int, *, parallel: int | None = None) -> None:
+    def __init__(self, directory: Path, count: int, *, parallel: int | None = None, is_chain: bool = False) -> None:
         self.directory = directory
+        self.is_chain = is_chain
         self.names = tuple(f"n{number:03}" for number in range(1, count + 1))
         self.key = directory / "key"
         self.ports = dict(zip(self.names, _free_ports(count), strict=True))
@@ -144,7 +146,8 @@ class ModelFleet:
             )
             for index, (name, port) in enumerate(self.ports.items(), 1):
                 address = _address(index)
-                text += f"  {name}: {{address: {address}, ssh: {{host: 127.0.0.1, port: {port}}}}}\n"
+                role = "role: base, " if self.is_chain and index == 1 else ""
+                text += f"  {name}: {{{role}address: {address}, ssh: {{host: 127.0.0.1, port: {port}}}}}\n"
             self.inventory(variant).write_text(text, encoding="utf-8")
 
     def _write_nodes(self) -> None:
@@ -169,7 +172,10 @@ class ModelFleet:
             public = next(line for line in said.splitlines() if line.startswith("ssh-ed25519 "))
             pins.append(f"{name} {' '.join(public.split()[:2])}\n")
             files = {path: content.decode() for path, content in self.rendered("a", name).items()}
-            nodes[name] = {"address": _address(index), "port": port, "files": files, "version": version}
+            chain = [index, len(self.ports)] if self.is_chain else None
+            nodes[name] = {
+                "address": _address(index), "port": port, "files": files, "version": version, "chain": chain
+            }  # fmt: skip
         (self.directory / "known_hosts").write_text("".join(pins))
         (place / "nodes.json").write_text(json.dumps(nodes))
 

@@ -17,6 +17,7 @@ import shlex
 import tarfile
 from dataclasses import dataclass, field
 from pathlib import Path
+from uuid import UUID
 
 # A 400 MHz MIPS router: one fork and exec; one sync of jffs2; the key exchange and login of an SSH connection.
 PROCESS_S, SYNC_S, LOGIN_S = 0.0035, 0.1, 2.0
@@ -26,6 +27,8 @@ RELOAD_S = 4.5
 _HERE = Path(__file__).parent
 RECORDED_OBSERVATION = _HERE / "observation.txt"
 RECORDED_COSTS = _HERE / "costs.json"
+# the first bytes of the recorded node's MACs
+RECORDED_MAC = "02:4d:00:01"
 _SECTION = re.compile(r"NONCE begin (?P<name>.*)\n(?P<body>(?:.*\n)*?)\nNONCE end (?P<status>\d+)\n")
 _PRINTF = re.compile(r"printf %s (?P<content>.*?) >(?P<path>/\S+)\.new && mv ", re.DOTALL)
 
@@ -88,6 +91,9 @@ def takes_input(command: str) -> bool:
 
 
 _KINDS = (
+    ("watch", r"^mkdir -p /tmp/meshctl; \[ ! -f \S*/tmp/meshctl/forget\."),
+    ("flush", r"(?m)^flush_(stale|restarted) "),
+    ("uptime", r"^cat /proc/uptime /proc/sys/kernel/random/boot_id$"),
     ("observe", r"(?m)^section done true$"),
     ("survey", r"(?m)^have=0; "),
     ("chunk", r"(?m)^cat >>\"\$p\""),
@@ -161,7 +167,7 @@ class Node:
         nonce = _value(script, "N")
         sections = dict(self.sections)
         sections["uptime"] = (f"{now_s - self.booted_s:.2f} 1.00\n", "0")
-        sections["boot_id"] = (f"{hashlib.md5(self.name.encode()).hexdigest()}\n", "0")
+        sections["boot_id"] = (f"{self._boot_id}\n", "0")
         sections["deadman"] = (self._status_line(now_s), "0")
         for name in [name for name in sections if name.startswith("config ")]:
             del sections[name]
@@ -196,6 +202,21 @@ class Node:
             f"window_s={self.window_s} left_s={left} due_uptime_s={due} reload_status={reloaded} "
             f"lock_owner={self.lock_owner} lock_left_s=100 {self.last} uptime_s={now_s - self.booted_s:.2f}\n"
         )
+
+    @property
+    def _boot_id(self) -> str:
+        return str(UUID(bytes=hashlib.md5(self.name.encode()).digest()))
+
+    def _uptime(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
+        return f"{now_s - self.booted_s:.2f} 1.00\n{self._boot_id}\n", 0
+
+    def _watch(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
+        return "watching\n", 0
+
+    def _flush(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
+        """No station entry is stale."""
+        asked = re.findall(r"(?m)^flush_(?:stale|restarted) .* '?((?:[0-9a-f]{2}:){5}[0-9a-f]{2})'? \d+$", script)
+        return "".join(f"answers {mac}\n" for mac in asked), 0
 
     def _survey(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
         return "", 0
@@ -244,7 +265,8 @@ class Node:
         return f"ok state=armed id={self.change_id}\n", 0
 
     def _apply(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:
-        self.state, self.due_s = "waiting", now_s + float(script.split()[-1])
+        *_, clock, at_s = script.split()
+        self.state, self.due_s = "waiting", float(at_s) + (self.booted_s if clock == "at" else now_s)
         return f"ok state=waiting id={self.change_id} due_uptime_s={self.due_s - self.booted_s:.2f}\n", 0
 
     def _status(self, script: str, stdin: bytes, now_s: float) -> tuple[str, int]:

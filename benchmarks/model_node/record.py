@@ -18,10 +18,12 @@ from benchmarks.model_node.counting import counting
 from benchmarks.model_node.node import RECORDED_COSTS, RECORDED_OBSERVATION, Cost, kind_of
 from benchmarks.provisioning import script
 from meshctl.apply.change_set import new_change_id, new_nonce, reload_script
+from meshctl.apply.stale_stations import StationEntry, flush_script, watch_script
 from meshctl.device import deadman
 from meshctl.device.connection import Completed, Connection, Credentials, Endpoint
 from meshctl.device.deadman import Change, NewFile, Payload
-from meshctl.device.observe import observation_script
+from meshctl.device.observe import observation_script, observe
+from meshctl.device.openwrt import measure_uptime
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey
 from meshctl.render import DeviceFacts
@@ -29,6 +31,8 @@ from meshlab.fleet import VirtualNode
 from tests.meshctl.proof.rig import Rig
 
 RELOAD_LIMIT_S = 10
+# long enough to abort the change before it starts
+LATER_S = 60.0
 OWNER = "recorder@bench:1:1"
 
 
@@ -78,6 +82,28 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
     return observation
 
 
+def scheduled_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:
+    """One change as meshctl makes it on all nodes at one moment, and what it asks of a neighbor."""
+    node = rig.fleet.node(name)
+    before, after = (rig.rendered(variant, name, DeviceFacts("1.0")) for variant in ("a", "b"))
+    files = {f"/{path}": NewFile(content) for path, content in after.items() if content != before[path]}
+    change = Change(new_change_id(), files, reload_script({path[1:] for path in files}, ()))
+    nonce = new_nonce()
+    with connected(rig, name) as opened:
+        connection = CountingConnection(opened, node, costs)
+        heard = observe(opened).stations or ()
+        entries = [StationEntry(name, station.ifname, station.mac) for station in heard]
+        deadman.lock(connection, OWNER, ttl_s=120)
+        deadman.stage(connection, OWNER, change)
+        deadman.arm(connection, OWNER, change.change_id, nonce=nonce, window_s=90)
+        connection.run(watch_script("base", entries, for_s=5))
+        measure_uptime(connection, samples=1)
+        connection.run(flush_script(entries, older_than_s=0))
+        deadman.apply(connection, OWNER, change.change_id, in_s=LATER_S)
+        deadman.abort(opened, OWNER, change.change_id)
+        deadman.unlock(connection, OWNER)
+
+
 def ansible_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:
     """One change as the playbook of benchmarks.provisioning makes it."""
     node = rig.fleet.node(name)
@@ -107,6 +133,7 @@ def main() -> None:
         time.sleep(RELOAD_LIMIT_S)
         observation = meshctl_change(rig, "n001", costs)
         ansible_change(rig, "n001", costs)
+        scheduled_change(rig, "n001", costs)
     RECORDED_OBSERVATION.write_text(without_neighbors(observation))
     RECORDED_COSTS.write_text(
         json.dumps({kind: [c.processes, c.syncs] for kind, c in sorted(costs.items())}, indent=1) + "\n"

@@ -19,10 +19,12 @@ import selectors
 import subprocess
 import sys
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from benchmarks.model_node.chain import chain_sections
 from benchmarks.model_node.node import (
     LOGIN_S,
     READER,
@@ -60,11 +62,13 @@ class _Server:
         self.nodes: dict[str, Node] = {}
         self.pipes: dict[str, int] = {}
         self.in_work: set[str] = set()
+        self.queued: dict[str, deque[int]] = defaultdict(deque)
         self.sessions: set[tuple[str, int]] = set()
         self.servers: list[subprocess.Popen[bytes]] = []
         for name, item in json.loads((directory / "nodes.json").read_text()).items():
             files = {path: content.encode() for path, content in item["files"].items()}
-            self.nodes[name] = Node(name, item["address"], files, item["version"], costs, sections, now_s - 3600)
+            own = chain_sections(sections, *item["chain"]) if item["chain"] else sections
+            self.nodes[name] = Node(name, item["address"], files, item["version"], costs, own, now_s - 3600)
             self.pipes[name] = _fifo(directory / f"{name}.status")
             self.servers.append(self._dropbear(name, item["port"]))
 
@@ -104,7 +108,9 @@ class _Server:
 
     def _open(self, node: Node, process: int) -> None:
         if node.name in self.in_work:
-            raise RuntimeError(f"{node.name}: a second command at the same time")
+            # its neighbors may be queried for several nodes at once
+            self.queued[node.name].append(process)
+            return
         self.in_work.add(node.name)
         environment = Path(f"/proc/{process}/environ").read_bytes().split(b"\0")
         script = next((text[21:] for text in environment if text.startswith(b"SSH_ORIGINAL_COMMAND=")), b"").decode()
@@ -154,6 +160,8 @@ class _Server:
                 pass
         self.in_work.discard(command.node.name)
         os.write(self.pipes[command.node.name], f"{status}\n".encode())
+        if self.queued[command.node.name]:
+            self._open(command.node, self.queued[command.node.name].popleft())
 
 
 def _fifo(path: Path) -> int:
