@@ -19,7 +19,7 @@ from meshctl.lint import BY_CODE, RULES, CheckResult, Rule, check_path
 from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
 from meshctl.regdb import SHIPPED, load, shipped_version
-from meshctl.report.findings import FORMATS, Findings
+from meshctl.report.findings import Findings, formatted
 
 
 class LintFormat(StrEnum):
@@ -101,7 +101,7 @@ def lint(
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)
-    report = FORMATS["json" if json else format.value](findings)
+    report = formatted(findings, "json" if json else format.value)
     if output is not None:
         write_file(output, report)
     else:

@@ -50,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # looking for some; a caller's process keeps its own thresholds
     if arguments is None:
         gc.set_threshold(*GC_THRESHOLD)
+    # no plugin takes part in reading an inventory, and to look for some reads the metadata of all installed packages
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         defaults = user_defaults(os.environ)
         command = typer.main.get_command(build(requested))

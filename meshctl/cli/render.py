@@ -18,18 +18,10 @@ from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore
 from meshctl.inventory.selection import LIST_HINT, attributes_of, select
 from meshctl.model import Fleet, Secret, SecretRef
-from meshctl.render import (
-    ImageFolder,
-    NodeChange,
-    NodeDifference,
-    Rendered,
-    compare_fleets,
-    folder_files,
-    image_folders,
-    render_nodes,
-    write_folder,
-    write_node,
-)
+from meshctl.render import Rendered, render_nodes
+from meshctl.render.compare import NodeChange, NodeDifference, compare_fleets
+from meshctl.render.imagebuilder import ImageFolder, folder_files, image_folders
+from meshctl.render.write import write_folder, write_node
 
 
 def render(

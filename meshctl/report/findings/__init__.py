@@ -1,20 +1,20 @@
 """Findings for people and for other tools: text, JSON, SARIF 2.1.0, JUnit XML, GitHub annotations.
 
-Each format is a function from `Findings` to text; `FORMATS` names them as the command line does.
+Each format is a function of that name, from `Findings` to text, in a module of its own.
 """
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from importlib import import_module
 
-from meshctl.report.findings.annotations import github
 from meshctl.report.findings.document import Findings
-from meshctl.report.findings.junit import junit
-from meshctl.report.findings.machine import json
-from meshctl.report.findings.plain import text
-from meshctl.report.findings.sarif import sarif
 
-FORMATS: Mapping[str, Callable[[Findings], str]] = MappingProxyType(
-    {"text": text, "json": json, "sarif": sarif, "junit": junit, "github": github}
-)
+# As the command line names them -> the module, which is imported only for its format.
+FORMATS = {"text": "plain", "json": "machine", "sarif": "sarif", "junit": "junit", "github": "annotations"}
 
-__all__ = ["FORMATS", "Findings", "github", "json", "junit", "sarif", "text"]
+
+def formatted(findings: Findings, name: str) -> str:
+    """The findings in one of `FORMATS`."""
+    text: str = getattr(import_module(f"meshctl.report.findings.{FORMATS[name]}"), name)(findings)
+    return text
+
+
+__all__ = ["FORMATS", "Findings", "formatted"]

@@ -43,4 +43,5 @@ def test_lint_of_shipped_templates_imports_no_ssh_no_cryptography_and_no_jinja(t
     assert "meshctl.lint.check_path" in imported
     heavy = {"bcrypt", "cryptography", "jinja2", "meshlab", "nacl", "paramiko", "pyrage", "rich"}
     assert packages(imported).isdisjoint(heavy)
-    assert not imported & {"asyncio", "sqlite3", "ssl"}
+    assert not imported & {"asyncio", "sqlite3", "ssl", "xml"}
+    assert not imported & {"meshctl.render.compare", "meshctl.report.findings.junit", "meshctl.report.findings.sarif"}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from meshctl.model import MASK, Encryption, MeshMode, NodeState, Release, SecretKind, SecretRef
-from meshctl.render import NodeChange, compare_files, compare_fleets, compare_nodes, render_node
+from meshctl.render import render_node
+from meshctl.render.compare import NodeChange, compare_files, compare_fleets, compare_nodes
 from tests.meshctl.render import fleets
 
 FLEET = fleets.fleet(fleets.node(name="a"), fleets.node(name="b"))

@@ -11,7 +11,9 @@ import pytest
 
 from meshctl.errors import InputError
 from meshctl.model import Encryption, Fleet, HardwareProfile, Release
-from meshctl.render import Rendered, folder_files, image_folders, render_fleet, write_folder, write_node
+from meshctl.render import Rendered, render_fleet
+from meshctl.render.imagebuilder import folder_files, image_folders
+from meshctl.render.write import write_folder, write_node
 from tests.meshctl.render import fleets
 
 

@@ -13,8 +13,12 @@ from hypothesis import strategies as st
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.lint import Suppressed
-from meshctl.report.findings import FORMATS, Findings, github, junit, sarif, text
-from meshctl.report.findings import json as as_json
+from meshctl.report.findings import FORMATS, Findings, formatted
+from meshctl.report.findings.annotations import github
+from meshctl.report.findings.junit import junit
+from meshctl.report.findings.machine import json as as_json
+from meshctl.report.findings.plain import text
+from meshctl.report.findings.sarif import sarif
 
 _CHANNEL = Diagnostic(
     "MC323",
@@ -224,3 +228,10 @@ def test_no_text_breaks_any_format(message: str, found: str, file: str, line: in
 
 def test_the_formats_are_named_as_on_the_command_line() -> None:
     assert list(FORMATS) == ["text", "json", "sarif", "junit", "github"]
+    assert [formatted(_NOTHING, name) for name in FORMATS] == [
+        text(_NOTHING),
+        as_json(_NOTHING),
+        sarif(_NOTHING),
+        junit(_NOTHING),
+        github(_NOTHING),
+    ]
