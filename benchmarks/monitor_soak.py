@@ -39,10 +39,11 @@ from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
 from meshctl.monitor.sampler import FrameClock, FrameSampler
 from meshctl.monitor.store import FrameStore
+from meshctl.nodes.collect import reports_of
 from meshctl.robots.facts import ComputerFacts, PeerFacts, QueueFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status.assess import Snapshot
 from meshctl.status.values import NoAnswer
-from meshctl.topology import observed_graph, report_of
+from meshctl.topology import observed_graph
 
 RESULTS = Path(__file__).with_name("results") / "monitor_soak.jsonl"
 INTERVAL_S = 5.0
@@ -121,13 +122,14 @@ class SimulatedFleet:
         seen = {name: self.observation(n, name) for n, name in enumerate(self.names) if name not in self.down}
         for name in seen:
             self.bytes_by_device[name] = self.bytes_by_device.get(name, 0) + _ANSWER_BYTES
-        reports = [report_of(name, one) for name, one in seen.items()]
+        reports = reports_of(seen)
         return Snapshot(
             fleet=self.fleet,
             observations=seen,
             no_answer={name: NoAnswer("does not answer within 5 s") for name in self.down},
             plans={},
-            graph=observed_graph(reports, known_macs=self.by_mac),
+            reports=reports,
+            graph=observed_graph(reports.values(), known_macs=self.by_mac),
             known={},
             macs=self.by_mac,
             entry=self.names[0],

@@ -17,7 +17,7 @@ from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Backend
 from meshctl.status import assess
 from meshctl.status.topology_formats import FORMATS, TopologyView, directions
-from meshctl.topology import observed_graph, report_of
+from meshctl.topology import observed_graph
 from meshctl.topology.cells import link_cells, mesh_reports
 
 
@@ -64,7 +64,7 @@ def topology(
         wires = [(link.a, link.b) for link in snapshot.graph.links if link.wired]
         graph = observed_graph(reports.values(), known_macs=snapshot.macs, wires=wires)
     else:
-        reports = {name: report_of(name, one) for name, one in snapshot.observations.items()}
+        reports = dict(snapshot.reports)
         graph = snapshot.graph
     routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
     view = TopologyView(

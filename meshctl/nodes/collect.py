@@ -38,20 +38,26 @@ class FleetObservation:
     unreachable: Mapping[str, str]
     refused: Mapping[str, NodeError] = field(default_factory=dict)
 
-    @property
-    def reports(self) -> tuple[Report, ...]:
-        return tuple(report_of(name, seen) for name, seen in self.observations.items())
-
     def graph(self, fleet: Fleet, known: Mapping[str, LastKnown]) -> Graph:
-        """The mesh as these nodes observe it. The radios of a robot are wired together."""
-        wires = [
-            (first, second)
-            for robot in fleet.robots.values()
-            for index, first in enumerate(robot.nodes)
-            for second in robot.nodes[index + 1 :]
-            if first in self.observations and second in self.observations
-        ]
-        return observed_graph(self.reports, known_macs=known_macs(fleet, known), wires=wires)
+        """The mesh as these nodes observe it."""
+        return fleet_graph(fleet, known, reports_of(self.observations))
+
+
+def reports_of(observations: Mapping[str, Observation]) -> dict[str, Report]:
+    """The report of each node."""
+    return {name: report_of(name, seen) for name, seen in observations.items()}
+
+
+def fleet_graph(fleet: Fleet, known: Mapping[str, LastKnown], reports: Mapping[str, Report]) -> Graph:
+    """The mesh as the nodes report it. The radios of a robot are wired together."""
+    wires = [
+        (first, second)
+        for robot in fleet.robots.values()
+        for index, first in enumerate(robot.nodes)
+        for second in robot.nodes[index + 1 :]
+        if first in reports and second in reports
+    ]
+    return observed_graph(reports.values(), known_macs=known_macs(fleet, known), wires=wires)
 
 
 def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:

@@ -6,6 +6,7 @@ Paths have no leading slash (`etc/config/network`), as in rendered files.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from ipaddress import ip_address
 
 from meshctl.device.observation import FileInfo, Observation
@@ -50,8 +51,12 @@ def packages_seen(paths: Iterable[str], seen: Observation) -> dict[str, Package 
 
 def parsed(text: str | None, package: str) -> Package | None:
     """A package's tree, or None if it is missing or unreadable."""
-    if text is None:
-        return None
+    return None if text is None else _parsed(text, package)
+
+
+# A plan reads the same file several times, and many nodes have the same dhcp or firewall file.
+@lru_cache(maxsize=64)
+def _parsed(text: str, package: str) -> Package | None:
     try:
         return parse(text, package)
     except InvalidInput:

@@ -19,16 +19,17 @@ from meshctl.status.radio_facts import neighbors_of, radios_of, snr_of, temperat
 from meshctl.status.robots import RobotAnswers, robot_status
 from meshctl.status.unreachable import NOT_ASKED, lost_relay_alarm, no_answer_alarm
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NoAnswer, NodeStatus, health_of
-from meshctl.topology import Graph, Sighting, neighbours_of, report_of, seen_by
+from meshctl.topology import Graph, Report, Sighting, neighbours_of, seen_by
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """The answers of all queried devices at one time.
 
-    `known` are the facts in the journal before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `no_answer`
-    and `no_answer_robots` hold the reasons for missing answers; `unrendered` why a node or `robot.NAME` could not be
-    compared with the inventory; `own_lock` is our name in the nodes' locks; `robots_skipped` why no robot was queried.
+    `known` are the facts in the journal before it, by node and by `robot.NAME`; `macs` maps MACs to nodes; `reports`
+    are those of `observations`; `no_answer` and `no_answer_robots` hold the reasons for missing answers; `unrendered`
+    why a node or `robot.NAME` could not be compared with the inventory; `own_lock` is our name in the nodes' locks;
+    `robots_skipped` why no robot was queried.
     `is_partial`: only some nodes were queried, so paths and cut vertices are unknown.
     """
 
@@ -36,6 +37,7 @@ class Snapshot:
     observations: Mapping[str, Observation]
     no_answer: Mapping[str, NoAnswer]
     plans: Mapping[str, NodePlan]
+    reports: Mapping[str, Report]
     graph: Graph
     known: Mapping[str, LastKnown]
     macs: Mapping[str, str]
@@ -53,7 +55,7 @@ class Snapshot:
 
 def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterable[str] = ()) -> FleetStatus:
     """The status of these radios and robots at `now` (Unix time)."""
-    reports = {name: report_of(name, seen) for name, seen in snapshot.observations.items()}
+    reports = snapshot.reports
     sightings = seen_by(reports.values(), snapshot.macs)
     paths = {} if snapshot.is_partial else snapshot.graph.paths(snapshot.entry)
     cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by(snapshot.entry)

@@ -22,7 +22,7 @@ from meshctl.device.observe import observe
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
-from meshctl.nodes.collect import FleetObservation, facts_of, known_macs
+from meshctl.nodes.collect import facts_of, fleet_graph, known_macs, reports_of
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
 from meshctl.plan import DesiredState, NodePlan, node_plan
@@ -95,12 +95,13 @@ class Collector:
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
                 no_answer[kind][name] = no_answer_of(answer)
-        seen = FleetObservation(observations, {})
+        # a report is made of all paths that a node knows: once
+        reports = reports_of(observations)
         self.journal.remember_all(
             self.fleet.name, {name: facts_of(one) for name, one in observations.items()}, self.clock()
         )
         macs = known_macs(self.fleet, known)
-        for report in seen.reports:
+        for report in reports.values():
             macs.update(dict.fromkeys(report.macs, report.node))
         plans, unrendered = self._plans(asked.values(), observations)
         for robot in targets:
@@ -113,7 +114,8 @@ class Collector:
             observations=observations,
             no_answer=no_answer["node"],
             plans=plans,
-            graph=seen.graph(self.fleet, known),
+            reports=reports,
+            graph=fleet_graph(self.fleet, known, reports),
             known=merge_by_device(known),
             macs=macs,
             entry=base.name if base is not None else "",

@@ -51,14 +51,16 @@ def mesh_macs(seen: Observation) -> tuple[str, ...]:
 def _paths(originators: tuple[Originator, ...]) -> dict[str, dict[str, float]]:
     """Next hop's MAC -> originator's MAC -> quality; the direct link where both are the same."""
     paths: dict[str, dict[str, float]] = {}
-    for entry in originators:
-        if entry.tq is not None:
-            value = entry.tq / TQ_MAX
-        elif entry.throughput_kbit_s is not None:
-            value = entry.throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
+    for mac, next_hop, _, _, _, tq, throughput_kbit_s in originators:
+        if tq is not None:
+            value = tq / TQ_MAX
+        elif throughput_kbit_s is not None:
+            value = throughput_kbit_s / FULL_THROUGHPUT_KBIT_S
         else:
             continue
-        best = paths.setdefault(entry.next_hop.lower(), {})
-        mac = entry.mac.lower()
-        best[mac] = min(1.0, max(value, best.get(mac, 0.0)))
+        best = paths.get(next_hop)
+        if best is None:
+            best = paths[next_hop] = {}
+        known = best.get(mac, 0.0)
+        best[mac] = known if known >= value else value if value < 1.0 else 1.0
     return paths

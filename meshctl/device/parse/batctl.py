@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from types import MappingProxyType
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from types import MappingProxyType, NoneType
+from typing import Any
 
 from meshctl.device.observation import MeshInfo, MeshNeighbour, Originator
 from meshctl.device.parse.jsontext import integer, mapping, maps, parse_json, string
@@ -104,33 +106,60 @@ def parse_neighbours_text(text: str) -> tuple[MeshNeighbour, ...] | None:
 def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Originator, ...] | None:
     """`originators_json`: `tq` for BATMAN_IV, `throughput` in kbit/s for BATMAN_V; `best` is absent when false.
 
-    Each node of a fleet knows several paths to every other one, so this is most of what status parses: values of the
-    usual types are taken as they are.
+    Each node of a fleet knows several paths to every other one, so this is most of what status parses: a table in which
+    every row has the usual keys and types is taken as it is.
     """
     data = parse_json(text)
     if not isinstance(data, list):
         return None
-    found = []
-    for item in data:
-        if type(item) is not dict:
-            continue
-        get = item.get
-        mac, next_hop, ifname = get("orig_address"), get("neigh_address"), get("hard_ifname")
-        seen, tq, throughput = get("last_seen_msecs"), get("tq"), get("throughput")
-        if not (mac := mac if type(mac) is str else string(mac)):
-            continue
-        found.append(
-            Originator(
-                mac.lower(),
-                (next_hop if type(next_hop) is str else string(next_hop)).lower(),
-                ifname if ifname and type(ifname) is str else _interface(item, names),
-                seen if type(seen) is int else integer(seen) or 0,
-                get("best") is True,
-                tq if type(tq) is int else integer(tq),
-                throughput if type(throughput) is int else integer(throughput),
+    usual = _usual_originators(data) if text.islower() else None
+    return usual if usual is not None else tuple(_originators(data, names))
+
+
+# The types of each column of a usual table: MAC, next hop, interface, last seen, best, quality, throughput.
+_COLUMNS: tuple[set[type], ...] = ({str}, {str}, {str}, {int}, {bool}, {int, NoneType}, {int, NoneType})
+
+
+def _usual_originators(data: Iterable[Any]) -> tuple[Originator, ...] | None:
+    """None if a row lacks a key, or a value has an unusual type or is empty; both are checked for whole columns."""
+    try:
+        rows = [
+            (
+                item["orig_address"],
+                item["neigh_address"],
+                item["hard_ifname"],
+                item["last_seen_msecs"],
+                item.get("best", False),
+                item.get("tq"),
+                item.get("throughput"),
             )
-        )
-    return tuple(found)
+            for item in data
+        ]
+    except (KeyError, TypeError, AttributeError):
+        return None
+    columns = tuple(zip(*rows, strict=True))
+    if not all(set(map(type, column)) <= types for column, types in zip(columns, _COLUMNS, strict=False)):
+        return None
+    if any("" in column for column in columns[:3]):
+        return None
+    return tuple(map(_ORIGINATOR_OF, rows))
+
+
+_ORIGINATOR_OF = partial(tuple.__new__, Originator)
+
+
+def _originators(data: Iterable[object], names: Mapping[int, str]) -> Iterator[Originator]:
+    for item in maps(data):
+        if mac := string(item.get("orig_address")):
+            yield Originator(
+                mac.lower(),
+                string(item.get("neigh_address")).lower(),
+                _interface(item, names),
+                integer(item.get("last_seen_msecs")) or 0,
+                item.get("best") is True,
+                integer(item.get("tq")),
+                integer(item.get("throughput")),
+            )
 
 
 def parse_originators_text(text: str) -> tuple[Originator, ...] | None:

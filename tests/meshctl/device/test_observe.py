@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from meshctl.device.observation import Observation
+from meshctl.device.observation import Observation, Originator
 from meshctl.device.observe import interpret, observation_script, observe
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
 from meshctl.device.parse.deadman import parse_answer, parse_status
@@ -36,7 +36,9 @@ def observed(case: Path) -> Observation:
 
 
 def as_json(value: object) -> object:
-    """Dataclasses and mappings as JSON writes them."""
+    """Dataclasses, named tuples and mappings as JSON writes them."""
+    if isinstance(value, Originator):
+        return as_json(value._asdict())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -328,6 +330,31 @@ def test_the_output_of_apk_list_is_parsed() -> None:
         "batctl-full": "2025.4-r1",
         "libubox20240329": "2024.03.29~eb9bcb64-r1",
     }
+
+
+_MACS = st.sampled_from(["02:00:00:00:00:01", "02:00:00:00:00:0A", "", 7, None])
+_NUMBERS = st.sampled_from([0, 120, 255, 1.5, True, "250", None])
+_ROWS = st.fixed_dictionaries(
+    {"orig_address": _MACS, "neigh_address": _MACS, "hard_ifname": st.sampled_from(["mesh0", "", "Mesh0", None])},
+    optional={
+        "hard_ifindex": st.sampled_from([7, 8, None]),
+        "last_seen_msecs": _NUMBERS,
+        "best": st.sampled_from([True, False, 1]),
+        "tq": _NUMBERS,
+        "throughput": _NUMBERS,
+    },
+)
+
+
+@given(st.lists(_ROWS | st.sampled_from([{}, [], "row", None]), max_size=6))
+def test_a_table_of_originators_reads_the_same_as_its_rows_alone(rows: list[object]) -> None:
+    # an unusual row next to it makes the whole table be read row by row
+    unusual = {"orig_address": "02:00:00:00:00:0F", "last_seen_msecs": 1.5}
+    names = {7: "mesh7"}
+    whole = batctl.parse_originators_json(json.dumps(rows), names)
+    with_unusual = batctl.parse_originators_json(json.dumps([*rows, unusual]), names)
+    assert whole is not None
+    assert with_unusual == (*whole, Originator("02:00:00:00:00:0f", "", "", 1, best=False))
 
 
 def test_batman_v_tables_give_throughput() -> None:

@@ -27,12 +27,13 @@ from meshctl.device.observation import (
 from meshctl.fleet.journal import LastKnown
 from meshctl.inventory import load_fleet
 from meshctl.model import Fleet
+from meshctl.nodes.collect import reports_of
 from meshctl.plan import NodePlan
 from meshctl.robots.facts import ComputerFacts, PeerFacts, QueueFacts, RobotFacts, ServiceFacts, TopicFacts
 from meshctl.status import Alarm, FleetStatus, Health, assess
 from meshctl.status.assess import Snapshot
 from meshctl.status.values import NoAnswer
-from meshctl.topology import observed_graph, report_of
+from meshctl.topology import observed_graph
 
 INVENTORY = """\
 meshctl: 1
@@ -166,13 +167,14 @@ def look_of(
     silent_robots: Mapping[str, NoAnswer] | None = None,
     **other: Any,
 ) -> Snapshot:
-    graph = observed_graph([report_of(name, one) for name, one in observations.items()], known_macs=NAMES)
+    reports = reports_of(observations)
     look = Snapshot(
         fleet=fleet,
         observations=observations,
         no_answer=silent or {},
         plans=plans or {},
-        graph=graph,
+        reports=reports,
+        graph=observed_graph(reports.values(), known_macs=NAMES),
         known=known or {},
         macs=NAMES,
         entry="base",
