@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.udp_mesh.wire.log_vectors import make_logs
 from tests.udp_mesh.wire.subscription_vectors import make_subscriptions
 from tests.udp_mesh.wire.thin_vectors import make_thin
 from udp_mesh.core.relaying.hop_channel import HopChannels, hop_key, membership_proof
@@ -354,6 +355,7 @@ def make_relay() -> object:
 MAKERS = {
     "frames.json": make_frames,
     "sealed.json": make_sealed,
+    "logs.json": make_logs,
     "subscriptions.json": make_subscriptions,
     "versions.json": make_versions,
     "relay.json": make_relay,
