@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.udp_mesh.core.fuzzed_nodes import FuzzedLogs, FuzzedRelay
 from tests.udp_mesh.core.pair import Pair, pair, settings
 from tests.udp_mesh.core.thin.fleet import RADIO, ThinFleet
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
@@ -68,6 +69,21 @@ class Fuzzer:
         ]
         self.pair = self._new_pair()
         self.thin = self._new_thin()
+        # Made where their surfaces are run: to let them meet takes longer than most other surfaces.
+        self._relay: FuzzedRelay | None = None
+        self._logs: FuzzedLogs | None = None
+
+    @property
+    def relay(self) -> FuzzedRelay:
+        if self._relay is None:
+            self._relay = FuzzedRelay(self.rng.getrandbits(32))
+        return self._relay
+
+    @property
+    def logs(self) -> FuzzedLogs:
+        if self._logs is None:
+            self._logs = FuzzedLogs(self.rng.getrandbits(32))
+        return self._logs
 
     def _new_thin(self) -> ThinFleet:
         fleet = ThinFleet("a", "b", seed=self.rng.getrandbits(32))
@@ -132,10 +148,14 @@ class Fuzzer:
                 self.check_bounds()
                 self.pair = self._new_pair()
                 self.thin = self._new_thin()
+                self._relay, self._logs = None, None
 
     def _let_nodes_work(self) -> None:
         self.pair.now += 0.05
         self.thin.run(0.05)
+        for running in (self._relay, self._logs):
+            if running is not None:
+                running.run(0.05)
         for node in (self.pair.b, self.pair.a):
             node.handle_timer(self.pair.now)
             while node.datagrams_to_send(self.pair.now):
@@ -145,6 +165,9 @@ class Fuzzer:
 
     def check_bounds(self) -> None:
         """Raises AssertionError if the node holds more than its limits allow."""
+        for running in (self._relay, self._logs):
+            if running is not None:
+                running.check_bounds()
         thin = self.thin.thin("b")
         assert len(thin.reassembly) <= MAX_PARTIALS
         assert len(thin.peers.peers) <= MAX_THIN_NUMBER
@@ -238,6 +261,21 @@ def xbee_lines(fuzzer: Fuzzer) -> None:
     assert len(decoder._unfinished) <= MAX_API_LINE_BYTES
 
 
+def relay_frames(fuzzer: Fuzzer) -> None:
+    """A key holder's frames between relays, to one neighbor and to all."""
+    seeds, bits = fuzzer.relay.seeds, fuzzer.rng.getrandbits(16)
+    frame = seeds[bits % len(seeds)]
+    fuzzer.relay.receive(fuzzer.mutated(frame) if bits & 0x7000 else frame, to_all=bool(bits & 1 << 15))
+
+
+def log_messages(fuzzer: Fuzzer) -> None:
+    """A key holder's messages about shared logs, and items."""
+    logs, bits = fuzzer.logs, fuzzer.rng.getrandbits(16)
+    seeds, receive = (logs.control, logs.receive_control) if bits & 0xC000 else (logs.items, logs.receive_item)
+    data = seeds[bits % len(seeds)]
+    receive(fuzzer.mutated(data) if bits & 0x3800 else data)
+
+
 SURFACES = {
     surface.__name__: surface
     for surface in (
@@ -251,6 +289,8 @@ SURFACES = {
         thin_frames,
         sealed_thin,
         xbee_lines,
+        relay_frames,
+        log_messages,
     )
 }
 

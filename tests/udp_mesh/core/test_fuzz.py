@@ -12,7 +12,16 @@ from pathlib import Path
 import pytest
 
 from tests.udp_mesh.core import fuzzing
-from tests.udp_mesh.core.fuzzing import SURFACES, Chunk, Fuzzer, legacy, mutated_datagrams, random_bytes
+from tests.udp_mesh.core.fuzzing import (
+    SURFACES,
+    Chunk,
+    Fuzzer,
+    legacy,
+    log_messages,
+    mutated_datagrams,
+    random_bytes,
+    relay_frames,
+)
 from udp_mesh.core.events import MessageReceived
 
 INPUTS = int(os.environ.get("UDP_MESH_FUZZ_INPUTS", "100000000"))
@@ -33,6 +42,15 @@ def test_a_pair_still_communicates_after_fuzzed_input() -> None:
     both.a.send("any", b"still here", destination="b", now=both.now)
     both.roundtrip(times=100)
     assert any(isinstance(event, MessageReceived) and event.payload == b"still here" for event in both.events(both.b))
+
+
+def test_relays_and_shared_logs_still_work_after_fuzzed_input() -> None:
+    fuzzer = Fuzzer(seed=78)
+    for surface in (relay_frames, log_messages):
+        fuzzer.run(surface, 1000)
+    fuzzer.check_bounds()
+    assert fuzzer.relay.works()
+    assert fuzzer.logs.works()
 
 
 def test_a_failure_names_the_input_that_caused_it(monkeypatch: pytest.MonkeyPatch) -> None:
