@@ -125,7 +125,9 @@ def flush_compression(state: State, now: float) -> None:
 def _enqueue_all(
     state: State, accepted: AcceptedMessage, names: Sequence[str], now: float, store_keys: Sequence[int | None] = ()
 ) -> None:
-    if names:
+    if len(names) == 1 and not store_keys:
+        enqueue(state, names[0], accepted, now)
+    elif names:
         for name, store_key in zip_longest(names, store_keys):
             enqueue(state, name, accepted, now, store_key)
     else:
@@ -221,7 +223,8 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
         sender.finish(message, Outcome.PEER_LOST)
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
-    report_ended(state, peer, now)
+    if sender.ended:
+        report_ended(state, peer, now)
     session = peer.session
     shared_at = now if session is None else pack_until(sender, topic.priority, session.path.room_bytes, now)
     if shared_at <= now:
@@ -234,7 +237,7 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
 
 def _broadcast(state: State, accepted: AcceptedMessage, now: float) -> None:
     topic = accepted.channel.topic
-    accepted = replace(accepted, flags=accepted.flags | MessageFlag.TO_ALL)
+    accepted = accepted._replace(flags=accepted.flags | MessageFlag.TO_ALL)
     sessions = [peer.session for peer in state.peer_table.online() if peer.session is not None]
     # With peers of earlier versions each gets its own copy, so that the others have the number.
     same_for_all = not accepted.flags & MessageFlag.NUMBERED or all_accept(state, (), Feature.THIN)

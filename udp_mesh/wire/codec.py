@@ -84,7 +84,15 @@ def encode(frames: Sequence[Frame], *, compact: bool = False) -> bytes:
     if not 1 <= len(frames) <= limits.MAX_FRAMES_PER_DATAGRAM:
         raise ValueError(f"datagram: expected 1 to {limits.MAX_FRAMES_PER_DATAGRAM} frames, found {len(frames)}")
     final = len(frames) - 1
-    return b"".join([_encode_frame(frame, last=place == final, compact=compact) for place, frame in enumerate(frames)])
+    # Without another call for the many fragments of small messages.
+    return b"".join(
+        [
+            encode_fragment(frame, last=place == final, compact=compact)
+            if type(frame) is Fragment
+            else _encode_frame(frame, last=place == final, compact=compact)
+            for place, frame in enumerate(frames)
+        ]
+    )
 
 
 def _encode_frame(frame: Frame, *, last: bool, compact: bool) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from udp_mesh.core.peers.heartbeat import own_features
 from udp_mesh.core.peers.session import Session
@@ -33,4 +32,4 @@ def uncompressed(accepted: AcceptedMessage) -> AcceptedMessage:
     if not accepted.flags & MessageFlag.COMPRESSED:
         return accepted
     flags = accepted.flags & ~(MessageFlag.COMPRESSED | MessageFlag.ZSTD)
-    return replace(accepted, body=accepted.payload, flags=flags)
+    return accepted._replace(body=accepted.payload, flags=flags)

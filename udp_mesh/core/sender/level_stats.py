@@ -66,12 +66,18 @@ class PriorityLevels:
 
     def add(self, message: OutgoingMessage) -> None:
         """Count an accepted message."""
-        self._count(message, 1)
-        self.append(message)
+        level = self._levels[message.priority]
+        size = message.queued_bytes
+        level.messages += 1
+        level.bytes += size
+        self.queued_bytes += size
+        self._append(level, message)
 
     def append(self, message: OutgoingMessage) -> None:
         """Append the message to its level (again, if it restarts as another object)."""
-        level = self._levels[message.priority]
+        self._append(self._levels[message.priority], message)
+
+    def _append(self, level: LevelStats, message: OutgoingMessage) -> None:
         level.order.append(message)
         if len(level.order) > 64 + 2 * level.messages:
             level.order = deque(waiting for waiting in level.order if not waiting.ended)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from udp_mesh.core.events import MessageId
 from udp_mesh.core.settings import Topic
@@ -28,9 +27,9 @@ class TopicChannel:
         self.type_name = type_name
 
 
-@dataclass(frozen=True, slots=True)
-class AcceptedMessage:
-    """A message accepted by `Endpoint.send`, shared by the copies for every destination."""
+class AcceptedMessage(NamedTuple):
+    """A message accepted by `Endpoint.send`, shared by the copies for every destination. A tuple, because thousands are
+    made a second."""
 
     message_id: MessageId
     channel: TopicChannel
@@ -129,8 +128,13 @@ class OutgoingMessage:
         """Assign the wire id and fragment sizes. The first fragment carries less, because of the head."""
         self.wire_id = wire_id
         self.fragment_bytes = fragment_bytes
-        self.first_bytes = min(first_bytes, len(self.body))
-        self.fragments = 1 + max(0, -(-(len(self.body) - first_bytes) // fragment_bytes))
+        size = len(self.body)
+        if size <= first_bytes:
+            self.first_bytes = size
+            self.fragments = 1
+        else:
+            self.first_bytes = first_bytes
+            self.fragments = 1 - (first_bytes - size) // fragment_bytes
         self.missing = self.fragments
         self.arrived = bytearray(self.fragments)
 

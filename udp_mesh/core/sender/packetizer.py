@@ -40,7 +40,16 @@ from udp_mesh.wire.fragment import (
     WIDE_FROM,
     WIDE_HEADER,
 )
-from udp_mesh.wire.frames import Delivered, Fragment, Frame, MessageFlag, MessageHead, Ping, TopicAnnounce
+from udp_mesh.wire.frames import (
+    Delivered,
+    Fragment,
+    Frame,
+    MessageFlag,
+    MessageHead,
+    Payload,
+    Ping,
+    TopicAnnounce,
+)
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 MIN_ROOM_BYTES = 64
@@ -290,7 +299,8 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float
         if len(run.message.body) > room or (version is not None and not version.prepared):
             return None, 0
         _begin(sender, path, run.message)
-        run = Run(run.message, 0, run.message.fragments, retransmit=False, stale=run.stale)
+        if run.message.fragments > 1:
+            run = Run(run.message, 0, run.message.fragments, retransmit=False, stale=run.stale)
     size = _fragment_frame_bytes(sender, path, run, now)
     return (run, size) if size <= room else (None, 0)
 
@@ -298,10 +308,10 @@ def _next_small(sender: Sender, path: Path, priority: int, room: int, now: float
 def _fragment_frame_bytes(sender: Sender, path: Path, run: Run, now: float) -> int:
     """Size of the frames that carry one fragment, at most."""
     message = run.message
-    start, end = message.span(run.position)
-    size = end - start + LENGTH_BYTES
     if run.position:
-        return size + FRAGMENT_WIDE_BYTES
+        start, end = message.span(run.position)
+        return end - start + LENGTH_BYTES + FRAGMENT_WIDE_BYTES
+    size = message.first_bytes + LENGTH_BYTES
     channel = message.accepted.channel
     if path.compact and message.fragments == 1 and (now - message.accepted.accepted_at) * 1000 <= MAX_COMPACT_AGE_MS:
         size += COMPACT_BYTES
@@ -325,8 +335,10 @@ def _frames(sender: Sender, path: Path, run: Run, now: float, *, ack_now: bool) 
     wire_id = message.wire_id
     assert wire_id is not None
     is_broadcast = accepted.broadcast_number is not None
-    start, end = message.span(position)
-    payload = memoryview(message.body)[start:end]
+    payload: Payload = message.body
+    if message.fragments > 1:
+        start, end = message.span(position)
+        payload = memoryview(payload)[start:end]
     if position:
         return [Fragment(wire_id, position, payload, None, ack_now, is_broadcast)]
     head = MessageHead(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
@@ -174,7 +174,7 @@ class Selection:
         if bounds.max_age_s is not None:
             deadline = accepted.accepted_at + bounds.max_age_s
             if accepted.deadline is None or deadline < accepted.deadline:
-                accepted = replace(accepted, deadline=deadline)
+                accepted = accepted._replace(deadline=deadline)
         if accepted.deadline is not None and accepted.deadline <= now:
             self._drop(destination, accepted, ExpiryReason.DEADLINE)
             return None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.wire.frames import MessageFlag
 
@@ -15,14 +13,14 @@ def numbered(accepted: AcceptedMessage, number: int | None) -> AcceptedMessage:
     if number is None:
         return accepted
     body = number.to_bytes(NUMBER_BYTES, "big") + accepted.body
-    return replace(accepted, body=body, flags=accepted.flags | MessageFlag.NUMBERED)
+    return accepted._replace(body=body, flags=accepted.flags | MessageFlag.NUMBERED)
 
 
 def unnumbered(accepted: AcceptedMessage) -> AcceptedMessage:
     """The message without its number, for peers that do not accept it."""
     if not accepted.flags & MessageFlag.NUMBERED:
         return accepted
-    return replace(accepted, body=accepted.body[NUMBER_BYTES:], flags=accepted.flags & ~MessageFlag.NUMBERED)
+    return accepted._replace(body=accepted.body[NUMBER_BYTES:], flags=accepted.flags & ~MessageFlag.NUMBERED)
 
 
 def split_number(flags: int, body: bytes) -> tuple[int | None, bytes] | None:
