@@ -130,6 +130,7 @@ class AlarmHooks:
 def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
     """POST the alarm; what went wrong, empty if nothing. The whole exchange is bounded, not only each read."""
     failure: list[str] = []
+    no_response = f"webhook {url}: no response within {timeout_s:g} s"
 
     def send() -> None:
         body = json.dumps(document).encode()
@@ -140,12 +141,14 @@ def _post(url: str, document: Mapping[str, Any], timeout_s: float) -> str:
         except urllib.error.HTTPError as error:
             failure.append(f"webhook {url}: {error.code} {error.reason}")
         except (OSError, ValueError, http.client.HTTPException) as error:
-            failure.append(f"webhook {url}: {getattr(error, 'reason', None) or error}")
+            reason = getattr(error, "reason", None) or error
+            # A read may reach its own timeout before the whole exchange does.
+            failure.append(no_response if isinstance(reason, TimeoutError) else f"webhook {url}: {reason}")
 
     thread = threading.Thread(target=send, name="webhook", daemon=True)
     thread.start()
     thread.join(timeout_s)
-    return f"webhook {url}: no response within {timeout_s:g} s" if thread.is_alive() else "".join(failure)
+    return no_response if thread.is_alive() else "".join(failure)
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
