@@ -62,13 +62,16 @@ def connected(rig: Rig, name: str) -> SshConnection:
     )
 
 
-def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
-    """One change as meshctl makes it; returns an observation made before, with the nonce NONCE."""
-    node = rig.fleet.node(name)
+def change_of(rig: Rig, name: str) -> Change:
+    """The change that takes a node from configuration `a` to `b`."""
     before, after = (rig.rendered(variant, name, DeviceFacts("1.0")) for variant in ("a", "b"))
     files = {f"/{path}": NewFile(content) for path, content in after.items() if content != before[path]}
-    change = Change(new_change_id(), files, reload_script({path[1:] for path in files}, ()))
-    nonce = new_nonce()
+    return Change(new_change_id(), files, reload_script({path[1:] for path in files}, ()))
+
+
+def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
+    """One change as meshctl makes it; returns an observation made before, with the nonce NONCE."""
+    node, change, nonce = rig.fleet.node(name), change_of(rig, name), new_nonce()
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
         observation = connection.run(observation_script("NONCE")).stdout
@@ -84,11 +87,7 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
 
 def scheduled_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:
     """One change as meshctl makes it on all nodes at one moment, and what it asks of a neighbor."""
-    node = rig.fleet.node(name)
-    before, after = (rig.rendered(variant, name, DeviceFacts("1.0")) for variant in ("a", "b"))
-    files = {f"/{path}": NewFile(content) for path, content in after.items() if content != before[path]}
-    change = Change(new_change_id(), files, reload_script({path[1:] for path in files}, ()))
-    nonce = new_nonce()
+    node, change, nonce = rig.fleet.node(name), change_of(rig, name), new_nonce()
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
         heard = observe(opened).stations or ()
