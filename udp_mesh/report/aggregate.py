@@ -219,11 +219,8 @@ class Recording:
                     self.logs[topic, source] = progress
             case ThinLinkSample():
                 self._thin_link(item)
-            case ThinPeerSample():
-                if item.present and item.peer not in self.thin_present and self._has_room(self.thin_present, item.peer):
-                    self.thin_present[item.peer] = OnlineTimes(item.t)
-                if (present := self.thin_present.get(item.peer)) is not None:
-                    present.begin(item.t) if item.present else present.stop(item.t)
+            case ThinPeerSample(t, peer, present):
+                self._mark(self.thin_present, peer, t, is_there=present)
             case Gap():
                 self.missing_lines += item.lines
             case InvalidLine(text):
@@ -289,17 +286,21 @@ class Recording:
             self.latencies_ms.add(item.topic, item.t, item.latency_s * 1e3)
 
     def _presence(self, item: Presence) -> None:
-        times = self.online.get(item.peer)
+        self._online_now += self._mark(self.online, item.peer, item.t, is_there=item.online)
+
+    def _mark(self, known: dict[str, OnlineTimes], peer: str, t: float, *, is_there: bool) -> int:
+        """Whether a peer is there from now on: 1 if it was not before, -1 if it was and is not any more, else 0."""
+        times = known.get(peer)
         if times is None:
-            if not item.online or not self._has_room(self.online, item.peer):
-                return
-            times = self.online[item.peer] = OnlineTimes(item.t)
-        was_online = times.since_s is not None
-        if item.online:
-            times.begin(item.t)
+            if not is_there or not self._has_room(known, peer):
+                return 0
+            times = known[peer] = OnlineTimes(t)
+        was_there = times.since_s is not None
+        if is_there:
+            times.begin(t)
         else:
-            times.stop(item.t)
-        self._online_now += (times.since_s is not None) - was_online
+            times.stop(t)
+        return (times.since_s is not None) - was_there
 
     def _place(self, item: Place) -> None:
         track = self.tracks.get(item.at)
