@@ -30,6 +30,43 @@ TRIED_AGAIN = "tried again"
 """The property of a test in whose setup a machine was made once more: why."""
 
 
+NOT_TESTED = (
+    (
+        expects_ros2,
+        f"ROS 2: there is no {PYTHON}, so tests/udp_mesh/bridges/test_ros2.py was not collected. scripts/setup-ros2"
+        f" makes it (Python 3.11, x86_64); {NEEDS_ROS2}=1 makes it fail instead.",
+    ),
+    (
+        expects_ros,
+        f"ROS 1: {ROS_PYTHON} has no rospy and rosmaster, so tests/udp_mesh/bridges/test_ros1_quick.py was not"
+        f" collected. scripts/setup-ros installs them (Debian, Ubuntu); {NEEDS_ROS}=1 makes it fail instead.",
+    ),
+    (
+        expects_browser,
+        f"Browser: there is no {CHROMIUM} in PATH, so the tests of the monitor's page were skipped."
+        f" scripts/setup-browser installs it (Debian); {NEEDS_BROWSER}=1 makes them fail instead.",
+    ),
+    (
+        expects_prometheus,
+        "Prometheus: there is no prometheus in PATH, so tests/meshctl/monitor/test_prometheus.py was not"
+        f" collected. scripts/setup-prometheus installs it (Debian, Ubuntu); {NEEDS_PROMETHEUS}=1 makes it fail"
+        " instead.",
+    ),
+    (
+        expects_speech,
+        "Speech: there is no espeak-ng in PATH, so tests/meshctl/cli/test_voice.py was not collected."
+        f" scripts/setup-speech installs it (Debian, Ubuntu); {NEEDS_SPEECH}=1 makes it fail instead.",
+    ),
+    (
+        expects_postgresql,
+        "PostgreSQL: there is no /usr/lib/postgresql/*/bin/initdb, so the tests of a shared journal were not"
+        f" collected. scripts/setup-postgresql installs it (Debian, Ubuntu); {NEEDS_POSTGRESQL}=1 makes them fail"
+        " instead.",
+    ),
+)
+"""Programs that tests need: whether their tests are collected, and what to say where they are not."""
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Tests that share a fleet or a machine share a worker; a pytest that loses that without a word is refused.
 
@@ -54,38 +91,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.section("tried again")
         for reason in reasons:
             terminalreporter.line(reason)
-    expected = (expects_ros, expects_ros2, expects_prometheus, expects_browser, expects_postgresql, expects_speech)
-    if not all(expects() for expects in expected):
+    absent = [text for expects, text in NOT_TESTED if not expects()]
+    if absent:
         terminalreporter.section("not tested here")
-    if not expects_ros2():
-        terminalreporter.line(
-            f"ROS 2: there is no {PYTHON}, so tests/udp_mesh/bridges/test_ros2.py was not collected. scripts/setup-ros2"
-            f" makes it (Python 3.11, x86_64); {NEEDS_ROS2}=1 makes it fail instead."
-        )
-    if not expects_ros():
-        terminalreporter.line(
-            f"ROS 1: {ROS_PYTHON} has no rospy and rosmaster, so tests/udp_mesh/bridges/test_ros1_quick.py was not"
-            f" collected. scripts/setup-ros installs them (Debian, Ubuntu); {NEEDS_ROS}=1 makes it fail instead."
-        )
-    if not expects_browser():
-        terminalreporter.line(
-            f"Browser: there is no {CHROMIUM} in PATH, so the tests of the monitor's page were skipped."
-            f" scripts/setup-browser installs it (Debian); {NEEDS_BROWSER}=1 makes them fail instead."
-        )
-    if not expects_prometheus():
-        terminalreporter.line(
-            "Prometheus: there is no prometheus in PATH, so tests/meshctl/monitor/test_prometheus.py was not"
-            f" collected. scripts/setup-prometheus installs it (Debian, Ubuntu); {NEEDS_PROMETHEUS}=1 makes it fail"
-            " instead."
-        )
-    if not expects_speech():
-        terminalreporter.line(
-            "Speech: there is no espeak-ng in PATH, so tests/meshctl/cli/test_voice.py was not collected."
-            f" scripts/setup-speech installs it (Debian, Ubuntu); {NEEDS_SPEECH}=1 makes it fail instead."
-        )
-    if not expects_postgresql():
-        terminalreporter.line(
-            "PostgreSQL: there is no /usr/lib/postgresql/*/bin/initdb, so the tests of a shared journal were not"
-            f" collected. scripts/setup-postgresql installs it (Debian, Ubuntu); {NEEDS_POSTGRESQL}=1 makes them fail"
-            " instead."
-        )
+        for text in absent:
+            terminalreporter.line(text)
