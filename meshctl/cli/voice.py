@@ -41,8 +41,7 @@ class Voice:
 
     def say(self, phrase: str) -> None:
         """Speak a phrase; one that is being spoken ends first."""
-        if self.is_speaking:
-            self.wait()
+        self.wait()
         self._messages = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the program has ended
         try:
             self._speaking = subprocess.Popen(
