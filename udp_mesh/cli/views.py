@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from udp_mesh.cli.output import duration, milliseconds, rate, size, table
@@ -159,12 +160,20 @@ def status_view(status: Json) -> str:
     if saved_messages:
         saved_bytes = sum(peer["saved_bytes"] for peer in conditions["peers"])
         lines.append(f"not sent because no program there wants it: {saved_messages} messages, {size(saved_bytes)}")
-    dropped = {name.removeprefix("dropped_"): n for name, n in counters.items() if name.startswith("dropped_") and n}
-    if dropped:
-        lines.append("dropped: " + ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in dropped.items()))
+    if dropped := _drops(counters):
+        lines.append(f"dropped: {_listed(dropped)}")
     if status["recording"]:
         lines.append(f"recording to {status['recording']['path']} ({size(status['recording']['bytes'])})")
     return "\n".join(lines)
+
+
+def _drops(counters: Json) -> dict[str, int]:
+    """Cause -> number of datagrams dropped for it; those that occurred."""
+    return {name.removeprefix("dropped_"): n for name, n in counters.items() if name.startswith("dropped_") and n}
+
+
+def _listed(drops: Mapping[str, int]) -> str:
+    return ", ".join(f"{number} {cause.replace('_', ' ')}" for cause, number in drops.items())
 
 
 def relays_view(relaying: Json) -> list[str]:
@@ -188,11 +197,13 @@ def relays_view(relaying: Json) -> list[str]:
     ]
     if relaying["relays"]:
         counters = relaying["counters"]
-        dropped = sum(count for name, count in counters.items() if name.startswith("dropped_"))
+        causes = _drops(counters)
+        dropped = sum(causes.values())
+        by_cause = f" ({_listed(causes)})" if dropped else ""
         lines += [
             "",
             f"relay: {counters['passed_on']} datagrams passed on ({size(counters['passed_on_bytes'])}), "
-            f"{dropped} dropped, {size(relaying['queued_bytes'])} queued",
+            f"{dropped} dropped{by_cause}, {size(relaying['queued_bytes'])} queued",
         ]
     return lines
 

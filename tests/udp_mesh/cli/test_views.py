@@ -8,11 +8,12 @@ import pytest
 from tests.udp_mesh.core.pair import pair
 from udp_mesh.cli import output
 from udp_mesh.cli.inspect import screen_text
-from udp_mesh.cli.views import peers_view, topics_view
+from udp_mesh.cli.views import peers_view, relays_view, topics_view
 from udp_mesh.core.link_trend import Direction, Measure, Trend
+from udp_mesh.core.relaying.conditions import RelayConditions, RelayCounters
 from udp_mesh.core.settings import Settings, Topic
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
-from udp_mesh.daemon.status import peer_json, topics_json
+from udp_mesh.daemon.status import peer_json, relaying_json, topics_json
 
 
 @pytest.mark.parametrize(
@@ -105,3 +106,12 @@ def test_peers_view_shows_relays_trend_and_what_is_left_for_a_priority() -> None
     for key in ("via", "trend", "available_bits_per_s"):
         del even[key]
     assert "through" not in peers_view([even])
+
+
+def test_the_view_of_a_relay_names_the_causes_of_dropped_datagrams() -> None:
+    counters = RelayCounters(passed_on=378, passed_on_bytes=227_000, dropped_queue=3, dropped_loop=1)
+    conditions = RelayConditions(
+        relays=True, active=True, neighbours=(), routes=(), counters=counters, queued_bytes=12_000
+    )
+    lines = relays_view(relaying_json(conditions))
+    assert lines == ["", "relay: 378 datagrams passed on (227 kB), 4 dropped (3 queue, 1 loop), 12 kB queued"]
