@@ -26,6 +26,8 @@ _FLAGS = {"true": True, "false": False, "yes": True, "no": False, "on": True, "o
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
+# of any text on one line, as rendering requires
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 def expected_error(expected: str) -> PydanticCustomError:
@@ -71,6 +73,12 @@ def _name(value: str) -> str:
     raise expected_error(
         "a name of at most 63 letters, digits, '.', '_' and '-', starting and ending with a letter or digit"
     )
+
+
+def _line(value: str) -> str:
+    if not _CONTROL.search(value):
+        return value
+    raise expected_error("text on one line, without control characters")
 
 
 def _mac(value: str) -> str:
@@ -166,6 +174,7 @@ Whole = Annotated[int, BeforeValidator(_whole)]
 Real = Annotated[float, BeforeValidator(_real)]
 Flag = Annotated[bool, BeforeValidator(_flag)]
 Text = Annotated[str, BeforeValidator(_text)]
+Line = Annotated[str, BeforeValidator(_text), AfterValidator(_line)]
 Name = Annotated[str, BeforeValidator(_text), AfterValidator(_name)]
 Mac = Annotated[
     str,

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from meshctl.inventory.addresses import AddressField
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document
-from meshctl.inventory.fields import Address, Mac, Name, Real, ReleaseName, Text, Whole
+from meshctl.inventory.fields import Address, Line, Mac, Name, Real, ReleaseName, Text, Whole
 from meshctl.model import NodeState, Role
 
 
@@ -85,9 +85,9 @@ class NodeLayer(Document):
     """SSH login."""
     robot: Name = NOT_WRITTEN
     """The robot that carries the node. Default: the robot that lists it."""
-    label: Text = ""
+    label: Line = ""
     """Label on the device."""
-    serial: Text = ""
+    serial: Line = ""
     """Serial number of the device."""
     mac: Mac = ""
     """MAC address of the device, as on its label."""
