@@ -27,6 +27,7 @@ from udp_mesh.core.events import (
     TopicStarved,
 )
 from udp_mesh.core.legacy.sender import can_publish
+from udp_mesh.core.link_strength import LinkStrength
 from udp_mesh.core.logs.conditions import LogConditions
 from udp_mesh.core.logs.delivery import LOG_RECEIPT
 from udp_mesh.core.logs.messages import CONTROL_TOPIC
@@ -46,13 +47,6 @@ SILENT_S = 3.5
 """A peer not heard for this long is probably out of reach, long before it is offline: robots meet for seconds."""
 
 
-WEAK_SHARE = 0.7
-"""A link over which less of the datagrams to all arrives is weak. The radio sends these once; others it repeats, so
-that their loss shows only when the link breaks."""
-WEAK_DATAGRAMS, LEAST_DATAGRAMS = 8, 4
-"""Of so many of the newest ones, and of no fewer: robots may meet for seconds."""
-
-
 class SharedLogs:
     """The logs of one node."""
 
@@ -60,8 +54,8 @@ class SharedLogs:
         self._state = state
         self._events = EventQueue(settings.limits.events)
         self._sync_at = now
-        self._met_at: dict[str, tuple[Session, int]] = {}
-        """By peer with logs: its session, and the first datagram to all that counts for the strength of the link."""
+        self._strengths: dict[str, LinkStrength] = {}
+        """By peer with logs."""
         self._plain: dict[MessageId, MessageId] = {}
         """Copies of items sent as ordinary messages: their id -> the item's."""
         self.replicator = Replicator(
@@ -149,7 +143,7 @@ class SharedLogs:
                 if self._has_logs(peer):
                     logs.peer_online(peer, now)
             case PeerOffline(peer):
-                self._met_at.pop(peer, None)
+                self._strengths.pop(peer, None)
                 logs.peer_offline(peer)
             case MessageReceived(source, topic, _, payload) if is_log_traffic(topic):
                 log = log_of(topic)
@@ -188,26 +182,23 @@ class SharedLogs:
         for name in list(self.replicator.peers):
             session = self._session(name)
             if session is None:
-                self._met_at.pop(name, None)
+                self._strengths.pop(name, None)
                 self.replicator.peer_offline(name)
             else:
                 silent_s = max(SILENT_S, MISSED_HEARTBEATS * session.interval_s)
                 self.replicator.peer_silent(name, now - session.last_heard > silent_s)
-                self.replicator.peer_weak(name, self._is_weak(name, session), now)
+                self.replicator.peer_weak(name, self._is_weak(name, session, now), now)
 
-    def _is_weak(self, name: str, session: Session) -> bool:
+    def _is_weak(self, name: str, session: Session, now: float) -> bool:
         """Whether much of what the peer sends to all is lost. Neighbors get copies with numbers of their own, which do
         not show it."""
         link = self._state.links.get(session.path.link)
         if link is None or link.kind is not LinkKind.BROADCAST:
             return False
-        window = session.broadcast_channels[0].window
-        met, first = self._met_at.get(name, (None, 0))
-        if met is not session:
-            first = window.next_new
-            self._met_at[name] = session, first
-        share = window.accepted_share(first, WEAK_DATAGRAMS, LEAST_DATAGRAMS)
-        return share is not None and share < WEAK_SHARE
+        strength = self._strengths.get(name)
+        if strength is None or strength.session is not session:
+            strength = self._strengths[name] = LinkStrength(session)
+        return strength.is_weak(now)
 
     def _send(self, topic: str, payload: bytes, destination: str | None, now: float) -> MessageId | Rejected:
         return publish.send(self._state, topic, payload, destination, "", now)

@@ -57,6 +57,16 @@ MISSED_HEARTBEATS = 3.5
 """A peer is offline only after so many of its announced intervals without a heartbeat."""
 
 
+def _hears_us(session: Session, rates: Rates, now: float) -> bool:
+    """Whether the peer acknowledged something recently. One that came online recently may wait for a heartbeat that
+    lists it."""
+    peer = session.peer
+    if peer is None or peer.online_since is None or now - peer.online_since <= rates.heartbeat_sparse_s:
+        return False
+    sender = peer.sender
+    return sender is not None and sender.delivered_packets > 0 and now - sender.delivered_at < rates.heartbeat_s
+
+
 class HeartbeatScheduler:
     """`next_at` is when the next heartbeat is due."""
 
@@ -90,13 +100,7 @@ class HeartbeatScheduler:
         team."""
         rates = settings.rates
         online = [session for session in sessions if session.peer is not None and session.peer.online]
-        verified = bool(online) and all(
-            session.peer is not None
-            and session.peer.sender is not None
-            and now - session.peer.sender.delivered_at < rates.heartbeat_s
-            and session.peer.sender.delivered_packets
-            for session in online
-        )
+        verified = bool(online) and all(_hears_us(session, rates, now) for session in online)
         base = rates.heartbeat_sparse_s if verified else rates.heartbeat_s
         return max(base, len(online) / rates.heartbeats_heard_per_s)
 

@@ -119,3 +119,19 @@ def test_new_nodes_beyond_one_heartbeats_capacity_are_listed_soon() -> None:
         listed.update(heartbeats.build(settings("a"), strangers, (), 0, 0.0, now).heard)
     # Four heartbeats at the pace of discovery, not of a regular interval of ten seconds.
     assert now < 5 * len(strangers) / (DISCOVERY_RATE_FACTOR * RATES.heartbeats_heard_per_s)
+
+
+def test_heartbeats_become_sparse_only_once_the_peer_has_been_online_for_a_while() -> None:
+    world = World(seed=3)
+    for name in ("a", "b"):
+        world.add(settings(name, Topic("state")))
+    assert world.run(5.0, until=lambda: all(world.events_of(name, PeerOnline) for name in world.nodes))
+    intervals = []
+    for _ in range(50):
+        world.send("a", "state", b"here", destination="b")
+        world.run(0.2)
+        state = world.nodes["a"]._state
+        sessions = list(state.peer_table.sessions.values())
+        intervals.append(state.heartbeats.interval_s(state.settings, sessions, world.now))
+    assert set(intervals[:14]) == {RATES.heartbeat_s}
+    assert set(intervals[16:]) == {RATES.heartbeat_sparse_s}

@@ -1,0 +1,56 @@
+"""Whether the link to a peer is weak: how much of what it sends to all arrives.
+
+The radio sends these datagrams once; others it repeats, so that their loss shows only when the link breaks. What is
+lost while a peer is out of reach says nothing about its link after its return: the count begins again, if the link was
+good before. On a link that was not, pauses are loss like any other.
+"""
+
+from __future__ import annotations
+
+from udp_mesh.core.peers.session import Session
+
+WEAK_SHARE = 0.7
+"""A link over which less arrives is weak."""
+WEAK_DATAGRAMS, LEAST_DATAGRAMS = 8, 4
+"""Of so many of the newest ones, and of no fewer: robots may meet for seconds."""
+GOOD_DATAGRAMS = 1
+"""So few show that a link is good enough for a pause to be an absence."""
+ABSENT_HEARTBEATS = 2.5
+"""A peer that was not heard for so many of its heartbeat intervals was out of reach."""
+
+
+class LinkStrength:
+    """The link of one session. Call `is_weak` about once per second."""
+
+    __slots__ = ("_absent", "_first", "_good", "_known", "session")
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._begin()
+        self._good = False
+        """Whether the link is not weak, as far as can be said."""
+        self._absent = False
+
+    def _begin(self) -> None:
+        self._known = self.session.broadcast_channels[0].window.next_new
+        self._first: int | None = None
+        """The first datagram to all that counts: the one after the first that is heard, whatever was lost before."""
+
+    def is_weak(self, now: float) -> bool:
+        if now - self.session.last_heard > ABSENT_HEARTBEATS * self.session.interval_s:
+            self._absent = True
+        elif self._absent:
+            self._absent = False
+            if self._good:
+                self._begin()
+                self._good = False
+        window = self.session.broadcast_channels[0].window
+        if self._first is None:
+            if window.next_new == self._known:
+                return False
+            self._first = window.next_new
+        share = window.accepted_share(self._first, WEAK_DATAGRAMS, GOOD_DATAGRAMS)
+        if share is not None:
+            self._good = share >= WEAK_SHARE
+        share = window.accepted_share(self._first, WEAK_DATAGRAMS, LEAST_DATAGRAMS)
+        return share is not None and share < WEAK_SHARE
