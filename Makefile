@@ -14,10 +14,10 @@ demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/demo
 
 # The tests start the programs hundreds of times; with PYTHONDONTWRITEBYTECODE each start would compile them.
-# Three workers on two cores: tests of virtual fleets wait for about half of their time.
+# Four workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
 test: setup
 	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
-	$(BIN)/pytest -n 3 --dist loadgroup
+	$(BIN)/pytest -n 4 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .

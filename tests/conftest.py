@@ -26,6 +26,9 @@ settings.register_profile("deep", deadline=None, max_examples=2000, suppress_hea
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
 
 
+LONGEST_GROUPS = ("lab-real", "fleet", "tutorials", "lab")
+"""The groups of tests that share a fleet or a machine and wait for minutes: each begins at once, on its own worker."""
+
 TRIED_AGAIN = "tried again"
 """The property of a test in whose setup a machine was made once more: why."""
 
@@ -80,6 +83,19 @@ def pytest_configure(config: pytest.Config) -> None:
             f"pytest {pytest.__version__} and pytest-xdist {version('pytest-xdist')} lose the groups of tests:"
             " expected pytest below 9.2, which `make setup` installs"
         )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest groups first: pytest-xdist hands groups out in this order (`--no-loadscope-reorder`).
+
+    It would begin with the group of the most tests; then a group of few long ones would run last, and alone.
+    """
+    items.sort(key=_turn)
+
+
+def _turn(item: pytest.Item) -> int:
+    mark = item.get_closest_marker("xdist_group")
+    return LONGEST_GROUPS.index(mark.args[0]) if mark and mark.args[0] in LONGEST_GROUPS else len(LONGEST_GROUPS)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
