@@ -17,6 +17,7 @@ from tests.udp_mesh.wire.foreign_peer import (
     COMPRESSED,
     FLAG_TO_ALL,
     FLAG_ZSTD,
+    NUMBERED,
     RELIABLE,
     VERSION,
     VERSIONS,
@@ -27,6 +28,7 @@ from tests.udp_mesh.wire.foreign_peer import (
     ForeignNode,
     Parser,
     difference,
+    read_number,
     read_version,
     version_hash,
 )
@@ -40,6 +42,8 @@ packed = { priority = 6, compression = true }
 cast = { priority = 4, repair = true }
 grid = { priority = 7, delta = true }
 """
+LATER_FEATURES = 0xFFFFFFFF << 11 & 0xFFFFFFFF
+"""Bits that have no meaning yet; with these, the heartbeats have unknown fields too."""
 ZSTD_MAGIC, ZLIB_MAGIC = "28b52ffd", "78"
 
 
@@ -51,7 +55,7 @@ def daemon() -> Iterator[RunningDaemon]:
             yield one
 
 
-@pytest.fixture(params=[0, ZLIB, ZLIB | ZSTD | VERSIONS])
+@pytest.fixture(params=[0, ZLIB, ZLIB | ZSTD | VERSIONS, ZLIB | ZSTD | VERSIONS | LATER_FEATURES])
 def foreign(daemon: RunningDaemon, request: pytest.FixtureRequest) -> Iterator[ForeignNode]:
     """One that the daemon has met; it goes with a good-bye."""
     with daemon.client() as client:
@@ -60,6 +64,8 @@ def foreign(daemon: RunningDaemon, request: pytest.FixtureRequest) -> Iterator[F
         own.bind(("127.0.3.7", int(port)))
         name = f"foreign{request.param}-{os.urandom(4).hex()}"
         node = ForeignNode(bytes.fromhex(KEY), name, own, (host, int(port)), request.param)
+        if request.param & LATER_FEATURES:
+            node.new_fields = b"of a later version" * 10
         assert node.run(lambda: node.peer("alice"), WAIT_S)
         with daemon.client() as client:
             assert node.run(lambda: node.name in online(client), WAIT_S)
@@ -81,6 +87,15 @@ def test_an_independent_implementation_matches_the_published_vectors() -> None:
         assert sealed.hex() == vector["datagram"]
     for vector in json.loads((FOLDER / "frames.json").read_text()).values():
         assert len(Parser(bytes.fromhex(vector["hex"])).frames()) == len(vector["frames"])
+    for vector in json.loads((FOLDER / "newer.json").read_text()).values():
+        (_, heartbeat), *others = Parser(bytes.fromhex(vector["hex"])).frames()
+        assert heartbeat["features"] == vector["frames"][0]["features"]
+        assert [tag.hex() for tag in heartbeat["heard"]] == vector["frames"][0]["heard"]
+        assert len(others) == len(vector["frames"]) - 1
+    for vector in json.loads((FOLDER / "thin.json").read_text())["numbered"].values():
+        ((_, fragment),) = Parser(bytes.fromhex(vector["hex"])).frames()
+        assert fragment["head"]["flags"] == RELIABLE | NUMBERED
+        assert read_number(fragment["payload"]) == (vector["number"], bytes.fromhex(vector["payload"]))
     versions = json.loads((FOLDER / "versions.json").read_text())
     for vector in versions["accepted"].values():
         held = {version_hash(base)[:4]: base for base in [bytes.fromhex(vector["base"] or "")] if base}
@@ -195,6 +210,24 @@ def test_messages_from_a_foreign_node_arrive_once_and_are_acknowledged(
         foreign.send(alice, "from-abroad", b"last")
         foreign.run(lambda: not alice.in_flight, WAIT_S)
         assert collect(client, 1)[0].payload == b"last"
+
+
+def test_numbered_messages_from_a_foreign_node_arrive_without_their_number_and_copies_once(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
+    alice = foreign.peer("alice")
+    assert alice is not None
+    bodies = [b"\x12\x34stop", b"\x12\x34stop", b"\x12\x35", b"\x12\x36go"]
+    with daemon.client() as client:
+        client.subscribe("*")
+        numbers = [foreign.send(alice, "estop", body, flags=RELIABLE | NUMBERED) for body in bodies]
+        assert foreign.run(lambda: all(number in alice.ends for number in numbers), WAIT_S)
+        assert {alice.ends[number] for number in numbers} == {"delivered"}
+        assert sorted(message.payload for message in collect(client, 3)) == [b"", b"go", b"stop"]
+        too_short = foreign.send(alice, "estop", b"\x12", flags=RELIABLE | NUMBERED)
+        assert foreign.run(partial(alice.ends.get, too_short), WAIT_S)
+        assert alice.ends[too_short] == "refused 3"
+        assert list(client.messages(0.1)) == []
 
 
 def test_broadcasts_work_in_both_directions(daemon: RunningDaemon, foreign: ForeignNode) -> None:

@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 HELLO, BROADCAST, INTRODUCTION, DATA = range(4)
 TO_ALL = bytes(16)
-RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR, FLAG_ZSTD, VERSION = 1, 2, 4, 8, 64, 128
+RELIABLE, COMPRESSED, FLAG_TO_ALL, REPAIR, NUMBERED, FLAG_ZSTD, VERSION = 1, 2, 4, 8, 32, 64, 128
 ZLIB, REPAIRS, ZSTD, VERSIONS = 1, 2, 64, 128
 FIRST_UNREPAIRED_NUMBER = 1 << 31
 COVER = bytes.fromhex("02ffffffffffff00000000")
@@ -226,6 +226,11 @@ def difference(version: bytes, base: bytes) -> bytes:
     return version_hash(base)[:4] + version_hash(version) + packed
 
 
+def read_number(body: bytes) -> tuple[int, bytes]:
+    """The number of a message's copies on thin links, and the rest of its body."""
+    return int.from_bytes(body[:2], "big"), body[2:]
+
+
 # The node
 
 
@@ -274,6 +279,8 @@ class ForeignNode:
     def __init__(self, secret: bytes, name: str, own: socket.socket, neighbour: Address, features: int = 0) -> None:
         self.key, self.name, self.socket, self.neighbour = FleetKey(secret), name, own, neighbour
         self.features = features
+        self.new_fields = b""
+        """Fields of a later version, at the end of the heartbeat's extension."""
         self.boot = os.urandom(16)
         self.to_all = Channel(self.key, self.boot, TO_ALL)
         self.peers: dict[bytes, Peer] = {}
@@ -311,7 +318,8 @@ class ForeignNode:
         heard = [peer.boot[:8] for peer in self.peers.values() if now - peer.heard_at < HEARD_FOR_S]
         numbers = (1, 1, self.features, 1000, len(heard), 0, self.to_all.next_number, self.broadcasts)
         head = b"\x01" + text(self.name) + struct.pack(">BBIHHIQI", *numbers)
-        return head + bytes((len(heard),)) + b"".join(heard) + b"\x00\x00"
+        extension = bytes(4 + 3 * len(heard)) + self.new_fields if self.new_fields else b""
+        return head + bytes((len(heard),)) + b"".join(heard) + b"\x00" + bytes((len(extension),)) + extension
 
     def send(
         self, peer: Peer, topic: str, payload: bytes, *, priority: int = 5, size: int = 1000, flags: int = RELIABLE
@@ -447,6 +455,8 @@ class ForeignNode:
             raise ValueError(f"{len(body)} bytes arrived of a message of {head['size']}")
         topic, type_name = peer.topics[head["topic"]]
         flags = head["flags"]
+        if flags & NUMBERED:
+            _, body = read_number(body)
         if flags & VERSION:
             payload = read_version(body, flags, peer.versions.setdefault((topic, type_name), {}))
         else:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.udp_mesh.wire.log_vectors import make_logs
+from tests.udp_mesh.wire.newer_vectors import NEWER
 from tests.udp_mesh.wire.subscription_vectors import make_subscriptions
 from tests.udp_mesh.wire.thin_vectors import make_thin
 from udp_mesh.core.relaying.hop_channel import HopChannels, hop_key, membership_proof
@@ -252,6 +253,11 @@ def make_frames() -> object:
     return {name: {"frames": describe(frames), "hex": encoded.hex()} for name, (frames, encoded) in vectors.items()}
 
 
+def make_newer() -> object:
+    """Of each the frames that a receiver of this version reads."""
+    return {name: {"frames": describe(frames), "hex": encoded.hex()} for name, (frames, encoded) in NEWER.items()}
+
+
 def make_sealed() -> object:
     key, sender, receiver = Key(bytes(range(32))), bytes(range(16)), bytes(range(100, 116))
     vectors = []
@@ -354,6 +360,7 @@ def make_relay() -> object:
 
 MAKERS = {
     "frames.json": make_frames,
+    "newer.json": make_newer,
     "sealed.json": make_sealed,
     "logs.json": make_logs,
     "subscriptions.json": make_subscriptions,

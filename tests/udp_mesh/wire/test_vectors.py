@@ -16,9 +16,11 @@ from tests.udp_mesh.wire.make_vectors import (
     MESH_DATA,
     RELAY_FRAMES,
 )
+from tests.udp_mesh.wire.newer_vectors import NEWER, NUMBERED
+from udp_mesh.core.thin.numbering import split_number
 from udp_mesh.crypto import Key, ReceiveChannel, check_long
 from udp_mesh.wire.codec import decode
-from udp_mesh.wire.frames import Ping
+from udp_mesh.wire.frames import Fragment, Ping
 from udp_mesh.wire.header import LongHeader, ShortHeader, parse_header
 from udp_mesh.wire.legacy import decode_legacy, decode_mesh_data
 from udp_mesh.wire.relay import Carry, HopAck, decode_relay
@@ -33,6 +35,21 @@ def test_published_vectors_match_the_generated_ones(name: str) -> None:
 def test_published_bytes_decode_to_their_frames(name: str) -> None:
     vectors = json.loads((FOLDER / "frames.json").read_text())
     assert decode(bytes.fromhex(vectors[name]["hex"])) == (FRAMES | COMPACT_FRAMES)[name]
+
+
+@pytest.mark.parametrize("name", NEWER)
+def test_published_heartbeats_of_later_versions_are_read_without_what_is_new(name: str) -> None:
+    vectors = json.loads((FOLDER / "newer.json").read_text())
+    assert decode(bytes.fromhex(vectors[name]["hex"])) == NEWER[name].frames
+
+
+@pytest.mark.parametrize("name", NUMBERED)
+def test_published_numbered_messages_contain_the_number_and_the_payload(name: str) -> None:
+    vector = json.loads((FOLDER / "thin.json").read_text())["numbered"][name]
+    (fragment,) = decode(bytes.fromhex(vector["hex"]))
+    assert isinstance(fragment, Fragment)
+    assert fragment.head is not None
+    assert split_number(fragment.head.flags, bytes(fragment.payload)) == NUMBERED[name]
 
 
 def test_published_datagrams_open() -> None:

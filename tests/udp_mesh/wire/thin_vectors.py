@@ -7,6 +7,7 @@ from typing import Any
 from digi.xbee.models.address import XBee16BitAddress, XBee64BitAddress
 from digi.xbee.packets.common import ReceivePacket
 
+from tests.udp_mesh.wire.newer_vectors import make_numbered
 from udp_mesh.crypto import Key
 from udp_mesh.crypto.thin import ThinChannel, thin_hint
 from udp_mesh.wire.serial_framing import encode_line
@@ -98,4 +99,5 @@ def make_thin() -> object:
         "fleet_key": THIN_KEY.secret.hex(),
         "hint": thin_hint(THIN_KEY),
         "frames": thin_frame_vectors(),
+        "numbered": make_numbered(),
     }
