@@ -17,32 +17,27 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.udp_mesh.core.fuzzed_nodes import FuzzedLogs, FuzzedRelay
+from tests.udp_mesh.core.fuzzed_nodes import FuzzedLine, FuzzedLogs, FuzzedMessages, FuzzedRelay
 from tests.udp_mesh.core.pair import Pair, pair, settings
 from tests.udp_mesh.core.thin.fleet import RADIO, ThinFleet
 from tests.udp_mesh.wire.make_vectors import FRAMES, LEGACY, MESH_DATA
-from tests.udp_mesh.wire.subscription_vectors import SUBSCRIPTIONS
-from tests.udp_mesh.wire.thin_vectors import ITEMS, thin_frame_vectors
+from tests.udp_mesh.wire.thin_vectors import ITEMS
 from udp_mesh.core.settings import Limits, LinkInfo, LinkKind, Neighbour
-from udp_mesh.core.subscriptions.messages import decode_message, encode_ask, encode_table
-from udp_mesh.core.subscriptions.table import KnownTable
 from udp_mesh.core.thin.link import MAX_ACKS, MAX_QUEUED, ComposedFrame
 from udp_mesh.core.thin.reassembly import MAX_PARTIALS
 from udp_mesh.crypto import TO_ALL, SendChannel
 from udp_mesh.wire.codec import decode, encode
 from udp_mesh.wire.errors import DecodeError
+from udp_mesh.wire.frames import MessageFlag
 from udp_mesh.wire.legacy import encode_legacy, encode_mesh_data, fragment_legacy
-from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES, MAX_THIN_NUMBER
+from udp_mesh.wire.limits import MAX_THIN_NUMBER
 from udp_mesh.wire.thin import encode_item
-from udp_mesh.wire.xbee import XBeeDecoder
 
 RECORD = Path("build/fuzz.jsonl")
 CHUNK_INPUTS = 250_000
 FRESH_PAIR_EVERY = 20_000
 """Inputs after which both nodes are replaced: growth shows by then, and stuck state does not hide other failures."""
 TIMERS_EVERY = 200
-MAX_API_LINE_BYTES = 2 * (3 + 18 + 256)
-"""An unfinished API frame of an XBee, each of its bytes escaped."""
 MAX_PARTIAL_BYTES, MAX_PEERS, MAX_STRANGERS = 2_000_000, 64, 16
 
 LEGACY_ADDRESS = ("10.0.0.9", 8700)
@@ -59,19 +54,13 @@ class Fuzzer:
         self.seeds = [encode(frames) for frames in FRAMES.values()]
         self.legacy_seeds = [encode_legacy(datagram) for datagram in LEGACY.values()]
         self.legacy_seeds += fragment_legacy(encode_mesh_data(MESH_DATA))
-        self.subscription_seeds = [
-            encode_ask() if table is None else encode_table(table) for table in SUBSCRIPTIONS.values()
-        ]
-        vectors = [(XBeeDecoder(escaped=False), "xbee"), (XBeeDecoder(escaped=True), "xbee_escaped")]
-        self.xbee = [
-            (decoder, [bytes.fromhex(line) for frame in thin_frame_vectors() for line in frame[key].values()])
-            for decoder, key in vectors
-        ]
         self.pair = self._new_pair()
         self.thin = self._new_thin()
         # Made where their surfaces are run: to let them meet takes longer than most other surfaces.
         self._relay: FuzzedRelay | None = None
         self._logs: FuzzedLogs | None = None
+        self._messages: FuzzedMessages | None = None
+        self.line = FuzzedLine()
 
     @property
     def relay(self) -> FuzzedRelay:
@@ -84,6 +73,12 @@ class Fuzzer:
         if self._logs is None:
             self._logs = FuzzedLogs(self.rng.getrandbits(32))
         return self._logs
+
+    @property
+    def messages(self) -> FuzzedMessages:
+        if self._messages is None:
+            self._messages = FuzzedMessages(self.rng.getrandbits(32))
+        return self._messages
 
     def _new_thin(self) -> ThinFleet:
         fleet = ThinFleet("a", "b", seed=self.rng.getrandbits(32))
@@ -148,12 +143,12 @@ class Fuzzer:
                 self.check_bounds()
                 self.pair = self._new_pair()
                 self.thin = self._new_thin()
-                self._relay, self._logs = None, None
+                self._relay, self._logs, self._messages = None, None, None
 
     def _let_nodes_work(self) -> None:
         self.pair.now += 0.05
         self.thin.run(0.05)
-        for running in (self._relay, self._logs):
+        for running in (self._relay, self._logs, self._messages):
             if running is not None:
                 running.run(0.05)
         for node in (self.pair.b, self.pair.a):
@@ -165,7 +160,7 @@ class Fuzzer:
 
     def check_bounds(self) -> None:
         """Raises AssertionError if the node holds more than its limits allow."""
-        for running in (self._relay, self._logs):
+        for running in (self._relay, self._logs, self._messages):
             if running is not None:
                 running.check_bounds()
         thin = self.thin.thin("b")
@@ -221,14 +216,21 @@ def legacy(fuzzer: Fuzzer) -> None:
 
 
 def subscriptions(fuzzer: Fuzzer) -> None:
-    """Messages of a key holder about what its programs read."""
-    seeds = fuzzer.subscription_seeds
-    try:
-        table = decode_message(fuzzer.mutated(seeds[fuzzer.rng.getrandbits(16) % len(seeds)]))
-    except DecodeError:
-        return
-    if table is not None:
-        KnownTable(table, fuzzer.pair.now).bounds("artifacts/1")
+    """Messages of a key holder about what its programs read, while it is sent messages."""
+    bits = fuzzer.rng.getrandbits(16)
+    table = fuzzer.messages.tables[bits % len(fuzzer.messages.tables)]
+    fuzzer.messages.receive_table(fuzzer.mutated(table) if bits & 0x7000 else table)
+
+
+def versions(fuzzer: Fuzzer) -> None:
+    """Versions of a key holder, and differences to those that arrived before."""
+    bits = fuzzer.rng.getrandbits(24)
+    body, flags = fuzzer.messages.versions[bits % len(fuzzer.messages.versions)]
+    if bits & 0x3000:
+        body = fuzzer.mutated(body)
+    if not bits & 0x1C000:
+        flags = bits >> 17 & (MessageFlag.COMPRESSED | MessageFlag.ZSTD)
+    fuzzer.messages.receive_version(body, flags)
 
 
 def thin_frames(fuzzer: Fuzzer) -> None:
@@ -241,24 +243,34 @@ def thin_frames(fuzzer: Fuzzer) -> None:
     fuzzer.receive_thin(fuzzer.mutated(data))
 
 
-def sealed_thin(fuzzer: Fuzzer) -> None:
-    """A key holder's items, in short frames and introductions."""
+def _thin_frame(fuzzer: Fuzzer) -> bytes:
+    """A key holder's items in a short frame or an introduction."""
     sender = fuzzer.thin.thin("a")
     seeds, bits = fuzzer.thin_seeds, fuzzer.rng.getrandbits(24)
     items = b"".join(seeds[bits >> shift & 7] for shift in range(0, 3 * (bits >> 21), 3))
     if bits & 1 << 20:
         items = fuzzer.mutated(items)
-    composed = ComposedFrame(items[:240], bool(bits & 1 << 19), False, ())
-    fuzzer.receive_thin(sender._seal(composed, fuzzer.thin.now))
+    return sender._seal(ComposedFrame(items[:240], bool(bits & 1 << 19), False, ()), fuzzer.thin.now)
 
 
-def xbee_lines(fuzzer: Fuzzer) -> None:
-    """Lines from a radio modified on their way, and noise, at decoders that continue from what came before."""
+def sealed_thin(fuzzer: Fuzzer) -> None:
+    """A key holder's items, in short frames and introductions."""
+    fuzzer.receive_thin(_thin_frame(fuzzer))
+
+
+def serial_lines(fuzzer: Fuzzer) -> None:
+    """The bytes of a key holder's frames on a serial line or from an XBee, as they are, modified on their way, and
+    noise; what the decoder finds in them reaches the node."""
     bits = fuzzer.rng.getrandbits(24)
-    decoder, seeds = fuzzer.xbee[bits & 1]
-    data = fuzzer.mutated(seeds[(bits >> 1) % len(seeds)]) if bits & 0x30000 else fuzzer.rng.randbytes(bits >> 2 & 0xFF)
-    assert all(0 < len(frame) <= MAX_THIN_FRAME_BYTES for frame in decoder.feed(data))
-    assert len(decoder._unfinished) <= MAX_API_LINE_BYTES
+    framing = bits % 3
+    if bits >> 2 & 7:
+        data = fuzzer.line.encode(framing, _thin_frame(fuzzer))
+        data = fuzzer.mutated(data) if bits >> 5 & 3 else data
+    else:
+        data = fuzzer.rng.randbytes(bits >> 8 & 0xFF)
+    fuzzer.thin.thin("b").links[RADIO.name].forgeries.failures = 0
+    for frame in fuzzer.line.feed(framing, data):
+        fuzzer.receive_thin(frame)
 
 
 def relay_frames(fuzzer: Fuzzer) -> None:
@@ -288,9 +300,10 @@ SURFACES = {
         subscriptions,
         thin_frames,
         sealed_thin,
-        xbee_lines,
+        serial_lines,
         relay_frames,
         log_messages,
+        versions,
     )
 }
 

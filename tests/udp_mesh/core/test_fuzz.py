@@ -21,6 +21,9 @@ from tests.udp_mesh.core.fuzzing import (
     mutated_datagrams,
     random_bytes,
     relay_frames,
+    serial_lines,
+    subscriptions,
+    versions,
 )
 from udp_mesh.core.events import MessageReceived
 
@@ -44,13 +47,22 @@ def test_a_pair_still_communicates_after_fuzzed_input() -> None:
     assert any(isinstance(event, MessageReceived) and event.payload == b"still here" for event in both.events(both.b))
 
 
-def test_relays_and_shared_logs_still_work_after_fuzzed_input() -> None:
+def test_running_nodes_still_work_after_fuzzed_input() -> None:
     fuzzer = Fuzzer(seed=78)
-    for surface in (relay_frames, log_messages):
+    for surface in (relay_frames, log_messages, subscriptions, versions):
         fuzzer.run(surface, 1000)
     fuzzer.check_bounds()
     assert fuzzer.relay.works()
     assert fuzzer.logs.works()
+    assert fuzzer.messages.works()
+
+
+def test_frames_still_arrive_over_a_serial_line_after_fuzzed_input() -> None:
+    fuzzer = Fuzzer(seed=79)
+    fuzzer.run(serial_lines, 3000)
+    for framing in range(3):
+        fuzzer.line.feed(framing, bytes(600))
+        assert fuzzer.line.feed(framing, fuzzer.line.encode(framing, b"a frame~}")) == [b"a frame~}"]
 
 
 def test_a_failure_names_the_input_that_caused_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,8 +54,8 @@ def check(team: LogTeam, payloads: list[bytes]) -> None:
         assert pipe.dropped == pipe.carried, "they never met"
 
 
-# 1, 53, 213 and 222 failed once.
-@pytest.mark.parametrize("seed", [0, 1, 2, 53, 213, 222])
+# 1, 208, 213 and 424 failed once.
+@pytest.mark.parametrize("seed", [0, 1, 2, 208, 213, 424])
 def test_every_artifact_arrives_exactly_once(seed: int) -> None:
     check(*play(seed))
 
