@@ -15,6 +15,7 @@ from udp_mesh.core.events import MessageDelivered, MessageReceived, Rejected
 from udp_mesh.core.logs.item import ItemId, LogItem, LogKey, encode_item
 from udp_mesh.core.logs.messages import Have, HaveEntry, Holder, ItemRequest, encode_control
 from udp_mesh.core.logs.serving import MAX_QUEUED
+from udp_mesh.core.receiver.datagram_age import clock_ms
 from udp_mesh.core.relaying.hop_queue import MAX_HOP_BYTES
 from udp_mesh.core.relaying.relaying import MAX_NEIGHBOURS
 from udp_mesh.core.settings import Topic
@@ -23,7 +24,7 @@ from udp_mesh.core.versions.encoding import Version
 from udp_mesh.core.versions.encoding import encode as encode_grid
 from udp_mesh.crypto.signing import SigningKey
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead, TopicAnnounce
+from udp_mesh.wire.frames import Fragment, MessageFlag, MessageHead, Sent, TopicAnnounce
 from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES
 from udp_mesh.wire.relay import Carry, encode_carry
 from udp_mesh.wire.serial_framing import LineDecoder, encode_line
@@ -153,7 +154,9 @@ class FuzzedMessages:
         self._message_id += 1
         topic_id = 0x8000 + len(topic)
         head = MessageHead(len(body), 1, topic_id, 4, flags)
-        frames = encode([TopicAnnounce(topic_id, topic, ""), Fragment(self._message_id, 0, body, head)])
+        # One without its sender's clock could be a recording, and is dropped.
+        sent = Sent(clock_ms(self.world.now))
+        frames = encode([sent, TopicAnnounce(topic_id, topic, ""), Fragment(self._message_id, 0, body, head)])
         number, data = self._channel.seal(frames)
         self._in_flight.add(number, None)
         self.world.nodes["a"].receive(data, "mesh", self.world.addresses["b"], self.world.now)

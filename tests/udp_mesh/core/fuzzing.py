@@ -13,7 +13,7 @@ import json
 import random
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -326,12 +326,12 @@ class Chunk(NamedTuple):
             raise
 
 
-def chunks(inputs: int, chunk_inputs: int = CHUNK_INPUTS) -> Iterator[Chunk]:
-    """An equal part for each surface; the seed is the number of the chunk."""
-    seed = 0
+def chunks(inputs: int, chunk_inputs: int = CHUNK_INPUTS, surfaces: Sequence[str] = ()) -> Iterator[Chunk]:
+    """An equal part for each surface (empty: all); the seed is the number of the chunk."""
+    seed, names = 0, surfaces or tuple(SURFACES)
     while inputs > 0:
         size = min(inputs, chunk_inputs)
-        yield Chunk(tuple(SURFACES)[seed % len(SURFACES)], seed, size)
+        yield Chunk(names[seed % len(names)], seed, size)
         inputs -= size
         seed += 1
 
@@ -342,12 +342,12 @@ def finished(record: Path) -> list[Chunk]:
     return [Chunk(**json.loads(line)) for line in record.read_text().splitlines()]
 
 
-def run(inputs: int, record: Path, part: tuple[int, int] = (1, 1), chunk_inputs: int = CHUNK_INPUTS) -> int:
+def run(planned: Iterable[Chunk], record: Path, part: tuple[int, int] = (1, 1)) -> int:
     """Run every chunk of this part that the record does not hold; returns the inputs it ran."""
     number, of = part
     done = set(finished(record))
     ran = 0
-    for chunk in chunks(inputs, chunk_inputs):
+    for chunk in planned:
         if chunk.seed % of != number - 1 or chunk in done:
             continue
         chunk.run()
@@ -364,20 +364,30 @@ def _part(text: str) -> tuple[int, int]:
     return int(number), int(of)
 
 
+def _surfaces(text: str) -> list[str]:
+    names = text.split(",")
+    if unknown := sorted(set(names) - set(SURFACES)):
+        raise argparse.ArgumentTypeError(f"expected names of {', '.join(SURFACES)}, found {', '.join(unknown)}")
+    return names
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.udp_mesh.core.fuzzing", description=__doc__)
     parser.add_argument("--inputs", type=int, default=100_000_000, help="inputs in all, including those recorded")
     parser.add_argument("--part", type=_part, default=(1, 1), metavar="NUMBER/PARTS", help="run only these chunks")
     parser.add_argument("--record", type=Path, default=RECORD, help="finished chunks, one per line")
-    parser.add_argument("--totals", type=Path, help="also write the inputs per surface to this file")
+    parser.add_argument("--surfaces", type=_surfaces, default=(), metavar="NAME,...", help="only these")
+    parser.add_argument("--totals", type=Path, help="also update the inputs per surface in this file")
     arguments = parser.parse_args()
     arguments.record.parent.mkdir(parents=True, exist_ok=True)
-    run(arguments.inputs, arguments.record, arguments.part)
+    run(chunks(arguments.inputs, surfaces=arguments.surfaces), arguments.record, arguments.part)
     by_surface: Counter[str] = Counter()
     for chunk in finished(arguments.record):
         by_surface[chunk.surface] += chunk.inputs
     if arguments.totals is not None:
-        totals = [json.dumps({"surface": name, "inputs": count}) for name, count in by_surface.items()]
+        rows = arguments.totals.read_text().splitlines() if arguments.totals.exists() else []
+        counts = {row["surface"]: row["inputs"] for row in map(json.loads, rows)} | by_surface
+        totals = [json.dumps({"surface": name, "inputs": counts[name]}) for name in SURFACES if name in counts]
         arguments.totals.write_text("\n".join(totals) + "\n")
     lines = [*by_surface.items(), ("in all", by_surface.total())]
     sys.stdout.writelines(f"{name:18} {count:>12,}\n" for name, count in lines)
