@@ -96,7 +96,7 @@ class LineDecoder:
         if not encoded and not overlong:
             return None
         plain = None if overlong else cobs_decode(encoded)
-        if plain is None or len(plain) <= CRC_BYTES:
+        if plain is None or not CRC_BYTES < len(plain) <= MAX_THIN_FRAME_BYTES + CRC_BYTES:
             self.damaged += 1
             return None
         frame, crc = plain[:-CRC_BYTES], plain[-CRC_BYTES:]

@@ -84,3 +84,11 @@ def test_an_endless_line_is_held_up_to_one_frame() -> None:
 def test_the_framing_costs_what_airtime_counts() -> None:
     for size in (1, 64, 253):
         assert len(encode_line(b"\x01" * size)) <= size + FRAMING_BYTES
+
+
+def test_a_frame_longer_than_any_counts_as_damage() -> None:
+    """The encoding of one that is a little too long is no longer than the worst case of others."""
+    decoder = LineDecoder()
+    assert decoder.feed(encode_line(b"x" * MAX_THIN_FRAME_BYTES)) == [b"x" * MAX_THIN_FRAME_BYTES]
+    assert decoder.feed(encode_line(b"x" * (MAX_THIN_FRAME_BYTES + 1))) == []
+    assert decoder.damaged == 1
