@@ -1,12 +1,13 @@
 """Ten robots at random: artifacts to the base by a shared log, by direct delivery alone, and by flooding.
 
-    python -m benchmarks.shared_logs [--seeds N] [--seconds S] [--ways WAY,...] [--results FILE]
+    python -m benchmarks.shared_logs [--seeds N] [--seconds S] [--ways WAY,...] [--results FILE] [--fill]
 
 Robots walk between random points of a square and rarely meet; the base stays in a corner. Each robot publishes an
 artifact now and then; the last part of a run has no new ones, so that what can still arrive does. `direct`: an
 outbox for the base. `flooding`: each robot sends what it hears for the first time to all others, with an outbox for
 each. Prints one JSON line per run and a table; all in virtual time, so that a seed gives the same figures anywhere.
-With `--results`, runs are appended to a file, and those that it contains are not repeated.
+With `--results`, runs are appended to a file, and those that it contains are not repeated; `--fill` writes the table
+to docs/benchmarks.md. Flooding fills the channel: half a second of processor time per simulated second, or more.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from benchmarks.page import fill
 from udp_mesh.core.events import Event, MessageReceived
 from udp_mesh.core.settings import Log, Outbox, Settings, Topic
 from udp_mesh.sim.medium import RadioChannel
@@ -132,6 +134,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1800.0)
     parser.add_argument("--ways", default=",".join(WAYS), help="comma-separated")
     parser.add_argument("--results", type=Path, help="JSON lines")
+    parser.add_argument("--fill", action="store_true", help="write the table to docs/benchmarks.md")
     arguments = parser.parse_args()
     ways = arguments.ways.split(",")
     runs = read_results(arguments.results)
@@ -146,18 +149,30 @@ def main() -> None:
             if arguments.results is not None:
                 with arguments.results.open("a", encoding="utf-8") as file:
                     file.write(f"{json.dumps(run)}\n")
-    runs = [run for run in runs if run["seconds"] == arguments.seconds and run["seed"] <= arguments.seeds]
-    print("| way | seeds | arrived | twice | median delay (s) | airtime per artifact published (ms) |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    lines = table(runs, ways, arguments.seconds, arguments.seeds)
+    print(*lines, sep="\n")
+    if arguments.fill:
+        fill("shared logs", "\n".join(lines))
+
+
+def table(runs: list[dict[str, Any]], ways: list[str], seconds: float, seeds: int) -> list[str]:
+    """The runs of this length with the first seeds, as Markdown."""
+    lines = [
+        "| way | seeds | arrived | twice | median delay (s) | airtime per artifact published (ms) |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for way in ways:
-        mine = [run for run in runs if run["way"] == way]
+        mine = [run for run in runs if (run["way"], run["seconds"]) == (way, seconds) and run["seed"] <= seeds]
         arrived, published = sum(run["arrived"] for run in mine), sum(run["published"] for run in mine)
-        delay_s = statistics.median(run["delay_p50_s"] for run in mine if run["delay_p50_s"] is not None)
+        delays_s = [run["delay_p50_s"] for run in mine if run["delay_p50_s"] is not None]
+        delay = f"{statistics.median(delays_s):.0f}" if delays_s else "-"
         airtime_ms = 1000 * sum(run["airtime_s"] for run in mine) / published
-        print(
-            f"| {way} | {len(mine)} | {arrived / published:.1%} of {published} | {sum(run['twice'] for run in mine)} "
-            f"| {delay_s:.0f} | {airtime_ms:.0f} |"
+        # A program that floods gets an artifact from many; it tells them apart itself.
+        twice = "-" if way == "flooding" else sum(run["twice"] for run in mine)
+        lines.append(
+            f"| {way} | {len(mine)} | {arrived / published:.1%} of {published} | {twice} | {delay} | {airtime_ms:.0f} |"
         )
+    return lines
 
 
 if __name__ == "__main__":
