@@ -76,8 +76,10 @@ def _name(value: str) -> str:
 
 
 def _line(value: str) -> str:
-    if not _CONTROL.search(value):
-        return value
+    # a block scalar (`|`) ends with a line break
+    line = value.rstrip("\n")
+    if not _CONTROL.search(line):
+        return line
     raise expected_error("text on one line, without control characters")
 
 

@@ -127,7 +127,8 @@ def expected_value(error: ErrorDetails) -> str:
     if kind == "string_pattern_mismatch":
         return f"text that matches {context['pattern']}"
     if "expected" in context:
-        return str(context["expected"]).replace("' or '", "', '") if kind == "enum" else str(context["expected"])
+        expected = str(context["expected"])
+        return "one of " + expected.replace("' or '", "', '") if kind == "enum" else expected
     return error["msg"]
 
 

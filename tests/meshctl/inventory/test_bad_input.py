@@ -134,6 +134,12 @@ _PARTS = {
         "exceeds the address range at index 2",
     ),
     "bad MAC": ("nodes: {n: {mac: 02:00:00:00:00}}\n", "INV021", 1, "expected a MAC address"),
+    "unknown role": (
+        "nodes: {n: {role: relay}}\n",
+        "INV021",
+        1,
+        "expected one of 'base', 'robot', 'beacon', found 'relay'",
+    ),
     "label of two lines": ('nodes: {n: {label: "B\\n3"}}\n', "INV021", 1, "nodes.n.label: expected text on one line"),
     "group in a group": ("groups: {a: {groups: [b]}}\n", "INV020", 1, "unknown key 'groups'"),
     "inherits in a node": ("nodes: {n: {inherits: [b]}}\n", "INV020", 1, "unknown key 'inherits'"),

@@ -28,6 +28,13 @@ def test_scalars_are_interpreted_by_field_type_and_not_by_yaml_rules(tmp_path: P
     assert (node.mac, node.serial, node.label) == ("12:34:56:12:34:56", "0123", "1e3")
 
 
+def test_a_label_in_a_block_has_no_line_break_at_its_end(tmp_path: Path) -> None:
+    fleet = fleet_of(
+        tmp_path, "nodes:\n  n:\n    hardware: rocket\n    address: 10.42.0.1\n    label: |\n      left lid\n"
+    )
+    assert fleet.nodes["n"].label == "left lid"
+
+
 def test_a_range_expands_in_order_with_consecutive_addresses(tmp_path: Path) -> None:
     fleet = fleet_of(tmp_path, "nodes: {'b[08-11]': {hardware: rocket, address: {from: 10.42.0.101}}}\n")
     assert [(name, str(node.address)) for name, node in fleet.nodes.items()] == [
