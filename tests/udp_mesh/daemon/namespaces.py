@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
+from tests.udp_mesh.daemon.veth_links import ip
 from udp_mesh.cli.views import status_view
 
 MAP_BYTES = 3_000_000
@@ -28,8 +29,7 @@ class Pair:
 
     def ip(self, daemon: RunningDaemon, words: str) -> None:
         """`ip WORDS` in the daemon's namespace."""
-        assert daemon.process is not None
-        subprocess.run(["nsenter", "-t", str(daemon.process.pid), "-n", "ip", *words.split()], check=True)
+        ip(daemon, words)
 
     def join(self, interface: str) -> None:
         """A veth pair with one end, named so, in each namespace; both up."""

@@ -7,50 +7,23 @@ Anything that is not as it should be raises.
 from __future__ import annotations
 
 import contextlib
-import subprocess
 import tempfile
 from pathlib import Path
 
 from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
+from tests.udp_mesh.daemon.veth_links import connect, isolated_daemon, join
 from udp_mesh.cli.views import status_view
 
 LINKS = (("alice", "r1", "10.1.0"), ("r1", "bob", "10.2.0"), ("alice", "r2", "10.3.0"), ("r2", "bob", "10.4.0"))
+TOPICS = """
+status = { priority = 0 }
+map = { priority = 7 }
+"""
 
 
 def _daemon(folder: Path, name: str) -> RunningDaemon:
-    relay = 'relay = ["bob"]\n' if name.startswith("r") else ""
-    configuration = f"""
-name = "{name}"
-key_file = "{folder}/key"
-{relay}
-[topics]
-status = {{ priority = 0 }}
-map = {{ priority = 7 }}
-{RATES}
-[daemon]
-socket = "{folder / name}.sock"
-state_directory = "{folder / name}"
-"""
-    daemon = RunningDaemon(folder, name, configuration)
-    daemon.prefix = ["unshare", "--net"]
-    return daemon
-
-
-def _ip(daemon: RunningDaemon, words: str) -> None:
-    assert daemon.process is not None
-    subprocess.run(["nsenter", "-t", str(daemon.process.pid), "-n", "ip", *words.split()], check=True)
-
-
-def _join(daemons: dict[str, RunningDaemon], left: str, right: str, network: str) -> None:
-    """A veth pair between two daemons, each end named after the other one."""
-    one, other = daemons[left].process, daemons[right].process
-    assert one is not None
-    assert other is not None
-    words = f"link add {right} netns {one.pid} type veth peer name {left} netns {other.pid}"
-    subprocess.run(["ip", *words.split()], check=True)
-    for place, (name, interface) in enumerate(((left, right), (right, left)), 1):
-        _ip(daemons[name], f"addr add {network}.{place}/24 brd + dev {interface}")
-        _ip(daemons[name], f"link set {interface} up")
+    relay = 'relay = ["bob"]' if name.startswith("r") else ""
+    return isolated_daemon(folder, name, TOPICS, top=relay, more=RATES)
 
 
 def _via(daemon: RunningDaemon, name: str) -> list[str]:
@@ -66,7 +39,8 @@ def main() -> None:
         (folder / "key").write_text(KEY + "\n")
         daemons = {name: stack.enter_context(_daemon(folder, name)) for name in ("alice", "bob", "r1", "r2")}
         for left, right, network in LINKS:
-            _join(daemons, left, right, network)
+            join(daemons, left, right, network)
+            connect(daemons, left, right)
         alice, bob = daemons["alice"], daemons["bob"]
         wait_online(alice, "bob")
         wait_online(bob, "alice")
