@@ -7,7 +7,7 @@ makes at most that many on one connection. dropbear does not count `auth_none`, 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,14 @@ import paramiko
 from cryptography.exceptions import UnsupportedAlgorithm
 from paramiko.pkey import PKey, UnknownKeyType
 
-from meshctl.device.connection import Credentials, OwnKey
+from meshctl.device.connection import Credentials, OwnKey, fingerprint_of
 from meshctl.device.file_state import FileState, file_state
 from meshctl.device.legacy_rsa import with_sha1
 from meshctl.errors import InputError
 from meshctl.model import Secret
+
+# Every SSH agent and server of the last years knows it (RFC 8332).
+_RSA_SIGNATURE = "rsa-sha2-512"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,32 @@ def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
     """The public parts of all keys that would be tried. Raises InputError for an unusable key file."""
     with login_attempts(credentials, legacy_rsa_sha1=False) as found:
         return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
+
+
+def sign(credentials: Credentials, fingerprints: Collection[str], data: bytes) -> tuple[OwnKey, bytes] | None:
+    """`data` signed by the first key that would be tried and has one of the fingerprints (`SHA256:...`); None without
+    such a key. The signature is that of RFC 4253 section 6.6, as in SSH's public key login. Raises InputError for an
+    unusable key file."""
+    with login_attempts(credentials, legacy_rsa_sha1=False) as found:
+        for one in found:
+            if one.key is None or fingerprint_of(one.key.asbytes()) not in fingerprints:
+                continue
+            algorithm = _RSA_SIGNATURE if one.key.get_name() == "ssh-rsa" else None
+            try:
+                signed = one.key.sign_ssh_data(data, algorithm)
+            except (paramiko.SSHException, OSError) as error:
+                raise InputError(f"{one.name} does not sign: {error}") from error
+            own = OwnKey(one.name, one.key.get_name(), one.key.asbytes())
+            return own, signed if isinstance(signed, bytes) else signed.asbytes()
+    return None
+
+
+def is_signed_by(key_type: str, blob: bytes, data: bytes, signature: bytes) -> bool:
+    """Whether a public key, as in authorized_keys, has signed `data` (see `sign`)."""
+    try:
+        return bool(PKey.from_type_string(key_type, blob).verify_ssh_sig(data, paramiko.Message(signature)))
+    except (paramiko.SSHException, UnknownKeyType, UnsupportedAlgorithm, ValueError, IndexError):
+        return False
 
 
 # File, its state and passphrase -> parsed key. Checking an RSA key, or deriving the key of an encrypted file, takes

@@ -32,6 +32,7 @@ from meshctl.device.legacy_rsa import SSH_RSA, LegacyTransport
 from meshctl.device.liveness import ActivityStream, Watchdog, keepalives
 from meshctl.device.sockets import open_socket
 from meshctl.device.ssh_channel import collect, ignoring_closed, open_session, sending_stdin
+from meshctl.device.ssh_stream import LineStream
 from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKey, HostKeyPolicy
 from meshctl.errors import MeshctlError
@@ -299,6 +300,13 @@ class SshConnection(Connection):
                 with ignoring_closed():
                     channel.close()
         return Completed(out, err, status)
+
+    def stream(self, command: str) -> LineStream:
+        """Start a command that exchanges lines with us until either side ends it. Raises Timeout, ConnectionLost."""
+        with self._waiting(self._limits.channel_s, "opening a channel"):
+            channel = open_session(self._transport)
+            channel.exec_command(command)
+        return LineStream(channel, self._endpoint.label)
 
     def _waiting(self, seconds: float, phase: str) -> AbstractContextManager[None]:
         silence_s = self._limits.silence_s

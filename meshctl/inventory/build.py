@@ -23,6 +23,7 @@ from meshctl.inventory.documents import (
     OtherComputerDocument,
     RobotDocument,
     SecretDocument,
+    SiteDocument,
     SshLayer,
 )
 from meshctl.inventory.layers import NodeSpec
@@ -48,6 +49,7 @@ from meshctl.model import (
     Robot,
     SecretKind,
     SecretRef,
+    Site,
     SshSettings,
     SystemSettings,
     UdpMesh,
@@ -113,6 +115,7 @@ def build(
         provenance=Provenance(root, specs, robot_of),
         files=tuple(str(path) for path in files),
         base=str(files[0].parent),
+        sites=MappingProxyType({name: _site(name, item) for name, item in document.sites.items()}),
     )
     return Built(fleet, ())
 
@@ -307,6 +310,10 @@ def _names(
 
 def _other_computer(document: OtherComputerDocument) -> Computer:
     return Computer(document.address, _computer_ssh(document.ssh))
+
+
+def _site(name: str, document: SiteDocument) -> Site:
+    return Site(name, _computer_ssh(document.ssh), document.worker_key)
 
 
 def _computer_ssh(document: SshLayer) -> SshSettings:

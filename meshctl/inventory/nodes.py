@@ -174,6 +174,7 @@ class _Building:
             gateway=values.get("gateway"),
             position=fixed_position(values.get("position")),
             lan_filter=_lan_filter(values.get("lan_filter")),
+            site=values.get("site", ""),
         )
         network = self.meshes[first_mesh].network if first_mesh is not None else None
         return _Template(node, values["address"], address_layer, values.get("hostname", ""), network)

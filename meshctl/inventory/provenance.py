@@ -15,6 +15,7 @@ _TITLES = {
     "meshes": "mesh {}",
     "groups": "group {}",
     "robots": "robot {}",
+    "sites": "site {}",
     "topics": "topic {}",
     "defaults": "defaults",
 }

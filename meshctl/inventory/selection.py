@@ -5,7 +5,7 @@ A word is one term or several separated by commas:
     b03  'husky*'           a node by name or pattern
     beacons                 a group by name, where no node has that name
     B3  02:00:5e:00:00:03   a node by label, serial number or MAC, where no node or group has that name
-    role:beacon  state:carried  mesh:main  group:spares  robot:spot1  hardware:box  release:24.10  label:B3
+    role:beacon  state:carried  mesh:main  group:spares  robot:spot1  site:north  hardware:box  release:24.10  label:B3
                             an attribute
     '!b07'  '!role:base'    excludes; a selection of exclusions alone starts from everything
     @FILE                   the terms in a file, one or more per line, `#` starts a comment
@@ -68,6 +68,7 @@ def attributes_of(node: Node) -> Attributes:
         "mesh": node.meshes,
         "group": node.groups,
         "robot": (node.robot,) if node.robot else (),
+        "site": (node.site,) if node.site else (),
         "hardware": (node.hardware.name,),
         "release": (node.release.value,),
         "label": (node.label,) if node.label else (),

@@ -33,6 +33,7 @@ from meshctl.lint.rules import (
     routed_lans,
     routing,
     secrets,
+    sites,
     system,
     team,
     thin_links,
@@ -45,6 +46,7 @@ from meshctl.lint.rules import (
 CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Suppressions and the baseline", housekeeping),
     ("References", references),
+    ("Sites", sites),
     ("Identity", identity),
     ("Addresses", addresses),
     ("Networks", networks),

@@ -110,7 +110,7 @@ class Node:
     """One radio device. `address` is its management address with the prefix length, in its mesh's network.
 
     `lan_address` is its address in its robot's own LAN, between which and the mesh it routes; None: it bridges the two.
-    `lan_filter` None: it bridges every frame.
+    `lan_filter` None: it bridges every frame. `site` is empty for a node that belongs to none.
     """
 
     name: str
@@ -136,6 +136,7 @@ class Node:
     lan_address: IpInterface | None = None
     position: FixedPosition | None = None
     lan_filter: LanFilter | None = None
+    site: str = ""
 
     @property
     def bridges_lan(self) -> bool:
@@ -222,6 +223,20 @@ class Robot:
 
 
 @dataclass(frozen=True, slots=True)
+class Site:
+    """A place with nodes of its own. `ssh` is the login to its gateway, where a worker provisions them; without a host
+    there is no worker. The nodes accept the SSH public key `worker_key`."""
+
+    name: str
+    ssh: SshSettings = SshSettings()
+    worker_key: str = ""
+
+    @property
+    def has_worker(self) -> bool:
+        return bool(self.ssh.host)
+
+
+@dataclass(frozen=True, slots=True)
 class Operators:
     """Login to the nodes: public keys for root, and whether passwords are allowed."""
 
@@ -294,6 +309,7 @@ class Fleet:
     provenance: Mapping[tuple[str, ...], Origin]
     files: tuple[str, ...] = ()
     base: str = ""
+    sites: Mapping[str, Site] = field(default_factory=lambda: MappingProxyType({}))
 
     def where(self, *path: str) -> Origin:
         """The origin of a value, or of its innermost container that has one.
@@ -320,6 +336,11 @@ class Fleet:
         """The radio that routes the robot's LAN: its first managed one with an address there."""
         nodes = (self.nodes.get(name) for name in robot.nodes)
         return next((node for node in nodes if node and node.state.is_managed and node.lan_address), None)
+
+    def worker_site(self, node: Node) -> Site | None:
+        """The site whose worker provisions the node; None if the operator does."""
+        site = self.sites.get(node.site)
+        return site if site is not None and site.has_worker else None
 
     def members(self, mesh: str) -> Iterator[Node]:
         """The managed nodes with at least one radio in `mesh`."""

@@ -76,7 +76,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         backbone=_backbone(node, primary, masters),
         routes=routes(fleet, node),
         lan_filter=_lan_filter(fleet, node, primary, masters),
-        login=Login(_ssh_port(node), fleet.operators.password_login, fleet.operators.ssh_keys),
+        login=Login(_ssh_port(node), fleet.operators.password_login, _login_keys(fleet, node)),
         system=fleet.system,
         backend=primary.backend if primary is not None else Backend.BATMAN,
         operator_parts=primary.operator_parts if primary is not None else OperatorParts(),
@@ -90,6 +90,12 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
     if checks.found:
         raise InvalidInput(checks.found)
     return intent
+
+
+def _login_keys(fleet: Fleet, node: Node) -> tuple[str, ...]:
+    """The public keys that the node accepts: the operators', and that of its site's worker."""
+    site = fleet.worker_site(node)
+    return (*fleet.operators.ssh_keys, *((site.worker_key,) if site is not None and site.worker_key else ()))
 
 
 def _primary(meshes: tuple[Mesh, ...], node: Node) -> Mesh | None:

@@ -35,6 +35,7 @@ from meshctl.inventory.documents.robot import (
     UdpMeshDocument,
 )
 from meshctl.inventory.documents.root import InventoryDocument
+from meshctl.inventory.documents.site import SiteDocument
 
 __all__ = [
     "NOT_WRITTEN",
@@ -60,6 +61,7 @@ __all__ = [
     "ReductionDocument",
     "RobotDocument",
     "SecretDocument",
+    "SiteDocument",
     "SshLayer",
     "SystemDocument",
     "TopicDocument",

@@ -85,6 +85,8 @@ class NodeLayer(Document):
     """SSH login."""
     robot: Name = NOT_WRITTEN
     """The robot that carries the node. Default: the robot that lists it."""
+    site: Name = NOT_WRITTEN
+    """The site where the node is. Default: none."""
     label: Line = ""
     """Label on the device."""
     serial: Line = ""

@@ -1,0 +1,159 @@
+"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC136)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from meshctl.diagnostics import Severity
+from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.references import suggest
+from meshctl.lint.sshkey import BadKey, parse_authorized_key
+from meshctl.model import Fleet
+
+_KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g worker"
+_NORTH = f"{{ssh: {{host: north.example.org}}, worker_key: {_KEY}}}"
+_SOUTH = f"{{ssh: {{host: south.example.org}}, worker_key: {_KEY}}}"
+
+
+@fleet_rule(
+    "MC131",
+    Severity.ERROR,
+    "A node is at a site that does not exist",
+    why="No worker provisions the node, and the operator, who may not reach it, would try instead.",
+    fix="Use a site defined in `sites`.",
+    failing="""
+    sites: {north: {}}
+    nodes: {base: {site: north}, b01: {site: nort}}
+    """,
+    passing="""
+    sites: {north: {}}
+    nodes: {b01: {site: north}}
+    """,
+)
+def unknown_site(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        if node.site and node.site not in fleet.sites:
+            expected, hint = suggest(fleet.sites, node.site)
+            yield Finding(("nodes", node.name, "site"), "no such site", expected, node.site, hint)
+
+
+@fleet_rule(
+    "MC132",
+    Severity.ERROR,
+    "A mesh has nodes at a site with a worker, and others elsewhere",
+    why="""A change of a mesh is planned with all its nodes: which one cuts off which, and when the whole cell has met
+    again. A worker has only the nodes of its site.""",
+    fix="Set the same `site` for all nodes of the mesh, for example in their group.",
+    failing=f"""
+    sites: {{north: {_NORTH}, south: {_SOUTH}}}
+    defaults: {{site: north}}
+    nodes: {{b01: {{site: south}}}}
+    """,
+    passing=f"""
+    sites: {{north: {_NORTH}}}
+    defaults: {{site: north}}
+    """,
+)
+def mesh_at_two_sites(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name in fleet.meshes:
+        sites = group_by_key((node.site, node.name) for node in fleet.members(name))
+        if len(sites) > 1 and any(site.has_worker for key in sites if (site := fleet.sites.get(key)) is not None):
+            found = "; ".join(f"{key or 'no site'}: {join_limited(nodes)}" for key, nodes in sites.items())
+            yield Finding(("meshes", name), "its nodes are not at one site", "all nodes at one site", found)
+
+
+@fleet_rule(
+    "MC133",
+    Severity.WARNING,
+    "A site has no nodes",
+    why="A site without nodes is usually a leftover, or its nodes lack `site`.",
+    fix="Set `site` at its nodes or in their group, or remove the site.",
+    failing="sites: {north: {}}",
+    passing="""
+    sites: {north: {}}
+    nodes: {b01: {site: north}}
+    """,
+)
+def empty_site(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    used = {node.site for node in fleet.managed()}
+    for name in fleet.sites:
+        if name not in used:
+            yield Finding(("sites", name), "no managed node is at this site", "at least one node", "none")
+
+
+@fleet_rule(
+    "MC134",
+    Severity.ERROR,
+    "A node's jump host is at another site",
+    why="The worker of a site knows only the nodes of its site, so it cannot connect through this one.",
+    fix="Name a jump host of the same site, or remove `ssh.jump`: the worker is at the site.",
+    failing=f"""
+    sites: {{north: {_NORTH}, south: {_SOUTH}}}
+    defaults: {{site: north}}
+    meshes: {{far: {{ssid: far, band: 5g, channel: 36, network: 10.43.0.0/24, encryption: sae, mode: mesh,
+                   key: {{env: MESH_KEY}}}}}}
+    nodes:
+      b01: {{ssh: {{jump: far}}}}
+      far: {{site: south, role: base, state: deployed, address: 10.43.0.1, label: FAR, mac: "00:15:6d:00:00:09",
+            host_keys: [{_KEY}], radios: {{radio0: {{mesh: null}}, radio1: {{mesh: far}}}}}}
+    """,
+    passing=f"""
+    sites: {{north: {_NORTH}}}
+    defaults: {{site: north}}
+    nodes: {{b01: {{ssh: {{jump: base}}}}}}
+    """,
+)
+def jump_to_other_site(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.nodes.values():
+        jump = fleet.nodes.get(node.ssh.jump)
+        if jump is not None and jump.site != node.site and fleet.worker_site(node) is not None:
+            expected = f"a node at {node.site}"
+            found = f"{jump.name}, at {jump.site or 'no site'}"
+            yield Finding(("nodes", node.name, "ssh", "jump"), "a node at another site", expected, found)
+
+
+@fleet_rule(
+    "MC135",
+    Severity.WARNING,
+    "A site's nodes do not accept its worker",
+    why="Without `worker_key` the worker can log in only if its gateway has a key of an operator.",
+    fix="Run `meshctl sites install NAME`, which generates a key there and writes its public part here.",
+    failing="""
+    sites: {north: {ssh: {host: north.example.org}}}
+    defaults: {site: north}
+    """,
+    passing=f"""
+    sites: {{north: {_NORTH}}}
+    defaults: {{site: north}}
+    """,
+)
+def worker_without_key(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name, site in fleet.sites.items():
+        if site.has_worker and not site.worker_key:
+            yield Finding(("sites", name), "no worker_key", "the worker's SSH public key", "none")
+
+
+@fleet_rule(
+    "MC136",
+    Severity.ERROR,
+    "A site's worker key is not a public key",
+    why="dropbear silently skips a line that it cannot read: after the change, the worker is locked out.",
+    fix="Run `meshctl sites install NAME` again, or copy the whole line that it prints.",
+    failing="""
+    sites: {north: {ssh: {host: north.example.org}, worker_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5}}
+    defaults: {site: north}
+    """,
+    passing=f"""
+    sites: {{north: {_NORTH}}}
+    defaults: {{site: north}}
+    """,
+)
+def worker_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name, site in fleet.sites.items():
+        if site.worker_key:
+            try:
+                parse_authorized_key(site.worker_key)
+            except BadKey as reason:
+                yield Finding(("sites", name, "worker_key"), "", "an SSH public key", str(reason))
