@@ -98,6 +98,7 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
+        opened.access.use_gateways = False
         places = _expected_places(opened, nodes or [], limit or [], _named_places(at or [], interface or []))
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
@@ -223,6 +224,7 @@ def replace(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
+        opened.access.use_gateways = False
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
         spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]

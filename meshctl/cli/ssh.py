@@ -32,8 +32,9 @@ from meshctl.device.framing import command_line
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet import run as run_on_all
-from meshctl.model import Node
+from meshctl.model import Node, Site
 from meshctl.nodes.host_keys import HostKeyState, fetch_host_keys
+from meshctl.nodes.site_gateways import gateway_credentials, gateway_endpoint
 from meshctl.nodes.slots import transfers_at_once
 
 
@@ -230,11 +231,26 @@ def ssh_arguments(opened: Session, node: Node) -> list[str]:
     arguments += ["-o", f"HostKeyAlias={node.name}", "-o", "StrictHostKeyChecking=yes"]
     for path in access.credentials(node).key_files:
         arguments += ["-i", str(path)]
+    hop: list[str] = []
     if node.ssh.jump:
-        through = replace(opened.fleet.nodes[node.ssh.jump], ssh=replace(node.ssh, jump=""))
-        hop = [*ssh_arguments(opened, through)[:-1], "-W", "%h:%p", _login(opened, through)]
-        arguments += ["-o", f"ProxyCommand={shlex.join(hop)}"]
+        jump = opened.fleet.nodes[node.ssh.jump]
+        through = replace(jump, ssh=replace(jump.ssh, jump=""))
+        hop = ssh_arguments(opened, through)
+    elif (site := opened.fleet.worker_site(node)) is not None:
+        hop = _gateway_arguments(opened, site)
+    if hop:
+        arguments += ["-o", f"ProxyCommand={shlex.join([*hop[:-1], '-W', '%h:%p', hop[-1]])}"]
     return [*arguments, _login(opened, node)]
+
+
+def _gateway_arguments(opened: Session, site: Site) -> list[str]:
+    """The OpenSSH command line for a site's gateway, with the fleet's pinned host keys."""
+    end, access = gateway_endpoint(site), opened.access
+    arguments = ["ssh", "-p", str(end.port), "-o", f"UserKnownHostsFile={opened.trust.path}"]
+    arguments += ["-o", f"HostKeyAlias={end.identity}", "-o", "StrictHostKeyChecking=yes"]
+    for path in gateway_credentials(opened.fleet, site, access.key_files, use_agent=access.use_agent).key_files:
+        arguments += ["-i", str(path)]
+    return [*arguments, f"{end.user}@{end.host}"]
 
 
 def _login(opened: Session, node: Node) -> str:

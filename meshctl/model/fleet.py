@@ -342,6 +342,11 @@ class Fleet:
         site = self.sites.get(node.site)
         return site if site is not None and site.has_worker else None
 
+    def robot_site(self, robot: Robot) -> Site | None:
+        """The site with a worker where the robot's radios are; None without one."""
+        radios = (self.nodes.get(name) for name in robot.nodes)
+        return next((site for node in radios if node is not None and (site := self.worker_site(node))), None)
+
     def members(self, mesh: str) -> Iterator[Node]:
         """The managed nodes with at least one radio in `mesh`."""
         return (node for node in self.managed() if mesh in node.meshes)

@@ -22,8 +22,9 @@ from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKeyPolicy, TrustStore
 from meshctl.errors import InputError, Unreachable
 from meshctl.inventory.file_paths import file_path
-from meshctl.model import Fleet, Node
+from meshctl.model import Fleet, Node, Site
 from meshctl.model.ip import IpAddress
+from meshctl.nodes.site_gateways import PIN_PREFIX, connect_gateway, gateway_credentials
 from meshctl.nodes.slots import ChannelSlots
 
 # Closing waits up to two seconds for a connection whose other side is gone, so a fleet's are closed in parallel.
@@ -62,12 +63,16 @@ class ConnectionPool:
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
     meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
+    # off on the bench, where a device is on a cable of the operator's
+    use_gateways: bool = True
     slots: ChannelSlots = field(default_factory=ChannelSlots, repr=False)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
     _jumps: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _jump_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    # a jump node may itself be behind a gateway
+    _gateway_lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def endpoint(self, node: Node, address: IpAddress | None = None) -> Endpoint:
         host, port = self.locate(node, address or node.address.ip)
@@ -133,7 +138,8 @@ class ConnectionPool:
 
     def _via(self, node: Node) -> SshConnection | None:
         if not node.ssh.jump:
-            return None
+            site = self.fleet.worker_site(node)
+            return self.gateway(site) if site is not None and self.use_gateways else None
         through = self.fleet.nodes.get(node.ssh.jump)
         if through is None:
             raise InputError(f"node {node.name}: ssh.jump names {node.ssh.jump!r}, which is not in the fleet")
@@ -143,6 +149,20 @@ class ConnectionPool:
                 # only one hop: the jump node's own ssh.jump is ignored
                 kept = self._jumps[through.name] = self.open(replace(through, ssh=replace(through.ssh, jump="")))
             return kept
+
+    def gateway(self, site: Site) -> SshConnection:
+        """The connection to a site's gateway, through which its nodes are reached; the pool owns it."""
+        with self._gateway_lock:
+            name = f"{PIN_PREFIX}{site.name}"
+            kept = self._jumps.get(name)
+            if kept is None or not kept.is_open:
+                kept = self._jumps[name] = self.connect_gateway(site)
+            return kept
+
+    def connect_gateway(self, site: Site, policy: HostKeyPolicy | None = None) -> SshConnection:
+        """A new connection to a site's gateway, owned by the caller. Raises what `ssh.connect` raises."""
+        credentials = gateway_credentials(self.fleet, site, self.key_files, use_agent=self.use_agent)
+        return connect_gateway(site, credentials, policy or self.trust, self.deadlines, self.meter)
 
     @contextmanager
     def borrow(self, node: Node) -> Iterator[SshConnection]:

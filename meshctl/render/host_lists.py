@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from meshctl.model import Fleet, Node, Release, SshSettings
+from meshctl.model import Fleet, Node, Release, Site, SshSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,32 +28,48 @@ class HostEntry:
 
 
 def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
-    """The nodes, then the computers of all robots."""
+    """The nodes, the computers of all robots, and the gateways of sites, through which the site's nodes are reached."""
+    listed = tuple(nodes)
     radios = [
         HostEntry(
             node.name,
             node.name,
             node.ssh.host or str(node.address.ip),
-            node.ssh,
+            _through(node.ssh, fleet.worker_site(node)),
             tuple(dict.fromkeys((f"role_{node.role.value}", f"state_{node.state.value}", *node.groups))),
             is_openwrt=True,
             has_sha1_rsa_only=node.release is Release.V19_07,
         )
-        for node in nodes
+        for node in listed
     ]
     computers = [
         HostEntry(
             ".".join(("robot", name, *place[1:])),
             ".".join(("robot", name, *place[1:])),
             computer.ssh.host or str(computer.address.ip),
-            computer.ssh,
+            _through(computer.ssh, fleet.robot_site(robot)),
             ("robots",),
             is_openwrt=False,
         )
         for name, robot in fleet.robots.items()
         for place, _, computer in robot.all_computers()
     ]
-    return (*radios, *computers)
+    gateways = [
+        HostEntry(_gateway(site), _gateway(site), site.ssh.host, site.ssh, ("gateways",), is_openwrt=False)
+        for site in fleet.sites.values()
+        if site.has_worker
+    ]
+    return (*radios, *computers, *gateways)
+
+
+def _gateway(site: Site) -> str:
+    """The name of a site's gateway, also for its host key."""
+    return f"site.{site.name}"
+
+
+def _through(ssh: SshSettings, site: Site | None) -> SshSettings:
+    """The login with the site's gateway as jump host, unless it has another."""
+    return ssh if site is None or ssh.jump else replace(ssh, jump=_gateway(site))
 
 
 def ssh_config(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callable[[str], Path]) -> str:

@@ -5,7 +5,6 @@ Host keys are pinned in the fleet's known_hosts as `robot.NAME`, since a node ma
 
 from __future__ import annotations
 
-import getpass
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,6 +20,7 @@ from meshctl.inventory.selection import robot_attributes, select
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Secret
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.site_gateways import local_user
 from meshctl.robots.host import Host, SshHost, become_root
 from meshctl.robots.preconditions import computer_of
 
@@ -42,7 +42,7 @@ class RobotConnector:
     def endpoint(self, robot: str) -> Endpoint:
         computer = computer_of(self.fleet, robot)
         host = computer.ssh.host or str(computer.address.ip)
-        user = computer.ssh.user or local_user(robot)
+        user = computer.ssh.user or local_user(f"robots.{robot}.computer.ssh.user")
         return Endpoint(host, computer.ssh.port, user, identity=f"robot.{robot}")
 
     @contextmanager
@@ -68,7 +68,9 @@ class RobotConnector:
         endpoint = self.endpoint(robot)
         with ExitStack() as stack:
             via = self._jump(robot)
-            if via is not None:
+            if via is None:
+                via = self._gateway(robot)
+            else:
                 stack.callback(via.close)
             try:
                 connection = connect(
@@ -96,6 +98,11 @@ class RobotConnector:
             raise InputError(f"{place}: node {name!r} does not exist", hint=did_you_mean(name, self.fleet.nodes))
         return self.access.open(radio)
 
+    def _gateway(self, robot: str) -> SshConnection | None:
+        """The connection to the gateway of the site where the robot's radios are; None without one."""
+        site = self.fleet.robot_site(self.fleet.robots[robot])
+        return None if site is None else self.access.gateway(site)
+
     def presented_key(self, robot: str) -> HostKey | None:
         """The unverified host key that the computer presents. Raises what `ssh.connect` raises."""
         recorder = AcceptAnyKey()
@@ -108,15 +115,6 @@ class RobotConnector:
             if recorder.key is None:
                 raise
             return recorder.key
-
-
-def local_user(robot: str) -> str:
-    """The default login name: the local user, as in OpenSSH. Raises InputError if it has no name, as in a container."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError, ImportError):
-        place = f"robots.{robot}.computer.ssh.user"
-        raise InputError(f"{place} is not set, and the current user has no name", hint=f"set {place}") from None
 
 
 def _hint_for(error: NodeError, robot: str, endpoint: Endpoint, *, is_user_written: bool) -> str:
