@@ -99,6 +99,19 @@ def is_signed_by(key_type: str, blob: bytes, data: bytes, signature: bytes) -> b
         return False
 
 
+def new_key_pair(comment: str) -> tuple[bytes, str]:
+    """A new Ed25519 key: the private key as OpenSSH's key file, and the public key as in authorized_keys."""
+    from cryptography.hazmat.primitives import serialization
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    key = Ed25519PrivateKey.generate()
+    form = serialization.PrivateFormat.OpenSSH
+    private = key.private_bytes(serialization.Encoding.PEM, form, serialization.NoEncryption())
+    openssh = serialization.Encoding.OpenSSH
+    public = key.public_key().public_bytes(openssh, serialization.PublicFormat.OpenSSH)
+    return private, f"{public.decode()} {comment}"
+
+
 # File, its state and passphrase -> parsed key. Checking an RSA key, or deriving the key of an encrypted file, takes
 # longer than the whole SSH handshake, and the nodes of a fleet share a few key files.
 _parsed_keys: dict[tuple[Path, FileState, Secret | None], PKey] = {}

@@ -11,6 +11,7 @@ from meshctl.errors import NodeError, Unreachable
 __all__ = [
     "AuthenticationRefused",
     "ChannelClosed",
+    "CommandEnded",
     "CommandFailed",
     "ConnectionLost",
     "HostKeyChanged",
@@ -38,6 +39,14 @@ class ConnectionLost(Unreachable):
 
 class ChannelClosed(ConnectionLost):
     """The channel ended without an exit status: the command or the server's process was killed."""
+
+
+class CommandEnded(ConnectionLost):
+    """A command that exchanges lines with us ended; `exit_status` is None if the server did not report one."""
+
+    def __init__(self, message: str, *, exit_status: int | None) -> None:
+        super().__init__(message)
+        self.exit_status = exit_status
 
 
 class IncompatibleServer(NodeError):

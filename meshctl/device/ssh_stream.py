@@ -1,22 +1,22 @@
 """A long-lived command on a connection: lines in both directions, for as long as both sides want.
 
 `SshConnection.stream` starts it. `send` writes a line; `receive` waits for the next one. A peer that is silent for too
-long, or ends, is `ConnectionLost`: the connection cannot be used again.
+long is `ConnectionLost`, and one that ends `CommandEnded`.
 """
 
 from __future__ import annotations
 
-import socket
 from types import TracebackType
 
 import paramiko
 
-from meshctl.device.errors import ConnectionLost, OutputTooLarge
+from meshctl.device.errors import CommandEnded, ConnectionLost, OutputTooLarge
 from meshctl.device.ssh_channel import ignoring_closed
 
 # A saved plan of a site with hundreds of nodes is a few MiB; a peer that sends more is not a worker.
 MAX_LINE_BYTES = 64 << 20
 _READ_BYTES = 64 << 10
+_STATUS_S = 2.0
 
 
 class LineStream:
@@ -48,12 +48,14 @@ class LineStream:
                 raise OutputTooLarge(f"{self._label}: a line of more than {MAX_LINE_BYTES >> 20} MiB")
             try:
                 more = self._channel.recv(_READ_BYTES)
-            except socket.timeout as error:
+            except TimeoutError as error:
                 raise ConnectionLost(f"{self._label}: silent for {timeout_s:g} s") from error
             except (paramiko.SSHException, OSError, EOFError) as error:
                 raise ConnectionLost(f"{self._label}: the connection broke: {error}") from error
             if not more:
-                raise ConnectionLost(f"{self._label}: {self._last_words() or 'the command ended'}")
+                raise CommandEnded(
+                    f"{self._label}: {self._last_words() or 'the command ended'}", exit_status=self._exit_status()
+                )
             self._buffer += more
         line = bytes(self._buffer[:end])
         del self._buffer[: end + 1]
@@ -68,6 +70,13 @@ class LineStream:
                 text += self._channel.recv_stderr(_READ_BYTES)
         lines = text.decode("utf-8", "replace").strip().splitlines()
         return lines[-1] if lines else ""
+
+    def _exit_status(self) -> int | None:
+        # it follows the end of the output, unless the server was killed
+        self._channel.status_event.wait(_STATUS_S)
+        return (
+            self._channel.exit_status if self._channel.exit_status_ready() and self._channel.exit_status >= 0 else None
+        )
 
     def close(self) -> None:
         with ignoring_closed():

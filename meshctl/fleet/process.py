@@ -31,16 +31,22 @@ def is_dead(lock: str) -> bool:
     return bool(lock) and not process_lives(lock.partition("@")[2])
 
 
+def process_of(pid: int) -> str:
+    """`host:pid:start` of a process on this computer."""
+    return f"{socket.gethostname()}:{pid}:{_start_ticks(pid)}"
+
+
 def this_process() -> str:
     """`host:pid:start` of this process."""
-    return f"{socket.gethostname()}:{os.getpid()}:{_start_ticks(os.getpid())}"
+    return process_of(os.getpid())
 
 
 def process_lives(process: str) -> bool:
     """Whether a process is still running; one on another host counts as running."""
     name, _, start = process.rpartition(":")
     pid = name.rpartition(":")[2]
-    return not runs_here(process) or (pid.isdigit() and _start_ticks(int(pid)) == start)
+    # without a start it had ended before it was named
+    return not runs_here(process) or (bool(start) and pid.isdigit() and _start_ticks(int(pid)) == start)
 
 
 def runs_here(process: str) -> bool:

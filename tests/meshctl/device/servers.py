@@ -166,6 +166,7 @@ def dropbear(node: Sandbox, *options: str, port: int | None = None, tmp_kib: int
 
 
 OPENSSH = r"""
+mount -t proc proc /proc
 mount --bind "$1/shadow" /etc/shadow
 mount --bind "$1/root" /root
 mkdir -p /run/sshd
