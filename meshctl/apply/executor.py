@@ -53,7 +53,7 @@ def execute(
         node.hardware.name: checked_image(node.hardware)
         for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
     }
-    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := _unchanged_outcome(fleet, made))}
+    outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():
         _finish(run_context, outcome)
     contexts = _node_contexts(prepared, run_context)
@@ -139,7 +139,7 @@ def _finish(run_context: RunContext, outcome: Outcome) -> None:
     run_context.observer(Event(EventKind.FINISHED, outcome.node, time.time(), outcome.reason, outcome=outcome))
 
 
-def _unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
+def unchanged_outcome(fleet: Fleet, plan: NodePlan) -> Outcome | None:
     """The outcome of a node that is not changed; None for one that is."""
     match plan.verdict:
         case Verdict.SAME:

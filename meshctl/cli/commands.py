@@ -25,6 +25,7 @@ _INVENTORY = "Inventory"
 _CHANGE = "Change the fleet"
 _INSPECT = "Inspect and connect"
 _ROBOTS = "Robots"
+_SITES = "Sites"
 _LAB = "Lab"
 _HELP = "Help"
 
@@ -58,6 +59,8 @@ COMMANDS: dict[str, Entry] = {
     "run": Entry("meshctl.cli.ssh", "run", "Run a shell command on nodes", _INSPECT),
     "ssh": Entry("meshctl.cli.ssh", "ssh", "Log in to a node", _INSPECT),
     "robots": Entry("meshctl.cli.robots", "app", "Deploy and manage udp_mesh on robots", _ROBOTS),
+    "sites": Entry("meshctl.cli.sites", "app", "Install and watch the workers of sites", _SITES),
+    "worker": Entry("meshctl.cli.worker", "worker", "Serve a site (started by the others)", _SITES),
     "lab": Entry("", "app", "Run a virtual fleet on this machine", _LAB),
     "help": Entry("meshctl.cli.help", "help_command", "Show the help of a command", _HELP),
 }

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +24,17 @@ from meshctl.cli.plan_execution import (
     report_check,
     report_plan,
 )
-from meshctl.errors import InputError
+from meshctl.cli.site_runs import (
+    RunOptions,
+    confirm_everywhere,
+    execute_everywhere,
+    meet,
+    prepare_everywhere,
+    report_everywhere,
+    show_everywhere,
+    sites_of,
+)
+from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict
 from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
@@ -49,6 +60,11 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation.")
 Rate = Annotated[float | None, typer.Option("--rate", metavar="KB_S", help="Upload limit per node in kB/s.")]
 
 
+Direct = Annotated[
+    bool, typer.Option("--direct", help="Connect to nodes of sites from here, instead of through their workers.")
+]
+
+
 def plan(
     nodes: Nodes = None,
     limit: Limit = None,
@@ -60,6 +76,7 @@ def plan(
     together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
+    direct: Direct = False,
     brief: Brief = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -71,7 +88,15 @@ def plan(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepare_plan(opened, nodes, choices, limits=limit)
+        own, sites = sites_of(opened, nodes, limit, direct=direct)
+        if sites:
+            if out is not None:
+                raise InputError(
+                    f"--out: a saved plan is for nodes without a site, and {next(iter(sites.values()))[0]} has one",
+                    hint="`meshctl provision` plans, asks and applies in one go; --direct plans from here",
+                )
+            raise typer.Exit(_plan_everywhere(opened, inventory, own, sites, choices, as_json=as_json, brief=brief))
+        prepared = prepare_plan(opened, own, choices)
         if out is not None:
             write_file(out, dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)))
         raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
@@ -120,6 +145,7 @@ def provision(
     together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
+    direct: Direct = False,
     rate: Rate = None,
     brief: Brief = False,
     as_json: AsJson = False,
@@ -132,7 +158,13 @@ def provision(
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        prepared = prepare_plan(opened, nodes, choices, limits=limit)
+        own, sites = sites_of(opened, nodes, limit, direct=direct)
+        if sites:
+            options = RunOptions("provision", choices, as_json, rate)
+            raise _change_everywhere(
+                opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run, check=check
+            )
+        prepared = prepare_plan(opened, own, choices)
         if check:
             raise typer.Exit(report_check(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
         confirm_and_execute(
@@ -151,6 +183,7 @@ def resume(
     ] = None,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
+    direct: Direct = False,
     rate: Rate = None,
     brief: Brief = False,
     as_json: AsJson = False,
@@ -178,6 +211,9 @@ def resume(
         if record.command == "rollback":
             hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
             raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
+        if '"sites"' in record.plan:
+            meet(opened, record, as_json=as_json)
+            left = opened.journal.unfinished(record.id)
         names = _still_managed(opened, left)
         if not names:
             echo(f"run {record.id} is finished: nothing to resume", err=as_json)
@@ -192,6 +228,10 @@ def resume(
             (*recorded.get("accept_cuts", ()), *added.accept_cuts),
             together=bool(recorded.get("together", False)) if together is None else together,
         )
+        own, sites = sites_of(opened, names, None, direct=direct)
+        if sites:
+            options = RunOptions("resume", choices, as_json, rate)
+            raise _change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
         prepared = prepare_plan(opened, names, choices)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
@@ -201,6 +241,43 @@ def resume(
         confirm_and_execute(
             opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
         )
+
+
+def _plan_everywhere(
+    opened: Session,
+    inventory: Path,
+    own: list[str],
+    sites: Mapping[str, Sequence[str]],
+    choices: PlanOptions,
+    *,
+    as_json: bool,
+    brief: bool,
+) -> ExitCode:
+    with closing(prepare_everywhere(opened, inventory, own, sites, choices)) as made:
+        return report_everywhere(opened, made, choices, as_json=as_json, brief=brief)
+
+
+def _change_everywhere(
+    opened: Session,
+    inventory: Path,
+    own: list[str],
+    sites: Mapping[str, Sequence[str]],
+    options: RunOptions,
+    *,
+    yes: bool,
+    brief: bool,
+    dry_run: bool,
+    check: bool = False,
+) -> typer.Exit:
+    """Plan, show, ask and execute, where some nodes are provisioned by the workers of their sites."""
+    with closing(prepare_everywhere(opened, inventory, own, sites, options.choices)) as made:
+        if dry_run or check:
+            code = report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief)
+            return typer.Exit(ExitCode.FINDINGS if check and made.changing else code)
+        if not options.as_json:
+            show_everywhere(opened, made, brief=brief)
+        confirm_everywhere(opened, made, yes=yes)
+        return execute_everywhere(opened, made, options)
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, run_context
 from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, MeshctlError
+from meshctl.fleet import Outcome
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
 from meshctl.model import Fleet
 from meshctl.plan import Plan, Verdict
@@ -121,7 +122,7 @@ def confirm_and_execute(
     )
 
 
-def _save_before(opened: Session, run: JournaledRun, prepared: Prepared) -> None:
+def save_before(opened: Session, run: JournaledRun, prepared: Prepared) -> None:
     """Save what the run changes, and what it replaces, for `history` and `rollback`."""
     changing = {node.node: node for node in prepared.plan.of(Verdict.CHANGE)}
     files = RunFiles(opened.journal.path)
@@ -159,17 +160,22 @@ def execute_plan(
     )
     changing = [node.node for node in plan.of(Verdict.CHANGE)]
     with journaled_run(opened, command, tuple(plan.nodes), changing=changing, plan=recorded, as_json=as_json) as run:
-        _save_before(opened, run, prepared)
-        assign_slots(prepared, opened.access)
-        seen, flushes = prepared.observed.observations, StationFlushes()
-        unflushed = unflushed_since(prepared, opened.journal)
-        context = run_context(
-            opened,
-            run,
-            flushes,
-            {name: seen[name] for name in unflushed},
-            observed={**seen, **prepared.neighbor_observations},
-            rate_bytes_per_s=None if rate is None else rate * 1000,
-        )
-        run.outcomes.update(execute(prepared, context, flushes, unflushed))
+        save_before(opened, run, prepared)
+        run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
     raise print_totals(opened, run, as_json=as_json)
+
+
+def execute_direct(opened: Session, run: JournaledRun, prepared: Prepared, *, rate: float | None) -> dict[str, Outcome]:
+    """Execute a plan whose nodes this process changes itself; `rate` is the upload limit per node in kB/s."""
+    assign_slots(prepared, opened.access)
+    seen, flushes = prepared.observed.observations, StationFlushes()
+    unflushed = unflushed_since(prepared, opened.journal)
+    context = run_context(
+        opened,
+        run,
+        flushes,
+        {name: seen[name] for name in unflushed},
+        observed={**seen, **prepared.neighbor_observations},
+        rate_bytes_per_s=None if rate is None else rate * 1000,
+    )
+    return execute(prepared, context, flushes, unflushed)

@@ -59,7 +59,7 @@ def site_part(
 
     Raises InputError for a secret that the site needs and the operator does not have.
     """
-    data: dict[str, Any] = {key: value for key, value in _mapping(plain_data(root)).items()}
+    data: dict[str, Any] = dict(_mapping(plain_data(root)))
     for section in _REMOVED_SECTIONS:
         data.pop(section, None)
     members = {name: node for name, node in fleet.nodes.items() if node.site == site}
@@ -69,7 +69,10 @@ def site_part(
     meshes = dict.fromkeys(mesh for node in members.values() for mesh in node.meshes)
     revealed = _secrets(data, fleet, meshes, secrets)
     profiles = {node.hardware.name: node.hardware for node in members.values()}
-    files = (*_hardware_files(data, profiles, fleet.base, with_firmware=with_firmware), *_mesh_files(data, fleet, meshes))
+    files = (
+        *_hardware_files(data, profiles, fleet.base, with_firmware=with_firmware),
+        *_mesh_files(data, fleet, meshes),
+    )
     return SitePart(_yaml(data), _yaml(revealed), files)
 
 
@@ -97,7 +100,9 @@ def _keep_robots(data: dict[str, Any], fleet: Fleet, names: tuple[str, ...]) -> 
     robots = _mapping(data.get("robots"))
     kept: dict[str, Any] = {}
     for name, entry in robots.items():
-        listed = {key: [node for node in getattr(fleet.robots[name], key) if node in names] for key in ("nodes", "carries")}
+        listed = {
+            key: [node for node in getattr(fleet.robots[name], key) if node in names] for key in ("nodes", "carries")
+        }
         if any(listed.values()) or any(fleet.nodes[node].robot == name for node in names):
             kept[name] = {key: value for key, value in _mapping(entry).items() if key not in ("relay", "thin", *listed)}
             kept[name].update({key: nodes for key, nodes in listed.items() if nodes})
@@ -186,10 +191,15 @@ def _node(value: object) -> yaml.Node:
         case None:
             return yaml.ScalarNode("tag:yaml.org,2002:null", "null")
         case Plain():
-            tag = yaml.SafeDumper("").resolve(yaml.ScalarNode, str(value), (True, False))
-            return yaml.ScalarNode(tag, str(value))
+            return yaml.ScalarNode(_tag(str(value)), str(value))
         case _:
             return _text(str(value))
+
+
+def _tag(text: str) -> str:
+    """The tag that a reader gives to the unquoted text: with any other one it would be quoted."""
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    return "tag:yaml.org,2002:str" if node is None else str(node.tag)
 
 
 def _text(text: str) -> yaml.Node:

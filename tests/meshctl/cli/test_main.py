@@ -86,6 +86,7 @@ def test_help_names_values_in_words_and_gives_each_example_its_own_line() -> Non
 # these read no inventory: they make one, describe its format, show journal or help, or act on a running virtual fleet
 _IN_THE_LAB = "down status shell break mend plug unplug image link move ground mission sweep"
 WITHOUT_INVENTORY = {
+    "worker",
     "init",
     "schema",
     "history",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -19,7 +20,9 @@ def repack(directory: Path, projects: tuple[str, ...] = (*REQUIREMENTS, "backpor
         tags = [line.removeprefix("Tag: ") for line in (found.read_text("WHEEL") or "").splitlines() if "Tag: " in line]
         parts = [sorted({tag.split("-")[number] for tag in tags}) for number in range(3)]
         tag = "-".join(".".join(part) for part in parts)
-        path = directory / f"{project}-{found.version}-{tag}.whl"
+        # the form of names in wheels' files (PyPA binary distribution format)
+        name = re.sub(r"[-_.]+", "_", project).lower()
+        path = directory / f"{name}-{found.version}-{tag}.whl"
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for file in sorted(found.files or (), key=str):
                 if ".." in file.parts or "__pycache__" in file.parts:

@@ -1,0 +1,279 @@
+"""Provision nodes of sites, and others, in one command: plan everywhere -> show -> confirm -> execute everywhere.
+
+The operator's own nodes (`direct`) are planned and changed here, the others by the workers of their sites, at the same
+time, in one run of the journal. `meet` finds out how the sites' parts of an earlier run ended.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import typer
+
+from meshctl.apply.executor import unchanged_outcome
+from meshctl.apply.prepare import PlanOptions, Prepared
+from meshctl.cli.context import Session, confirm, progress_for, selected_nodes
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.output import echo, echo_error, echo_json
+from meshctl.cli.plan_execution import PlanRefused, execute_direct, prepare_plan, save_before, show
+from meshctl.errors import ExitCode, InputError, MeshctlError, Unreachable
+from meshctl.fleet import Event, EventKind, Outcome, Result, totals
+from meshctl.fleet.journal import Run, RunRecord
+from meshctl.fleet.process import owner
+from meshctl.nodes.site_gateways import gateway_credentials
+from meshctl.plan import Plan, Verdict
+from meshctl.plan.saved import SavedPlan, dump
+from meshctl.sites.bundle import SiteBundle, site_bundle
+from meshctl.sites.dispatch import SiteExecution, SitePlan, SiteRun, by_site, prepare_sites
+from meshctl.sites.order import Order, SignedOrder, sign_order
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """The options of one command that its execution needs."""
+
+    command: str
+    choices: PlanOptions
+    as_json: bool
+    rate_kb_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WholePlan:
+    """The plans of one command: that of the operator's own nodes, if there are any, and those of the sites."""
+
+    direct: Prepared | None
+    sites: tuple[SitePlan, ...]
+
+    @property
+    def plans(self) -> tuple[Plan, ...]:
+        made = [site.saved.plan for site in self.sites if site.saved is not None]
+        return (*((self.direct.plan,) if self.direct is not None else ()), *made)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        direct = () if self.direct is None else tuple(self.direct.plan.nodes)
+        return (*direct, *(name for site in self.sites for name in site.nodes))
+
+    @property
+    def changing(self) -> tuple[str, ...]:
+        return tuple(node.node for plan in self.plans if not plan.refusal for node in plan.of(Verdict.CHANGE))
+
+    def close(self) -> None:
+        for site in self.sites:
+            site.close()
+
+
+def sites_of(
+    opened: Session, nodes: list[str] | None, limits: list[str] | None, *, direct: bool
+) -> tuple[list[str], dict[str, tuple[str, ...]]]:
+    """The names of the selected nodes: the operator's own, and those of sites with a worker."""
+    selected = selected_nodes(opened.fleet, nodes, limits)
+    if direct:
+        return [node.name for node in selected], {}
+    own, sites = by_site(opened.fleet, selected)
+    return [node.name for node in own], sites
+
+
+def prepare_everywhere(
+    opened: Session, inventory: Path, own: list[str], sites: Mapping[str, Sequence[str]], choices: PlanOptions
+) -> WholePlan:
+    """Plan the operator's own nodes here and the others at their sites. Raises InputError for a mesh at two sites."""
+    _check_meshes(opened, sites)
+
+    def bundle_of(site: str) -> SiteBundle:
+        return site_bundle(
+            inventory,
+            opened.fleet,
+            site,
+            opened.renderer.secrets,
+            opened.trust,
+            os.environ,
+            with_firmware=choices.with_firmware,
+        )
+
+    direct = prepare_plan(opened, own, choices) if own else None
+    return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, _options(choices))))
+
+
+def _check_meshes(opened: Session, sites: Mapping[str, Sequence[str]]) -> None:
+    """A worker plans with the nodes of its site, so a mesh must not have others (MC132)."""
+    fleet = opened.fleet
+    for site in sites:
+        for mesh in dict.fromkeys(mesh for name in sites[site] for mesh in fleet.nodes[name].meshes):
+            elsewhere = [node.name for node in fleet.members(mesh) if node.site != site]
+            if elsewhere:
+                raise InputError(
+                    f"mesh {mesh} has nodes at site {site} and elsewhere: {', '.join(elsewhere[:4])}",
+                    hint="set the same `site` for all nodes of a mesh, or pass --direct",
+                )
+
+
+def _options(choices: PlanOptions) -> list[str]:
+    """The options of `meshctl plan` at a site."""
+    words = [] if choices.with_firmware else ["--no-firmware"]
+    if choices.leave_behind:
+        words += ["--leave-behind", ",".join(choices.leave_behind)]
+    if choices.accept_cuts:
+        words += ["--accept-cut", ",".join(choices.accept_cuts)]
+    return [*words, "--together"] if choices.together else words
+
+
+def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:
+    if plan.direct is not None:
+        show(plan.direct.plan, opened.fleet, brief=brief)
+    for site in plan.sites:
+        echo(f"site {site.site.name}:")
+        if site.saved is not None:
+            show(site.saved.plan, opened.fleet, brief=brief)
+        if site.error is not None:
+            echo(f"  no plan: {site.error}")
+            if site.error.hint:
+                echo(f"  hint: {site.error.hint}")
+
+
+def report_everywhere(
+    opened: Session, plan: WholePlan, choices: PlanOptions, *, as_json: bool, brief: bool
+) -> ExitCode:
+    """Print the plans; with `as_json`, as one object of saved plans."""
+    if as_json:
+        direct = plan.direct
+        saved = None
+        if direct is not None:
+            saved = json.loads(dump(SavedPlan(direct.plan, direct.salt, opened.inventory, choices.with_firmware)))
+        sites = {
+            site.site.name: json.loads(site.text) if site.saved is not None else {"error": str(site.error)}
+            for site in plan.sites
+        }
+        echo_json(json.dumps({"fleet": opened.fleet.name, "direct": saved, "sites": sites}, indent=1))
+    else:
+        show_everywhere(opened, plan, brief=brief)
+    failed = [site.error for site in plan.sites if site.error is not None]
+    if failed or any(each.refusal for each in plan.plans):
+        return ExitCode.FINDINGS
+    return ExitCode.OK
+
+
+def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
+    """Ask once for all. Raises PlanRefused if nothing can be done."""
+    refused = [each for each in plan.plans if each.refusal]
+    if plan.direct is not None and plan.direct.plan.refusal:
+        raise PlanRefused(plan.direct.plan.refusal, hint=plan.direct.plan.refusal_hint)
+    if len(refused) == len(plan.plans) and refused:
+        raise PlanRefused(refused[0].refusal, hint=refused[0].refusal_hint)
+    count = len(plan.changing)
+    if count and not yes:
+        there = sum(1 for site in plan.sites if site.saved is not None and not site.saved.plan.is_empty)
+        confirm(f"Change {count} node{'s' if count != 1 else ''}, at {there} site{'s' if there != 1 else ''}?")
+
+
+def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) -> typer.Exit:
+    """Execute all plans in one run; returns the exit to raise."""
+    runs = {site.site.name: site.run for site in plan.sites if _is_to_start(site)}
+    orders = {site.run: _order(opened, site, options) for site in plan.sites if _is_to_start(site)}
+    stages = [] if plan.direct is None else [[stage.kind.value, *stage.nodes] for stage in plan.direct.plan.stages]
+    recorded = json.dumps({"choices": asdict(options.choices), "stages": stages, "sites": runs})
+    changing = plan.changing
+    with journaled_run(
+        opened, options.command, plan.names, changing=changing, plan=recorded, as_json=options.as_json
+    ) as run:
+        _finish_others(opened, plan, run)
+        site_runs = [
+            SiteRun(site.site, site.run, site.nodes, order=orders[site.run], uplink=site.uplink)
+            for site in plan.sites
+            if _is_to_start(site)
+        ]
+        execution = SiteExecution(opened.fleet, opened.access, run.entry, run.progress, opened.interrupt)
+        with ThreadPoolExecutor(1, "sites") as pool:
+            at_sites = pool.submit(execution.execute, site_runs)
+            if plan.direct is not None:
+                save_before(opened, run, plan.direct)
+                run.outcomes.update(execute_direct(opened, run, plan.direct, rate=options.rate_kb_s))
+            run.outcomes.update(at_sites.result())
+    return print_totals(opened, run, as_json=options.as_json)
+
+
+def _is_to_start(site: SitePlan) -> bool:
+    return site.saved is not None and not site.saved.plan.refusal and not site.saved.plan.is_empty
+
+
+def _order(opened: Session, site: SitePlan, options: RunOptions) -> SignedOrder:
+    assert site.uplink is not None, "a site with a plan has an uplink"
+    plan_sha256 = hashlib.sha256(site.text.encode()).hexdigest()
+    order = Order(
+        opened.fleet.name,
+        site.site.name,
+        site.run,
+        options.command,
+        owner(),
+        plan_sha256,
+        site.part_sha256,
+        options.rate_kb_s,
+    )
+    accepted = site.uplink.greeting.operators
+    access = opened.access
+    credentials = gateway_credentials(opened.fleet, site.site, access.key_files, use_agent=access.use_agent)
+    return sign_order(order, credentials, accepted)
+
+
+def _finish_others(opened: Session, plan: WholePlan, run: JournaledRun) -> None:
+    """The outcomes of nodes that no worker has to change: without a plan, refused, or as they should be."""
+    for site in plan.sites:
+        if _is_to_start(site):
+            continue
+        site.close()
+        for name in site.nodes:
+            outcome = _outcome_without_run(opened, site, name)
+            run.outcomes[name] = outcome
+            run.entry.finish_node(outcome)
+            run.progress(Event(EventKind.FINISHED, name, time.time(), outcome.reason, outcome=outcome))
+
+
+def _outcome_without_run(opened: Session, site: SitePlan, name: str) -> Outcome:
+    if site.saved is None:
+        error = site.error or MeshctlError("no plan")
+        # errors of the uplink and of the worker name the site
+        result = Result.UNREACHABLE if isinstance(error, Unreachable) else Result.REFUSED
+        return Outcome(name, result, str(error), error.hint)
+    plan = site.saved.plan
+    if name not in plan.nodes:
+        return Outcome(name, Result.REFUSED, f"site {site.site.name}: the worker did not plan it")
+    if outcome := unchanged_outcome(opened.fleet, plan.nodes[name]):
+        return outcome
+    return Outcome(name, Result.REFUSED, plan.refusal, plan.refusal_hint)
+
+
+def meet(opened: Session, record: RunRecord, *, as_json: bool) -> None:
+    """Follow the sites' parts of an earlier run to their end, and complete its entry in the journal."""
+    recorded = json.loads(record.plan) if record.plan else {}
+    started: Mapping[str, str] = recorded.get("sites", {})
+    left = opened.journal.unfinished(record.id)
+    runs = [
+        SiteRun(opened.fleet.sites[site], run, nodes)
+        for site, run in started.items()
+        if site in opened.fleet.sites and (nodes := _nodes_at(opened, left, site))
+    ]
+    if not runs:
+        return
+    entry = Run(opened.journal, record.id)
+    names = [name for run in runs for name in run.nodes]
+    if not as_json:
+        echo(f"run {record.id}: asking {', '.join(run.site.name for run in runs)} how it ended")
+    with progress_for(len(names), as_json=as_json) as progress, opened.interrupt.on_signals(progress.stopping):
+        SiteExecution(opened.fleet, opened.access, entry, progress, opened.interrupt).execute(runs)
+    entry.end(str(totals(opened.journal.outcomes(record.id))))
+    if opened.interrupt.stopping:
+        echo_error("interrupted before it was known")
+        raise typer.Exit(ExitCode.INTERRUPTED)
+
+
+def _nodes_at(opened: Session, names: Iterable[str], site: str) -> tuple[str, ...]:
+    nodes = opened.fleet.nodes
+    return tuple(name for name in names if name in nodes and nodes[name].site == site)

@@ -1,0 +1,225 @@
+"""`meshctl sites`: the workers at the sites of the inventory."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from meshctl import __version__
+from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Session, session
+from meshctl.cli.output import echo, echo_json
+from meshctl.cli.site_status import as_object, exit_code, look, show
+from meshctl.device.errors import AuthenticationRefused
+from meshctl.device.trust import AcceptAnyKey, HostKey
+from meshctl.device.upload import UploadProgress
+from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.inventory.edit import Editor, save
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Site
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.site_gateways import PIN_PREFIX
+from meshctl.sites.gateway import Gateway, WorkerRelease, build_release, download_wheels, install, probe
+from meshctl.sites.uplink import Uplink
+
+app = typer.Typer(no_args_is_help=True)
+
+_PERCENT_EVERY_S = 5.0
+
+SiteNames = Annotated[list[str] | None, typer.Argument(metavar="[SITES]...", help="Names of sites; default: all.")]
+
+
+def selected_sites(opened: Session, names: Iterable[str] | None) -> tuple[Site, ...]:
+    """The named sites with a gateway; all without names. Raises InputError."""
+    able = {name: site for name, site in opened.fleet.sites.items() if site.has_worker}
+    wanted = list(names or ())
+    for name in wanted:
+        if name not in opened.fleet.sites:
+            hint = did_you_mean(name, opened.fleet.sites) or "the inventory's sites are in `sites`"
+            raise InputError(f"no site of {opened.fleet.name} is named {name!r}", hint=hint)
+        if name not in able:
+            raise InputError(f"site {name} has no gateway", hint=f"set sites.{name}.ssh.host")
+    if not able:
+        raise InputError(f"no site of {opened.fleet.name} has a gateway", hint="set sites.NAME.ssh.host")
+    return tuple(able[name] for name in dict.fromkeys(wanted or able))
+
+
+@app.command("status")
+def status_command(
+    sites: SiteNames = None,
+    inventory: InventoryPath = Path(),
+    nodes: Annotated[bool, typer.Option("--nodes", help="Also let the workers query all their nodes.")] = False,
+    as_json: AsJson = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Show each site's worker and its latest run; with --nodes also how many nodes are healthy, and the alarms.
+
+    Exit code: 0 healthy, 1 degraded or a site does not answer, 3 no site answers, 2 could not run.
+
+    Example: meshctl sites status --nodes
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        found = look(opened, inventory, selected_sites(opened, sites), with_nodes=nodes)
+    if as_json:
+        echo_json(json.dumps([as_object(each) for each in found], indent=1))
+    else:
+        show(found)
+    raise typer.Exit(exit_code(found))
+
+
+@app.command("install")
+def install_command(
+    sites: SiteNames = None,
+    inventory: InventoryPath = Path(),
+    wheels: Annotated[
+        Path | None,
+        typer.Option("--wheels", metavar="DIR", help="Directory with the required wheels; default: use pip's index."),
+    ] = None,
+    dry_run: DryRun = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Install or update meshctl on the gateways, give each a key of its own, and write that key into the inventory.
+
+    Needs Python 3.11 there, and neither root nor the internet. Only the operators in the inventory may give orders.
+
+    Example: meshctl sites install north --wheels wheels/
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        if not opened.fleet.operators.ssh_keys:
+            raise InputError("operators.ssh_keys is empty: no operator could sign an order", hint="add your public key")
+        failed: list[MeshctlError] = []
+        releases: dict[Gateway, WorkerRelease] = {}
+        for site in selected_sites(opened, sites):
+            try:
+                public_key = _install(opened, site, wheels, releases, dry_run=dry_run)
+            except MeshctlError as error:
+                failed.append(error)
+                echo(f"{site.name}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""), err=True)
+                continue
+            if public_key and public_key != site.worker_key:
+                _write_key(inventory, site.name, public_key)
+    if failed:
+        raise typer.Exit(failed[0].exit_code)
+
+
+def _install(
+    opened: Session, site: Site, wheels: Path | None, releases: dict[Gateway, WorkerRelease], *, dry_run: bool
+) -> str:
+    """Install on one gateway; returns the worker's public key, empty with `dry_run`. `releases` were made so far."""
+    with opened.access.connect_gateway(site) as connection:
+        gateway = probe(connection)
+        echo(f"{site.name}: {gateway.target}")
+        if dry_run:
+            echo(f"{site.name}: meshctl {__version__} would be installed")
+            return ""
+        if gateway not in releases:
+            with tempfile.TemporaryDirectory() as scratch:
+                directory = Path(scratch) if wheels is not None else _cache(str(gateway.target))
+                releases[gateway] = build_release(gateway, download_wheels(gateway.target, directory, wheels))
+        release = releases[gateway]
+        echo(f"{site.name}: sending meshctl {__version__}, {len(release.archive) >> 20} MiB")
+        install(connection, gateway, release, _Percent(site.name))
+    with Uplink(opened.fleet, site, opened.access) as uplink:
+        public_key = uplink.install(opened.fleet.operators.ssh_keys)
+    echo(f"{site.name}: installed; its worker has the key {public_key}")
+    return public_key
+
+
+class _Percent:
+    """A line every few seconds of an upload, for terminals and logs alike."""
+
+    def __init__(self, site: str) -> None:
+        self._site = site
+        self._next_s = time.monotonic() + _PERCENT_EVERY_S
+
+    def __call__(self, progress: UploadProgress) -> None:
+        if time.monotonic() >= self._next_s and progress.total:
+            self._next_s = time.monotonic() + _PERCENT_EVERY_S
+            echo(f"{self._site}: {progress.verified * 100 // progress.total} % sent")
+
+
+def _cache(target: str) -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    return Path(root) / "meshctl" / "gateway-wheels" / f"{__version__} {target}".replace(" ", "-")
+
+
+def _write_key(inventory: Path, site: str, public_key: str) -> None:
+    editor = Editor.open(inventory, environ=os.environ)
+    editor.set(("sites", site, "worker_key"), public_key)
+    changes = editor.changes()
+    save(changes)
+    for change in changes:
+        echo(f"{site}: worker_key written to {change.file}")
+    echo(f"{site}: provision its nodes once more without the worker, so that they accept the key:")
+    echo(f"  meshctl provision site:{site} --direct")
+
+
+@app.command("trust")
+def trust_command(
+    sites: SiteNames = None,
+    inventory: InventoryPath = Path(),
+    change: Annotated[bool, typer.Option("--replace", help="Also accept changed keys.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Show the gateways' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
+
+    Example: meshctl sites trust north
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        results = [_pin(opened, site, may_replace=change, yes=yes) for site in selected_sites(opened, sites)]
+    if not all(results):
+        raise typer.Exit(ExitCode.FINDINGS)
+
+
+def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
+    try:
+        shown = _presented_key(opened, site)
+    except MeshctlError as error:
+        echo(f"{site.name}: {error}" + (f"\n  hint: {error.hint}" if error.hint else ""))
+        return False
+    name = f"{PIN_PREFIX}{site.name}"
+    pinned = opened.trust.pinned(name)
+    line = f"{site.name}: {shown.fingerprint} ({shown.key_type})"
+    if shown in pinned:
+        echo(f"{line}: pinned")
+        return True
+    if pinned and not may_replace:
+        echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
+        echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
+        return False
+    if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the gateway?")):
+        opened.trust.replace(name, shown)
+        echo(f"{line}: pinned now")
+        return True
+    echo(f"{line}: not pinned")
+    return False
+
+
+def _presented_key(opened: Session, site: Site) -> HostKey:
+    """The unverified host key of a gateway."""
+    recorder = AcceptAnyKey()
+    anonymous = ConnectionPool(opened.fleet, opened.trust, use_agent=False, deadlines=opened.access.deadlines)
+    try:
+        # without credentials: the key is presented before the login
+        anonymous.connect_gateway(_without_keys(site), recorder).close()
+    except AuthenticationRefused:
+        if recorder.key is None:
+            raise
+    assert recorder.key is not None, "a completed handshake presents a key"
+    return recorder.key
+
+
+def _without_keys(site: Site) -> Site:
+    return replace(site, ssh=replace(site.ssh, key_files=()))

@@ -1,0 +1,259 @@
+"""The plans and runs of all sites of one command, one thread each: prepare -> (the operator confirms) -> execute.
+
+A site continues without its uplink: meshctl connects again until the run is over there, and reads its events from
+where it was. A run that the operator leaves is met again by its id, by the same code without an order.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from meshctl.errors import MeshctlError, Unreachable
+from meshctl.fleet import Event, EventKind, Interrupt, Observer, Outcome, Result
+from meshctl.fleet.journal import Run
+from meshctl.model import Fleet, Node, Site
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.plan.saved import SavedPlan, load
+from meshctl.sites.bundle import SiteBundle
+from meshctl.sites.events import events_of, final_outcomes
+from meshctl.sites.order import SignedOrder
+from meshctl.sites.uplink import Uplink
+
+# Uplinks wait far more than they work.
+MAX_SITES_AT_ONCE = 64
+_FIRST_WAIT_S = 1.0
+_LONGEST_WAIT_S = 15.0
+_WATCH_S = 0.25
+# A site without contact for so long is left to itself; `meshctl resume` meets its run again.
+GIVE_UP_S = 900.0
+
+
+def new_run_id() -> str:
+    return secrets.token_hex(8)
+
+
+def by_site(fleet: Fleet, nodes: Iterable[Node]) -> tuple[tuple[Node, ...], dict[str, tuple[str, ...]]]:
+    """The nodes that the operator provisions, and the names of the others by the site whose worker does."""
+    direct: list[Node] = []
+    sites: dict[str, list[str]] = {}
+    for node in nodes:
+        site = fleet.worker_site(node)
+        if site is None:
+            direct.append(node)
+        else:
+            sites.setdefault(site.name, []).append(node.name)
+    return tuple(direct), {name: tuple(names) for name, names in sites.items()}
+
+
+@dataclass(slots=True)
+class SitePlan:
+    """One site's plan: what `saved` says, or why there is none (`error`). The uplink stays open for its execution."""
+
+    site: Site
+    nodes: tuple[str, ...]
+    run: str
+    saved: SavedPlan | None = None
+    text: str = field(default="", repr=False)
+    part_sha256: str = ""
+    error: MeshctlError | None = None
+    uplink: Uplink | None = field(default=None, repr=False)
+
+    def close(self) -> None:
+        if self.uplink is not None:
+            self.uplink.close()
+
+
+def prepare_sites(
+    fleet: Fleet,
+    sites: Mapping[str, Sequence[str]],
+    access: ConnectionPool,
+    bundle_of: Callable[[str], SiteBundle],
+    options: Sequence[str],
+) -> list[SitePlan]:
+    """Let the workers plan, all at the same time. A site that cannot is one with an `error`."""
+
+    plans = [SitePlan(fleet.sites[name], tuple(nodes), new_run_id()) for name, nodes in sites.items()]
+
+    def prepare(plan: SitePlan) -> None:
+        try:
+            bundle = bundle_of(plan.site.name)
+            plan.part_sha256 = bundle.sha256
+            plan.uplink = Uplink(fleet, plan.site, access)
+            plan.uplink.send_images(bundle.image_files)
+            plan.text, _ = plan.uplink.plan(plan.run, bundle.archive, bundle.images, plan.nodes, options)
+            plan.saved = load(plan.text, f"the plan of site {plan.site.name}")
+        except MeshctlError as error:
+            plan.error = error
+            plan.close()
+
+    pool = ThreadPoolExecutor(min(MAX_SITES_AT_ONCE, len(sites)), "site")
+    try:
+        list(pool.map(prepare, plans))
+    except BaseException:
+        # Ctrl-C: the workers forget their plans with their uplinks
+        for plan in plans:
+            plan.close()
+        raise
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    return plans
+
+
+@dataclass(slots=True)
+class SiteRun:
+    """A run at a site, as the operator sees it. `outcomes` has one for each of its nodes once it is over or left."""
+
+    site: Site
+    run: str
+    nodes: tuple[str, ...]
+    outcomes: dict[str, Outcome] = field(default_factory=dict)
+    order: SignedOrder | None = field(default=None, repr=False)
+    uplink: Uplink | None = field(default=None, repr=False)
+    offset: int = 0
+    is_started: bool = False
+    is_over: bool = False
+    in_work: set[str] = field(default_factory=set)
+
+
+@dataclass(frozen=True, slots=True)
+class SiteExecution:
+    """What the runs of all sites share. `entry` is the operator's journal, `observer` shows events."""
+
+    fleet: Fleet
+    access: ConnectionPool
+    entry: Run
+    observer: Observer
+    interrupt: Interrupt
+
+    def execute(self, runs: Sequence[SiteRun]) -> dict[str, Outcome]:
+        """Start (or follow) all runs and stay with them until each is over, or the operator leaves."""
+        done = threading.Event()
+        watcher = threading.Thread(target=self._watch, args=(runs, done), name="interrupts", daemon=True)
+        watcher.start()
+        try:
+            with ThreadPoolExecutor(max(1, len(runs)), "site") as pool:
+                for _ in pool.map(self._execute_site, runs):
+                    pass
+        finally:
+            done.set()
+            watcher.join()
+        return {name: outcome for run in runs for name, outcome in run.outcomes.items()}
+
+    def _execute_site(self, run: SiteRun) -> None:
+        wait_s, contact_s = _FIRST_WAIT_S, time.monotonic()
+        while not run.is_over and not self.interrupt.leaving and time.monotonic() - contact_s < GIVE_UP_S:
+            try:
+                offset = run.offset
+                self._stay(run)
+            except Unreachable as error:
+                if run.offset != offset:
+                    wait_s, contact_s = _FIRST_WAIT_S, time.monotonic()
+                self._note(f"site {run.site.name}: {error}; connecting again" + (
+                    ", the site continues on its own" if run.is_started else ""
+                ))  # fmt: skip
+                self.interrupt.wait(wait_s)
+                wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+            except MeshctlError as error:
+                self._finish_all(run, Result.FAILED if run.is_started else Result.REFUSED, str(error), error.hint)
+                run.is_over = True
+            finally:
+                self._close(run)
+        if not run.is_over:
+            text = f"site {run.site.name} continues on its own" if run.is_started else "it did not start"
+            self._finish_all(run, Result.PENDING, text, "run `meshctl resume` to see how it ended")
+
+    def _stay(self, run: SiteRun) -> None:
+        """Connect if necessary, start the run if it has not been, and follow it to its end."""
+        if run.uplink is None:
+            run.uplink = Uplink(self.fleet, run.site, self.access)
+            there = run.uplink.greeting.run(run.run)
+            # an uplink that was lost at the start leaves open whether the order arrived
+            run.is_started = there is not None and there.state != "prepared"
+            if there is None and run.order is None:
+                self._finish_all(run, Result.PENDING, f"site {run.site.name} does not know run {run.run}", "")
+                run.is_over = True
+                return
+        if not run.is_started:
+            if self.interrupt.stopping:
+                self._finish_all(run, Result.PENDING, "interrupted before it started", "")
+                run.is_over = True
+                return
+            if run.order is None:
+                self._finish_all(run, Result.PENDING, f"run {run.run} was not started at site {run.site.name}", "")
+                run.is_over = True
+                return
+            run.uplink.start(run.order)
+            run.is_started = True
+        for reply in run.uplink.follow(run.run, run.offset):
+            self._read(run, reply)
+
+    def _read(self, run: SiteRun, reply: Mapping[str, object]) -> None:
+        objects = reply.get("events", [])
+        assert isinstance(objects, list)
+        for event in events_of(objects):
+            if event.node and event.node not in run.nodes:
+                continue
+            if event.outcome is not None:
+                self._finish(run, event.outcome, at_s=event.at_s)
+            else:
+                run.in_work.add(event.node)
+                self.observer(event)
+        for outcome in final_outcomes(objects).values():
+            if outcome.node in run.nodes and run.outcomes.get(outcome.node) != outcome:
+                run.outcomes[outcome.node] = outcome
+                self.entry.finish_node(outcome)
+        run.offset = int(str(reply["offset"]))
+        over = reply.get("over")
+        if isinstance(over, Mapping):
+            reason, hint = str(over.get("error", "")), str(over.get("hint", ""))
+            self._end(run, reason, hint)
+            run.is_over = True
+
+    def _end(self, run: SiteRun, reason: str, hint: str) -> None:
+        """Nodes without an outcome when the run is over: it died, or could not start."""
+        for name in run.nodes:
+            if name not in run.outcomes:
+                result = Result.UNCERTAIN if name in run.in_work else Result.PENDING
+                text = reason or "the run ended without an outcome for it"
+                self._finish(run, Outcome(name, result, f"site {run.site.name}: {text}", hint))
+
+    def _finish_all(self, run: SiteRun, result: Result, reason: str, hint: str) -> None:
+        for name in run.nodes:
+            if name not in run.outcomes:
+                self._finish(run, Outcome(name, result, reason, hint))
+
+    def _finish(self, run: SiteRun, outcome: Outcome, at_s: float = 0.0) -> None:
+        run.outcomes[outcome.node] = outcome
+        run.in_work.discard(outcome.node)
+        self.entry.finish_node(outcome)
+        self.observer(Event(EventKind.FINISHED, outcome.node, at_s or time.time(), outcome.reason, outcome=outcome))
+
+    def _note(self, text: str) -> None:
+        self.observer(Event(EventKind.NOTE, "", time.time(), text))
+
+    def _close(self, run: SiteRun) -> None:
+        uplink, run.uplink = run.uplink, None
+        if uplink is not None:
+            uplink.close()
+
+    def _watch(self, runs: Sequence[SiteRun], done: threading.Event) -> None:
+        """Pass Ctrl-C on to the sites: the first one stops their runs, the second one leaves them."""
+        stopped: set[str] = set()
+        while not done.wait(_WATCH_S):
+            for run in runs:
+                uplink = run.uplink
+                if uplink is None or run.is_over:
+                    continue
+                if self.interrupt.leaving:
+                    uplink.close()
+                elif self.interrupt.stopping and run.is_started and run.run not in stopped:
+                    # an uplink that is lost meanwhile is tried again with the next one
+                    with suppress(MeshctlError):
+                        if uplink.stop(run.run):
+                            stopped.add(run.run)

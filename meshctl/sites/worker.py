@@ -1,0 +1,221 @@
+"""The worker at a site: requests on standard input, replies on standard output, until either is closed.
+
+It keeps nothing in memory: a run belongs to its own processes (`runner`) and its directory (`runs`), and another
+worker process, over the next uplink, finds it there. `plan` and `apply` are the commands that an operator would type
+at the gateway.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import PurePosixPath
+from typing import Any, BinaryIO
+
+from meshctl import __version__
+from meshctl.device.connection import fingerprint_of
+from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.sites import runner
+from meshctl.sites.events import condensed
+from meshctl.sites.order import SignedOrder, operator_keys
+from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, PROTOCOL, WorkerError, decode, encode, error_message
+from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json
+
+_POLL_S = 0.25
+_MAX_ERROR_LINES = 20
+
+
+class Worker:
+    """Serves one uplink. `environ` is the process environment."""
+
+    def __init__(self, directory: SiteDirectory, environ: Mapping[str, str], requests: BinaryIO, out: BinaryIO) -> None:
+        self._directory = directory
+        self._environ = environ
+        self._requests = requests
+        self._out = out
+        self._lock = threading.Lock()
+        # reaped, so that the process of a run that was killed does not look alive
+        self._runners: list[subprocess.Popen[bytes]] = []
+        # planned over this uplink; what is not ordered before its end is deleted, since it has secrets
+        self._planned: list[RunDirectory] = []
+
+    def serve(self) -> None:
+        """Answer requests until the end of the input. A reader that is gone ends the process."""
+        self._directory.root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        self._directory.clean()
+        threading.Thread(target=self._beat, name="beat", daemon=True).start()
+        for line in self._requests:
+            try:
+                request = decode(line)
+                self._answer(request)
+            except MeshctlError as error:
+                self._send(error_message(error))
+            except (KeyError, TypeError, ValueError) as error:
+                self._send(error_message(InputError(f"invalid request: {type(error).__name__}: {error}")))
+            except OSError as error:
+                self._send(error_message(MeshctlError(f"{error.filename or 'gateway'}: {error.strerror or error}")))
+        self._forget_planned()
+
+    def _forget_planned(self) -> None:
+        for run in self._planned:
+            if not run.order.exists():
+                run.discard()
+
+    def _answer(self, request: Mapping[str, Any]) -> None:
+        match request["do"]:
+            case "hello":
+                self._reply(self._hello())
+            case "install":
+                self._reply({"public_key": self._directory.install(tuple(map(str, request["operators"])))})
+            case "images":
+                self._reply({"missing": self._directory.missing_images(tuple(map(str, request["sha256"])))})
+            case "plan":
+                self._reply(self._plan(request))
+            case "start":
+                self._reply(self._start(request))
+            case "follow":
+                self._follow(self._directory.run(str(request["run"])), int(request["offset"]))
+            case "stop":
+                self._reply({"stopping": runner.stop(self._directory.run(str(request["run"])))})
+            case "status":
+                self._reply(self._status(request))
+            case unknown:
+                raise InputError(f"unknown request {unknown!r}", hint="run `meshctl sites install`")
+
+    def _hello(self) -> dict[str, object]:
+        self._reap()
+        return {
+            "protocol": PROTOCOL,
+            "meshctl": __version__,
+            "site": f"{self._directory.fleet}/{self._directory.site}",
+            "directory": str(self._directory.root),
+            "operators": [fingerprint_of(key.blob) for key in operator_keys(self._directory.operators())],
+            "runs": [
+                {"run": each.run, "state": each.state, "operator": each.operator, "command": each.command,
+                 "began_s": each.began_s}
+                for each in self._directory.runs()
+            ],
+        }  # fmt: skip
+
+    def _plan(self, request: Mapping[str, Any]) -> dict[str, object]:
+        """Unpack the site's part of the inventory and plan; the plan's text, as `meshctl plan --json` prints it."""
+        run = self._directory.run(str(request["run"]))
+        images = {str(path): self._directory.image(_file_name(sha256)) for path, sha256 in request["images"].items()}
+        self._planned.append(run)
+        run.create(_bytes_of(request["part"]), images)
+        words = [*map(str, request["nodes"]), "-i", str(run.inventory), "--out", str(run.plan), "--brief"]
+        words += [*map(str, request["options"]), *runner.key_options(self._directory)]
+        done = self._command("plan", *words)
+        if not run.plan.exists():
+            run.forget_secrets()
+            raise _failure(done)
+        return {"plan": run.plan.read_text(encoding="utf-8"), "exit": done.returncode}
+
+    def _status(self, request: Mapping[str, Any]) -> dict[str, object]:
+        """The site's status, as `meshctl status --json` prints it."""
+        run = self._directory.run(str(request["run"]))
+        run.create(_bytes_of(request["part"]), {})
+        try:
+            words = [*map(str, request["nodes"]), "-i", str(run.inventory), "--json", *map(str, request["options"])]
+            done = self._command("status", *words, *runner.key_options(self._directory))
+        finally:
+            run.discard()
+        if not done.stdout.strip():
+            raise _failure(done)
+        return {"status": done.stdout.decode("utf-8", "replace"), "exit": done.returncode}
+
+    def _command(self, *words: str) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.run(
+            runner.meshctl_command(*words),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            env=runner.environment(self._directory, self._environ),
+            check=False,
+        )
+
+    def _start(self, request: Mapping[str, Any]) -> dict[str, object]:
+        signed = SignedOrder(str(request["order"]), str(request["key"]), str(request["signature"]))
+        self._runners.append(runner.start(self._directory, signed, self._environ))
+        return {"started": True}
+
+    def _follow(self, run: RunDirectory, offset: int) -> None:
+        """Send the run's events from `offset` (bytes) on until it is over."""
+        if not run.order.exists():
+            raise InputError(f"run {run.path.name} has not been started at this site")
+        while True:
+            self._reap()
+            # its end is looked up before the events: those written before it are then read as well
+            over, is_alive = read_json(run.over), run.is_alive()
+            events = run.new_events(offset, MAX_EVENTS_BYTES)
+            if events:
+                offset += len(events)
+                self._reply({"offset": offset, "events": condensed(events)})
+            elif over:
+                self._reply({"offset": offset, "over": over})
+                return
+            elif not is_alive and not run.over.exists():
+                text = "the run's process ended without a result: the gateway was switched off, or it was killed"
+                self._reply({"offset": offset, "over": {"error": text, "hint": ""}})
+                return
+            else:
+                time.sleep(_POLL_S)
+
+    def _reap(self) -> None:
+        self._runners = [each for each in self._runners if each.poll() is None]
+
+    def _reply(self, reply: Mapping[str, object]) -> None:
+        self._send({"reply": dict(reply)})
+
+    def _send(self, message: Mapping[str, object]) -> None:
+        try:
+            with self._lock:
+                self._out.write(encode(message) + b"\n")
+                self._out.flush()
+        except (OSError, ValueError):
+            # the uplink is gone: the runs are not this process's, and its threads have nothing left to do
+            self._forget_planned()
+            os._exit(int(ExitCode.OK))
+
+    def _beat(self) -> None:
+        while True:
+            time.sleep(BEAT_S)
+            self._send({"beat": BEAT_S})
+
+
+def _bytes_of(text: object) -> bytes:
+    try:
+        return base64.b64decode(str(text), validate=True)
+    except binascii.Error as error:
+        raise InputError(f"invalid request: {error}") from error
+
+
+def _file_name(text: object) -> str:
+    name = str(text)
+    if PurePosixPath(name).name != name:
+        raise InputError(f"invalid request: {name!r} is no file name")
+    return name
+
+
+def _failure(done: subprocess.CompletedProcess[bytes]) -> WorkerError:
+    """What a command said before it failed, as its error."""
+    said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+    errors = [line.removeprefix("error: ") for line in said if not line.startswith("hint: ")][:_MAX_ERROR_LINES]
+    hints = [line.removeprefix("hint: ") for line in said if line.startswith("hint: ")]
+    text = "\n".join(errors) or f"the command ended with {done.returncode} and said nothing"
+    return WorkerError(text, hint=hints[-1] if hints else "")
+
+
+def serve(name: str, environ: Mapping[str, str], requests: BinaryIO, out: BinaryIO) -> None:
+    """Serve the site `FLEET/SITE` on these streams."""
+    Worker(SiteDirectory.of(name, environ), environ, requests, out).serve()
+
+
+def execute(name: str, run: str, environ: Mapping[str, str]) -> int:
+    """Execute a started run to its end; returns its exit status."""
+    directory = SiteDirectory.of(name, environ)
+    return runner.execute(directory, directory.run(run), environ)

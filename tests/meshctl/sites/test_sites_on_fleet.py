@@ -1,0 +1,166 @@
+"""Sites of virtual nodes are provisioned by their workers, over real SSH, with uplinks that are cut.
+
+Each test ends with all nodes as the inventory has them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.meshctl.sites.rig import NORTH, SECRETS, SOUTH, SitesRig
+from tests.waiting import until
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("sites"), pytest.mark.timeout(600)]
+_EVERY = (*NORTH, *SOUTH)
+_PROVISION = ("provision", "--yes", "--json")
+# the canary of north: the others follow
+_AT_WORK = '"node": "n[12]", "at_s": [0-9.]*, "text": "apply"'
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SitesRig]:
+    with SitesRig(tmp_path_factory.mktemp("sites")) as started:
+        yield started
+
+
+@pytest.fixture
+def rig(shared: SitesRig) -> SitesRig:
+    for uplink in shared.uplinks.values():
+        uplink.mend()
+    return shared
+
+
+def test_all_sites_change_in_one_run_without_the_secrets_of_each_other(rig: SitesRig) -> None:
+    power_dbm = rig.change_power()
+    planned = rig.run("provision", "--check")
+    assert planned.code == 1
+    assert "site north:" in planned.out
+    assert "3 to change" in planned.out
+    started = rig.start(*_PROVISION)
+    inventory = until(lambda: next(rig.site_directory("north").glob("runs/*/inventory"), None), "the part of north")
+    secrets = until(lambda: _text(inventory / "secrets.yaml"), "its secrets")
+    assert SECRETS["north"] in secrets
+    assert SECRETS["south"] not in secrets
+    assert "s-base" not in (_text(inventory / "fleet.yaml") or "")
+    done = started.end()
+    assert (done.code, done.results) == (0, dict.fromkeys(_EVERY, "done"))
+    assert set(rig.powers().values()) == {str(power_dbm)}
+    kept = [path for path in rig.site_directory("north").rglob("*") if path.is_file()]
+    assert kept
+    assert [path for path in kept if any(secret.encode() in path.read_bytes() for secret in SECRETS.values())] == []
+    history = json.loads(rig.run("history", "--json", expected=0).out)
+    assert (history[0]["command"], history[0]["state"]) == ("provision", "4 done")
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text()
+    except FileNotFoundError:
+        return None
+
+
+def test_a_site_continues_while_its_uplink_is_cut_and_takes_no_second_run(rig: SitesRig) -> None:
+    rig.change_power()
+    first = rig.start(*_PROVISION)
+    first.wait_for(_AT_WORK)
+    second = rig.run("provision", *NORTH, "--yes", "--json")
+    reasons = [event["outcome"]["reason"] for event in second.events if event["event"] == "finished"]
+    assert second.code == 1
+    assert len(reasons) == len(NORTH)
+    assert all("is in progress at this site" in reason for reason in reasons), second
+    run = rig.started_run("north")
+    rig.uplinks["north"].cut()
+    first.wait_for("connecting again, the site continues on its own")
+    until(lambda: (run / "over.json").exists(), "the end of the run at the site", wait_s=120)
+    rig.uplinks["north"].mend()
+    ended = first.end()
+    assert (ended.code, ended.results) == (0, dict.fromkeys(_EVERY, "done"))
+
+
+def test_a_run_whose_operator_died_is_met_again(rig: SitesRig) -> None:
+    power_dbm = rig.change_power()
+    started = rig.start(*_PROVISION)
+    started.wait_for(_AT_WORK)
+    os.killpg(started.process.pid, signal.SIGKILL)
+    started.process.wait()
+    met = rig.run("resume", "--yes", expected=0)
+    assert "asking north" in met.out
+    assert "is finished: nothing to resume" in met.out
+    assert set(rig.powers().values()) == {str(power_dbm)}
+    history = json.loads(rig.run("history", "--json", expected=0).out)
+    assert history[0]["state"] == "4 done"
+
+
+@pytest.mark.proof
+def test_an_interrupt_stops_the_sites_and_a_second_one_leaves_them(rig: SitesRig) -> None:
+    rig.change_power()
+    started = rig.start(*_PROVISION)
+    started.wait_for(_AT_WORK)
+    started.signal(signal.SIGINT)
+    ended = started.end()
+    assert ended.code == 130
+    assert set(ended.results.values()) == {"done", "pending"}
+    assert "in progress" not in rig.runs_at("north").values()
+    resumed = rig.start("resume", "--yes", "--json")
+    resumed.wait_for('"node": "n[-a-z0-9]*", "at_s": [0-9.]*, "text": "apply"')
+    resumed.signal(signal.SIGINT)
+    resumed.wait_for("stopping")
+    resumed.signal(signal.SIGINT)
+    assert resumed.end().code == 130
+    until(lambda: rig.run("resume", "--yes", "--json").code == 0, "all nodes to be as planned", wait_s=240)
+    assert rig.run("provision", "--check").code == 0
+
+
+def test_a_site_that_cannot_be_reached_or_refuses_keeps_no_other_from_its_change(rig: SitesRig) -> None:
+    rig.change_power()
+    rig.uplinks["south"].cut()
+    ended = rig.run(*_PROVISION)
+    assert ended.code == 3
+    assert ended.results == {**dict.fromkeys(NORTH, "done"), **dict.fromkeys(SOUTH, "unreachable")}
+    rig.uplinks["south"].mend()
+    operators = rig.site_directory("south") / "operators"
+    kept = operators.read_text()
+    operators.write_text("ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g other\n")
+    refused = rig.run("resume", "--yes", "--json")
+    operators.write_text(kept)
+    assert refused.code == 2
+    assert "none of those keys is here" in refused.err
+    assert rig.run("resume", "--yes", "--json", expected=0).results == dict.fromkeys(SOUTH, "done")
+
+
+def test_workers_query_the_nodes_and_other_commands_pass_through_the_gateway(rig: SitesRig) -> None:
+    said = rig.run("sites", "status", "--nodes")
+    assert re.search(r"north  3 ok; meshctl \S+, \w+ by \S+ .* ago: over", said.out), said
+    found = json.loads(rig.run("sites", "status", "north", "--nodes", "--json").out)
+    assert {node["name"]: node["health"] for node in found[0]["status"]["nodes"]} == dict.fromkeys(NORTH, "ok")
+    before = rig.uplinks["south"].accepted
+    assert rig.run("run", "s-base", "--", "uname", expected=0).out == "s-base: Linux\n"
+    assert rig.uplinks["south"].accepted == before + 1
+    rig.uplinks["south"].cut()
+    assert "check the uplink of south" in rig.run("run", "s-base", "--", "uname").err
+    cut = rig.run("sites", "status")
+    assert cut.code == 1
+    assert "check the uplink of south" in cut.out
+
+
+@pytest.mark.proof
+def test_a_run_whose_processes_die_at_the_site_is_reported_and_resumed(rig: SitesRig) -> None:
+    rig.change_power()
+    started = rig.start(*_PROVISION)
+    started.wait_for(_AT_WORK)
+    for line in (rig.started_run("north") / "process").read_text().splitlines():
+        rig.kill(int(line.split(":")[1]))
+    ended = started.end()
+    assert ended.code == 1
+    assert ended.results["s-base"] == "done"
+    assert "uncertain" in ended.results.values()
+    # the node that was armed goes back by itself, within its window
+    until(lambda: rig.run("resume", "--yes", "--json").code == 0, "the nodes to be as planned", wait_s=240)
+    assert rig.run("provision", "--check").code == 0
