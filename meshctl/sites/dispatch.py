@@ -152,8 +152,10 @@ class SiteExecution:
                 offset = run.offset
                 self._stay(run)
             except Unreachable as error:
+                if run.uplink is not None:
+                    contact_s = time.monotonic()
                 if run.offset != offset:
-                    wait_s, contact_s = _FIRST_WAIT_S, time.monotonic()
+                    wait_s = _FIRST_WAIT_S
                 self._note(f"site {run.site.name}: {error}; connecting again" + (
                     ", the site continues on its own" if run.is_started else ""
                 ))  # fmt: skip
