@@ -8,7 +8,8 @@ umask 022
 take() {
 	[ -f /tmp/run/procd/booted ] || return 0
 	. /lab/node/board
-	/rom/lab/genuine/busybox usleep $((($1 + $(chance "${2:-0}")) * 1000 * SLOWNESS))
+	draw "${2:-0}"
+	/rom/lab/genuine/busybox usleep $((($1 + draw) * 1000 * SLOWNESS))
 }
 # the current device of each network
 devices_now() {

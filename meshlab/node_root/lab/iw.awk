@@ -2,6 +2,7 @@
 # stays in the table for a minute, and does not reappear when deleted. `now` is Unix time, as in air/heard.
 BEGIN {
 	FS = "\t"
+	mac = tolower(mac); now = systime()
 	while ((getline line < "/tmp/run/netifd/forgotten") > 0) { split(line, told, " "); since[told[1] " " told[2]] = told[3] }
 	# a file that is open for reading is not written
 	close("/tmp/run/netifd/forgotten")

@@ -1,5 +1,5 @@
 # Stand-in for rpcd's iwinfo object: `info` and `assoclist` of one device, from the files of netifd and the fleet.
-BEGIN { FS = "\t" }
+BEGIN { FS = "\t"; now = systime() }
 FILENAME ~ /iw$/ && $1 == device { found = 1; n = split($0, face, "\t") }
 FILENAME ~ /heard$/ && $1 == "S" && $2 == device { mac[++stations] = $3; signal[stations] = $4; age[stations] = $5 + ($8 ? (now - $8) * 1000 : 0); connected[stations] = $7 ? now - $7 : 60; rate[stations] = $6 }
 END {

@@ -18,11 +18,16 @@ break_lock() { # NAME HOLDER
 }
 lock() { until try_lock "$1"; do /rom/lab/genuine/busybox usleep 10000; done; }
 unlock() { rm -f "/tmp/run/lock.$1"; }
-# A number from 0 to MAX, from the board's seed: the same sequence in every fleet with that seed.
-chance() { # MOST
+# A number from 0 to MAX, from the board's seed: the same sequence in every fleet with that seed. `draw` sets the variable
+# of its name, `chance` prints it.
+draw() { # MOST
 	. /lab/node/board
 	read -r drawn 2>/dev/null </tmp/run/drawn || drawn=$((SEED + 1))
 	drawn=$(((drawn * 1103515245 + 12345) % 2147483648))
 	echo $drawn >/tmp/run/drawn
-	echo $((drawn / 65536 % ($1 + 1)))
+	draw=$((drawn / 65536 % ($1 + 1)))
+}
+chance() { # MOST
+	draw "$1"
+	echo $draw
 }

@@ -405,23 +405,24 @@ function sys_script(    d, file, port, n, i, list, dir) {
 	# remove what the last run created and this one does not
 	print "for d in *; do case \" lo " ports " \" in *\" $d \"*) ;; *) [ -e '/tmp/run/netifd/has.'\"$d\" ] || rm -rf \"$d\" ;; esac; done" > (run "/sys.end")
 	close(run "/sys.end")
-	printf "rm -f /tmp/run/netifd/has.*\nrm -rf /var/run/wpa_supplicant; mkdir -p /var/run/wpa_supplicant\n" > file
+	printf "rm -f /tmp/run/netifd/has.* /var/run/wpa_supplicant/*; [ -d /var/run/wpa_supplicant ] || mkdir -p /var/run/wpa_supplicant\n" > file
 	for (d in encrypted) printf ": >/var/run/wpa_supplicant/%s\n", d > file
 	for (d in exists) {
 		printf ": >/tmp/run/netifd/has.%s\n", d > file
 		printf "[ -d %s ] || mkdir %s\necho %s >%s/address\necho %s >%s/operstate\necho %s >%s/mtu\necho 1 >%s/carrier\n", \
 			d, d, mac[d], d, (d == "lo" ? "unknown" : "up"), d, (d in mtu ? mtu[d] : (d == "lo" ? 65536 : 1500)), d, d > file
 		if (d in is_bridge) {
-			printf "rm -rf %s/brif; mkdir -p %s/bridge %s/brif\necho 0 >%s/bridge/stp_state\n", d, d, d, d > file
+			printf "[ ! -d %s/brif ] || rm -rf %s/brif; mkdir -p %s/bridge %s/brif", d, d, d, d > file
 			n = split(bridge_ports[d], list, " ")
-			for (i = 1; i <= n; i++) printf "mkdir %s/brif/%s\n", d, list[i] > file
+			for (i = 1; i <= n; i++) printf " %s/brif/%s", d, list[i] > file
+			printf "\necho 0 >%s/bridge/stp_state\n", d > file
 		}
 		printf "echo %d >%s/ifindex\n", (d in index_of ? index_of[d] : device_index(d)), d > file
-		if (d in is_radio) printf "mkdir -p %s/wireless %s/phy80211\n", d, d > file
-		if (d in is_soft) printf "mkdir -p /sys/module/batman_adv %s/mesh\n", d > file
-		if (d in bridge_of) printf "rm -f %s/master; ln -s ../%s %s/master\n", d, bridge_of[d], d > file
-		else if (d in master) printf "rm -f %s/master; ln -s ../%s %s/master\n", d, master[d], d > file
-		else printf "rm -f %s/master\n", d > file
+		if (d in is_radio) printf "[ -d %s/phy80211 ] || mkdir -p %s/wireless %s/phy80211\n", d, d, d > file
+		if (d in is_soft) printf "[ -d %s/mesh ] || mkdir -p /sys/module/batman_adv %s/mesh\n", d, d > file
+		if (d in bridge_of) printf "ln -sfn ../%s %s/master\n", bridge_of[d], d > file
+		else if (d in master) printf "ln -sfn ../%s %s/master\n", master[d], d > file
+		else printf "[ ! -L %s/master ] || rm -f %s/master\n", d, d > file
 	}
 	print ". /tmp/run/netifd/sys.end" > file
 }
