@@ -32,7 +32,10 @@ def spec_of(
                 hint="use IPv4 networks in a copy of the inventory for practice; provision supports both on real nodes",
             )
     names = [node.name for node in chosen]
-    used = default_links(names) if links is None else [one for one in links if one.a in names and one.b in names]
+    if links is None:
+        used = default_links(names, [[node.name for node in chosen if mesh in node.meshes] for mesh in fleet.meshes])
+    else:
+        used = [one for one in links if one.a in names and one.b in names]
     return FleetSpec(
         name=fleet.name,
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),
@@ -42,7 +45,16 @@ def spec_of(
     )
 
 
-def default_links(names: Sequence[str]) -> list[LinkSpec]:
+def default_links(names: Sequence[str], meshes: Sequence[Sequence[str]] = ()) -> list[LinkSpec]:
+    """Links that connect all nodes, and within each of `meshes` its own nodes: radios of another mesh forward nothing."""
+    found: dict[frozenset[str], LinkSpec] = {}
+    for members in (*meshes, names):
+        for link in _chain_or_tree(members):
+            found.setdefault(link.ends, link)
+    return list(found.values())
+
+
+def _chain_or_tree(names: Sequence[str]) -> list[LinkSpec]:
     """A chain with a weaker link past every second node; for big fleets, a tree with three children per node, because
     batman-adv's TQ reaches 0 after some thirty hops."""
     if len(names) > _MAX_CHAIN_NODES:

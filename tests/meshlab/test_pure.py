@@ -57,6 +57,14 @@ def test_default_links_keep_every_node_of_a_large_fleet_within_six_hops() -> Non
     assert max(map(hops, names)) <= 6
 
 
+def test_default_links_connect_the_nodes_of_each_mesh_without_those_of_another() -> None:
+    names = ["base", "a1", "a2", "b1", "b2"]
+    meshes = [["base", "a1", "a2"], ["base", "b1", "b2"]]
+    ends = {link.ends for link in from_inventory.default_links(names, meshes) if link.tq > 200}
+    assert {frozenset(("base", "b1")), frozenset(("b1", "b2")), frozenset(("base", "a1"))} <= ends
+    assert from_inventory.default_links(names, [names]) == from_inventory.default_links(names)
+
+
 def test_faults_are_parsed_and_described_with_an_optional_step() -> None:
     assert faults.parse("power-cut@7") == FaultRequest(Fault.CUT, "7")
     assert faults.parse("full-flash") == FaultRequest(Fault.FULL_FLASH)
