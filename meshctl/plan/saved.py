@@ -43,7 +43,7 @@ class SavedPlan:
 
 
 def dump(saved: SavedPlan) -> str:
-    """The plan as JSON text."""
+    """The plan as JSON text. It quotes devices: what a terminal would obey is escaped."""
     plan = saved.plan
     document = {
         "format": FORMAT,
@@ -62,7 +62,7 @@ def dump(saved: SavedPlan) -> str:
         "stages": [_plain(stage) for stage in plan.stages],
         "nodes": [_plain(node) for node in plan.nodes.values()],
     }
-    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(document, indent=1).replace("\x7f", "\\u007f") + "\n"
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from meshctl.fleet import Event, EventKind, Outcome, Result
 from meshctl.fleet.journal import Journal
 from meshctl.model import Fleet
 from meshctl.plan import FileChange, NodePlan, Plan, Verdict
+from meshctl.plan.saved import SavedPlan, dump, load
 from meshctl.report.plan_text import plan_lines
 from meshctl.report.progress import JsonProgress, LiveProgress, PlainProgress
 from meshctl.report.terminal_escapes import clean, clean_styled, json_safe, one_line
@@ -84,6 +85,9 @@ def test_a_plan_for_a_hostile_device_contains_no_terminal_escapes() -> None:
         "lab", 0.0, "b00", {"b01": node, "b02": refused}, notes=(HOSTILE,), refusal=HOSTILE, refusal_hint=HOSTILE
     )
     assert [steering(line.text) for line in plan_lines(plan) if steering(line.text)] == []
+    saved = dump(SavedPlan(plan, b"salt", HOSTILE))
+    assert steering(saved) == []
+    assert load(saved, "plan.json").plan == plan
 
 
 def test_the_progress_of_a_hostile_device_has_no_escapes_and_forges_no_line() -> None:
