@@ -11,12 +11,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from meshctl.device.observation import Observation
+from meshctl.diagnostics import InvalidInput
+from meshctl.errors import InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.model import Node, Secret
 from meshctl.model.ip import IpAddress
 from meshctl.nodes.desired import Renderer
 from meshctl.plan import DesiredState, NodePlan
+from meshctl.plan.cell import Cell, cells, partitions
 from meshctl.plan.masking import masked_text, secrets_of
+from meshctl.plan.node import meshes_of
 from meshctl.plan.seen import file_info, management_address, package_of, parsed, text_of
 from meshctl.render import RenderedFile
 
@@ -119,7 +123,21 @@ class EarlierStates(Renderer):
             return Renderer.desired(self, node, seen)
         files = tuple(_rendered(file) for file in state.files if file.text is not None)
         found = {secret.reveal() for file in files for secret in file.secrets}
-        return DesiredState(node, files, tuple(sorted(found, key=lambda secret: (-len(secret), secret))))
+        secrets = tuple(sorted(found, key=lambda secret: (-len(secret), secret)))
+        return DesiredState(node, files, secrets, departs=self._departs(node, files, seen))
+
+    def _departs(self, node: Node, files: Iterable[RenderedFile], seen: Observation | None) -> tuple[str, ...]:
+        """The meshes whose cell was another one than in the inventory; all if that cannot be rendered now."""
+        try:
+            now = Renderer.desired(self, node, seen)
+        except (InvalidInput, InputError):
+            return node.meshes
+        return meshes_of(node, partitions(_cells(now.files), _cells(files)))
+
+
+def _cells(files: Iterable[RenderedFile]) -> dict[str, Cell]:
+    packages = {file.package.name: file.package for file in files if file.package is not None}
+    return cells(packages.get("wireless"), packages.get("network"))
 
 
 def _rendered(file: EarlierFile) -> RenderedFile:

@@ -133,8 +133,18 @@ def run_context(
     )
 
 
-def print_totals(opened: Session, run: JournaledRun, *, as_json: bool, unfinished: str = "nodes") -> typer.Exit:
-    """Print the totals, with `as_json` as the event `ended`; returns the exit to raise."""
+def retry_command(command: str, undoes: int | None = None) -> str:
+    """The command that takes up what a run of `command` left; `undoes` is the run that a rollback takes back."""
+    if undoes is not None:
+        return f"meshctl rollback {undoes}"
+    return "meshctl restore" if command == "restore" else "meshctl resume"
+
+
+def print_totals(
+    opened: Session, run: JournaledRun, *, as_json: bool, unfinished: str = "nodes", retry: str = "meshctl resume"
+) -> typer.Exit:
+    """Print the totals, with `as_json` as the event `ended`, and the command `retry` if something is left; returns the
+    exit to raise."""
     counted = totals(run.outcomes.values())
     # a closed pipe or terminal must not change the exit code
     with ignore_broken_pipe():
@@ -146,5 +156,5 @@ def print_totals(opened: Session, run: JournaledRun, *, as_json: bool, unfinishe
         else:
             echo(f"run {run.entry.id}: {counted}")
             if not counted.all_good:
-                echo(f"run `meshctl resume` for the unfinished {unfinished}", err=True)
+                echo(f"run `{retry}` for the unfinished {unfinished}", err=True)
     return typer.Exit(exit_for(run.outcomes.values(), opened.interrupt))

@@ -13,7 +13,7 @@ from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.apply.rollback import before_state
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, run_context
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
 from meshctl.cli.output import console, echo_error, echo_json
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome
@@ -162,7 +162,7 @@ def execute_plan(
     with journaled_run(opened, command, tuple(plan.nodes), changing=changing, plan=recorded, as_json=as_json) as run:
         save_before(opened, run, prepared)
         run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
-    raise print_totals(opened, run, as_json=as_json)
+    raise print_totals(opened, run, as_json=as_json, retry=retry_command(command, undoes))
 
 
 def execute_direct(opened: Session, run: JournaledRun, prepared: Prepared, *, rate: float | None) -> dict[str, Outcome]:

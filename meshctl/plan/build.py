@@ -101,15 +101,18 @@ def _refusal(
     found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
+        flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
         return (
             f"mesh {mesh} changes its cell, but not every member can take part: {'; '.join(why)}",
-            "change firmware first, without changing the cell, and fix the refused nodes",
+            "change firmware first, without changing the cell, and fix the refused nodes"
+            if flashes
+            else "fix the refused nodes, then plan again",
         )
     for mesh, names in found.left_behind.items():
         return (
             f"mesh {mesh} changes its cell and would leave behind {', '.join(names)}: unreachable, or not "
             "part of this plan",
-            f"switch them on, or acknowledge with --leave-behind {','.join(names)}",
+            f"switch them on and select them too, or acknowledge with --leave-behind {','.join(names)}",
         )
     cuts = graph.cut_off_by(entry)
     for name, plan in plans.items():

@@ -31,12 +31,14 @@ PUBLIC_FILES = (LAN_FILTER_PATH, MARKER_PATH, "etc/dropbear/authorized_keys")
 
 @dataclass(frozen=True, slots=True)
 class DesiredState:
-    """The desired state of one node: its rendered files, the secrets in them, its packages."""
+    """The desired state of one node: its rendered files, the secrets in them, its packages. `departs`: the meshes whose
+    cell in the inventory it leaves, as an earlier state may."""
 
     node: Node
     files: Sequence[RenderedFile] = field(repr=False)
     secrets: tuple[str, ...] = field(repr=False, default=())
     needs: Needs = NO_NEEDS
+    departs: tuple[str, ...] = ()
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -72,7 +74,8 @@ def node_plan(
         node.name,
         Verdict.SAME,
         splits=tuple(f"{radio}: {one}" for radio, all_of_it in partition.items() for one in all_of_it),
-        parted_from=_partitioned_meshes(node, partition),
+        parted_from=meshes_of(node, partition),
+        departs=desired.departs,
         meshes=node.meshes,
         has_cell=bool(live),
         is_meshed=is_meshed(seen, live),
@@ -113,7 +116,7 @@ def node_plan(
     )
 
 
-def _partitioned_meshes(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
+def meshes_of(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
     """The meshes of these radios; all of the node's if a radio is not in the inventory."""
     mesh_of = {radio.name: radio.mesh for radio in node.radios}
     names = set(radios)

@@ -123,6 +123,8 @@ def _node(data: Mapping[str, Any]) -> NodePlan:
         effects=tuple(Effect(str(item["service"]), Cut(item["cut"]), str(item["why"])) for item in data["effects"]),
         splits=_texts(data["splits"]),
         parted_from=_texts(data["parted_from"]),
+        # plans of earlier versions have none
+        departs=_texts(data.get("departs", ())),
         meshes=_texts(data["meshes"]),
         has_cell=bool(data["has_cell"]),
         is_meshed=bool(data["is_meshed"]),

@@ -49,15 +49,17 @@ def switches(
             unchanged[node.name] for node in fleet.members(mesh) if node.name in unchanged and node.name not in plans
         ]
         staying = [plan for plan in (*members, *beside) if plan.has_cell and mesh not in plan.parted_from]
+        departs = any(mesh in plan.departs for plan in parting)
         # the mesh is where most of its members are; the few that differ rejoin it one by one
-        if not parting or len(staying) >= len(parting):
+        if not parting or (len(staying) >= len(parting) and not departs):
             continue
         nodes[mesh] = tuple(plan.node for plan in parting)
         refused = [f"{plan.node}: {plan.reason}" for plan in members if plan.verdict is Verdict.REFUSED]
         flashed = [f"{plan.node}: its firmware changes too" for plan in parting if plan.firmware is not None]
         if refused or flashed:
             blocked[mesh] = (*refused, *flashed)
-        staying_names = {plan.node for plan in staying}
+        # members in the inventory's cell are where a rejoining node goes, and what a departing one leaves
+        staying_names = {plan.node for plan in staying if not departs or plan.node in plans}
         unplanned = [
             node.name for node in fleet.members(mesh) if node.name not in plans and node.name not in staying_names
         ]

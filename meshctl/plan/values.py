@@ -86,8 +86,9 @@ class NodePlan:
     """The steps of one node, in this order: firmware, packages, files.
 
     `observed` and `wanted` are fingerprints of its observed and desired state. `splits` lists how its current cell
-    differs from the planned one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns. `has_cell`:
-    a radio is configured for a mesh now; `is_meshed`: the node is part of a running mesh.
+    differs from the planned one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns. `departs`: of
+    which ones the planned cell is not the inventory's, so that it leads away from the members there. `has_cell`: a
+    radio is configured for a mesh now; `is_meshed`: the node is part of a running mesh.
     """
 
     node: str
@@ -100,6 +101,7 @@ class NodePlan:
     effects: tuple[Effect, ...] = ()
     splits: tuple[str, ...] = ()
     parted_from: tuple[str, ...] = ()
+    departs: tuple[str, ...] = ()
     meshes: tuple[str, ...] = ()
     has_cell: bool = False
     is_meshed: bool = False

@@ -37,8 +37,10 @@ def test_a_rollback_plan_restores_exactly_the_earlier_files() -> None:
     plan = node_plan(back, running(now_fleet, "b01"), FINGERPRINTS)
     assert plan.verdict is Verdict.CHANGE
     assert "channel '6'" in "".join(change.diff for change in plan.files)
-    # another cell: the plan knows that it partitions the mesh
-    assert plan.splits
+    # another cell: the plan knows that it partitions the mesh, and leads away from members in the inventory's cell
+    assert (bool(plan.splits), plan.departs) == (True, ("main",))
+    reverted = EarlierStates(fleet(), renderer.secrets, renderer.templates, {"b01": recorded()})
+    assert reverted.desired(fleet().nodes["b01"]).departs == ()
     assert node_plan(back, running(fleet(), "b01"), FINGERPRINTS).verdict is Verdict.SAME
     # nodes that the run did not change are those of the inventory
     assert earlier.desired(now_fleet.nodes["b02"]).files == wanted(now_fleet, "b02").files

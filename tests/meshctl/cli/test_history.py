@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.cli.journaled_run import retry_command
 from meshctl.cli.main import main
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal
@@ -64,3 +65,10 @@ def test_runs_are_filtered_by_fleet_and_by_real_or_virtual(
     listed = json.loads(said(capfd, *words, "--json"))
     assert [run["run"] for run in listed] == runs
     assert {run["lab"] for run in listed} <= {"", "/lab"}
+
+
+def test_the_command_for_what_a_run_left_is_one_that_takes_the_run_up() -> None:
+    assert retry_command("provision") == "meshctl resume"
+    # `meshctl resume` refuses these
+    assert retry_command("rollback", undoes=4) == "meshctl rollback 4"
+    assert retry_command("restore") == "meshctl restore"

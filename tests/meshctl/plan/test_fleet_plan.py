@@ -56,7 +56,7 @@ def test_a_node_in_two_meshes_switches_with_the_changed_one() -> None:
 def test_a_switch_leaves_nodes_behind_only_if_acknowledged() -> None:
     plan = changed_channel(away=("b03",))
     assert "would leave behind b03" in plan.refusal
-    assert plan.refusal_hint == "switch them on, or acknowledge with --leave-behind b03"
+    assert plan.refusal_hint == "switch them on and select them too, or acknowledge with --leave-behind b03"
     new = fleet(channel=11)
     seen = {name: None if name == "b03" else running(fleet(), name) for name in TEAM}
     assert fleet_plan(new, plans(new, seen), STAR, now_s=0.0, leave_behind=["b03"]).refusal == ""
@@ -81,6 +81,17 @@ def test_a_node_left_in_the_old_cell_rejoins_alone() -> None:
     assert plan.stages[0].kind is not StageKind.SWITCH
 
 
+def test_a_node_that_departs_from_the_running_cell_does_not_rejoin_it() -> None:
+    earlier, now = fleet(channel=6), fleet(channel=11)
+    departing = plans(earlier, {"b01": running(now, "b01")})
+    departing = {name: replace(plan, departs=plan.meshes) for name, plan in departing.items()}
+    others = plans(now, {name: running(now, name) for name in TEAM if name != "b01"})
+    plan = fleet_plan(now, departing, STAR, now_s=0.0, unchanged=others)
+    assert "would leave behind base, b02, b03, b04, b05" in plan.refusal
+    assert plan.notes == ()
+    assert fleet_plan(now, departing, STAR, now_s=0.0, unchanged=others, leave_behind=["all"]).refusal == ""
+
+
 def test_unselected_members_in_the_old_cell_block_a_partial_switch() -> None:
     new = fleet(channel=11)
     some = plans(new, {name: running(fleet(), name) for name in TEAM[:3]})
@@ -93,6 +104,7 @@ def test_refused_members_in_the_old_cell_block_a_switch() -> None:
     seen = {name: running(fleet(), name, uci_changes=("system.x",) if name > "b01" else ()) for name in TEAM}
     plan = fleet_plan(new, plans(new, seen), STAR, now_s=0.0)
     assert "changes its cell, but not every member can take part" in plan.refusal
+    assert plan.refusal_hint == "fix the refused nodes, then plan again"
 
 
 def test_a_base_without_neighbors_cannot_leave_its_mesh_unacknowledged() -> None:
