@@ -46,7 +46,7 @@ def spec_of(
 
 
 def default_links(names: Sequence[str], meshes: Sequence[Sequence[str]] = ()) -> list[LinkSpec]:
-    """Links that connect all nodes, and within each of `meshes` its own nodes: radios of another mesh forward nothing."""
+    """Links between all nodes, and among the nodes of each of `meshes`: radios of another mesh forward nothing."""
     found: dict[frozenset[str], LinkSpec] = {}
     for members in (*meshes, names):
         for link in _chain_or_tree(members):
