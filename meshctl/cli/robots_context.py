@@ -25,6 +25,7 @@ from meshctl.cli.context import (
     AsJson,
     InventoryPath,
     KeyFiles,
+    Lab,
     Limit,
     Session,
     read_selection,
@@ -83,6 +84,7 @@ _SHARED: dict[str, tuple[Any, Any]] = {
     "ask_sudo": (AskSudo, False),
     "as_json": (AsJson, False),
     "key": (KeyFiles, None),
+    "lab": (Lab, None),
 }
 
 
@@ -177,6 +179,7 @@ def open_robots_context(
     *,
     limit: list[str] | None = None,
     key: list[Path] | None = None,
+    lab: Path | None = None,
     ask_sudo: bool = False,
     wheels: Path | None = None,
     wait_s: int = 30,
@@ -184,7 +187,7 @@ def open_robots_context(
 ) -> Iterator[RobotsContext]:
     """Open a session and its context. Raises InvalidInput and InputError for a bad inventory or selection."""
     password = sudo_password(ask_sudo)
-    with session(inventory, key_files=key or ()) as opened:
+    with session(inventory, key_files=key or (), lab=lab) as opened:
         yield robots_context(
             opened, inventory, robots, password, limits=limit, wheels=wheels, wait_s=wait_s, as_json=as_json
         )
@@ -205,7 +208,8 @@ def robots_context(
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
     options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
-    connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner)
+    lab = "" if opened.lab is None else str(opened.lab.directory)
+    connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner, lab)
     selected = selected_robots(fleet, robots, read_selection, limits or ())
     return RobotsContext(opened, connector, selected, options, inventory, wheels, as_json)
 
@@ -216,7 +220,8 @@ def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callabl
     def opened(**given: Any) -> AbstractContextManager[RobotsContext]:
         return open_robots_context(**{"robots" if name == "named" else name: value for name, value in given.items()})
 
-    return with_options("context", opened, {name: option for name, option in _SHARED.items() if name in shared})
+    names = {*shared, "lab"}
+    return with_options("context", opened, {name: option for name, option in _SHARED.items() if name in names})
 
 
 def sudo_password(ask: bool) -> Secret | None:

@@ -32,15 +32,24 @@ def _no_password() -> Secret | None:
 @dataclass(frozen=True, slots=True)
 class RobotConnector:
     """Connects to the computers of a fleet. `access` holds pins, keys and connections to jump hosts; `password` returns
-    the sudo password; `owner` is our name in the robots' locks. Thread-safe."""
+    the sudo password; `owner` is our name in the robots' locks; `lab` is the directory of a virtual fleet, which has no
+    robots' computers. Thread-safe."""
 
     fleet: Fleet
     access: ConnectionPool
     password: Callable[[], Secret | None] = field(default=_no_password, repr=False)
     owner: str = ""
+    lab: str = ""
 
     def endpoint(self, robot: str) -> Endpoint:
         computer = computer_of(self.fleet, robot)
+        if self.lab and not computer.ssh.host:
+            # while practicing, the inventory's address may be that of the real robot
+            raise InputError(
+                f"robot.{robot}: the lab in {self.lab} has no computers to log in to, and {computer.address.ip} may be "
+                "the real robot's",
+                hint=f"set robots.{robot}.computer.ssh.host to a test machine, or unset MESHCTL_LAB",
+            )
         host = computer.ssh.host or str(computer.address.ip)
         user = computer.ssh.user or local_user(f"robots.{robot}.computer.ssh.user")
         return Endpoint(host, computer.ssh.port, user, identity=f"robot.{robot}")
