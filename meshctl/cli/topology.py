@@ -76,6 +76,7 @@ def topology(
         addresses={node.name: str(node.address.ip) for node in fleet.nodes.values()},
         routing=routing.value,
         cells=link_cells(fleet, snapshot.observations, snapshot.macs, (mesh,) if mesh else fleet.meshes),
+        queried=frozenset(node.name for node in queried) if nodes or limit else None,
     )
     drawn = FORMATS["json" if as_json else form.value](view)
     if drawn:

@@ -27,7 +27,7 @@ class Direction:
 @dataclass(frozen=True, slots=True)
 class TopologyView:
     """`directions[a, b]` is what `a` reports of hearing `b`, `cells[a, b]` in which cells; `ages_s` are the ages of the
-    nodes' reports."""
+    nodes' reports. `queried` are the selected nodes; None: all."""
 
     mesh: str
     entry: str
@@ -37,6 +37,10 @@ class TopologyView:
     addresses: Mapping[str, str]
     routing: str = "batman-adv"
     cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
+    queried: frozenset[str] | None = None
+
+    def was_queried(self, name: str) -> bool:
+        return self.queried is None or name in self.queried
 
     def age_s(self, name: str) -> float | None:
         """The age of a node's report, rounded to milliseconds."""
@@ -99,7 +103,8 @@ def tree(view: TopologyView) -> str:
         star = " *" if name in cuts else ""
         path = paths[name]
         text = "" if name == view.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
-        age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else ", does not answer"
+        silent = ", does not answer" if view.was_queried(name) else ", not queried"
+        age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else silent
         if name != view.entry and view.has_several_cells():
             text += "".join(f", {cell}" for cell in view.cells_of(name, path.via))
         return f"{name}{star}{text}{age if name != view.entry else ''}"
@@ -112,9 +117,11 @@ def tree(view: TopologyView) -> str:
         for index in range(len(inner) - 1, -1, -1):
             last = index == len(inner) - 1
             waiting.append((inner[index], below + ("`- " if last else "|- "), below + ("   " if last else "|  ")))
-    apart = [name for name in view.graph.nodes if name not in paths]
-    lines += [f"no path to {view.entry or 'the base'}: {', '.join(apart)}"] if apart else []
-    lines += ["* cut vertex: others reach the base only through it"] if cuts else []
+    apart = [name for name in view.graph.nodes if name not in paths and view.was_queried(name)]
+    # links that only other nodes report are missing
+    among = "" if view.queried is None else " among the links that the selected nodes report"
+    lines += [f"no path to {view.entry or 'the base'}{among}: {', '.join(apart)}"] if apart else []
+    lines += [f"* cut vertex{among}: others reach the base only through it"] if cuts else []
     return "\n".join(lines)
 
 

@@ -155,3 +155,23 @@ def test_swapped_radios_are_reported_as_two_wrong_channels(
         "mesh0 is on channel 6, its mesh on 149",
         "mesh1 is on channel 149, its mesh on 6",
     ]
+
+
+def test_a_selection_makes_no_claims_about_nodes_that_were_not_queried() -> None:
+    reports = {name: report_of(name, HEALTHY[name]) for name in ("base", "rover")}
+    view = TopologyView(
+        "main",
+        "base",
+        observed_graph(reports.values(), known_macs=NAMES),
+        directions(reports, NAMES),
+        dict.fromkeys(reports, 1.0),
+        {},
+        queried=frozenset(reports),
+    )
+    shown = FORMATS["tree"](view)
+    assert ", not queried" in shown
+    assert "does not answer" not in shown
+    assert "* cut vertex among the links that the selected nodes report:" in shown
+    apart = FORMATS["tree"](replace(view, graph=observed_graph([reports["rover"]], known_macs=NAMES)))
+    assert apart == "no path to base among the links that the selected nodes report: rover"
+    assert "does not answer" in FORMATS["tree"](replace(view, queried=None))
