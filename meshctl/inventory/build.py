@@ -25,6 +25,7 @@ from meshctl.inventory.documents import (
     SecretDocument,
     SiteDocument,
     SshLayer,
+    SystemDocument,
 )
 from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
@@ -99,7 +100,7 @@ def build(
         ),
         system=SystemSettings(
             timezone=document.system.timezone,
-            zonename=document.system.zonename,
+            zonename=_zonename(document.system),
             log_size_kib=document.system.log_size_kib,
             log_host=document.system.log_host,
             log_port=document.system.log_port,
@@ -118,6 +119,13 @@ def build(
         sites=MappingProxyType({name: _site(name, item) for name, item in document.sites.items()}),
     )
     return Built(fleet, ())
+
+
+def _zonename(document: SystemDocument) -> str:
+    """Images with zoneinfo packages prefer the name to `timezone`, so UTC is no default beside another time zone."""
+    if document.zonename is not None:
+        return document.zonename
+    return "UTC" if document.timezone == "UTC" else ""
 
 
 def _base(root: MappingNode, *path: str | int) -> str:

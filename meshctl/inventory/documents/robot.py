@@ -104,8 +104,8 @@ class SystemDocument(Document):
 
     timezone: Text = "UTC"
     """POSIX time zone, such as UTC or EST5EDT,M3.2.0,M11.1.0."""
-    zonename: Text = "UTC"
-    """Time zone name, such as America/New_York."""
+    zonename: Text | None = None
+    """Time zone name, such as America/New_York; default: UTC with `timezone: UTC`, otherwise none."""
     log_size_kib: Whole = Field(default=64, ge=8, le=65_536)
     """Size of the log in RAM."""
     log_host: Text = ""

@@ -28,6 +28,8 @@ _KEY_MATERIAL = (
     (re.compile(r"untrusted comment: (?:OpenWrt )?(?:secret|private) key", re.IGNORECASE), "a usign secret key"),
     # a 32-byte key in place of a reference
     (re.compile(r"(?i)\bkeys?\b[\"']?\s*:\s*\[?\s*[\"']?(?:[0-9a-f]{64}\b|[a-z0-9+/]{43}=)"), "a key"),
+    # a key in place of the variable's name
+    (re.compile(r"\benv[\"']?\s*:\s*[\"']?(?=[a-f_]*[0-9])(?:[0-9a-f]{16,}|[0-9A-F]{16,})\b"), "a key"),
     # a value after a telling name
     (
         re.compile(

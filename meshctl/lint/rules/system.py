@@ -68,8 +68,7 @@ def _near_by(name: str) -> list[str]:
 def zone_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     system = fleet.system
     posix = posix_of(system.zonename)
-    # both default to UTC
-    if posix is None or system.zonename == "UTC" or not is_posix(system.timezone):
+    if posix is None or not is_posix(system.timezone):
         return
     if not same_clock(posix, system.timezone):
         yield Finding(("system", "timezone"), f"does not match {system.zonename}", posix, system.timezone)

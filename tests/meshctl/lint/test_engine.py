@@ -96,6 +96,7 @@ def test_key_material_is_found_even_if_the_inventory_does_not_load(tmp_path: Pat
         "  key: 'tPjn8MOpTCGh0tmg9cNudyLRtsjj8EpbnH2OHyo7TF0='",
         "# AGE-SECRET-KEY-1QQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQQ",
         "wpa_key=correcthorse",
+        "  key: {env: b4f8e7f0c3a94c21a1d2d9a0f5c36e77}",
     ],
 )
 def test_key_material_on_any_line_is_reported_without_showing_it(line: str, tmp_path: Path) -> None:

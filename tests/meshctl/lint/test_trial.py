@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.diagnostics import Diagnostic
+from meshctl.inventory import load_fleet
 from meshctl.lint import Example, check_path
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
 from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_package
@@ -241,12 +242,18 @@ def test_strings_libc_cannot_parse_are_not_posix_time_zones(text: str) -> None:
         ("MST7MDT,M3.2.0,M11.1.0", "America/Boise", []),
         ("<-07>7<-06>,M3.2.0,M11.1.0", "America/Denver", []),
         ("EST5EDT,M3.2.0,M11.1.0", "America/New York", []),
-        # the name left at its default
-        ("MST7MDT,M3.2.0,M11.1.0", "UTC", []),
+        ("MST7MDT,M3.2.0,M11.1.0", "UTC", ["MC233"]),
+        ("MST7MDT,M3.2.0,M11.1.0", "", []),
     ],
 )
 def test_timezone_and_zonename_must_agree(timezone: str, zonename: str, codes: list[str], tmp_path: Path) -> None:
     assert _codes(f"system: {{timezone: '{timezone}', zonename: '{zonename}'}}", tmp_path) == codes
+
+
+def test_a_time_zone_without_a_name_is_not_overridden_by_utc(tmp_path: Path) -> None:
+    west = write(Example("system: {timezone: 'MST7MDT,M3.2.0,M11.1.0'}"), tmp_path)
+    assert load_fleet(west).system.zonename == ""
+    assert load_fleet(write(Example("system: {log_size_kib: 32}"), tmp_path)).system.zonename == "UTC"
 
 
 @pytest.mark.parametrize(
