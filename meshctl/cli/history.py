@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson
+from meshctl.cli.history_follow import concerns, is_pattern
 from meshctl.cli.history_follow import follow as follow_runs
 from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.errors import InputError
@@ -24,7 +25,9 @@ from meshctl.report.changed_options import diff_lines, summary
 
 def history(
     run: Annotated[int | None, typer.Argument(help="Run number; shows its nodes and steps.")] = None,
-    node: Annotated[str | None, typer.Option("--node", help="Only runs or steps of this node.")] = None,
+    node: Annotated[
+        str | None, typer.Option("--node", help="Only runs or steps of this node; a name or a pattern.")
+    ] = None,
     fleet: Annotated[str | None, typer.Option("--fleet", help="Only runs of this fleet.")] = None,
     lab: Annotated[
         bool | None, typer.Option("--virtual/--real", help="Only runs in a lab, or only on real nodes.")
@@ -40,6 +43,11 @@ def history(
 
     Example: meshctl history 12 --node b03
     """
+    if node is not None and (set(node) & set("@!:,") or not node):
+        raise InputError(
+            f"--node {node}: expected a name or a pattern such as 'b*'",
+            hint="history needs no inventory, so it knows no groups",
+        )
     if follow and run is not None:
         raise InputError("--follow shows all runs", hint="leave out the run number, or narrow with --node")
     with open_journal(os.environ, echo_error) as journal:
@@ -65,7 +73,10 @@ class _RunFilter:
 
 
 def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json: bool) -> None:
-    found = journal.runs(node=run_filter.node, limit=None)
+    node = run_filter.node
+    found = journal.runs(node=None if is_pattern(node) else node, limit=None)
+    if is_pattern(node):
+        found = tuple(run for run in found if any(concerns(node, one.node) for one in journal.outcomes(run.id)))
     records = tuple(islice((record for record in found if run_filter.matches(record)), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
@@ -93,7 +104,7 @@ def _list_group(journal: Journal, records: list[RunRecord], node: str | None) ->
         cells = [cell.ljust(width) for cell, width in zip(row[1:5], widths[1:], strict=True)]
         echo("  ".join([row[0].rjust(widths[0]), *cells, row[5]]).rstrip())
         for outcome in journal.outcomes(record.id) if record is not None and node is not None else ():
-            if outcome.node == node:
+            if concerns(node, outcome.node):
                 echo(f"{'':{widths[0]}}  {outcome}")
 
 
@@ -105,10 +116,10 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
     record = journal.run(run_id)
     if record is None:
         raise InputError(f"run {run_id} does not exist", hint="run `meshctl history` to list all runs")
-    outcomes = [outcome for outcome in journal.outcomes(run_id) if node in (None, outcome.node)]
+    outcomes = [outcome for outcome in journal.outcomes(run_id) if concerns(node, outcome.node)]
     if not outcomes and node is not None:
         raise InputError(f"{node} was not part of run {run_id}", hint=f"`meshctl history {run_id}` lists its nodes")
-    steps = journal.steps(run_id, node)
+    steps = [step for step in journal.steps(run_id) if concerns(node, step.node)]
     changes = _changes(journal, run_id)
     if as_json:
         document = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 from meshctl.cli.output import echo, echo_json
 from meshctl.fleet.journal import Journal, RunRecord
@@ -88,7 +89,16 @@ def happenings(
 
 
 def _outcomes(journal: Journal, run: RunRecord, node: str | None) -> list[Outcome]:
-    return [each for each in journal.outcomes(run.id) if node in (None, each.node)]
+    return [each for each in journal.outcomes(run.id) if concerns(node, each.node)]
+
+
+def is_pattern(node: str | None) -> bool:
+    return node is not None and bool(set(node) & set("*?["))
+
+
+def concerns(node: str | None, name: str) -> bool:
+    """Whether `name` is the node, or one of those, that `--node` names; None: all."""
+    return node is None or fnmatchcase(name, node)
 
 
 def _results(outcomes: Iterable[Outcome]) -> dict[str, Result]:

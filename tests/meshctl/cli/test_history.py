@@ -67,6 +67,17 @@ def test_runs_are_filtered_by_fleet_and_by_real_or_virtual(
     assert {run["lab"] for run in listed} <= {"", "/lab"}
 
 
+@pytest.mark.usefixtures("journal")
+def test_a_pattern_selects_the_runs_of_its_nodes(capfd: pytest.CaptureFixture[str]) -> None:
+    assert said(capfd, "--node", "b0*").count("b01: done") == 4
+    assert said(capfd, "1", "--node", "b?1").count("b01: done") == 1
+    assert said(capfd, "--node", "rover*") == "no runs of rover* yet\n"
+    with pytest.raises(SystemExit) as ended:
+        main(["history", "--node", "role:beacon"])
+    assert ended.value.code == 2
+    assert "expected a name or a pattern" in capfd.readouterr().err
+
+
 def test_the_command_for_what_a_run_left_is_one_that_takes_the_run_up() -> None:
     assert retry_command("provision") == "meshctl resume"
     # `meshctl resume` refuses these
