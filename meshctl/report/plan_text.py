@@ -89,11 +89,14 @@ def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
     """The totals and the nodes left out, repeated since the first lines have scrolled off the screen."""
     yield Line("")
     yield Line(_totals(plan), "bold")
-    for node in nodes:
+    for group in _grouped(nodes, with_diffs=False):
+        node = group[0]
         if node.verdict in (Verdict.AWAY, Verdict.REFUSED):
             style = "yellow" if node.verdict is Verdict.AWAY else "red"
             # the error of a failed connection starts with the node
             who = "" if node.reason.startswith(node.node) else f"{node.node}, "
+            if len(group) > 1:
+                who = f"{', '.join(one.node for one in group)}: "
             yield Line(f"  {node.verdict.value}: {who}{node.reason}", style)
 
 
@@ -129,7 +132,7 @@ def _ways(plan: Plan) -> Iterator[Line]:
 
 
 def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[NodePlan, ...]]:
-    """Nodes with the same changes grouped, in the order of their first node."""
+    """Nodes with the same changes, or the same reason for none, grouped, in the order of their first node."""
     groups: dict[object, list[NodePlan]] = {}
     for node in nodes:
         groups.setdefault(_effect_key(node, with_diffs=with_diffs), []).append(node)
@@ -138,7 +141,7 @@ def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[N
 
 def _effect_key(node: NodePlan, *, with_diffs: bool) -> object:
     if node.verdict is not Verdict.CHANGE:
-        return node.node
+        return node.verdict, node.reason, node.hint
     return (
         *(node.cut, node.splits, node.firmware, node.packages, node.effects, node.notes),
         tuple((one.path, one.kind, changed_lines(one) if with_diffs else summary(one)) for one in node.files),
@@ -152,9 +155,11 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
             return
         case Verdict.AWAY | Verdict.REFUSED:
             yield Line("")
-            yield Line(
-                f"{node.node}  {node.verdict.value}: {node.reason}", "yellow" if node.verdict is Verdict.AWAY else "red"
-            )
+            who = node.node if len(group) == 1 else f"{len(group)} nodes"
+            style = "yellow" if node.verdict is Verdict.AWAY else "red"
+            yield Line(f"{who}  {node.verdict.value}: {node.reason}", style)
+            if len(group) > 1:
+                yield Line(f"  {', '.join(one.node for one in group)}")
             if node.hint:
                 yield Line(f"  hint: {node.hint}")
             return

@@ -123,6 +123,16 @@ def test_the_last_lines_repeat_the_totals_and_the_excluded_nodes() -> None:
     ]
 
 
+def test_nodes_refused_for_the_same_reason_form_one_block() -> None:
+    refused = {name: NodePlan(name, Verdict.REFUSED, reason="it has no port eth9", hint="correct it") for name in ORDER}
+    refused["odd"] = NodePlan("odd", Verdict.REFUSED, reason="wrong board")
+    text = read(Plan("team", 0.0, "b00", refused), order=ORDER)
+    assert "15 nodes  refused: it has no port eth9\n  b00, b01, b02," in text
+    assert text.count("it has no port eth9") == 2
+    assert ", b12, uav1-radio, gone: it has no port eth9\n  refused: odd, wrong board" in text
+    assert text.count("hint: correct it") == 1
+
+
 def test_a_mesh_change_shows_each_members_reason() -> None:
     text = read(large(), order=ORDER)
     assert ", b11, b12: channel\n" in text
