@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from meshctl.model import Fleet
+from meshctl.plan.cell import LEAVES_MESH
 from meshctl.plan.order import MeshContext, stages_of, stages_together
 from meshctl.plan.switch import MeshSwitches, switches
 from meshctl.plan.values import Cut, NodePlan, Plan, Stage, StageKind, Verdict
@@ -54,7 +55,7 @@ def fleet_plan(
         else ways_of(in_order, at_once, plans, measured, quorum=fleet.apply.quorum, window_s=max(windows, default=0))
     )
     notes = [
-        f"{name}: alone in its cell; it rejoins its mesh ({', '.join(plans[name].splits)})"
+        f"{name}: changes its cell alone ({', '.join(plans[name].splits)}): the others already run the inventory's"
         for name in plans
         if plans[name].verdict is Verdict.CHANGE
         and plans[name].splits
@@ -62,7 +63,7 @@ def fleet_plan(
     ]
     notes += [
         f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} "
-        f"{'may' if plans[stage.nodes[0]].cut <= Cut.WEAK_LINKS else 'will'} be unreachable meanwhile"
+        f"{_cut_off_for(plans[stage.nodes[0]])}"
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
     ]
@@ -78,6 +79,13 @@ def fleet_plan(
         ways,
         measured.text if ways else "",
     )
+
+
+def _cut_off_for(plan: NodePlan) -> str:
+    """Whether, and how long, the nodes behind this one are cut off."""
+    if any(split.endswith(LEAVES_MESH) for split in plan.splits):
+        return "will be unreachable from then on, unless another node relays for them"
+    return f"{'may' if plan.cut <= Cut.WEAK_LINKS else 'will'} be unreachable meanwhile"
 
 
 def _refused_together(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) -> tuple[str, str]:

@@ -13,6 +13,9 @@ from meshctl.uci import Package, Section
 # batman-adv's default without the option (openwrt-facts.md section 1)
 DEFAULT_ROUTING = "BATMAN_IV"
 
+# the difference of a radio that is in no cell any more
+LEAVES_MESH = "leaves the mesh"
+
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -87,5 +90,5 @@ def partitions(before: Mapping[str, Cell], after: Mapping[str, Cell]) -> dict[st
     return {
         radio: changed
         for radio, cell in before.items()
-        if (changed := differences(cell, after[radio]) if radio in after else ("leaves the mesh",))
+        if (changed := differences(cell, after[radio]) if radio in after else (LEAVES_MESH,))
     }

@@ -53,6 +53,21 @@ def test_a_node_in_two_meshes_switches_with_the_changed_one() -> None:
     assert switches_of(two_meshes(far_channel=40)) == [("far", {"b02", "b03", "b04"})]
 
 
+def test_a_relay_that_leaves_a_mesh_cuts_off_what_is_behind_it_for_good() -> None:
+    team = two_meshes()
+    relay = team.nodes["b02"]
+    alone = replace(
+        relay, radios=tuple(replace(one, mesh=one.mesh if one.mesh == "main" else None) for one in relay.radios)
+    )
+    new = replace(team, nodes=MappingProxyType({**team.nodes, "b02": alone}))
+    seen = {name: running(team, name) for name in new.nodes}
+    notes = fleet_plan(new, plans(new, seen), graph("base-b01", "b01-b02", "b02-b03", "b03-b04"), now_s=0.0).notes
+    assert notes == (
+        "b02: changes its cell alone (radio1: leaves the mesh): the others already run the inventory's",
+        "stage 1: b02 is a cut vertex: b03, b04 will be unreachable from then on, unless another node relays for them",
+    )
+
+
 def test_a_switch_leaves_nodes_behind_only_if_acknowledged() -> None:
     plan = changed_channel(away=("b03",))
     assert "would leave behind b03" in plan.refusal
@@ -116,7 +131,7 @@ def test_a_base_without_neighbors_cannot_leave_its_mesh_unacknowledged() -> None
 def test_a_stray_node_rejoins_its_mesh_without_a_switch() -> None:
     plan = changed_channel(already=TEAM[:5])
     assert [(stage.kind, stage.nodes) for stage in plan.stages] == [(StageKind.ROLLING, ("b05",))]
-    assert plan.notes[0].startswith("b05: alone in its cell")
+    assert plan.notes[0].startswith("b05: changes its cell alone (radio0: ")
 
 
 def test_a_switch_with_a_refused_member_is_refused() -> None:
