@@ -137,6 +137,19 @@ def test_a_node_is_reachable_only_at_its_new_address_after_a_change(fleet: Virtu
     transport.close()
 
 
+def test_static_routes_are_in_the_kernel_and_follow_the_address(node: VirtualNode) -> None:
+    node.exec(
+        "uci set network.far=route; uci set network.far.interface=lan; uci set network.far.target=10.43.1.0/24; "
+        "uci set network.far.gateway=192.168.1.7; uci commit network; reload_config"
+    ).check("add")
+    until(lambda: "10.43.1.0/24 via 192.168.1.7" in node.exec("ip route").stdout, "the route")
+    node.exec("uci set network.lan.netmask=255.255.0.0; uci commit network; reload_config").check("widen")
+    until(lambda: "192.168.0.0/16" in node.exec("ip route").stdout, "the wider network")
+    until(lambda: "10.43.1.0/24 via 192.168.1.7" in node.exec("ip route").stdout, "the same route")
+    node.exec("uci delete network.far; uci commit network; reload_config").check("remove")
+    until(lambda: "10.43.1.0" not in node.exec("ip route").stdout, "its end")
+
+
 def test_a_network_without_a_firewall_zone_is_unreachable(fleet: VirtualFleet, node: VirtualNode) -> None:
     node.exec("uci delete firewall.@zone[0]; uci commit; reload_config").check("close")
     until(lambda: not answers(node.bench), "the firewall")

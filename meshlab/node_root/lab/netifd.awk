@@ -1,7 +1,7 @@
 # Stand-in for netifd, the model. Input: `uci export network; uci export wireless`.
 #
 # sections -> which radio interfaces come up -> which devices exist -> which interfaces are up
-#   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/effective, run/sys (a shell script)
+#   -> run/dump, run/wireless (JSON for ubus), run/iw, run/addresses.new, run/routes.new, run/effective, run/sys (a shell script)
 #
 # Setting up radios takes time, so a change has two phases. Phase 1: everything else is as configured; radios whose
 # configuration differs from run/radios are pending, and their interfaces that will be recreated are gone. Phase 2: all is
@@ -333,8 +333,8 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 	print dump "\n\t]\n}" > (run "/dump")
 }
 
-# static routes of interfaces that are up: "route DEVICE TARGET PREFIX GATEWAY"
-function routes(    i, id, device, target, mask) {
+# static routes of interfaces that are up: "route DEVICE TARGET PREFIX GATEWAY", and those with a gateway for the kernel
+function routes(    i, id, device, target, mask, kernel) {
 	for (i = 1; i <= sections; i++) {
 		id = order[i]
 		if (kind[id] != "network.route" || !(get(id, "interface", "") in up_device)) continue
@@ -342,7 +342,9 @@ function routes(    i, id, device, target, mask) {
 		target = get(id, "target", "0.0.0.0"); mask = get(id, "netmask", "255.255.255.255")
 		if (target ~ /\//) { mask = target; sub(/.*\//, "", mask); sub(/\/.*/, "", target) }
 		effective = effective "route\t" device "\t" target "\t" prefix(mask) "\t" get(id, "gateway", "") "\n"
+		if (get(id, "gateway", "") != "") kernel = kernel device " " target "/" prefix(mask) " " get(id, "gateway", "") "\n"
 	}
+	printf "%s", kernel > (run "/routes.new")
 }
 
 function wireless_status(    i, d, text, n, list, j, id, m, k, o, first) {
