@@ -211,8 +211,7 @@ def resume(
         if record.command == "rollback":
             hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
             raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
-        if '"sites"' in record.plan:
-            meet(opened, record, as_json=as_json)
+        if meet(opened, record, as_json=as_json):
             left = opened.journal.unfinished(record.id)
         names = _still_managed(opened, left)
         if not names:

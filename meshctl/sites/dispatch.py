@@ -204,7 +204,8 @@ class SiteExecution:
             if event.outcome is not None:
                 self._finish(run, event.outcome, at_s=event.at_s)
             else:
-                run.in_work.add(event.node)
+                if event.node:
+                    run.in_work.add(event.node)
                 self.observer(event)
         for outcome in final_outcomes(objects).values():
             if outcome.node in run.nodes and run.outcomes.get(outcome.node) != outcome:
