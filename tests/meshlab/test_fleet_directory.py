@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 from pathlib import Path
@@ -14,6 +15,7 @@ from meshctl.cli.main import build
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.lab_directory import INVENTORY, MARK, lab_of
 from meshctl.inventory import load_fleet
+from meshctl.inventory.secrets import SecretStore
 from meshctl.resources import shipped
 from meshlab import fleet_directory
 from meshlab.control import address_of
@@ -57,6 +59,25 @@ def test_a_fleet_with_19_07_gets_an_rsa_key_in_a_reused_lab_directory(tmp_path: 
         assert keys[-1].strip() in copy.fleet.operators.ssh_keys
     assert [key.split()[0] for key in keys] == ["ssh-ed25519", "ssh-rsa", "ssh-rsa"]
     assert keys[1] == keys[2]
+
+
+def test_secrets_beside_the_inventory_are_still_found_from_the_copy(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project / "inventory")
+    (project / "secrets.yaml").write_text("mesh: outside\ntransport: outside, too\n")
+    (project / "inventory/own.yaml").write_text("transport: inside\n")
+    text = (project / "inventory/fleet.yaml").read_text()
+    keys = "keys: [{file: own.yaml, key: transport}, {file: ../secrets.yaml, key: transport}]"
+    text = re.sub(r"encryption: \w+", "encryption: psk2+ccmp\n    key: {file: ../secrets.yaml, key: mesh}", text)
+    text, count = re.subn(r"\n  keys: .*", f"\n  {keys}", text)
+    assert count == 1, text
+    (project / "inventory/fleet.yaml").write_text(text)
+    fleet = copy_inventory(project / "inventory", tmp_path / "lab").fleet
+    store = SecretStore({}, Path(fleet.base))
+    mesh = next(iter(fleet.meshes.values()))
+    assert mesh.key is not None
+    assert store.get(mesh.key).reveal() == "outside"
+    assert [store.get(key).reveal() for key in fleet.udp_mesh.keys] == ["inside", "outside, too"]
 
 
 def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
