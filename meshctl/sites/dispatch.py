@@ -27,6 +27,8 @@ from meshctl.sites.uplink import Uplink
 
 # Uplinks wait far more than they work.
 MAX_SITES_AT_ONCE = 64
+# How often an uplink may be lost while its site plans.
+PLAN_ATTEMPTS = 4
 _FIRST_WAIT_S = 1.0
 _LONGEST_WAIT_S = 15.0
 _WATCH_S = 0.25
@@ -84,9 +86,19 @@ def prepare_sites(
         try:
             bundle = bundle_of(plan.site.name)
             plan.part_sha256 = bundle.sha256
-            plan.uplink = Uplink(fleet, plan.site, access)
-            plan.uplink.send_images(bundle.image_files)
-            plan.text, _ = plan.uplink.plan(plan.run, bundle.archive, bundle.images, plan.nodes, options)
+            for attempt in range(PLAN_ATTEMPTS):
+                try:
+                    plan.uplink = Uplink(fleet, plan.site, access)
+                    plan.uplink.send_images(bundle.image_files)
+                    plan.text, _ = plan.uplink.plan(plan.run, bundle.archive, bundle.images, plan.nodes, options)
+                    break
+                except Unreachable:
+                    # an uplink that comes and goes is tried again; one that is not there is reported at once
+                    if plan.uplink is None or attempt + 1 == PLAN_ATTEMPTS:
+                        raise
+                    plan.close()
+                    plan.run = new_run_id()
+                    time.sleep(_FIRST_WAIT_S * 2**attempt)
             plan.saved = load(plan.text, f"the plan of site {plan.site.name}")
         except MeshctlError as error:
             plan.error = error

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from meshctl import __version__
-from meshctl.device.errors import CommandEnded
+from meshctl.device.errors import CommandEnded, ConnectionLost
 from meshctl.device.ssh_stream import LineStream
 from meshctl.device.upload import upload
 from meshctl.errors import InputError
@@ -20,6 +21,7 @@ from meshctl.sites.gateway import WORKER_PROGRAM
 from meshctl.sites.order import SignedOrder
 from meshctl.sites.protocol import PROTOCOL, SILENCE_S, decode, encode, raise_error
 
+_FINISH_S = 2.0
 # Of a shell that cannot start a command (POSIX, Shell Command Language, 2.8.2).
 _NOT_THERE = (126, 127)
 
@@ -167,6 +169,14 @@ class Uplink:
                     return bool(message["reply"]["stopping"])
 
     def close(self) -> None:
+        """Close the connection, and let the worker delete what it planned and was not ordered."""
+        if self._connection.is_open:
+            with suppress(ConnectionLost):
+                self._stream.send(encode({"do": "finish"}), timeout_s=_FINISH_S)
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Close the connection as if it were lost."""
         self._stream.close()
         self._connection.close()
 

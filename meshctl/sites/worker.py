@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import os
 import subprocess
 import threading
 import time
@@ -19,7 +18,7 @@ from typing import Any, BinaryIO
 
 from meshctl import __version__
 from meshctl.device.connection import fingerprint_of
-from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.errors import InputError, MeshctlError
 from meshctl.sites import runner
 from meshctl.sites.events import condensed
 from meshctl.sites.order import SignedOrder, operator_keys
@@ -27,6 +26,8 @@ from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, PROTOCOL, WorkerErr
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json
 
 _POLL_S = 0.25
+# How long a plan waits for an order whose uplink was lost.
+LINGER_S = 600.0
 _MAX_ERROR_LINES = 20
 
 
@@ -41,18 +42,19 @@ class Worker:
         self._lock = threading.Lock()
         # reaped, so that the process of a run that was killed does not look alive
         self._runners: list[subprocess.Popen[bytes]] = []
-        # planned over this uplink; what is not ordered before its end is deleted, since it has secrets
         self._planned: list[RunDirectory] = []
+        # whether the operator said that no order will come
+        self._is_finished = False
+        self._is_lost = False
 
     def serve(self) -> None:
-        """Answer requests until the end of the input. A reader that is gone ends the process."""
+        """Answer requests until the end of the input."""
         self._directory.root.mkdir(parents=True, exist_ok=True, mode=0o700)
         self._directory.clean()
         threading.Thread(target=self._beat, name="beat", daemon=True).start()
         for line in self._requests:
             try:
-                request = decode(line)
-                self._answer(request)
+                self._answer(decode(line))
             except MeshctlError as error:
                 self._send(error_message(error))
             except (KeyError, TypeError, ValueError) as error:
@@ -62,9 +64,14 @@ class Worker:
         self._forget_planned()
 
     def _forget_planned(self) -> None:
-        for run in self._planned:
-            if not run.order.exists():
-                run.discard()
+        """Delete what was planned over this uplink and is not ordered, since it has secrets. After an uplink that was
+        lost, the next one may bring the order: it has some minutes."""
+        until_s = time.monotonic() + (0.0 if self._is_finished else LINGER_S)
+        while left := [run for run in self._planned if run.inventory.exists() and not run.order.exists()]:
+            if time.monotonic() >= until_s:
+                for run in left:
+                    run.discard()
+            time.sleep(_POLL_S)
 
     def _answer(self, request: Mapping[str, Any]) -> None:
         match request["do"]:
@@ -84,6 +91,8 @@ class Worker:
                 self._reply({"stopping": runner.stop(self._directory.run(str(request["run"])))})
             case "status":
                 self._reply(self._status(request))
+            case "finish":
+                self._is_finished = True
             case unknown:
                 raise InputError(f"unknown request {unknown!r}", hint="run `meshctl sites install`")
 
@@ -147,7 +156,7 @@ class Worker:
         """Send the run's events from `offset` (bytes) on until it is over."""
         if not run.order.exists():
             raise InputError(f"run {run.path.name} has not been started at this site")
-        while True:
+        while not self._is_lost:
             self._reap()
             # its end is looked up before the events: those written before it are then read as well
             over, is_alive = read_json(run.over), run.is_alive()
@@ -177,12 +186,11 @@ class Worker:
                 self._out.write(encode(message) + b"\n")
                 self._out.flush()
         except (OSError, ValueError):
-            # the uplink is gone: the runs are not this process's, and its threads have nothing left to do
-            self._forget_planned()
-            os._exit(int(ExitCode.OK))
+            # the input ends, too; the runs are not this process's
+            self._is_lost = True
 
     def _beat(self) -> None:
-        while True:
+        while not self._is_lost:
             time.sleep(BEAT_S)
             self._send({"beat": BEAT_S})
 

@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from meshctl import __version__
 from meshctl.archive import TarMember, tar_of
 from meshctl.sites.protocol import PROTOCOL
@@ -44,6 +46,7 @@ def _worker(directory: Path) -> Iterator[WorkerProcess]:
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
         yield WorkerProcess(process)
         assert process.stdin is not None
+        process.stdin.write(b'{"do": "finish"}\n')
         process.stdin.close()
         assert process.wait(60) == 0
 
@@ -90,9 +93,30 @@ def test_what_meshctl_says_against_the_inventory_is_the_reply(tmp_path: Path) ->
     assert list(tmp_path.rglob("fleet.yaml")) == []
 
 
-def test_a_plan_that_is_not_ordered_is_deleted_with_its_uplink(tmp_path: Path) -> None:
-    part = base64.b64encode(tar_of([TarMember("fleet.yaml", b"meshctl: 1\nfleet: mines\ncountry: US\n")])).decode()
+_PART = base64.b64encode(tar_of([TarMember("fleet.yaml", b"meshctl: 1\nfleet: mines\ncountry: US\n")])).decode()
+_PLAN = {"do": "plan", "run": _RUN, "part": _PART, "images": {}, "nodes": [], "options": []}
+
+
+def test_a_plan_is_deleted_when_the_operator_is_finished(tmp_path: Path) -> None:
     with _worker(tmp_path) as worker:
-        assert "plan" in worker.ask(do="plan", run=_RUN, part=part, images={}, nodes=[], options=[])["reply"]
+        assert "plan" in worker.ask(**_PLAN)["reply"]
         assert len(list(tmp_path.rglob("fleet.yaml"))) == 1
     assert list(tmp_path.rglob("fleet.yaml")) == []
+
+
+def test_a_plan_waits_for_its_order_when_the_uplink_is_lost(tmp_path: Path) -> None:
+    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
+    command = [sys.executable, "-m", "meshctl", "worker", "--stdio", "mines/north"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+        assert "plan" in WorkerProcess(process).ask(**_PLAN)["reply"]
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.close()
+        process.stdout.close()
+        (inventory,) = tmp_path.rglob("inventory")
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(2)
+        # the next uplink brought the order: the run is not this process's anymore
+        (inventory.parent / "order.json").write_text("{}")
+        assert process.wait(60) == 0
+        assert inventory.exists()
