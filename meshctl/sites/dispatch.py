@@ -28,7 +28,7 @@ from meshctl.sites.uplink import Uplink
 # Uplinks wait far more than they work.
 MAX_SITES_AT_ONCE = 64
 # How often an uplink may be lost while its site plans.
-PLAN_ATTEMPTS = 4
+PLAN_ATTEMPTS = 8
 _FIRST_WAIT_S = 1.0
 _LONGEST_WAIT_S = 15.0
 _WATCH_S = 0.25
@@ -98,7 +98,7 @@ def prepare_sites(
                         raise
                     plan.close()
                     plan.run = new_run_id()
-                    time.sleep(_FIRST_WAIT_S * 2**attempt)
+                    time.sleep(min(_FIRST_WAIT_S * 2**attempt, _LONGEST_WAIT_S))
             plan.saved = load(plan.text, f"the plan of site {plan.site.name}")
         except MeshctlError as error:
             plan.error = error
