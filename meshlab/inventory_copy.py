@@ -88,7 +88,8 @@ def _secrets_outside(fleet: Fleet, folder: Path) -> Iterator[tuple[tuple[str, ..
         for name, text in (*filter(None, (written.get(ref.kind),)), ("identity", ref.identity)):
             path = Path(ref.base, text)
             is_relative = bool(text) and not text.startswith(("/", "~"))
-            if is_relative and not path.resolve().is_relative_to(folder.resolve()):
+            # one that is not there may be meant to be made beside the copy
+            if is_relative and path.exists() and not path.resolve().is_relative_to(folder.resolve()):
                 yield (*place, name), str(path.resolve())
 
 

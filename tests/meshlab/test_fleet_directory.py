@@ -80,6 +80,16 @@ def test_secrets_beside_the_inventory_are_still_found_from_the_copy(tmp_path: Pa
     assert [store.get(key).reveal() for key in fleet.udp_mesh.keys] == ["inside", "outside, too"]
 
 
+def test_secrets_that_are_not_there_yet_are_expected_beside_the_copy(tmp_path: Path) -> None:
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project / "inventory")
+    first = project / "inventory/fleet.yaml"
+    first.write_text(first.read_text().replace("{env: UDP_MESH_KEY}", "{file: ../keys.yaml, key: transport}"))
+    fleet = copy_inventory(project / "inventory", tmp_path / "lab").fleet
+    (tmp_path / "lab/keys.yaml").write_text("transport: made later\n")
+    assert SecretStore({}, Path(fleet.base)).get(fleet.udp_mesh.keys[0]).reveal() == "made later"
+
+
 def test_the_inventory_s_own_directory_is_refused(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project)
