@@ -159,7 +159,7 @@ class SiteExecution:
 
     def _execute_site(self, run: SiteRun) -> None:
         wait_s, contact_s = _FIRST_WAIT_S, time.monotonic()
-        while not run.is_over and not self.interrupt.leaving and time.monotonic() - contact_s < GIVE_UP_S:
+        while not run.is_over and not self._leaves(run) and time.monotonic() - contact_s < GIVE_UP_S:
             try:
                 offset = run.offset
                 self._stay(run)
@@ -174,13 +174,20 @@ class SiteExecution:
                 self.interrupt.wait(wait_s)
                 wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             except MeshctlError as error:
-                self._finish_all(run, Result.FAILED if run.is_started else Result.REFUSED, str(error), error.hint)
+                # such as a gateway with another host key: the run itself may well continue there
+                self._finish_all(run, Result.UNCERTAIN if run.is_started else Result.REFUSED, str(error), error.hint)
                 run.is_over = True
             finally:
                 self._close(run)
         if not run.is_over:
-            text = f"site {run.site.name} continues on its own" if run.is_started else "it did not start"
+            text = f"site {run.site.name} continues on its own"
+            if not run.is_started:
+                text = "it has not started, or the uplink was lost just then"
             self._finish_all(run, Result.PENDING, text, "run `meshctl resume` to see how it ended")
+
+    def _leaves(self, run: SiteRun) -> bool:
+        """Whether the operator wants to wait no longer for this run, or for its start."""
+        return self.interrupt.leaving or (self.interrupt.stopping and not run.is_started)
 
     def _stay(self, run: SiteRun) -> None:
         """Connect if necessary, start the run if it has not been, and follow it to its end."""
