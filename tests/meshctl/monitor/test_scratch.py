@@ -15,6 +15,7 @@ import pytest
 
 from meshctl.monitor.scratch import MARK, PREFIX, remove_leftovers, scratch_directory
 
+# short sleeps: a signal that comes right before a long one would be handled after it
 HOLD = """
 import sys, time
 from pathlib import Path
@@ -22,7 +23,8 @@ from meshctl.monitor.scratch import scratch_directory
 with scratch_directory(Path(sys.argv[1])) as directory:
     (directory / "page").write_text("unfinished")
     print(directory, flush=True)
-    time.sleep(600)
+    while True:
+        time.sleep(0.1)
 """
 
 
