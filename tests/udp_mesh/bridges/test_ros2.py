@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -296,7 +298,12 @@ def test_a_cut_ends_calls_and_short_actions_and_nothing_else(whole: Team) -> Non
     for name, order in ((short, 1000), (count, 60)):
         bob.node.request("goal", name, order=order)
         assert bob.node.expect("accepted")["accepted"] is True
+    # A busy caller reads the response after the service was withdrawn.
+    bob.node.process.send_signal(signal.SIGSTOP)
     whole.cut()
+    poll(lambda: "service=/short/_action/get_result" in bob.bridge.log.read_text(), "the call has been ended")
+    time.sleep(1.0)
+    bob.node.process.send_signal(signal.SIGCONT)
     assert bob.node.expect("result", short)["status"] == ABORTED
     poll(lambda: not bob.node.is_available("/alice/mesh_comm/bob/reset"), "reset is gone")
     whole.join()

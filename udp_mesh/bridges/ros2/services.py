@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from typing import Any, Callable, Deque, Dict, Iterable, List, Tuple
+from typing import Any, Callable, Deque, Dict, Iterable, List, Optional, Tuple
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
@@ -32,6 +32,8 @@ BAD_BYTES = (RuntimeError, TypeError, ValueError)
 """What rclpy raises for bytes that are not of the type."""
 TICK_S = 0.2
 REFRESH_TICKS = 5
+LINGER_S = 5.0
+"""A server that goes takes its unread responses with it (seen with Fast DDS 3.2): a busy caller would wait forever."""
 SEND_GOAL, GET_RESULT, CANCEL_GOAL = "/_action/send_goal", "/_action/get_result", "/_action/cancel_goal"
 FEEDBACK, STATUS = "/_action/feedback", "/_action/status"
 STATUS_TYPE = "action_msgs/msg/GoalStatusArray"
@@ -45,6 +47,7 @@ class _Proxy:
         self._class = interface_class(offer.type, "srv", "action")
         self._headers: Dict[int, Any] = {}
         self._early: Dict[int, Tuple[str, bytes]] = {}
+        self.responded_at: Optional[float] = None
         self._service = node.create_service(
             self._class, name, lambda request, _response: call(bytes(serialize_message(request)))
         )
@@ -74,6 +77,11 @@ class _Proxy:
             answer = failed_response(self.offer.type, self._class.Response(), error)
         if answer is not None:
             self._send(answer, header)
+            self.responded_at = time.monotonic()
+
+    def is_awaited(self, now: float) -> bool:
+        """Whether a caller may not have read its response yet."""
+        return self.responded_at is not None and now - self.responded_at < LINGER_S
 
     def destroy(self, node: Any) -> None:
         node.destroy_service(self._service)
@@ -87,6 +95,7 @@ class Ros2Calls(MeshCalls):
         self._node, self._own, self._options = node, own, options
         self._inbox: Deque[Callable[[], List[CallEffect]]] = deque()
         self._proxies: Dict[Tuple[str, str], _Proxy] = {}
+        self._leaving: Dict[Tuple[str, str], _Proxy] = {}
         self._callers: Dict[int, _Proxy] = {}
         self._publishers: Dict[Tuple[str, str], Any] = {}
         self._clients: Dict[str, Tuple[str, Any]] = {}
@@ -113,6 +122,8 @@ class Ros2Calls(MeshCalls):
         for deadline, client, future in [each for each in self._asked if each[0] <= now]:
             client.remove_pending_request(future)
             self._asked.remove((deadline, client, future))
+        for key in [key for key, proxy in self._leaving.items() if not proxy.is_awaited(now)]:
+            self._leaving.pop(key).destroy(self._node)
         self._ticks += 1
         if self._ticks % REFRESH_TICKS == 1:
             self._refresh()
@@ -192,8 +203,13 @@ class Ros2Calls(MeshCalls):
             self._execute(effects)
             return number
 
+        leaving = self._leaving.pop((peer, offer.name), None)
+        if leaving is not None and leaving.offer.type != offer.type:
+            leaving.destroy(self._node)
+            leaving = None
         try:
-            proxy = _Proxy(self._node, name, offer, call)
+            # one that is back at once keeps the responses that are not read yet
+            proxy = leaving or _Proxy(self._node, name, offer, call)
             if offer.name.endswith(SEND_GOAL):
                 self._publish_events(peer, offer)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
@@ -217,7 +233,9 @@ class Ros2Calls(MeshCalls):
 
     def _remove_proxy(self, peer: str, name: str) -> None:
         proxy = self._proxies.pop((peer, name), None)
-        if proxy is not None:
+        if proxy is not None and proxy.is_awaited(time.monotonic()):
+            self._leaving[peer, name] = proxy
+        elif proxy is not None:
             proxy.destroy(self._node)
         if name.endswith(SEND_GOAL):
             for suffix in (FEEDBACK, STATUS):
