@@ -33,8 +33,8 @@ hardware:
 meshes:
   main: {{ssid: fleet, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}}
 defaults: {{hardware: rocket, state: deployed}}
-nodes:
-  base: {{role: base, address: 10.42.0.1}}
+{sites}nodes:
+  base: {{role: base, address: 10.42.0.1{site}}}
 apply: {{parallel: {parallel}}}
 robots:
 {robots}
@@ -91,9 +91,10 @@ class RobotFleet:
         user: str = "root",
         ros: str = "",
         jump: str = "",
+        gateway: str = "",
         parallel: int = 8,
     ) -> None:
-        """The inventory of all machines, with their host keys pinned."""
+        """The inventory of all machines, with their host keys pinned; `gateway` is the address of a site's gateway."""
         robots = "".join(
             _ROBOT.format(
                 name=name,
@@ -107,7 +108,11 @@ class RobotFleet:
             )
             for number, (name, machine) in enumerate(self.machines.items())
         )
-        self.file.write_text(_INVENTORY.format(robots=robots, parallel=parallel))
+        sites = (
+            f"sites: {{field: {{ssh: {{host: {gateway}, user: root, key_files: [operator]}}}}}}\n" if gateway else ""
+        )
+        site = ", site: field" if gateway else ""
+        self.file.write_text(_INVENTORY.format(robots=robots, parallel=parallel, sites=sites, site=site))
         trust = TrustStore(self.directory / "known_hosts")
         for name, machine in self.machines.items():
             trust.replace(f"robot.{name}", machine.host_key)

@@ -49,6 +49,15 @@ def test_a_robot_behind_its_radio_is_deployed_from_cached_pip_packages(
         TrustStore(fleet.directory / "known_hosts").replace("base", radio.host_key)
         assert "pinned now" in fleet.meshctl("trust", "--yes", "--key", str(fleet.key))
         assert "husky1: unchanged" in fleet.meshctl("deploy", "--key", str(fleet.key))
+        # the gateway of a site is such a way, too, with a key of its own
+        fleet.write(gateway="10.42.0.1")
+        unknown = fleet.meshctl("deploy", exit_code=1)
+        assert "run `meshctl sites trust field`" in unknown
+        TrustStore(fleet.directory / "known_hosts").replace("site.field", radio.host_key)
+        assert "husky1: unchanged" in fleet.meshctl("deploy")
+        assert fleet.status()["husky1"]["well"]
+        fleet.add_topic("position: {priority: 4}")
+        assert "husky1: done: runs " in fleet.meshctl("deploy")
     finally:
         fleet.stop()
         radio.stop()
