@@ -105,8 +105,11 @@ class Uplink:
         return self._reply()
 
     def _reply(self) -> dict[str, Any]:
+        return self._reply_on(self._stream)
+
+    def _reply_on(self, stream: LineStream) -> dict[str, Any]:
         while True:
-            message = decode(self._stream.receive(timeout_s=SILENCE_S))
+            message = decode(stream.receive(timeout_s=SILENCE_S))
             raise_error(message, self.site.name)
             reply = message.get("reply")
             if isinstance(reply, dict):
@@ -162,11 +165,7 @@ class Uplink:
         """Ask a run to stop, through a worker of its own: this one may be followed by another thread."""
         with self._start() as stream:
             stream.send(encode({"do": "stop", "run": run}), timeout_s=SILENCE_S)
-            while True:
-                message = decode(stream.receive(timeout_s=SILENCE_S))
-                raise_error(message, self.site.name)
-                if "reply" in message:
-                    return bool(message["reply"]["stopping"])
+            return bool(self._reply_on(stream)["stopping"])
 
     def close(self) -> None:
         """Close the connection, and let the worker delete what it planned and was not ordered."""
