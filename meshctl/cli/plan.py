@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -20,24 +19,29 @@ from meshctl.cli.plan_execution import (
     choices_of,
     confirm_and_execute,
     execute_plan,
+    prepare_agreed,
     prepare_plan,
     report_check,
     report_plan,
+    saved_plan,
 )
+from meshctl.cli.saved_site_plans import SavedSitePlans, dump_site_plans, load_site_plans
+from meshctl.cli.site_files import hand_over, with_sent_states
 from meshctl.cli.site_runs import (
     RunOptions,
+    change_everywhere,
     confirm_everywhere,
     execute_everywhere,
     meet,
     prepare_everywhere,
+    prepare_saved,
     report_everywhere,
-    show_everywhere,
     sites_of,
 )
-from meshctl.errors import ExitCode, InputError
+from meshctl.errors import InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict
-from meshctl.plan.saved import SavedPlan, as_agreed, dump, load
+from meshctl.plan.saved import dump, load
 
 NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Do not upgrade firmware.")]
 LeaveBehind = Annotated[
@@ -90,15 +94,15 @@ def plan(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
-            if out is not None:
-                raise InputError(
-                    f"--out: a saved plan is for nodes without a site, and {next(iter(sites.values()))[0]} has one",
-                    hint="`meshctl provision` plans, asks and applies in one go; --direct plans from here",
-                )
-            raise typer.Exit(_plan_everywhere(opened, inventory, own, sites, choices, as_json=as_json, brief=brief))
+            with closing(prepare_everywhere(opened, inventory, own, sites, choices)) as made:
+                if out is not None:
+                    write_file(out, dump_site_plans(made.saved(opened, choices)))
+                raise typer.Exit(report_everywhere(opened, made, choices, as_json=as_json, brief=brief))
+        opened = with_sent_states(opened)
         prepared = prepare_plan(opened, own, choices)
+        hand_over(prepared)
         if out is not None:
-            write_file(out, dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)))
+            write_file(out, dump(saved_plan(opened, prepared, choices)))
         raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
 
 
@@ -120,18 +124,34 @@ def apply(
     except (OSError, UnicodeDecodeError) as error:
         what = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"cannot read {plan_file}: {what}") from error
+    everywhere = load_site_plans(text, str(plan_file))
+    if everywhere is not None:
+        with session(inventory, key_files=key or (), lab=lab) as opened:
+            options = RunOptions("apply", PlanOptions(everywhere.with_firmware), as_json, rate)
+            raise _apply_everywhere(opened, inventory, everywhere, str(plan_file), options, dry_run=dry_run)
     saved = load(text, str(plan_file))
     with session(inventory, key_files=key or (), lab=lab) as opened:
         if saved.plan.fleet != opened.fleet.name:
             raise InputError(
                 f"{plan_file} is for fleet {saved.plan.fleet}, but the inventory is of {opened.fleet.name}"
             )
-        fresh = prepare_plan(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
-        agreed = replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
+        opened = with_sent_states(opened)
+        agreed = prepare_agreed(opened, saved)
         if dry_run:
+            hand_over(agreed)
             choices = PlanOptions(saved.with_firmware)
             raise typer.Exit(report_plan(opened, agreed, choices, as_json=as_json, brief=False))
         execute_plan(opened, agreed, "apply", saved.with_firmware, as_json=as_json, rate=rate)
+
+
+def _apply_everywhere(
+    opened: Session, inventory: Path, saved: SavedSitePlans, file: str, options: RunOptions, *, dry_run: bool
+) -> typer.Exit:
+    with closing(prepare_saved(opened, inventory, saved, file)) as made:
+        if dry_run:
+            return typer.Exit(report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=False))
+        confirm_everywhere(opened, made, yes=True)
+        return execute_everywhere(opened, made, options)
 
 
 def provision(
@@ -161,7 +181,7 @@ def provision(
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
             options = RunOptions("provision", choices, as_json, rate)
-            raise _change_everywhere(
+            raise change_everywhere(
                 opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run, check=check
             )
         prepared = prepare_plan(opened, own, choices)
@@ -208,11 +228,12 @@ def resume(
         if record.command == "restore":
             hint = f"run `meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` to apply the inventory"
             raise InputError(f"run {record.id} restored a backup, which cannot be resumed", hint=hint)
-        if record.command == "rollback":
+        has_met = meet(opened, record, as_json=as_json)
+        if has_met:
+            left = opened.journal.unfinished(record.id)
+        if record.command == "rollback" and (left or not has_met):
             hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
             raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
-        if meet(opened, record, as_json=as_json):
-            left = opened.journal.unfinished(record.id)
         names = _still_managed(opened, left)
         if not names:
             echo(f"run {record.id} is finished: nothing to resume", err=as_json)
@@ -230,7 +251,7 @@ def resume(
         own, sites = sites_of(opened, names, None, direct=direct)
         if sites:
             options = RunOptions("resume", choices, as_json, rate)
-            raise _change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
+            raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
         prepared = prepare_plan(opened, names, choices)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
@@ -240,43 +261,6 @@ def resume(
         confirm_and_execute(
             opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
         )
-
-
-def _plan_everywhere(
-    opened: Session,
-    inventory: Path,
-    own: list[str],
-    sites: Mapping[str, Sequence[str]],
-    choices: PlanOptions,
-    *,
-    as_json: bool,
-    brief: bool,
-) -> ExitCode:
-    with closing(prepare_everywhere(opened, inventory, own, sites, choices)) as made:
-        return report_everywhere(opened, made, choices, as_json=as_json, brief=brief)
-
-
-def _change_everywhere(
-    opened: Session,
-    inventory: Path,
-    own: list[str],
-    sites: Mapping[str, Sequence[str]],
-    options: RunOptions,
-    *,
-    yes: bool,
-    brief: bool,
-    dry_run: bool,
-    check: bool = False,
-) -> typer.Exit:
-    """Plan, show, ask and execute, where some nodes are provisioned by the workers of their sites."""
-    with closing(prepare_everywhere(opened, inventory, own, sites, options.choices)) as made:
-        if dry_run or check:
-            code = report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief)
-            return typer.Exit(ExitCode.FINDINGS if check and made.changing else code)
-        if not options.as_json:
-            show_everywhere(opened, made, brief=brief)
-        confirm_everywhere(opened, made, yes=yes)
-        return execute_everywhere(opened, made, options)
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import json
 import secrets
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
+from typing import Any
 
 import typer
 
 from meshctl.apply.executor import assign_slots, execute, unflushed_since
 from meshctl.apply.prepare import PlanOptions, Prepared, prepare
-from meshctl.apply.rollback import before_state
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
 from meshctl.cli.output import console, echo_error, echo_json
+from meshctl.cli.site_files import at_site, replaced_by
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome
 from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
 from meshctl.model import Fleet
-from meshctl.plan import Plan, Verdict
-from meshctl.plan.saved import SavedPlan, dump
+from meshctl.plan import NodePlan, Plan, Verdict
+from meshctl.plan.saved import SavedPlan, as_agreed, dump
 
 # Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
@@ -64,6 +66,16 @@ def prepare_plan(
     return prepared
 
 
+def saved_plan(opened: Session, prepared: Prepared, choices: PlanOptions) -> SavedPlan:
+    return SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)
+
+
+def prepare_agreed(opened: Session, saved: SavedPlan) -> Prepared:
+    """What still applies of a saved plan."""
+    fresh = prepare_plan(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
+    return replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
+
+
 def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
     from rich.text import Text
 
@@ -77,7 +89,7 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
 def report_plan(opened: Session, prepared: Prepared, choices: PlanOptions, *, as_json: bool, brief: bool) -> ExitCode:
     """Print the plan; with `as_json`, as a saved plan."""
     if as_json:
-        echo_json(dump(SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)), nl=False)
+        echo_json(dump(saved_plan(opened, prepared, choices)), nl=False)
     else:
         show(prepared.plan, opened.fleet, brief=brief)
     return ExitCode.FINDINGS if prepared.plan.refusal else ExitCode.OK
@@ -122,17 +134,16 @@ def confirm_and_execute(
     )
 
 
-def save_before(opened: Session, run: JournaledRun, prepared: Prepared) -> None:
-    """Save what the run changes, and what it replaces, for `history` and `rollback`."""
-    changing = {node.node: node for node in prepared.plan.of(Verdict.CHANGE)}
+def save_before(opened: Session, run: JournaledRun, changing: Iterable[NodePlan], replaced: Mapping[str, Any]) -> None:
+    """Save what the run changes, and what it replaces, for `history` and `rollback`; at a site only the former, since
+    the latter has the nodes' keys."""
     files = RunFiles(opened.journal.path)
-    changes = {name: [[each.path, each.kind, each.diff] for each in node.files] for name, node in changing.items()}
-    observed = prepared.observed.observations
-    before = {name: before_state(node, prepared.desired[name], observed[name]) for name, node in changing.items()}
+    changes = {node.node: [[each.path, each.kind, each.diff] for each in node.files] for node in changing}
     try:
         files.discard(run.entry.id)
         files.save(run.entry.id, CHANGES, changes)
-        files.save(run.entry.id, BEFORE, {name: state.to_json() for name, state in before.items()})
+        if not at_site():
+            files.save(run.entry.id, BEFORE, replaced)
     except MeshctlError as error:
         # a full disk must not prevent the run
         run.progress.stopping(f"{error}: `meshctl rollback {run.entry.id}` will not be possible")
@@ -158,9 +169,10 @@ def execute_plan(
     recorded = json.dumps(
         {"choices": asdict(choices), "stages": stages, **({} if undoes is None else {"undoes": undoes})}
     )
-    changing = [node.node for node in plan.of(Verdict.CHANGE)]
-    with journaled_run(opened, command, tuple(plan.nodes), changing=changing, plan=recorded, as_json=as_json) as run:
-        save_before(opened, run, prepared)
+    changing = plan.of(Verdict.CHANGE)
+    names = [node.node for node in changing]
+    with journaled_run(opened, command, tuple(plan.nodes), changing=names, plan=recorded, as_json=as_json) as run:
+        save_before(opened, run, changing, replaced_by(prepared))
         run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
     raise print_totals(opened, run, as_json=as_json, retry=retry_command(command, undoes))
 

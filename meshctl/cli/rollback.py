@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from meshctl.apply.rollback import EarlierState, EarlierStates, irreversible, without_undone
+from meshctl.apply.rollback import EarlierState, irreversible, without_undone
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -24,8 +23,10 @@ from meshctl.cli.context import (
     session,
 )
 from meshctl.cli.output import echo
-from meshctl.cli.plan import AcceptCut, Brief, LeaveBehind, Rate, Together, Yes
+from meshctl.cli.plan import AcceptCut, Brief, Direct, LeaveBehind, Rate, Together, Yes
 from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_execute, prepare_plan
+from meshctl.cli.site_files import with_states
+from meshctl.cli.site_runs import RunOptions, change_everywhere, meet, sites_of
 from meshctl.errors import ExitCode, InputError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import RunRecord
@@ -53,6 +54,7 @@ def rollback(
     together: Together = False,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
+    direct: Direct = False,
     rate: Rate = None,
     brief: Brief = False,
     as_json: AsJson = False,
@@ -68,13 +70,17 @@ def rollback(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         record = _record(opened, run)
         selected = {node.name for node in selected_nodes(opened.fleet, nodes, limit)} if nodes or limit else None
+        # how parts of it ended that were left to their sites
+        meet(opened, record, as_json=as_json)
         states = _states(opened, record, selected, as_json=as_json)
-        renderer = opened.renderer
-        earlier = EarlierStates(opened.fleet, renderer.secrets, renderer.templates, states)
-        opened = replace(opened, renderer=earlier)
+        opened = with_states(opened, states)
         choices = choices_of(True, leave_behind, accept_cut, together)
-        prepared = prepare_plan(opened, list(states), choices)
+        own, sites = sites_of(opened, list(states), None, direct=direct)
         try:
+            if sites:
+                options = RunOptions("rollback", choices, as_json, rate, undoes=run)
+                raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
+            prepared = prepare_plan(opened, own, choices)
             confirm_and_execute(
                 opened,
                 prepared,

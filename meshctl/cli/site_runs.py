@@ -10,26 +10,39 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import typer
 
 from meshctl.apply.executor import unchanged_outcome
 from meshctl.apply.prepare import PlanOptions, Prepared
+from meshctl.apply.rollback import EarlierStates
 from meshctl.cli.context import Session, confirm, progress_for, selected_nodes
-from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals
+from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command
 from meshctl.cli.output import echo, echo_error, echo_json
-from meshctl.cli.plan_execution import PlanRefused, execute_direct, prepare_plan, save_before, show
+from meshctl.cli.plan_execution import (
+    PlanRefused,
+    execute_direct,
+    prepare_agreed,
+    prepare_plan,
+    save_before,
+    saved_plan,
+    show,
+)
+from meshctl.cli.saved_site_plans import SavedSitePlans, Unplanned, check_placement, dump_site_plans
+from meshctl.cli.site_files import replaced_by
 from meshctl.errors import ExitCode, InputError, MeshctlError, Unreachable
 from meshctl.fleet import Event, EventKind, Outcome, Result, totals
 from meshctl.fleet.journal import Run, RunRecord
 from meshctl.fleet.process import owner
 from meshctl.nodes.site_gateways import gateway_credentials
-from meshctl.plan import Plan, Verdict
-from meshctl.plan.saved import SavedPlan, dump
+from meshctl.plan import NodePlan, Plan, Verdict
+from meshctl.plan.saved import dump
 from meshctl.sites.bundle import SiteBundle, site_bundle
 from meshctl.sites.dispatch import SiteExecution, SitePlan, SiteRun, by_site, prepare_sites
 from meshctl.sites.order import Order, SignedOrder, sign_order
@@ -43,6 +56,8 @@ class RunOptions:
     choices: PlanOptions
     as_json: bool
     rate_kb_s: float | None = None
+    # the run that a rollback takes back
+    undoes: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +78,24 @@ class WholePlan:
         return (*direct, *(name for site in self.sites for name in site.nodes))
 
     @property
-    def changing(self) -> tuple[str, ...]:
-        return tuple(node.node for plan in self.plans if not plan.refusal for node in plan.of(Verdict.CHANGE))
+    def changing(self) -> tuple[NodePlan, ...]:
+        return tuple(node for plan in self.plans if not plan.refusal for node in plan.of(Verdict.CHANGE))
+
+    @property
+    def replaced(self) -> dict[str, Any]:
+        """Node -> what its change replaces, as JSON."""
+        direct = {} if self.direct is None else replaced_by(self.direct)
+        return direct | {name: state for site in self.sites for name, state in site.replaced.items()}
+
+    def saved(self, opened: Session, choices: PlanOptions) -> SavedSitePlans:
+        """What a file of these plans has."""
+        direct = self.direct
+        return SavedSitePlans(
+            opened.fleet.name,
+            None if direct is None else saved_plan(opened, direct, choices),
+            {site.site.name: site.saved for site in self.sites if site.saved is not None},
+            {site.site.name: Unplanned(site.nodes, str(site.error)) for site in self.sites if site.saved is None},
+        )
 
     def close(self) -> None:
         for site in self.sites:
@@ -87,20 +118,44 @@ def prepare_everywhere(
 ) -> WholePlan:
     """Plan the operator's own nodes here and the others at their sites. Raises InputError for a mesh at two sites."""
     _check_meshes(opened, sites)
+    direct = prepare_plan(opened, own, choices) if own else None
+    bundle_of = _bundles(opened, inventory, choices)
+    return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, _options(choices))))
+
+
+def prepare_saved(opened: Session, inventory: Path, saved: SavedSitePlans, file: str) -> WholePlan:
+    """What still applies of saved plans; the workers check those of their sites. Raises InputError."""
+    check_placement(saved, opened.fleet, file)
+    nodes = {name: tuple(plan.plan.nodes) for name, plan in saved.sites.items()}
+    _check_meshes(opened, nodes)
+    direct = prepare_agreed(opened, saved.direct) if saved.direct is not None else None
+    bundle_of = _bundles(opened, inventory, PlanOptions(saved.with_firmware))
+    agreed = {name: dump(plan) for name, plan in saved.sites.items()}
+    sites = prepare_sites(opened.fleet, nodes, opened.access, bundle_of, (), agreed) if nodes else []
+    for name, missing in saved.unplanned.items():
+        error = InputError(f"{file} has no plan of site {name}: {missing.error}", hint="make a new plan")
+        sites.append(SitePlan(opened.fleet.sites[name], missing.nodes, "", error=error))
+    return WholePlan(direct, tuple(sites))
+
+
+def _bundles(opened: Session, inventory: Path, choices: PlanOptions) -> Callable[[str], SiteBundle]:
+    """The bundle of a site by its name. Of a rollback it has the earlier states of the site's own nodes."""
+    renderer, nodes = opened.renderer, opened.fleet.nodes
+    states = renderer.states if isinstance(renderer, EarlierStates) else {}
 
     def bundle_of(site: str) -> SiteBundle:
         return site_bundle(
             inventory,
             opened.fleet,
             site,
-            opened.renderer.secrets,
+            renderer.secrets,
             opened.trust,
             os.environ,
             with_firmware=choices.with_firmware,
+            earlier={name: state.to_json() for name, state in states.items() if nodes[name].site == site},
         )
 
-    direct = prepare_plan(opened, own, choices) if own else None
-    return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, _options(choices))))
+    return bundle_of
 
 
 def _check_meshes(opened: Session, sites: Mapping[str, Sequence[str]]) -> None:
@@ -142,17 +197,9 @@ def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:
 def report_everywhere(
     opened: Session, plan: WholePlan, choices: PlanOptions, *, as_json: bool, brief: bool
 ) -> ExitCode:
-    """Print the plans; with `as_json`, as one object of saved plans."""
+    """Print the plans; with `as_json`, as `meshctl plan --out` saves them."""
     if as_json:
-        direct = plan.direct
-        saved = None
-        if direct is not None:
-            saved = json.loads(dump(SavedPlan(direct.plan, direct.salt, opened.inventory, choices.with_firmware)))
-        sites = {
-            site.site.name: json.loads(site.text) if site.saved is not None else {"error": str(site.error)}
-            for site in plan.sites
-        }
-        echo_json(json.dumps({"fleet": opened.fleet.name, "direct": saved, "sites": sites}, indent=1))
+        echo_json(dump_site_plans(plan.saved(opened, choices)), nl=False)
     else:
         show_everywhere(opened, plan, brief=brief)
     failed = [site.error for site in plan.sites if site.error is not None]
@@ -179,11 +226,13 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
     runs = {site.site.name: site.run for site in plan.sites if _is_to_start(site)}
     orders = {site.run: _order(opened, site, options) for site in plan.sites if _is_to_start(site)}
     stages = [] if plan.direct is None else [[stage.kind.value, *stage.nodes] for stage in plan.direct.plan.stages]
-    recorded = json.dumps({"choices": asdict(options.choices), "stages": stages, "sites": runs})
-    changing = plan.changing
+    undoes = {} if options.undoes is None else {"undoes": options.undoes}
+    recorded = json.dumps({"choices": asdict(options.choices), "stages": stages, "sites": runs, **undoes})
+    changing = [node.node for node in plan.changing]
     with journaled_run(
         opened, options.command, plan.names, changing=changing, plan=recorded, as_json=options.as_json
     ) as run:
+        save_before(opened, run, plan.changing, plan.replaced)
         _finish_others(opened, plan, run)
         site_runs = [
             SiteRun(site.site, site.run, site.nodes, order=orders[site.run], uplink=site.uplink)
@@ -194,10 +243,33 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
         with ThreadPoolExecutor(1, "sites") as pool:
             at_sites = pool.submit(execution.execute, site_runs)
             if plan.direct is not None:
-                save_before(opened, run, plan.direct)
                 run.outcomes.update(execute_direct(opened, run, plan.direct, rate=options.rate_kb_s))
             run.outcomes.update(at_sites.result())
-    return print_totals(opened, run, as_json=options.as_json)
+    retry = retry_command(options.command, options.undoes)
+    return print_totals(opened, run, as_json=options.as_json, retry=retry)
+
+
+def change_everywhere(
+    opened: Session,
+    inventory: Path,
+    own: list[str],
+    sites: Mapping[str, Sequence[str]],
+    options: RunOptions,
+    *,
+    yes: bool,
+    brief: bool,
+    dry_run: bool,
+    check: bool = False,
+) -> typer.Exit:
+    """Plan, show, ask and execute, where some nodes are provisioned by the workers of their sites."""
+    with closing(prepare_everywhere(opened, inventory, own, sites, options.choices)) as made:
+        if dry_run or check:
+            code = report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief)
+            return typer.Exit(ExitCode.FINDINGS if check and made.changing else code)
+        if not options.as_json:
+            show_everywhere(opened, made, brief=brief)
+        confirm_everywhere(opened, made, yes=yes)
+        return execute_everywhere(opened, made, options)
 
 
 def _is_to_start(site: SitePlan) -> bool:

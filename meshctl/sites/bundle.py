@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from meshctl.archive import TarMember, tar_of
 from meshctl.device.trust import Pin, TrustStore, dump_pins
@@ -17,6 +19,7 @@ from meshctl.inventory.load import load
 from meshctl.inventory.source import Reader
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.sites.part import (
+    EARLIER_FILE,
     INVENTORY_FILE,
     KNOWN_HOSTS_FILE,
     SECRETS_FILE,
@@ -56,8 +59,12 @@ def site_bundle(
     environ: Mapping[str, str],
     *,
     with_firmware: bool,
+    earlier: Mapping[str, Any] | None = None,
 ) -> SiteBundle:
-    """The bundle of one site. Raises InputError for a missing file or secret."""
+    """The bundle of one site; `earlier` has the states that a rollback returns its nodes to, as JSON.
+
+    Raises InputError for a missing file or secret.
+    """
     root = read_files(inventory, environ).root
     if root is None:
         raise InputError(f"{inventory}: changed while it was being read")
@@ -68,6 +75,8 @@ def site_bundle(
         TarMember(SECRETS_FILE, part.secrets.encode(), 0o600),
     ]
     members.append(TarMember(KNOWN_HOSTS_FILE, _pins(fleet, site, trust).encode()))
+    if earlier:
+        members.append(TarMember(EARLIER_FILE, json.dumps(dict(earlier)).encode(), 0o600))
     images: dict[str, str] = {}
     image_files: dict[str, Path] = {}
     for file in part.files:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from meshctl.errors import MeshctlError, Unreachable
 from meshctl.fleet import Event, EventKind, Interrupt, Observer, Outcome, Result
@@ -55,13 +56,18 @@ def by_site(fleet: Fleet, nodes: Iterable[Node]) -> tuple[tuple[Node, ...], dict
 
 @dataclass(slots=True)
 class SitePlan:
-    """One site's plan: what `saved` says, or why there is none (`error`). The uplink stays open for its execution."""
+    """One site's plan: what `saved` says, or why there is none (`error`). The uplink stays open for its execution.
+
+    `text` is what is ordered: the plan, or the saved one of which `saved` is what still applies. `replaced` has what
+    it would replace on each node, as JSON.
+    """
 
     site: Site
     nodes: tuple[str, ...]
     run: str
     saved: SavedPlan | None = None
     text: str = field(default="", repr=False)
+    replaced: Mapping[str, Any] = field(default_factory=dict, repr=False)
     part_sha256: str = ""
     error: MeshctlError | None = None
     uplink: Uplink | None = field(default=None, repr=False)
@@ -77,20 +83,25 @@ def prepare_sites(
     access: ConnectionPool,
     bundle_of: Callable[[str], SiteBundle],
     options: Sequence[str],
+    agreed: Mapping[str, str] | None = None,
 ) -> list[SitePlan]:
-    """Let the workers plan, all at the same time. A site that cannot is one with an `error`."""
+    """Let the workers plan, all at the same time, or check the saved plans `agreed`. A site that cannot is one with an
+    `error`."""
 
     plans = [SitePlan(fleet.sites[name], tuple(nodes), new_run_id()) for name, nodes in sites.items()]
 
     def prepare(plan: SitePlan) -> None:
         try:
             bundle = bundle_of(plan.site.name)
+            saved = (agreed or {}).get(plan.site.name, "")
             plan.part_sha256 = bundle.sha256
             for attempt in range(PLAN_ATTEMPTS):
                 try:
                     plan.uplink = Uplink(fleet, plan.site, access)
                     plan.uplink.send_images(bundle.image_files)
-                    plan.text, _ = plan.uplink.plan(plan.run, bundle.archive, bundle.images, plan.nodes, options)
+                    text, plan.replaced = plan.uplink.plan(
+                        plan.run, bundle.archive, bundle.images, plan.nodes, options, saved
+                    )
                     break
                 except Unreachable:
                     # an uplink that comes and goes is tried again; one that is not there is reported at once
@@ -99,7 +110,8 @@ def prepare_sites(
                     plan.close()
                     plan.run = new_run_id()
                     time.sleep(min(_FIRST_WAIT_S * 2**attempt, _LONGEST_WAIT_S))
-            plan.saved = load(plan.text, f"the plan of site {plan.site.name}")
+            plan.text = saved or text
+            plan.saved = load(text, f"the plan of site {plan.site.name}")
         except MeshctlError as error:
             plan.error = error
             plan.close()

@@ -28,12 +28,18 @@ def meshctl_command(*words: str) -> list[str]:
     return [sys.executable, "-m", "meshctl", *words]
 
 
-def environment(directory: SiteDirectory, environ: Mapping[str, str]) -> dict[str, str]:
+def environment(directory: SiteDirectory, run: RunDirectory, environ: Mapping[str, str]) -> dict[str, str]:
     """The environment of a command at the site: a journal of its own, no agent that leaves with the uplink, and no
     settings of the gateway's user."""
     removed = ("SSH_AUTH_SOCK", "MESHCTL_INVENTORY", "MESHCTL_STORE", "COLUMNS")
     kept = {name: value for name, value in environ.items() if name not in removed}
-    return {**kept, "XDG_STATE_HOME": str(directory.state), "MESHCTL_CONFIG": "", "PYTHONUNBUFFERED": "1"}
+    return {
+        **kept,
+        "XDG_STATE_HOME": str(directory.state),
+        "MESHCTL_CONFIG": "",
+        "MESHCTL_SITE_FILES": str(run.inventory),
+        "PYTHONUNBUFFERED": "1",
+    }
 
 
 def key_options(directory: SiteDirectory) -> list[str]:
@@ -85,7 +91,7 @@ def execute(directory: SiteDirectory, run: RunDirectory, environ: Mapping[str, s
             stderr=errors,
             start_new_session=True,
             pass_fds=(lock,) if lock >= 0 else (),
-            env=environment(directory, environ),
+            env=environment(directory, run, environ),
             # an ignored signal would stay ignored there
             preexec_fn=_default_signals,
         )

@@ -32,6 +32,7 @@ from typing import Any
 from meshctl.device.authentication import new_key_pair
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet.process import process_lives
+from meshctl.sites.part import REPLACED_FILE
 
 # A plan that was prepared longer ago is made again before it is executed; its inventory, with secrets, is deleted.
 PREPARED_S = 3600.0
@@ -251,6 +252,13 @@ class RunDirectory:
     def is_alive(self) -> bool:
         """Whether one of the run's processes lives: the one that waits for its end, or the one that changes nodes."""
         return any(process_lives(line) for line in _text(self.process).splitlines())
+
+    def taken_replaced(self) -> dict[str, Any]:
+        """Node -> what the plan would replace on it, for the operator alone: it has the node's keys."""
+        path = self.inventory / REPLACED_FILE
+        found = read_json(path)
+        path.unlink(missing_ok=True)
+        return found
 
     def forget_secrets(self) -> None:
         shutil.rmtree(self.inventory, ignore_errors=True)

@@ -127,10 +127,16 @@ class Uplink:
                 upload(self._connection, images[sha256], f"{self.greeting.directory}/images/{sha256}")
 
     def plan(
-        self, run: str, part: bytes, images: Mapping[str, str], nodes: Sequence[str], options: Sequence[str]
-    ) -> tuple[str, int]:
-        """The plan that the worker made, as JSON, and the exit code of `meshctl plan`. `images` are paths in the part
-        with the SHA-256 of their content."""
+        self,
+        run: str,
+        part: bytes,
+        images: Mapping[str, str],
+        nodes: Sequence[str],
+        options: Sequence[str],
+        agreed: str = "",
+    ) -> tuple[str, dict[str, Any]]:
+        """The plan that the worker made, or what still applies of the saved plan `agreed`, as JSON; and node -> what it
+        would replace there. `images` are paths in the part with the SHA-256 of their content."""
         said = self.ask(
             {
                 "do": "plan",
@@ -139,9 +145,10 @@ class Uplink:
                 "images": dict(images),
                 "nodes": list(nodes),
                 "options": list(options),
+                "agreed": agreed,
             }
         )
-        return str(said["plan"]), int(said["exit"])
+        return str(said["plan"]), dict(said["replaced"])
 
     def status(self, run: str, part: bytes, nodes: Sequence[str], options: Sequence[str]) -> str:
         """The status of the site's nodes, as `meshctl status --json` prints it there."""

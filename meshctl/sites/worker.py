@@ -112,18 +112,26 @@ class Worker:
         }  # fmt: skip
 
     def _plan(self, request: Mapping[str, Any]) -> dict[str, object]:
-        """Unpack the site's part of the inventory and plan; the plan's text, as `meshctl plan --json` prints it."""
+        """Unpack the site's part of the inventory and plan, or find out what still applies of the saved plan `agreed`;
+        the plan's text, as `meshctl plan --json` prints it, and what its nodes have now, which the site does not keep.
+        """
         run = self._directory.run(str(request["run"]))
         images = {str(path): self._directory.image(_file_name(sha256)) for path, sha256 in request["images"].items()}
         self._planned.append(run)
         run.create(_bytes_of(request["part"]), images)
-        words = [*map(str, request["nodes"]), "-i", str(run.inventory), "--out", str(run.plan), "--brief"]
-        words += [*map(str, request["options"]), *runner.key_options(self._directory)]
-        done = self._command("plan", *words)
-        if not run.plan.exists():
+        options = ["-i", str(run.inventory), *runner.key_options(self._directory)]
+        if agreed := str(request.get("agreed", "")):
+            run.plan.write_text(agreed, encoding="utf-8")
+            done = self._command(run, "apply", str(run.plan), "--dry-run", "--json", *options)
+            text = done.stdout.decode("utf-8", "replace")
+        else:
+            words = [*map(str, request["nodes"]), "--out", str(run.plan), "--brief", *map(str, request["options"])]
+            done = self._command(run, "plan", *words, *options)
+            text = run.plan.read_text(encoding="utf-8") if run.plan.exists() else ""
+        if not text.strip():
             run.forget_secrets()
             raise _failure(done)
-        return {"plan": run.plan.read_text(encoding="utf-8"), "exit": done.returncode}
+        return {"plan": text, "replaced": run.taken_replaced()}
 
     def _status(self, request: Mapping[str, Any]) -> dict[str, object]:
         """The site's status, as `meshctl status --json` prints it."""
@@ -131,19 +139,19 @@ class Worker:
         run.create(_bytes_of(request["part"]), {})
         try:
             words = [*map(str, request["nodes"]), "-i", str(run.inventory), "--json", *map(str, request["options"])]
-            done = self._command("status", *words, *runner.key_options(self._directory))
+            done = self._command(run, "status", *words, *runner.key_options(self._directory))
         finally:
             run.discard()
         if not done.stdout.strip():
             raise _failure(done)
         return {"status": done.stdout.decode("utf-8", "replace"), "exit": done.returncode}
 
-    def _command(self, *words: str) -> subprocess.CompletedProcess[bytes]:
+    def _command(self, run: RunDirectory, *words: str) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
             runner.meshctl_command(*words),
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            env=runner.environment(self._directory, self._environ),
+            env=runner.environment(self._directory, run, self._environ),
             check=False,
         )
 

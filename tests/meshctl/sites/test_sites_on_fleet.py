@@ -5,6 +5,7 @@ Each test ends with all nodes as the inventory has them.
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import re
@@ -52,11 +53,24 @@ def test_all_sites_change_in_one_run_without_the_secrets_of_each_other(rig: Site
     done = started.end()
     assert (done.code, done.results) == (0, dict.fromkeys(_EVERY, "done"))
     assert set(rig.powers().values()) == {str(power_dbm)}
-    kept = [path for path in rig.site_directory("north").rglob("*") if path.is_file()]
-    assert kept
-    assert [path for path in kept if any(secret.encode() in path.read_bytes() for secret in SECRETS.values())] == []
+    assert _files_with_secrets(rig.site_directory("north")) == []
     history = json.loads(rig.run("history", "--json", expected=0).out)
     assert (history[0]["command"], history[0]["state"]) == ("provision", "4 done")
+
+
+def _files_with_secrets(directory: Path) -> list[Path]:
+    """The journal's files are compressed."""
+    files = [path for path in directory.rglob("*") if path.is_file()]
+    assert files
+    return [path for path in files if any(secret.encode() in _content(path) for secret in SECRETS.values())]
+
+
+def _content(path: Path) -> bytes:
+    return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+
+
+def _latest_run(rig: SitesRig) -> str:
+    return str(json.loads(rig.run("history", "--json", expected=0).out)[0]["run"])
 
 
 def _text(path: Path) -> str | None:
@@ -164,3 +178,69 @@ def test_a_run_whose_processes_die_at_the_site_is_reported_and_resumed(rig: Site
     # the node that was armed goes back by itself, within its window
     until(lambda: rig.run("resume", "--yes", "--json").code == 0, "the nodes to be as planned", wait_s=240)
     assert rig.run("provision", "--check").code == 0
+
+
+@pytest.mark.proof
+def test_a_run_at_sites_is_rolled_back_by_their_workers(rig: SitesRig) -> None:
+    before = rig.powers()
+    rig.change_power()
+    rig.run(*_PROVISION, expected=0)
+    run = _latest_run(rig)
+    assert "txpower" in rig.run("history", run, "--node", "n1", expected=0).out
+    shown = rig.run("rollback", run, "--dry-run", expected=0)
+    assert "site south:" in shown.out
+    done = rig.run("rollback", run, "--yes", "--json", expected=0)
+    assert done.results == dict.fromkeys(_EVERY, "done")
+    assert f"the inventory still describes run {run}" in done.err
+    assert rig.powers() == before
+    for site in SECRETS:
+        assert _files_with_secrets(rig.site_directory(site)) == []
+    again = rig.run("rollback", run, "--yes")
+    assert again.code == 1
+    assert "changed it later" in again.err
+    rig.change_power()
+    assert rig.run("provision", "--check").code == 0
+
+
+@pytest.mark.proof
+def test_a_run_whose_operator_died_is_met_by_its_rollback(rig: SitesRig) -> None:
+    before = rig.powers()
+    rig.change_power()
+    started = rig.start(*_PROVISION)
+    started.wait_for(_AT_WORK)
+    os.killpg(started.process.pid, signal.SIGKILL)
+    started.process.wait()
+    run = _latest_run(rig)
+    done = rig.run("rollback", run, "--yes", expected=0)
+    assert "asking north" in done.out
+    assert rig.powers() == before
+    rig.change_power()
+    assert rig.run("provision", "--check").code == 0
+
+
+@pytest.mark.proof
+def test_a_saved_plan_is_applied_by_the_workers_as_it_was_shown_or_refused(rig: SitesRig, tmp_path: Path) -> None:
+    file = tmp_path / "plan.json"
+    power_dbm = rig.change_power()
+    rig.uplinks["south"].cut()
+    assert rig.run("plan", "--out", str(file), "--brief").code == 1
+    rig.uplinks["south"].mend()
+    partly = rig.run("apply", str(file), "--dry-run")
+    assert "has no plan of site south" in partly.out
+    rig.run("plan", "--out", str(file), expected=0)
+    assert not any(secret in file.read_text() for secret in SECRETS.values())
+    rig.run("run", "n1", "--", "uci set wireless.radio0.txpower=20; uci commit wireless", expected=0)
+    stale = rig.run("apply", str(file), "--json")
+    assert stale.code == 1
+    assert stale.results == {**dict.fromkeys(_EVERY, "done"), "n1": "refused"}
+    assert "the node has changed since the plan was made" in stale.out
+    rig.run("plan", "--out", str(file), expected=0)
+    applied = rig.run("apply", str(file), "--json", expected=0)
+    assert applied.results == {**dict.fromkeys(_EVERY, "unchanged"), "n1": "done"}
+    assert set(rig.powers().values()) == {str(power_dbm)}
+    rig.run("plan", "--out", str(file), expected=0)
+    rig.change_power()
+    late = rig.run("apply", str(file), "--json")
+    assert set(late.results.values()) == {"refused"}, late
+    rig.run(*_PROVISION, expected=0)
+    assert _files_with_secrets(rig.site_directory("north")) == []
