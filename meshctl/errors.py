@@ -39,9 +39,11 @@ class InputError(MeshctlError):
 
 
 class NodeError(MeshctlError):
-    """A failure of one node; becomes that node's outcome."""
+    """A failure of one node; becomes that node's outcome. `gateway_of` is the site whose gateway is what failed on the
+    way to the node."""
 
     exit_code = ExitCode.FINDINGS
+    gateway_of: str = ""
 
 
 class Unreachable(NodeError):

@@ -208,6 +208,24 @@ def report_everywhere(
     return ExitCode.OK
 
 
+def check_everywhere(opened: Session, plan: WholePlan, *, as_json: bool, brief: bool) -> ExitCode:
+    """Print what differs, as `report_check` does without sites; a site that could not plan is among it."""
+    verdicts = {node.node: (node.verdict, node.reason) for each in plan.plans for node in each.nodes.values()}
+    for site in plan.sites:
+        if site.saved is None:
+            verdict = Verdict.AWAY if isinstance(site.error, Unreachable) else Verdict.REFUSED
+            verdicts |= dict.fromkeys(site.nodes, (verdict, str(site.error)))
+    if as_json:
+        nodes = {name: {"verdict": verdict.value, "reason": reason} for name, (verdict, reason) in verdicts.items()}
+        echo_json(json.dumps({"fleet": opened.fleet.name, "nodes": nodes}, indent=1))
+    else:
+        show_everywhere(opened, plan, brief=brief)
+    found = {verdict for verdict, _ in verdicts.values()}
+    if found & {Verdict.CHANGE, Verdict.REFUSED}:
+        return ExitCode.FINDINGS
+    return ExitCode.UNREACHABLE if Verdict.AWAY in found else ExitCode.OK
+
+
 def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
     """Ask once for all. Raises PlanRefused if nothing can be done."""
     refused = [each for each in plan.plans if each.refusal]
@@ -263,9 +281,10 @@ def change_everywhere(
 ) -> typer.Exit:
     """Plan, show, ask and execute, where some nodes are provisioned by the workers of their sites."""
     with closing(prepare_everywhere(opened, inventory, own, sites, options.choices)) as made:
-        if dry_run or check:
-            code = report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief)
-            return typer.Exit(ExitCode.FINDINGS if check and made.changing else code)
+        if check:
+            return typer.Exit(check_everywhere(opened, made, as_json=options.as_json, brief=brief))
+        if dry_run:
+            return typer.Exit(report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief))
         if not options.as_json:
             show_everywhere(opened, made, brief=brief)
         confirm_everywhere(opened, made, yes=yes)

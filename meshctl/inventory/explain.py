@@ -26,6 +26,7 @@ def explain(fleet: Fleet, node: Node) -> tuple[ExplainedValue, ...]:
 def _values(node: Node) -> Iterator[tuple[str, str]]:
     yield "role", node.role.value
     yield "state", node.state.value
+    yield "site", node.site
     yield "hardware", node.hardware.name
     yield "board", node.hardware.board
     yield "release", str(node.release)

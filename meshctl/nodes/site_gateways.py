@@ -53,6 +53,7 @@ def connect_gateway(
         return connect(endpoint, credentials=credentials, trust=trust, deadlines=deadlines, meter=meter)
     except NodeError as error:
         error.hint = _hint_for(error, site) or error.hint
+        error.gateway_of = site.name
         raise
 
 

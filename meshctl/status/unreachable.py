@@ -30,7 +30,10 @@ def no_answer_of(error: NodeError) -> NoAnswer:
             code = "login"
         case _:
             code = "failed"
-    return NoAnswer(re.sub(r"^\S+ \(\S+\): ", "", str(error)), code, error.hint)
+    reason = re.sub(r"^\S+ \(\S+\): ", "", str(error))
+    if error.gateway_of:
+        return NoAnswer(f"gateway of {error.gateway_of}: {reason}", code, error.hint, of_gateway=True)
+    return NoAnswer(reason, code, error.hint)
 
 
 def no_answer_alarm(
@@ -49,6 +52,8 @@ def no_answer_alarm(
     that never answered.
     """
     seen = sighting_text(heard_by)
+    if why.of_gateway:
+        return Alarm(Level.ERROR, why.code, why.reason, why.hint) if is_required else None
     if why.code != "unreachable":
         # it is on but refuses the connection, whether required or not
         hints = {

@@ -56,11 +56,13 @@ def health_of(alarms: Iterable[Alarm]) -> Health:
 @dataclass(frozen=True, slots=True)
 class NoAnswer:
     """Why a device gave no answer. `code` is `unreachable`, or why a device that is on could not be queried:
-    `host-key`, `untrusted`, `login` or `failed`."""
+    `host-key`, `untrusted`, `login` or `failed`. `of_gateway`: the gateway of its site failed, so nothing is
+    known about the device."""
 
     reason: str
     code: str = "unreachable"
     hint: str = ""
+    of_gateway: bool = False
 
 
 @dataclass(frozen=True, slots=True)

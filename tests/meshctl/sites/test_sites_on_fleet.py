@@ -133,8 +133,15 @@ def test_an_interrupt_stops_the_sites_and_a_second_one_leaves_them(rig: SitesRig
 
 
 def test_a_site_that_cannot_be_reached_or_refuses_keeps_no_other_from_its_change(rig: SitesRig) -> None:
-    rig.change_power()
     rig.uplinks["south"].cut()
+    checked = rig.run("provision", "--check", "--json", expected=3)
+    verdicts = {name: node["verdict"] for name, node in json.loads(checked.out)["nodes"].items()}
+    assert verdicts == {**dict.fromkeys(NORTH, "same"), **dict.fromkeys(SOUTH, "away")}
+    status = rig.run("status", expected=3).out
+    assert "s-base: gateway of south: " in status
+    assert "check the uplink of south" in status
+    rig.change_power()
+    assert rig.run("provision", "--check").code == 1
     ended = rig.run(*_PROVISION)
     assert ended.code == 3
     assert ended.results == {**dict.fromkeys(NORTH, "done"), **dict.fromkeys(SOUTH, "unreachable")}

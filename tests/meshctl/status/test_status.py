@@ -85,6 +85,15 @@ def test_each_reason_for_no_answer_has_its_own_code(fleet: Fleet, error: NodeErr
     assert found.code == code
 
 
+def test_a_gateway_that_fails_is_named_instead_of_the_device_behind_it(fleet: Fleet) -> None:
+    error = Timeout("site.north (192.0.2.1): no answer to connect within 5 s", hint="check the uplink", phase="connect")
+    error.gateway_of = "north"
+    status = status_of(fleet, WITHOUT_ROVER, silent={"rover": no_answer_of(error)})
+    (found,) = alarms(status, "rover").values()
+    text = "gateway of north: no answer to connect within 5 s"
+    assert (found.code, found.text, found.hint) == ("unreachable", text, "check the uplink")
+
+
 def test_a_carried_node_that_refuses_login_is_reported(fleet: Fleet) -> None:
     status = status_of(fleet, silent={"b02": NoAnswer("the host key changed", "host-key")})
     assert "meshctl trust b02 --replace" in alarms(status, "b02")["host-key"].hint
