@@ -69,7 +69,7 @@ def topology(
     routing = next((m.backend for m in fleet.meshes.values() if m.name == mesh or not mesh), Backend.BATMAN)
     view = TopologyView(
         mesh=mesh or fleet.name,
-        entry=found.entry,
+        entries=snapshot.entries,
         graph=graph,
         directions=directions(reports, snapshot.macs),
         ages_s={node.name: node.age_s for node in found.nodes if node.age_s is not None and not node.no_answer_reason},

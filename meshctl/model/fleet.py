@@ -328,6 +328,19 @@ class Fleet:
         """The operator's radio: the first managed node with the role BASE."""
         return next((node for node in self.managed() if node.role is Role.BASE), None)
 
+    @property
+    def base_nodes(self) -> tuple[Node, ...]:
+        """The base node, and the first managed node with the role BASE of each other site."""
+        first: dict[str, Node] = {}
+        for node in self.managed():
+            if node.role is Role.BASE:
+                first.setdefault(node.site, node)
+        return tuple(first.values())
+
+    def base_of(self, node: Node) -> Node | None:
+        """The base node of its site; of a site without one, that of the fleet."""
+        return next((base for base in self.base_nodes if base.site == node.site), self.base_node)
+
     def managed(self) -> Iterator[Node]:
         """The nodes that are neither lost nor retired, in order."""
         return (node for node in self.nodes.values() if node.state.is_managed)

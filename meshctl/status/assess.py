@@ -52,18 +52,28 @@ class Snapshot:
     is_partial: bool = False
     took_s: float = 0.0
 
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """The entry, and those of the other sites, whose meshes are apart."""
+        others = (base.name for base in self.fleet.base_nodes)
+        return tuple(dict.fromkeys((self.entry, *others))) if self.entry else ()
+
+    def entry_of(self, node: Node) -> str:
+        base = self.fleet.base_of(node)
+        return self.entry if base is None or base == self.fleet.base_node else base.name
+
 
 def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterable[str] = ()) -> FleetStatus:
     """The status of these radios and robots at `now` (Unix time)."""
     reports = snapshot.reports
     sightings = seen_by(reports.values(), snapshot.macs)
-    paths = {} if snapshot.is_partial else snapshot.graph.paths(snapshot.entry)
-    cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by(snapshot.entry)
+    paths = {} if snapshot.is_partial else snapshot.graph.paths_to_any(snapshot.entries)
+    cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
     heard = {name: neighbours_of(report, snapshot.macs) for name, report in reports.items()}
     snr = {name: snr_of(snapshot.observations[name], heard[name]) for name in reports}
     relays: dict[str, list[str]] = {}
     for name, path in paths.items():
-        if path.hops and path.via != snapshot.entry:
+        if path.hops and paths[path.via].hops:
             relays.setdefault(path.via, []).append(name)
     statuses = []
     for node in nodes:
@@ -85,7 +95,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             ),
             radios=radios_of(node, seen, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
-            is_path_known=snapshot.entry in paths,
+            is_path_known=snapshot.entry_of(node) in paths,
             cuts_off=cuts.get(node.name, ()),
             relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
             seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),

@@ -30,7 +30,8 @@ class TopologyView:
     nodes' reports. `queried` are the selected nodes; None: all."""
 
     mesh: str
-    entry: str
+    # the base, and those of the other sites; empty without one
+    entries: tuple[str, ...]
     graph: Graph
     directions: Mapping[tuple[str, str], Direction]
     ages_s: Mapping[str, float]
@@ -38,6 +39,10 @@ class TopologyView:
     routing: str = "batman-adv"
     cells: Mapping[tuple[str, str], tuple[LinkCell, ...]] = field(default_factory=dict)
     queried: frozenset[str] | None = None
+
+    @property
+    def entry(self) -> str:
+        return next(iter(self.entries), "")
 
     def was_queried(self, name: str) -> bool:
         return self.queried is None or name in self.queried
@@ -84,32 +89,32 @@ def table(view: TopologyView) -> str:
         )  # fmt: skip
     widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
     links = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines]
-    cuts = view.graph.cut_off_by(view.entry)
+    cuts = view.graph.cut_off_by_any(view.entries)
     notes = [f"cut vertex: {name} (connects {', '.join(lost)})" for name, lost in cuts.items()]
     return "\n".join([*links, *notes])
 
 
 def tree(view: TopologyView) -> str:
     """Each node below its next hop to the entry; cut vertices are marked with a star."""
-    paths = view.graph.paths(view.entry)
+    paths = view.graph.paths_to_any(view.entries)
     children: dict[str, list[str]] = {}
     for name, path in sorted(paths.items()):
-        if name != view.entry:
+        if path.hops:
             children.setdefault(path.via, []).append(name)
-    cuts = view.graph.cut_vertices(view.entry)
+    cuts = view.graph.cut_off_by_any(view.entries)
     lines: list[str] = []
 
     def label(name: str) -> str:
         star = " *" if name in cuts else ""
         path = paths[name]
-        text = "" if name == view.entry else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
+        text = "" if not path.hops else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
         silent = ", does not answer" if view.was_queried(name) else ", not queried"
         age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else silent
-        if name != view.entry and view.has_several_cells():
+        if path.hops and view.has_several_cells():
             text += "".join(f", {cell}" for cell in view.cells_of(name, path.via))
-        return f"{name}{star}{text}{age if name != view.entry else ''}"
+        return f"{name}{star}{text}{age if path.hops else ''}"
 
-    waiting = [(view.entry, "", "")] if view.entry in paths else []
+    waiting = [(name, "", "") for name in reversed(view.entries) if name in paths and not paths[name].hops]
     while waiting:
         name, lead, below = waiting.pop()
         lines.append(f"{lead}{label(name)}")
@@ -120,21 +125,21 @@ def tree(view: TopologyView) -> str:
     apart = [name for name in view.graph.nodes if name not in paths and view.was_queried(name)]
     # links that only other nodes report are missing
     among = "" if view.queried is None else " among the links that the selected nodes report"
-    lines += [f"no path to {view.entry or 'the base'}{among}: {', '.join(apart)}"] if apart else []
+    lines += [f"no path to {' or '.join(view.entries) or 'the base'}{among}: {', '.join(apart)}"] if apart else []
     lines += [f"* cut vertex{among}: others reach the base only through it"] if cuts else []
     return "\n".join(lines)
 
 
 def as_json(view: TopologyView) -> str:
     """Nodes, and links with both directions."""
-    paths = view.graph.paths(view.entry)
-    cuts = view.graph.cut_off_by(view.entry)
+    paths = view.graph.paths_to_any(view.entries)
+    cuts = view.graph.cut_off_by_any(view.entries)
     nodes: list[dict[str, Any]] = [
         {
             "name": name, "address": view.addresses.get(name), "age_s": view.age_s(name),
             "hops": paths[name].hops if name in paths else None,
             "quality": round(paths[name].quality, 4) if name in paths else None,
-            "via": paths[name].via if name in paths and name != view.entry else None,
+            "via": paths[name].via if name in paths and paths[name].hops else None,
             "cuts_off": list(cuts.get(name, ())),
         }
         for name in view.graph.nodes
@@ -192,10 +197,10 @@ def netjson(view: TopologyView) -> str:
 
 def dot(view: TopologyView) -> str:
     """Graphviz: cut vertices as boxes, quality as label and thickness."""
-    cuts = view.graph.cut_vertices(view.entry)
+    cuts = view.graph.cut_off_by_any(view.entries)
     lines = [f"graph {json.dumps(view.mesh)} {{"]
     for name in view.graph.nodes:
-        shape = "doublecircle" if name == view.entry else "box" if name in cuts else "ellipse"
+        shape = "doublecircle" if name in view.entries else "box" if name in cuts else "ellipse"
         lines.append(f"  {json.dumps(name)} [shape={shape}];")
     for link in view.graph.links:
         style = (

@@ -78,6 +78,14 @@ class Graph:
                     heapq.heappush(waiting, (negative * link.quality, hops + 1, other, name))
         return found
 
+    def paths_to_any(self, entries: Iterable[str]) -> dict[str, Path]:
+        """The best path of every node to the first of these entries that it can reach."""
+        found: dict[str, Path] = {}
+        for entry in entries:
+            if entry not in found:
+                found |= self.paths(entry)
+        return found
+
     def farthest_first(self, entry: str) -> tuple[str, ...]:
         """Nodes by hops to `entry`, most first; of equals the weaker path first; unreachable ones first of all."""
         paths = self.paths(entry)
@@ -117,6 +125,16 @@ class Graph:
                     # the nodes visited since `name` are its subtree, connected to the entry only through `parent`
                     cut.setdefault(parent, []).extend(visited[order[name] :])
         return {name: tuple(sorted(lost)) for name, lost in sorted(cut.items())}
+
+    def cut_off_by_any(self, entries: Iterable[str]) -> dict[str, tuple[str, ...]]:
+        """As `cut_off_by`, for each component with one of these entries and the first one there."""
+        found: dict[str, tuple[str, ...]] = {}
+        seen: set[str] = set()
+        for entry in entries:
+            if entry not in seen:
+                seen |= self.reachable(entry)
+                found |= self.cut_off_by(entry)
+        return dict(sorted(found.items()))
 
     def cut_vertices(self, entry: str) -> frozenset[str]:
         """The nodes whose loss alone would cut others off from `entry`."""

@@ -23,7 +23,7 @@ from meshctl.device.observation import (
 )
 from meshctl.errors import ExitCode, NodeError
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet, LanFilter
+from meshctl.model import Fleet, LanFilter, Role
 from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
 from meshctl.status.json_output import as_json
@@ -117,6 +117,19 @@ def test_a_node_without_a_path_to_a_base_that_answers_is_reported(fleet: Fleet) 
     status = status_of(fleet, apart)
     assert "no-path" in alarms(status, "rover")
     assert "alone" in alarms(status, "base")
+
+
+def test_a_node_of_another_site_has_its_path_to_the_base_there(fleet: Fleet) -> None:
+    south = {name: replace(fleet.nodes[name], site="south") for name in ("b01", "rover")}
+    nodes = {**fleet.nodes, **south, "b01": replace(south["b01"], role=Role.BASE)}
+    apart = {"base": seen("base", {}), "b01": seen("b01", {"rover": 200}), "rover": HEALTHY["rover"]}
+    status = status_of(replace(fleet, nodes=nodes), apart)
+    rover = next(node for node in status.nodes if node.name == "rover")
+    assert (rover.hops, rover.via) == (1, "b01")
+    assert "no-path" not in alarms(status, "rover")
+    # the base of the south is none of the north
+    lost = status_of(replace(fleet, nodes=nodes), {**apart, "b01": seen("b01", {}), "rover": seen("rover", {})})
+    assert next(node for node in lost.nodes if node.name == "rover").hops is None
 
 
 def test_a_cut_vertex_is_reported_without_degrading_the_node(fleet: Fleet) -> None:

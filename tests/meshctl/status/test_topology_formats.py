@@ -24,7 +24,7 @@ def test_each_format_shows_every_node_and_marks_the_cut_vertex(form: str) -> Non
     reports = {name: report_of(name, one) for name, one in HEALTHY.items()}
     picture = TopologyView(
         "main",
-        "base",
+        ("base",),
         observed_graph(reports.values()),
         directions(reports, NAMES),
         dict.fromkeys(HEALTHY, 1.0),
@@ -110,7 +110,7 @@ def test_a_link_shows_the_cells_it_uses(
     reports = {name: report_of(name, one) for name, one in observations.items()}
     picture = TopologyView(
         "trio",
-        "base",
+        ("base",),
         observed_graph(reports.values(), known_macs=names),
         directions(reports, names),
         dict.fromkeys(observations, 1.0),
@@ -157,11 +157,24 @@ def test_swapped_radios_are_reported_as_two_wrong_channels(
     ]
 
 
+def test_the_tree_has_a_root_for_the_base_of_each_site() -> None:
+    apart = {"base": seen("base", {}), "b01": seen("b01", {"rover": 200}), "rover": HEALTHY["rover"]}
+    reports = {name: report_of(name, one) for name, one in apart.items()}
+    graph = observed_graph(reports.values(), known_macs=NAMES)
+    view = TopologyView("trio", ("base", "b01"), graph, directions(reports, NAMES), dict.fromkeys(apart, 1.0), {})
+    lines = FORMATS["tree"](view).splitlines()
+    assert lines[:2] == ["base", "b01"]
+    assert lines[2].startswith("`- rover  1 hop")
+    assert len(lines) == 3
+    alone = FORMATS["tree"](replace(view, entries=("base",))).splitlines()
+    assert alone[-1] == "no path to base: b01, rover"
+
+
 def test_a_selection_makes_no_claims_about_nodes_that_were_not_queried() -> None:
     reports = {name: report_of(name, HEALTHY[name]) for name in ("base", "rover")}
     view = TopologyView(
         "main",
-        "base",
+        ("base",),
         observed_graph(reports.values(), known_macs=NAMES),
         directions(reports, NAMES),
         dict.fromkeys(reports, 1.0),
