@@ -172,7 +172,7 @@ def preflight(
 
     Without --send-estop, no message reaches the robots' programs: test messages end at their daemons.
 
-    With a selection, only those devices and the base must be ready, and the verdict says that others were not checked.
+    With a selection, only those devices and their base must be ready; the verdict says that others were not checked.
 
     Exit code: 0 go, 1 no-go, 2 could not run.
 
@@ -183,7 +183,8 @@ def preflight(
     fleet = fleet_view.fleet
     chosen = select_devices(fleet, names or (), read_selection, limit or ())
     if chosen.nodes is not None and fleet.base_node is not None:
-        chosen = replace(chosen, nodes=chosen.nodes | {fleet.base_node.name})
+        bases = {base.name for name in chosen.nodes if (base := fleet.base_of(fleet.nodes[name])) is not None}
+        chosen = replace(chosen, nodes=chosen.nodes | (bases or {fleet.base_node.name}))
     whole = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
     fleet_view.opened.journal.remember_all(fleet.name, facts_to_record(whole), time.time())
     found = chosen.devices_of(whole)

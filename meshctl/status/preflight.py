@@ -137,13 +137,19 @@ def _alarm_text(name: str, alarms: Iterable[Alarm], codes: Iterable[str]) -> str
 
 
 def _base_answers(fleet: Fleet, status: FleetStatus) -> Check:
-    base = fleet.base_node
-    if base is None:
+    """The base of each site that takes part."""
+    if fleet.base_node is None:
         return Check("base", False, "the inventory has no base")
-    found = next((node for node in status.nodes if node.name == base.name), None)
-    is_there = found is not None and not found.no_answer_reason
-    why = f": {found.no_answer_reason}" if found is not None and found.no_answer_reason else ""
-    return Check("base", is_there, f"{base.name} answers" if is_there else f"{base.name} does not answer{why}")
+    found = {node.name: node for node in status.nodes}
+    wanted = [base.name for node in status.nodes if (base := fleet.base_of(node.node)) is not None]
+    names = tuple(dict.fromkeys(wanted or (fleet.base_node.name,)))
+    reasons = {name: found[name].no_answer_reason if name in found else "" for name in names}
+    missing = [
+        f"{name} does not answer{f': {reasons[name]}' if reasons[name] else ''}"
+        for name in names
+        if name not in found or reasons[name]
+    ]
+    return Check("base", not missing, "; ".join(missing) or ", ".join(f"{name} answers" for name in names))
 
 
 def _robot_radios(fleet: Fleet, status: FleetStatus) -> Check:

@@ -8,7 +8,7 @@ from ipaddress import IPv4Address
 from typing import Any
 
 from meshctl.fleet.journal import LastKnown
-from meshctl.model import Fleet, Robot
+from meshctl.model import Fleet, Robot, Role
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
 from meshctl.status.emergency_stop import StopResult, parse_outcomes, stop_plan
@@ -16,7 +16,7 @@ from meshctl.status.filters import select_devices
 from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
 from meshctl.status.text import preflight_text
-from meshctl.status.values import Alarm, Level
+from meshctl.status.values import Alarm, Level, NoAnswer
 from tests.meshctl.status.fleets import HEALTHY, NOW, TEAM, robot_facts, seen, status_of
 
 KNOWN = {"b02": LastKnown("b02", NOW - 60, {})}
@@ -222,3 +222,19 @@ def test_an_emergency_stop_that_could_not_be_sent_is_a_no_go(fleet: Fleet) -> No
     assert [(check.name, check.reason) for check in result if not check.is_go] == [
         ("emergency stop", "station cannot send it")
     ]
+
+
+def test_the_base_of_each_site_that_takes_part_must_answer(fleet: Fleet) -> None:
+    south = {name: replace(fleet.nodes[name], site="south") for name in ("b01", "rover")}
+    nodes = {**fleet.nodes, **south, "b01": replace(south["b01"], role=Role.BASE)}
+    sites = replace(fleet, nodes=nodes)
+    whole = status_of(sites, HEALTHY, known=KNOWN)
+    found = next(check for check in preflight(sites, whole) if check.name == "base")
+    assert (found.is_go, found.reason) == (True, "base answers, b01 answers")
+    there = replace(whole, nodes=tuple(node for node in whole.nodes if node.node.site == "south"))
+    found = next(check for check in preflight(sites, there) if check.name == "base")
+    assert (found.is_go, found.reason) == (True, "b01 answers")
+    silent = {name: HEALTHY[name] for name in HEALTHY if name != "b01"}
+    lost = status_of(sites, silent, known=KNOWN, silent={"b01": NoAnswer("no answer to connect within 5 s")})
+    found = next(check for check in preflight(sites, lost) if check.name == "base")
+    assert (found.is_go, found.reason) == (False, "b01 does not answer: no answer to connect within 5 s")
