@@ -25,7 +25,7 @@ from meshctl.cli.plan_execution import (
     report_plan,
     saved_plan,
 )
-from meshctl.cli.saved_site_plans import SavedSitePlans, dump_site_plans, load_site_plans
+from meshctl.cli.saved_site_plans import SavedSitePlans, check_fleet, dump_site_plans, load_site_plans
 from meshctl.cli.site_files import hand_over, with_sent_states
 from meshctl.cli.site_runs import (
     RunOptions,
@@ -131,10 +131,7 @@ def apply(
             raise _apply_everywhere(opened, inventory, everywhere, str(plan_file), options, dry_run=dry_run)
     saved = load(text, str(plan_file))
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        if saved.plan.fleet != opened.fleet.name:
-            raise InputError(
-                f"{plan_file} is for fleet {saved.plan.fleet}, but the inventory is of {opened.fleet.name}"
-            )
+        check_fleet(saved.plan.fleet, opened.fleet, str(plan_file))
         opened = with_sent_states(opened)
         agreed = prepare_agreed(opened, saved)
         if dry_run:

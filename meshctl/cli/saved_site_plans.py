@@ -13,7 +13,7 @@ from typing import Any
 
 from meshctl.errors import InputError
 from meshctl.model import Fleet
-from meshctl.plan.saved import SavedPlan, dump, load
+from meshctl.plan.saved import SavedPlan, as_text, check_version, damaged, document_of, from_document
 
 FORMAT = "meshctl-site-plans"
 FORMAT_VERSION = 1
@@ -48,10 +48,10 @@ def dump_site_plans(saved: SavedSitePlans) -> str:
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "fleet": saved.fleet,
-        "direct": None if saved.direct is None else json.loads(dump(saved.direct)),
-        "sites": {name: json.loads(dump(plan)) for name, plan in saved.sites.items()} | missing,
+        "direct": None if saved.direct is None else document_of(saved.direct),
+        "sites": {name: document_of(plan) for name, plan in saved.sites.items()} | missing,
     }
-    return json.dumps(document, indent=1).replace("\x7f", "\\u007f") + "\n"
+    return as_text(document)
 
 
 def load_site_plans(text: str, file: str) -> SavedSitePlans | None:
@@ -62,34 +62,34 @@ def load_site_plans(text: str, file: str) -> SavedSitePlans | None:
         return None
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         return None
-    if document.get("version") != FORMAT_VERSION:
-        raise InputError(
-            f"{file}: expected plans of version {FORMAT_VERSION}, found {document.get('version')!r}",
-            hint="make a new plan with this version of meshctl",
-        )
+    check_version(document, FORMAT_VERSION, "plans", file)
     try:
         direct, sites = document["direct"], dict(document["sites"])
         missing = {name: _unplanned(said) for name, said in sites.items() if "error" in said}
         planned = {name: said for name, said in sites.items() if name not in missing}
         return SavedSitePlans(
             str(document["fleet"]),
-            None if direct is None else load(json.dumps(direct), file),
-            {name: load(json.dumps(said), f"{file}, site {name}") for name, said in planned.items()},
+            None if direct is None else from_document(direct, file),
+            {name: from_document(said, f"{file}, site {name}") for name, said in planned.items()},
             missing,
         )
     except (KeyError, TypeError, ValueError) as error:
-        what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{file}: damaged plan: {what}", hint="make a new plan") from error
+        raise damaged(file, error) from error
 
 
 def _unplanned(said: Mapping[str, Any]) -> Unplanned:
     return Unplanned(tuple(map(str, said["nodes"])), str(said["error"]))
 
 
+def check_fleet(planned: str, fleet: Fleet, file: str) -> None:
+    """Raises InputError for the plan of another fleet."""
+    if planned != fleet.name:
+        raise InputError(f"{file} is for fleet {planned}, but the inventory is of {fleet.name}")
+
+
 def check_placement(saved: SavedSitePlans, fleet: Fleet, file: str) -> None:
     """Raises InputError unless the plans are of this fleet, and each node is still where it was planned."""
-    if saved.fleet != fleet.name:
-        raise InputError(f"{file} is for fleet {saved.fleet}, but the inventory is of {fleet.name}")
+    check_fleet(saved.fleet, fleet, file)
     planned = {name: tuple(plan.plan.nodes) for name, plan in saved.sites.items()}
     for site, names in (planned | {name: each.nodes for name, each in saved.unplanned.items()}).items():
         for name in names:

@@ -43,9 +43,18 @@ class SavedPlan:
 
 
 def dump(saved: SavedPlan) -> str:
-    """The plan as JSON text. It quotes devices: what a terminal would obey is escaped."""
+    return as_text(document_of(saved))
+
+
+def as_text(document: Mapping[str, Any]) -> str:
+    """A document as JSON text. Plans quote devices: what a terminal would obey is escaped."""
+    return json.dumps(document, indent=1).replace("\x7f", "\\u007f") + "\n"
+
+
+def document_of(saved: SavedPlan) -> dict[str, Any]:
+    """The plan as values that JSON has."""
     plan = saved.plan
-    document = {
+    return {
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "fleet": plan.fleet,
@@ -62,7 +71,6 @@ def dump(saved: SavedPlan) -> str:
         "stages": [_plain(stage) for stage in plan.stages],
         "nodes": [_plain(node) for node in plan.nodes.values()],
     }
-    return json.dumps(document, indent=1).replace("\x7f", "\\u007f") + "\n"
 
 
 def _plain(value: Any) -> dict[str, Any]:
@@ -77,13 +85,14 @@ def load(text: str, file: str) -> SavedPlan:
         document = json.loads(text)
     except ValueError as error:
         raise InputError(f"{file}: expected a plan in JSON: {error}") from error
+    return from_document(document, file)
+
+
+def from_document(document: Any, file: str) -> SavedPlan:
+    """The plan of `document_of`, read back from JSON. Raises InputError with the file name and the fault."""
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f"{file}: expected a plan written by `meshctl plan --out`, found something else")
-    if document.get("version") != FORMAT_VERSION:
-        raise InputError(
-            f"{file}: expected a plan of version {FORMAT_VERSION}, found {document.get('version')!r}",
-            hint="make a new plan with this version of meshctl",
-        )
+    check_version(document, FORMAT_VERSION, "a plan", file)
     try:
         nodes = [_node(node) for node in document["nodes"]]
         plan = Plan(
@@ -106,8 +115,22 @@ def load(text: str, file: str) -> SavedPlan:
             plan, bytes.fromhex(document["salt"]), str(document["inventory"]), bool(document["with_firmware"])
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{file}: damaged plan: {what}", hint="make a new plan") from error
+        raise damaged(file, error) from error
+
+
+def check_version(document: Mapping[str, Any], version: int, what: str, file: str) -> None:
+    """Raises InputError for a document of another version."""
+    if document.get("version") != version:
+        raise InputError(
+            f"{file}: expected {what} of version {version}, found {document.get('version')!r}",
+            hint="make a new plan with this version of meshctl",
+        )
+
+
+def damaged(file: str, error: Exception) -> InputError:
+    """What is reported for a document with this fault."""
+    what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+    return InputError(f"{file}: damaged plan: {what}", hint="make a new plan")
 
 
 def _node(data: Mapping[str, Any]) -> NodePlan:
