@@ -26,6 +26,8 @@ from meshctl.plan.saved import SavedPlan, as_agreed, dump
 
 # Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
+# Node -> what becomes of it, and why.
+Verdicts = Mapping[str, tuple[Verdict, str]]
 
 
 class PlanRefused(MeshctlError):
@@ -96,14 +98,25 @@ def report_plan(opened: Session, prepared: Prepared, choices: PlanOptions, *, as
 
 
 def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
+    verdicts = {name: (node.verdict, node.reason) for name, node in plan.nodes.items()}
     if as_json:
-        nodes = {name: {"verdict": node.verdict.value, "reason": node.reason} for name, node in plan.nodes.items()}
-        echo_json(json.dumps({"fleet": plan.fleet, "nodes": nodes}, indent=1))
+        print_verdicts(plan.fleet, verdicts)
     else:
         show(plan, fleet, brief=brief)
-    if plan.of(Verdict.CHANGE) or plan.of(Verdict.REFUSED):
+    return check_code(verdicts)
+
+
+def print_verdicts(fleet: str, verdicts: Verdicts) -> None:
+    nodes = {name: {"verdict": verdict.value, "reason": reason} for name, (verdict, reason) in verdicts.items()}
+    echo_json(json.dumps({"fleet": fleet, "nodes": nodes}, indent=1))
+
+
+def check_code(verdicts: Verdicts) -> ExitCode:
+    """The exit code of `provision --check`."""
+    found = {verdict for verdict, _ in verdicts.values()}
+    if found & {Verdict.CHANGE, Verdict.REFUSED}:
         return ExitCode.FINDINGS
-    return ExitCode.UNREACHABLE if plan.of(Verdict.AWAY) else ExitCode.OK
+    return ExitCode.UNREACHABLE if Verdict.AWAY in found else ExitCode.OK
 
 
 def confirm_and_execute(

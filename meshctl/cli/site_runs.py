@@ -27,9 +27,11 @@ from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals,
 from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.cli.plan_execution import (
     PlanRefused,
+    check_code,
     execute_direct,
     prepare_agreed,
     prepare_plan,
+    print_verdicts,
     save_before,
     saved_plan,
     show,
@@ -216,14 +218,10 @@ def check_everywhere(opened: Session, plan: WholePlan, *, as_json: bool, brief: 
             verdict = Verdict.AWAY if isinstance(site.error, Unreachable) else Verdict.REFUSED
             verdicts |= dict.fromkeys(site.nodes, (verdict, str(site.error)))
     if as_json:
-        nodes = {name: {"verdict": verdict.value, "reason": reason} for name, (verdict, reason) in verdicts.items()}
-        echo_json(json.dumps({"fleet": opened.fleet.name, "nodes": nodes}, indent=1))
+        print_verdicts(opened.fleet.name, verdicts)
     else:
         show_everywhere(opened, plan, brief=brief)
-    found = {verdict for verdict, _ in verdicts.values()}
-    if found & {Verdict.CHANGE, Verdict.REFUSED}:
-        return ExitCode.FINDINGS
-    return ExitCode.UNREACHABLE if Verdict.AWAY in found else ExitCode.OK
+    return check_code(verdicts)
 
 
 def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
