@@ -18,14 +18,12 @@ from meshctl.apply.rollback import EarlierState, EarlierStates, before_state
 from meshctl.cli.context import Session
 from meshctl.errors import InputError
 from meshctl.plan import Verdict
-from meshctl.sites.part import EARLIER_FILE, REPLACED_FILE
-
-_VARIABLE = "MESHCTL_SITE_FILES"
+from meshctl.sites.part import EARLIER_FILE, FILES_VARIABLE, REPLACED_FILE
 
 
 def at_site() -> bool:
     """Whether a worker has started this command."""
-    return bool(os.environ.get(_VARIABLE))
+    return bool(os.environ.get(FILES_VARIABLE))
 
 
 def with_states(opened: Session, states: Mapping[str, EarlierState]) -> Session:
@@ -50,8 +48,10 @@ def with_sent_states(opened: Session) -> Session:
 def replaced_by(prepared: Prepared) -> dict[str, Any]:
     """Node -> what the plan replaces on it, as JSON."""
     seen, desired = prepared.observed.observations, prepared.desired
-    changing = (plan for plan in prepared.plan.of(Verdict.CHANGE))
-    return {plan.node: before_state(plan, desired[plan.node], seen[plan.node]).to_json() for plan in changing}
+    return {
+        plan.node: before_state(plan, desired[plan.node], seen[plan.node]).to_json()
+        for plan in prepared.plan.of(Verdict.CHANGE)
+    }
 
 
 def hand_over(prepared: Prepared) -> None:
@@ -63,5 +63,5 @@ def hand_over(prepared: Prepared) -> None:
 
 
 def _path(name: str) -> Path | None:
-    folder = os.environ.get(_VARIABLE, "")
+    folder = os.environ.get(FILES_VARIABLE, "")
     return Path(folder, name) if folder else None

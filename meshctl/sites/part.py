@@ -24,6 +24,8 @@ KNOWN_HOSTS_FILE = "known_hosts"
 # Beside the inventory: what a rollback returns nodes to, and what a plan would replace on them (cli/site_files).
 EARLIER_FILE = "earlier.json"
 REPLACED_FILE = "replaced.json"
+# Names the folder of both to a command that a worker starts.
+FILES_VARIABLE = "MESHCTL_SITE_FILES"
 # Sections that concern robots' computers and the operator's other sites.
 _REMOVED_SECTIONS = ("include", "topics", "sites")
 # The entry of a secret that the site does not get. Nothing there asks for it.

@@ -18,6 +18,7 @@ from pathlib import Path
 from meshctl.errors import InputError
 from meshctl.fleet.process import process_of, this_process
 from meshctl.sites.order import SignedOrder, checked_order, operator_keys
+from meshctl.sites.part import FILES_VARIABLE
 from meshctl.sites.runs import RunDirectory, SiteDirectory, closing, read_json, write_json
 
 _LAST_ERRORS_BYTES = 4096
@@ -37,7 +38,7 @@ def environment(directory: SiteDirectory, run: RunDirectory, environ: Mapping[st
         **kept,
         "XDG_STATE_HOME": str(directory.state),
         "MESHCTL_CONFIG": "",
-        "MESHCTL_SITE_FILES": str(run.inventory),
+        FILES_VARIABLE: str(run.inventory),
         "PYTHONUNBUFFERED": "1",
     }
 
