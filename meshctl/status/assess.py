@@ -58,9 +58,11 @@ class Snapshot:
         others = (base.name for base in self.fleet.base_nodes)
         return tuple(dict.fromkeys((self.entry, *others))) if self.entry else ()
 
-    def entry_of(self, node: Node) -> str:
-        base = self.fleet.base_of(node)
-        return self.entry if base is None or base == self.fleet.base_node else base.name
+    @property
+    def entry_by_site(self) -> dict[str, str]:
+        """The entry of each site that has one; nodes of the others are looked for from `entry`."""
+        first = self.fleet.base_node
+        return {base.site: self.entry if base == first else base.name for base in self.fleet.base_nodes}
 
 
 def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterable[str] = ()) -> FleetStatus:
@@ -69,6 +71,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
     sightings = seen_by(reports.values(), snapshot.macs)
     paths = {} if snapshot.is_partial else snapshot.graph.paths_to_any(snapshot.entries)
     cuts = {} if snapshot.is_partial else snapshot.graph.cut_off_by_any(snapshot.entries)
+    entry_by_site = snapshot.entry_by_site
     heard = {name: neighbours_of(report, snapshot.macs) for name, report in reports.items()}
     snr = {name: snr_of(snapshot.observations[name], heard[name]) for name in reports}
     relays: dict[str, list[str]] = {}
@@ -95,7 +98,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             ),
             radios=radios_of(node, seen, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
-            is_path_known=snapshot.entry_of(node) in paths,
+            is_path_known=entry_by_site.get(node.site, snapshot.entry) in paths,
             cuts_off=cuts.get(node.name, ()),
             relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
             seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),
