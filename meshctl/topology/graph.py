@@ -1,7 +1,7 @@
 """An undirected graph of nodes: distances, cut vertices, and what each one cuts off.
 
 Links (name, name, quality) -> `graph_of` -> `Graph`: `paths` (hops and quality to the entry), `farthest_first`,
-`cut_vertices` and `cut_off_by` (Hopcroft and Tarjan's articulation points, CACM 16(6), 1973), `cut_off_by_all` (what
+`cut_off_by` (cut vertices: Hopcroft and Tarjan's articulation points, CACM 16(6), 1973), `cut_off_by_all` (what
 a whole set of nodes going down at once would cut off). Everything is linear in links, except the last per call.
 """
 
@@ -135,10 +135,6 @@ class Graph:
                 seen |= self.reachable(entry)
                 found |= self.cut_off_by(entry)
         return dict(sorted(found.items()))
-
-    def cut_vertices(self, entry: str) -> frozenset[str]:
-        """The nodes whose loss alone would cut others off from `entry`."""
-        return frozenset(self.cut_off_by(entry))
 
     def cut_off_by_all(self, entry: str, down: Iterable[str]) -> frozenset[str]:
         """The nodes outside `down` that reach `entry` now and would not if all of `down` were gone at once."""

@@ -32,7 +32,7 @@ def test_each_inner_node_of_a_chain_cuts_off_every_node_behind_it() -> None:
 def test_a_ring_has_no_cut_vertex() -> None:
     names = NAMES[:5]
     ring = graph_of(names, [Link(a, b) for a, b in zip(names, [*names[1:], names[0]], strict=True)])
-    assert ring.cut_vertices("n0") == frozenset()
+    assert ring.cut_off_by("n0") == {}
 
 
 @given(graphs())
