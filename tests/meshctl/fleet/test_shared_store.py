@@ -127,6 +127,8 @@ def test_a_run_whose_computer_is_gone_is_called_out_of_contact(alice: Laptop, bo
         transaction.execute("UPDATE runs SET process = ?", ("elsewhere:1:1",))
     database.close()
     with bob.open() as his:
+        # the server ends what a closed connection held a moment later
+        until(lambda: not his.runs()[0].is_connected, "her connection to end", wait_s=30)
         (record,) = his.runs()
         assert record.state == "under way, or interrupted: out of contact"
 
