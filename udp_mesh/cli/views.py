@@ -61,6 +61,10 @@ def peers_view(peers: list[Json]) -> str:
     left = [[peer["name"], *step] for peer in peers for step in _available(peer)]
     if left:
         lines += ["", table(["left for", "priority", "rate"], left)]
+    radio = [_radio(peer["name"], peer["radio"]) for peer in peers if peer.get("radio")]
+    if radio:
+        head = ["radio path to", "radio", "next hop", "signal", "margin", "bottleneck", "quality", "trend", "age"]
+        lines += ["", table(head, radio)]
     return "\n".join(lines)
 
 
@@ -81,6 +85,25 @@ def _available(peer: Json) -> list[tuple[str, str]]:
         (str(start) if start == end else f"{start} to {end}", rate(available[start]))
         for start, end in zip(starts, ends, strict=True)
     ]
+
+
+def _radio(peer: str, radio: Json) -> list[str]:
+    """What a collector reports of the path to a peer."""
+    return [
+        peer,
+        radio["radio"],
+        radio["next_hop"],
+        _decibels(radio["signal_dbm"], "dBm"),
+        _decibels(radio["margin_db"], "dB"),
+        rate(radio["bottleneck_bits_per_s"]),
+        "-" if radio["quality"] is None else f"{radio['quality'] * 100:.0f} %",
+        (radio["trend"] or {}).get("direction", "-"),
+        duration(radio["age_s"]),
+    ]
+
+
+def _decibels(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.0f} {unit}"
 
 
 def _state(peer: Json) -> tuple[str, str]:
@@ -123,6 +146,9 @@ def status_view(status: Json) -> str:
         for refusal in status["refusals"]
     ]
     lines += ["", peers_view(conditions["peers"])]
+    radio = conditions.get("radio")
+    if radio and radio["problem"]:
+        lines.append(f"RADIO: {radio['problem']}")
     lines += [
         f"{stranger['name']} at {stranger['address']} on {stranger['link']} is heard but DOES NOT HEAR US, "
         f"for {duration(stranger['heard_for_s'])}"

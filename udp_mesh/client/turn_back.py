@@ -21,6 +21,10 @@ TURN_LOSS, GO_LOSS = 0.1, 0.05
 """A radio repeats each frame several times, so that a link which loses packets nevertheless is close to its end."""
 GO_FACTOR = 2.0
 """So many times the rate that is needed must be there before the robot continues."""
+GO_MARGIN_DB = 6.0
+"""So much more than the radio margin that is needed must be there before the robot continues."""
+STEEP_DB = 20.0
+"""With so much more than the needed margin its trend says nothing: near a radio the signal falls steeply, then less."""
 
 
 class Need(NamedTuple):
@@ -31,6 +35,8 @@ class Need(NamedTuple):
     """Of the topic that needs it."""
     reserve_s: float = 60.0
     """Time before the rate is no longer there at which the robot turns. A link fails faster than a trend says."""
+    margin_db: Optional[float] = None
+    """Radio margin of the next hop below which the robot turns, where a collector reports it. None: any."""
 
 
 class Decision(NamedTuple):
@@ -44,10 +50,13 @@ def decide(peer: Optional[Mapping[str, Any]], need: Need, before: bool) -> Decis
         return Decision(True, "offline")
     if (peer["unanswered_for_s"] or 0.0) >= NO_ANSWER_S:
         return Decision(True, "no answer for {:.0f} s".format(peer["unanswered_for_s"]))
+    radio = judge_radio(peer.get("radio"), need, before)
+    if radio is not None and radio.turn_back:
+        return radio
     available = peer["available_bits_per_s"]
     if available is None:
         # too little was sent: there is no reason to change anything
-        return Decision(before, "not measured yet")
+        return radio or Decision(before, "not measured yet")
     bits_per_s = available[need.priority]
     if bits_per_s < need.bits_per_s:
         return Decision(True, "{} of {}".format(rate(bits_per_s), rate(need.bits_per_s)))
@@ -60,6 +69,30 @@ def decide(peer: Optional[Mapping[str, Any]], need: Need, before: bool) -> Decis
     if before and not is_good:
         return Decision(True, "not good enough yet: {}".format(rate(bits_per_s)))
     return Decision(False, rate(bits_per_s))
+
+
+def judge_radio(radio: Optional[Mapping[str, Any]], need: Need, before: bool) -> Optional[Decision]:
+    """What the radio margin alone says; None if it is not needed, or not known."""
+    if need.margin_db is None or radio is None or radio["margin_db"] is None:
+        return None
+    margin_db, left_db = radio["margin_db"], radio["margin_db"] - need.margin_db
+    shown = "{:.0f} dB of margin to {}".format(margin_db, radio["next_hop"])
+    if left_db < 0.0:
+        return Decision(True, shown)
+    left_s = margin_left_s(left_db, radio["trend"])
+    if left_s < need.reserve_s:
+        return Decision(True, "{}, for {:.0f} s more".format(shown, left_s))
+    if before and (left_db < GO_MARGIN_DB or left_s < math.inf):
+        return Decision(True, "not good enough yet: {}".format(shown))
+    return Decision(False, shown)
+
+
+def margin_left_s(left_db: float, trend: Optional[Mapping[str, Any]]) -> float:
+    """Until the margin is less than what is needed if the trend continues; infinite unless it falls, or far above."""
+    change_db_per_s = 0.0 if trend is None else float(trend["change_db_per_s"] or 0.0)
+    if trend is None or trend["direction"] != "worsening" or change_db_per_s >= 0.0 or left_db > STEEP_DB:
+        return math.inf
+    return left_db / -change_db_per_s
 
 
 def time_left_s(bits_per_s: float, needed_bits_per_s: float, trend: Optional[Mapping[str, Any]]) -> float:
@@ -95,12 +128,14 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     parser.add_argument(
         "--reserve", type=float, default=60.0, metavar="SECONDS", help="turn so long before (default: 60)"
     )
+    parser.add_argument("--margin", type=float, metavar="DB", help="turn with less radio margin, where it is known")
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
     given = parser.parse_args(arguments)
     said: Optional[bool] = None
     try:
         with MeshClient(given.socket) as mesh:
-            for decision in decisions(mesh, given.peer, Need(given.bits_per_s, given.priority, given.reserve)):
+            need = Need(given.bits_per_s, given.priority, given.reserve, given.margin)
+            for decision in decisions(mesh, given.peer, need):
                 if decision.turn_back != said:
                     said = decision.turn_back
                     sys.stdout.write("{}: {}\n".format("turn-back" if said else "go", decision.reason))

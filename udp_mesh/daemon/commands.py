@@ -29,7 +29,8 @@ from udp_mesh.daemon.neighbours import (
     parse_address,
     read_neighbour,
 )
-from udp_mesh.daemon.position_requests import publish_meter, set_position
+from udp_mesh.daemon.position_requests import publish_meter, set_position, set_radio
+from udp_mesh.daemon.radio_paths import with_radio
 from udp_mesh.daemon.service import Service
 from udp_mesh.daemon.status import (
     conditions_json,
@@ -177,7 +178,7 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
         ],
         "link_failures": driver.link_failures,
         "recording": None if recorder is None else {"path": str(recorder.path), "bytes": recorder.bytes},
-        "conditions": conditions_json(driver.conditions()),
+        "conditions": _conditions(service),
         "relaying": relaying_json(driver.node.relaying(driver.now())),
         "thin": thin_json(
             driver.node.thin_conditions(driver.now()), service.thin_ports.failures, service.thin_ports.refusals
@@ -186,8 +187,13 @@ def status(service: Service, _client: Client, _header: Header, _: bytes) -> Head
     }
 
 
+def _conditions(service: Service) -> Header:
+    conditions = service.driver.conditions()
+    return with_radio(conditions_json(conditions), service.radio, conditions.now)
+
+
 def peers(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
-    return {"peers": conditions_json(service.driver.conditions())["peers"]}
+    return {"peers": _conditions(service)["peers"]}
 
 
 def topics(service: Service, _client: Client, _header: Header, _: bytes) -> Header:
@@ -374,6 +380,7 @@ COMMANDS = {
     "set-rates": set_rates,
     "set-position": set_position,
     "publish-meter": publish_meter,
+    "set-radio": set_radio,
     "set-neighbour": set_neighbour,
     "drop-neighbour": drop_neighbour,
     "neighbours": neighbours,

@@ -1,4 +1,4 @@
-"""The requests `set-position` and `publish-meter` of the local API (docs/local-api.md)."""
+"""The requests `set-position`, `publish-meter` and `set-radio` of the local API (docs/local-api.md)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from udp_mesh.daemon.positions import (
     is_coordinate,
     is_frame,
 )
+from udp_mesh.daemon.radio_paths import BadReport, parse_report
 
 if TYPE_CHECKING:
     from udp_mesh.daemon.service import Service
@@ -71,3 +72,12 @@ def publish_meter(service: Service, _client: Client, _header: Header, payload: b
     for client in clients:
         client.send_event({**header, "type": "application/json", "priority": 15, "broadcast": False}, payload)
     return {"subscribers": len(clients)}
+
+
+def set_radio(service: Service, _client: Client, _header: Header, payload: bytes) -> Header:
+    """A collector's report of the robot's radio, instead of the one before."""
+    try:
+        service.radio = parse_report(payload, service.driver.now())
+    except BadReport as error:
+        raise RequestError("bad-request", str(error)) from error
+    return {}

@@ -39,6 +39,7 @@ from udp_mesh.daemon.log_store import Put, SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
 from udp_mesh.daemon.pings import Pings
 from udp_mesh.daemon.position_exchange import PositionExchange
+from udp_mesh.daemon.radio_paths import RadioReport, with_radio
 from udp_mesh.daemon.recording import Recorder
 from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
 from udp_mesh.daemon.subscriptions import Subscriptions
@@ -86,6 +87,7 @@ class Service:
         self.positions = PositionExchange(
             self.driver, configuration.settings.name, configuration.position, lambda: self.recorder
         )
+        self.radio: RadioReport | None = None
         self.recorder: Recorder | None = None
         self.started = self.driver.now()
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
@@ -376,7 +378,7 @@ class Service:
                 "event": "conditions",
                 "source": self.settings.name,
                 "topic": CONDITIONS_TOPIC,
-                "conditions": conditions_json(conditions),
+                "conditions": with_radio(conditions_json(conditions), self.radio, conditions.now),
             }
             for client in clients:
                 client.send_event(header)

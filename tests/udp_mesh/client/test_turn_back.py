@@ -116,3 +116,42 @@ def test_the_program_of_the_guide_says_go_and_then_to_turn_back_when_the_peer_is
             reader.join()
             program.communicate()
     assert [line.split(":")[0] for line in lines] == ["go", "turn-back"]
+
+
+MARGIN_NEED = NEED._replace(margin_db=5.0)
+
+
+def radio(margin_db: float | None, change_db_per_s: float = 0.0) -> dict[str, Any]:
+    direction = "worsening" if change_db_per_s else "steady"
+    trend = {"direction": direction, "change_db_per_s": change_db_per_s}
+    return {"margin_db": margin_db, "next_hop": "b02", "trend": trend}
+
+
+@pytest.mark.parametrize(
+    ("found", "before", "decision"),
+    [
+        (radio(4.0), False, (True, "4 dB of margin to b02")),
+        # (15 - 5) / 0.25 = 40 s
+        (radio(15.0, -0.25), False, (True, "15 dB of margin to b02, for 40 s more")),
+        # far above the need the trend says nothing
+        (radio(30.0, -1.0), False, (False, "5.0 Mbit/s")),
+        (radio(6.0), False, (False, "5.0 Mbit/s")),
+        (radio(6.0), True, (True, "not good enough yet: 6 dB of margin to b02")),
+        (radio(11.0), True, (False, "5.0 Mbit/s")),
+        # not known
+        (radio(None), False, (False, "5.0 Mbit/s")),
+        (None, False, (False, "5.0 Mbit/s")),
+    ],
+)
+def test_the_radio_margin_counts_if_it_is_needed(
+    found: dict[str, Any] | None, before: bool, decision: tuple[bool, str]
+) -> None:
+    assert decide(peer(radio=found), MARGIN_NEED, before) == decision
+    assert not decide(peer(radio=found), NEED, before).turn_back
+
+
+def test_a_silent_robot_turns_back_and_continues_by_its_margin_alone() -> None:
+    assert decide(peer(None, radio=radio(4.0)), MARGIN_NEED, before=False).turn_back
+    assert decide(peer(None, radio=radio(12.0)), MARGIN_NEED, before=True) == (False, "12 dB of margin to b02")
+    # without a collector it knows nothing, and changes nothing
+    assert decide(peer(None), MARGIN_NEED, before=True) == (True, "not measured yet")
