@@ -1,6 +1,7 @@
-"""The links of one node's mesh radios and its next hop to the base, in one short round trip: scripts/links.sh.
+"""The links of one node's mesh radios and its paths, in one short round trip: scripts/links.sh.
 
-`read_links` is the round trip, `parse_links` is pure. About 120 bytes per station, so that once a second is affordable.
+`read_links` is a round trip of its own, for the path to the base; `answering_script` answers many requests over one
+connection, with all paths. `parse_links` is pure. About 120 bytes per station, so that once a second is affordable.
 """
 
 from __future__ import annotations
@@ -9,29 +10,40 @@ import re
 import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from meshctl.device.connection import Connection
 from meshctl.device.framing import quoted
-from meshctl.device.observation import Station
+from meshctl.device.observation import Originator, Station
 from meshctl.device.parse import batctl, iw
 from meshctl.device.parse.sections import OutputSection, split_sections
 from meshctl.device.scripts import script
 
+if TYPE_CHECKING:
+    # the collector on a robot has no SSH library
+    from meshctl.device.connection import Connection
+
 MAX_INACTIVE_MS = 3000
 """A station that was silent for longer is no link: a mesh radio sends several frames a second."""
+BEST_ROWS = "^ *[*] "
+"""The best path to each originator."""
+LAST_SECTION = "done"
+"""With its end an answer is complete."""
 _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}")
 
 
 @dataclass(frozen=True, slots=True)
 class LinkTable:
-    """One node's links at `taken_s`. `signals_dbm` and `noise_dbm` are by MAC of the station; `next_hop` is the MAC of
-    the best next hop to the base, empty if the node has no path."""
+    """One node's links at `taken_s`. By MAC of the station are `signals_dbm`, `noise_dbm`, and `expected_mbit_s` as far
+    as the driver tells. `next_hop` is the MAC of the best next hop to the base, empty if the node has no path. `paths`
+    are the rows of originators that were asked for; None if the node has no such table."""
 
     taken_s: float
     signals_dbm: Mapping[str, int]
     noise_dbm: Mapping[str, int | None]
     next_hop: str = ""
+    expected_mbit_s: Mapping[str, float] = field(default_factory=dict)
+    paths: tuple[Originator, ...] | None = None
 
 
 def read_links(
@@ -46,16 +58,35 @@ def read_links(
 def links_script(nonce: str, base_macs: Iterable[str]) -> str:
     """links.sh with its inputs set; without a base, no originator matches."""
     macs = [mac.lower() for mac in base_macs if _MAC.fullmatch(mac.lower())]
+    rows = f"^[ *]*({'|'.join(macs) or 'none'}) "
+    return f"N={quoted(nonce)}\nROWS={quoted(rows)}\n{_body()}\n"
+
+
+def answering_script() -> str:
+    """A script that answers each line of its standard input, a nonce, with the sections of links.sh, until that ends.
+
+    It reads nothing else, so that a key whose forced command it is can do nothing else.
+    """
+    # what links.sh runs must not read the requests
+    return f"ROWS={quoted(BEST_ROWS)}\nwhile read -r N; do\n{{\n{_body()}\n}} </dev/null\ndone\n"
+
+
+def _body() -> str:
     # it crosses the mesh every second: without its comments it is half as long
     lines = [line.strip() for line in script("links.sh").splitlines()]
-    body = "\n".join(line for line in lines if line and not line.startswith("#"))
-    return f"N={quoted(nonce)}\nBASE={quoted('|'.join(macs) or 'none')}\n{body}\n"
+    return "\n".join(line for line in lines if line and not line.startswith("#"))
+
+
+def is_complete(output: bytes | bytearray, nonce: str) -> bool:
+    """Whether these are all sections of an answer of `answering_script`."""
+    return output.endswith(f"{nonce} begin {LAST_SECTION}\n\n{nonce} end 0\n".encode())
 
 
 def parse_links(sections: Mapping[str, OutputSection], base_macs: Iterable[str], *, taken_s: float) -> LinkTable:
     """The sections of links.sh. Any input gives a table."""
     signals: dict[str, int] = {}
     noise: dict[str, int | None] = {}
+    expected: dict[str, float] = {}
     for name, section in sections.items():
         kind, _, ifname = name.partition(" ")
         if kind != "iw.stations":
@@ -67,7 +98,11 @@ def parse_links(sections: Mapping[str, OutputSection], base_macs: Iterable[str],
             if signal is not None:
                 signals[station.mac] = signal
                 noise[station.mac] = None if found is None else found.noise_dbm
-    return LinkTable(taken_s, signals, noise, _next_hop(sections, {mac.lower() for mac in base_macs}))
+                if station.expected_mbit_s is not None:
+                    expected[station.mac] = station.expected_mbit_s
+    rows = _rows(sections)
+    next_hop = _next_hop(rows or (), {mac.lower() for mac in base_macs})
+    return LinkTable(taken_s, signals, noise, next_hop, expected, rows)
 
 
 def _signal(station: Station) -> int | None:
@@ -77,13 +112,14 @@ def _signal(station: Station) -> int | None:
     return station.signal_dbm if station.signal_dbm is not None else station.signal_avg_dbm
 
 
-def _next_hop(sections: Mapping[str, OutputSection], base_macs: set[str]) -> str:
-    rows = [
-        row
-        for name, section in sections.items()
-        if name.startswith("batctl.path ")
-        for row in batctl.parse_originators_text(section.text) or ()
-        if row.mac in base_macs
-    ]
-    best = max(rows, key=lambda row: (row.best, row.tq or 0, row.throughput_kbit_s or 0), default=None)
+def _rows(sections: Mapping[str, OutputSection]) -> tuple[Originator, ...] | None:
+    tables = [section for name, section in sections.items() if name.startswith("batctl.path ")]
+    if not tables:
+        return None
+    return tuple(row for table in tables for row in batctl.parse_originators_text(table.text) or ())
+
+
+def _next_hop(rows: Iterable[Originator], base_macs: set[str]) -> str:
+    to_base = (row for row in rows if row.mac in base_macs)
+    best = max(to_base, key=lambda row: (row.best, row.tq or 0, row.throughput_kbit_s or 0), default=None)
     return "" if best is None else best.next_hop

@@ -21,7 +21,11 @@ _LENGTHS = struct.Struct(">II")
 
 
 class DaemonError(Exception):
-    """The daemon cannot be reached, or refused the request."""
+    """The daemon cannot be reached (empty `code`), or refused the request."""
+
+    def __init__(self, text: str, code: str = "") -> None:
+        super().__init__(text)
+        self.code = code
 
 
 def socket_path(given: Path | None, environ: Mapping[str, str] = os.environ) -> Path:
@@ -80,7 +84,7 @@ class LocalDaemon:
         # without a subscription, the reply is the next frame
         reply, _ = self._frame(self._read(_LENGTHS.size))
         if not reply.get("ok"):
-            raise DaemonError(f"{self.path}: {reply.get('error', 'refused')}")
+            raise DaemonError(f"{self.path}: {reply.get('error', 'refused')}", str(reply.get("code", "refused")))
         return reply
 
     def _read(self, count: int) -> bytes:

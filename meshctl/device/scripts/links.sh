@@ -1,6 +1,6 @@
-# Prints the links of a node's mesh radios and its path to the base, as few bytes as possible. Sent with `N` (a nonce no
-# output can contain) and `BASE` (MACs of the base's radios, separated by |) set before it. Sections as in observe.sh.
-# Nothing here changes the node.
+# Prints the links of a node's mesh radios and its paths, as few bytes as possible. Sent with `N` (a nonce no output can
+# contain) and `ROWS` (a pattern of lines in the table of originators) set before it. Sections as in observe.sh. Nothing
+# here changes the node.
 
 section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
@@ -10,16 +10,16 @@ section() { # NAME COMMAND...
 }
 
 stations() { # INTERFACE
-	iw dev "$1" station dump | grep -E '^Station|inactive time:|signal:|signal avg:'
+	iw dev "$1" station dump | grep -E '^Station|inactive time:|signal:|signal avg:|expected throughput:'
 }
 
 survey() { # INTERFACE
 	iw dev "$1" survey dump | awk '/^Survey/ { head = $0 } /frequency:/ { used = /\[in use\]/; if (used) print head } used && /frequency:|noise:/'
 }
 
-# the table of BATMAN_IV and BATMAN_V, of the base alone; before 2020 batctl has no meshif
+# the table of BATMAN_IV and BATMAN_V, of the wanted rows alone; before 2020 batctl has no meshif
 path() { # INTERFACE
-	{ batctl meshif "$1" originators 2>/dev/null || batctl -m "$1" originators; } | grep -iE "Originator|^[ *]*($BASE) "
+	{ batctl meshif "$1" originators 2>/dev/null || batctl -m "$1" originators; } | grep -iE "Originator|$ROWS"
 }
 
 for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { name = $2 } $1 == "type" && ($2 == "IBSS" || $2 == "mesh") { print name }'); do

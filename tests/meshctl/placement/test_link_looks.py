@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ STATIONS = """Station {mac} (on mesh0)
 \tinactive time:\t{inactive} ms
 \tsignal:  \t{signal} [-60, -62] dBm
 \tsignal avg:\t-50 [-50, -52] dBm
+\texpected throughput:\t39.0Mbps
 """
 SURVEY = "Survey data from mesh0\n\tfrequency:\t\t\t2437 MHz [in use]\n\tnoise:\t\t\t\t-92 dBm\n"
 PATHS = """[B.A.T.M.A.N. adv 2023.1, MainIF/MAC: mesh0/02:00:00:00:00:04 (bat0/02:00:00:00:01:04 BATMAN_IV)]
@@ -50,13 +52,19 @@ def test_the_output_of_a_radio_is_a_table_of_fresh_stations_and_the_next_hop() -
     }
     output = "".join(f"{nonce} begin {name}\n{body}\n{nonce} end 0\n" for name, body in sections.items()).encode()
     found = parse_links(split_sections(output, nonce), [MACS["base"].upper()], taken_s=5.0)
-    assert found == LinkTable(5.0, {MACS["b01"]: -61}, {MACS["b01"]: -92}, MACS["b01"])
+    assert replace(found, paths=None) == LinkTable(
+        5.0, {MACS["b01"]: -61}, {MACS["b01"]: -92}, MACS["b01"], {MACS["b01"]: 39.0}
+    )
+    assert [(row.next_hop, row.best, row.tq) for row in found.paths or ()] == [
+        (MACS["b02"], False, 150),
+        (MACS["b01"], True, 210),
+    ]
     assert parse_links({}, [MACS["base"]], taken_s=5.0) == LinkTable(5.0, {}, {}, "")
 
 
 def test_the_script_takes_no_word_that_a_shell_would_run() -> None:
     text = links_script("meshctl-1", [MACS["base"], "$(reboot)", "02:00:00:00:00:09"])
-    assert f"BASE={quoted('02:00:00:00:00:01|02:00:00:00:00:09')}" in text
+    assert f"ROWS={quoted('^[ *]*(02:00:00:00:00:01|02:00:00:00:00:09) ')}" in text
     assert "reboot" not in text
 
 
