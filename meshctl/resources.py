@@ -1,4 +1,4 @@
-"""Files shipped with meshctl: templates, example inventories, lint pages.
+"""Files shipped with meshctl: templates, example inventories, lint pages, scripts for nodes.
 
 In a checkout they are at the top of the repository, in an installed wheel inside the package (see pyproject.toml).
 """
@@ -10,6 +10,11 @@ from pathlib import Path
 _PACKAGE = Path(__file__).resolve().parent
 _SHIPPED = _PACKAGE / "_shipped"
 _CHECKOUT = {"templates": "templates", "inventory": "inventory", "lint": "docs/lint"}
+
+
+def device_script(name: str) -> str:
+    """A shell script for nodes that is also one of their files."""
+    return (_PACKAGE / "device" / "scripts" / name).read_text(encoding="utf-8")
 
 
 def shipped(kind: str) -> Path:

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 MAX_INACTIVE_MS = 3000
 """A station that was silent for longer is no link: a mesh radio sends several frames a second."""
-BEST_ROWS = "^ *[*] "
-"""The best path to each originator."""
 LAST_SECTION = "done"
 """With its end an answer is complete."""
 _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}")
@@ -63,12 +61,11 @@ def links_script(nonce: str, base_macs: Iterable[str]) -> str:
 
 
 def answering_script() -> str:
-    """A script that answers each line of its standard input, a nonce, with the sections of links.sh, until that ends.
+    """links.sh without a nonce: it answers each line of its standard input, a nonce, until that ends.
 
     It reads nothing else, so that a key whose forced command it is can do nothing else.
     """
-    # what links.sh runs must not read the requests
-    return f"ROWS={quoted(BEST_ROWS)}\nwhile read -r N; do\n{{\n{_body()}\n}} </dev/null\ndone\n"
+    return f"N= ROWS=\n{_body()}\n"
 
 
 def _body() -> str:

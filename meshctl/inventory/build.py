@@ -340,6 +340,8 @@ def _computer(document: ComputerDocument) -> Computer:
             ComputerLink(link.interface, link.address, MappingProxyType(dict(link.neighbors)), link.mtu)
             for link in document.links
         ),
+        collector=document.collector,
+        collector_key=document.collector_key,
     )
 
 

@@ -177,7 +177,8 @@ class ComputerLink:
 @dataclass(frozen=True, slots=True)
 class Computer:
     """A robot's computer, where the udp_mesh daemon runs. `gateway` is its next hop to other networks, by default the
-    robot's radio. `links` are those of the daemon beside the one with `address`."""
+    robot's radio. `links` are those of the daemon beside the one with `address`. With `collector`, it asks the robot's
+    radios for their links, with the private part of the SSH key `collector_key`."""
 
     address: IpInterface
     ssh: SshSettings = SshSettings()
@@ -186,6 +187,8 @@ class Computer:
     ros: str = ""
     gateway: IpAddress | None = None
     links: tuple[ComputerLink, ...] = ()
+    collector: bool = False
+    collector_key: str = ""
 
 
 @dataclass(frozen=True, slots=True)

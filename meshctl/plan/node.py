@@ -22,11 +22,11 @@ from meshctl.plan.packages import NO_NEEDS, Needs, package_step
 from meshctl.plan.preconditions import failed_precondition
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
-from meshctl.render import LAN_FILTER_PATH, MARKER_PATH, RenderedFile
+from meshctl.render import LAN_FILTER_PATH, LINKS_PATH, MARKER_PATH, RenderedFile
 from meshctl.resolve import wireless_scripts
 from meshctl.uci import Package
 
-PUBLIC_FILES = (LAN_FILTER_PATH, MARKER_PATH, "etc/dropbear/authorized_keys")
+PUBLIC_FILES = (LAN_FILTER_PATH, LINKS_PATH, MARKER_PATH, "etc/dropbear/authorized_keys")
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,19 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
 from meshctl.model import MASK, Fleet, Node, Secret, SecretRef
 from meshctl.render.extra import with_extra
 from meshctl.render.facts import NO_FACTS, DeviceFacts, with_board_sections
-from meshctl.render.rendered import CONFIG_FOLDER, LAN_FILTER_PATH, MARKER_PATH, Rendered, RenderedFile, replace_secrets
+from meshctl.render.rendered import (
+    CONFIG_FOLDER,
+    LAN_FILTER_PATH,
+    LINKS_PATH,
+    MARKER_PATH,
+    Rendered,
+    RenderedFile,
+    replace_secrets,
+)
 from meshctl.render.template_files import NOT_UCI, TemplateFile
 from meshctl.render.templates import Templates
 from meshctl.resolve import Intent, resolve
+from meshctl.resources import device_script
 
 # A WEP key has 5 characters; shorter values, such as the index in wireless' `key '1'`, are not secret.
 _MIN_SECRET_CHARACTERS = 5
@@ -132,6 +141,8 @@ def _files(intent: Intent, templates: Templates, facts: DeviceFacts) -> Iterator
             packages[package.name] = package
         else:
             yield _file(file.path, text, 0o755 if file.is_executable else 0o644, intent.secrets, None)
+    if intent.login.collectors:
+        yield _file(LINKS_PATH, device_script("links.sh"), 0o644, intent.secrets, None)
     for name, written in with_extra(packages, intent).items():
         package = with_board_sections(written, facts)
         yield _file(CONFIG_FOLDER + name, uci.dump(package), 0o644, intent.secrets, package)

@@ -13,6 +13,8 @@ MARKER_PATH = "etc/meshctl/node"
 CONFIG_FOLDER = "etc/config/"
 # Run by the firewall; only nodes with `lan_filter` have it.
 LAN_FILTER_PATH = "etc/meshctl/lan-filter.sh"
+# All that the key of a collector may run; only radios of robots with one have it.
+LINKS_PATH = "etc/meshctl/links.sh"
 
 
 @dataclass(frozen=True, slots=True)

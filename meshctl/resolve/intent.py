@@ -121,11 +121,12 @@ class LanFilterIntent:
 
 @dataclass(frozen=True, slots=True)
 class Login:
-    """SSH login to the node."""
+    """SSH login to the node. `keys` are the operators'; those in `collectors` may only ask for the node's links."""
 
     port: int
     is_password_allowed: bool
     keys: tuple[str, ...]
+    collectors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,9 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
         backbone=_backbone(node, primary, masters),
         routes=routes(fleet, node),
         lan_filter=_lan_filter(fleet, node, primary, masters),
-        login=Login(_ssh_port(node), fleet.operators.password_login, _login_keys(fleet, node)),
+        login=Login(
+            _ssh_port(node), fleet.operators.password_login, _login_keys(fleet, node), _collector_keys(fleet, node)
+        ),
         system=fleet.system,
         backend=primary.backend if primary is not None else Backend.BATMAN,
         operator_parts=primary.operator_parts if primary is not None else OperatorParts(),
@@ -96,6 +98,15 @@ def _login_keys(fleet: Fleet, node: Node) -> tuple[str, ...]:
     """The public keys that the node accepts: the operators', and that of its site's worker."""
     site = fleet.worker_site(node)
     return (*fleet.operators.ssh_keys, *((site.worker_key,) if site is not None and site.worker_key else ()))
+
+
+def _collector_keys(fleet: Fleet, node: Node) -> tuple[str, ...]:
+    """The key of the collector on the node's robot, which has it once it was deployed."""
+    robot = fleet.robots.get(node.robot or "")
+    computer = None if robot is None else robot.computer
+    if robot is None or computer is None or not computer.collector or node.name not in robot.nodes:
+        return ()
+    return (computer.collector_key,) if computer.collector_key else ()
 
 
 def _primary(meshes: tuple[Mesh, ...], node: Node) -> Mesh | None:
@@ -277,3 +288,5 @@ def _check_values(fleet: Fleet, node: Node, intent: Intent, checks: ValueChecks)
         checks.text(("system", "ntp_servers", str(index)), server, is_required=True)
     login = intent.login
     checks.login(login.keys, is_password_allowed=login.is_password_allowed, release=intent.release)
+    for key in login.collectors:
+        checks.collector(node.robot, key)

@@ -142,6 +142,12 @@ class ValueChecks:
         if release >= Release.V25_12 and "'" in value:
             self.add(VALUE, path, f"no single quote (OpenWrt {release} passes it to a shell)", _describe_secret(value))
 
+    def collector(self, robot: str, key: str) -> None:
+        """The public key of a robot's collector."""
+        if _PUBLIC_KEY.fullmatch(key) is None or _CONTROL.search(key):
+            path = ("robots", robot, "computer", "collector_key")
+            self.add(VALUE, path, "one OpenSSH public key on one line", repr(key))
+
     def login(self, keys: tuple[str, ...], *, is_password_allowed: bool, release: Release) -> None:
         """Public keys on one line each, at least one of which this release's dropbear supports."""
         usable = 0

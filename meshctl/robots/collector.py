@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import threading
 import time
@@ -267,6 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()
 
+    # systemd's way to stop a service
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         run(load(given.configuration), LocalDaemon(socket_path(given.socket)), say=say)
     except ConfigurationError as error:

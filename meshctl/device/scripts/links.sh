@@ -1,6 +1,7 @@
-# Prints the links of a node's mesh radios and its paths, as few bytes as possible. Sent with `N` (a nonce no output can
-# contain) and `ROWS` (a pattern of lines in the table of originators) set before it. Sections as in observe.sh. Nothing
-# here changes the node.
+# Prints the links of a node's mesh radios and its paths, as few bytes as possible. `N` is a nonce no output can contain,
+# `ROWS` a pattern of lines in the table of originators; both may be set before. Without `N`, each line of standard input
+# is a nonce and is answered. Sections as in observe.sh. Nothing here changes the node.
+ROWS=${ROWS:-'^ *[*] '}
 
 section() { # NAME COMMAND...
 	printf '%s begin %s\n' "$N" "$1"
@@ -22,11 +23,19 @@ path() { # INTERFACE
 	{ batctl meshif "$1" originators 2>/dev/null || batctl -m "$1" originators; } | grep -iE "Originator|$ROWS"
 }
 
-for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { name = $2 } $1 == "type" && ($2 == "IBSS" || $2 == "mesh") { print name }'); do
-	section "iw.stations $dev" stations "$dev"
-	section "iw.survey $dev" survey "$dev"
-done
-for dev in /sys/class/net/bat*; do
-	[ ! -e "$dev" ] || section "batctl.path ${dev##*/}" path "${dev##*/}"
-done
-section done true
+links() {
+	for dev in $(iw dev 2>/dev/null | awk '$1 == "Interface" { name = $2 } $1 == "type" && ($2 == "IBSS" || $2 == "mesh") { print name }'); do
+		section "iw.stations $dev" stations "$dev"
+		section "iw.survey $dev" survey "$dev"
+	done
+	for dev in /sys/class/net/bat*; do
+		[ ! -e "$dev" ] || section "batctl.path ${dev##*/}" path "${dev##*/}"
+	done
+	section done true
+}
+
+if [ -n "${N:-}" ]; then
+	links
+else
+	while read -r N; do links </dev/null; done
+fi

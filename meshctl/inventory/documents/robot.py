@@ -7,7 +7,7 @@ from pydantic import Field
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
 from meshctl.inventory.documents.node import PositionDocument, SshLayer
 from meshctl.inventory.documents.thin import ThinLinkDocument, ThinPortsDocument
-from meshctl.inventory.fields import Address, Flag, Interface, IPv4Only, Name, Network, Real, Text, Whole, Window
+from meshctl.inventory.fields import Address, Flag, Interface, IPv4Only, Line, Name, Network, Real, Text, Whole, Window
 from meshctl.model import Outbox, TopicClass
 
 
@@ -42,6 +42,11 @@ class ComputerDocument(Document):
     the robot's LAN, else of the robot's first radio."""
     links: tuple[ComputerLinkDocument, ...] = ()
     """Links of the daemon beside the one with `address`, such as a second radio or a tether."""
+    collector: Flag = False
+    """Ask the robot's radios for their links, and add them to the daemon's conditions."""
+    collector_key: Line = ""
+    """The collector's SSH public key, which the robot's radios accept for that alone; written by `meshctl robots
+    deploy`."""
 
 
 class OtherComputerDocument(Document):

@@ -1,0 +1,213 @@
+"""The collector end to end: a virtual radio with dropbear, the system's ssh, a real daemon, a client."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from meshctl.device.authentication import new_key_pair
+from meshctl.inventory import load
+from meshctl.model import Secret
+from meshctl.render import LINKS_PATH, render_node
+from meshctl.robots.radio_session import Login, Radio, ssh_command
+from meshlab.fleet import VirtualFleet, VirtualNode
+from tests.meshlab.conftest import LINE
+from tests.meshlab.test_ground_on_fleet import mac_of
+from tests.udp_mesh.daemon.processes import RunningDaemon, two_daemons
+from tests.waiting import until
+from udp_mesh.client.turn_back import Need, decide
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("lab")]
+
+# of the two robots with daemons, alice has the radio near, and bob far
+INVENTORY = """\
+meshctl: 1
+fleet: collectors
+country: US
+operators: {{ssh_keys: ["ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g test"]}}
+hardware:
+  rocket:
+    board: ubnt,rocket-m
+    profile: ubnt_rocket-m
+    target: ath79/generic
+    release: "23.05"
+    lan_ports: [eth0]
+    radios: {{radio0: {{path: "pci0000:00/0000:00:00.0", band: 2g, rated_power_dbm: 30, max_drive_dbm: 28}}}}
+meshes:
+  main: {{ssid: fleet, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}}
+defaults: {{hardware: rocket, state: deployed}}
+nodes:
+  base: {{role: base, address: 10.42.0.1}}
+  near: {{address: 10.42.0.2}}
+  far: {{address: 10.42.0.3}}
+robots:
+  alice: {{nodes: [near], computer: {{address: 10.42.0.12/24, collector: true, collector_key: "{key}"}}}}
+  bob: {{nodes: [far], computer: {{address: 10.42.0.13/24}}}}
+"""
+AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
+# without a password a factory-fresh node lets everyone in
+DROPBEAR = "etc/config/dropbear"
+
+
+@dataclass(frozen=True)
+class Team:
+    """Alice's radio accepts the collector's key; her daemon and bob's run."""
+
+    fleet: VirtualFleet
+    alice: RunningDaemon
+    radio: Radio
+    login: Login
+    file: Path
+
+    @property
+    def near(self) -> VirtualNode:
+        return self.fleet.node("near")
+
+    @contextmanager
+    def collector(self) -> Iterator[subprocess.Popen[str]]:
+        command = [sys.executable, "-m", "meshctl.robots.collector", str(self.file), "--socket", str(self.alice.socket)]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        try:
+            yield process
+        finally:
+            process.terminate()
+            process.communicate(timeout=30)
+
+    def conditions(self) -> dict[str, Any]:
+        with self.alice.client() as client:
+            found: dict[str, Any] = client.request("status")["conditions"]
+        return found
+
+    def path(self) -> dict[str, Any] | None:
+        """The radio path to bob."""
+        return next((peer["radio"] for peer in self.conditions()["peers"]), None)
+
+    def signal_dbm(self) -> float | None:
+        path = self.path()
+        return None if path is None else path["signal_dbm"]
+
+    def problem(self) -> str:
+        radio = self.conditions()["radio"]
+        return "" if radio is None else radio["problem"] or ""
+
+
+@pytest.fixture
+def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
+    near = mesh.node("near")
+    private, public = new_key_pair("collector of alice")
+    (tmp_path / "fleet.yaml").write_text(INVENTORY.format(key=public))
+    fleet = load(tmp_path / "fleet.yaml").fleet
+    rendered = {file.path: file for file in render_node(fleet, "near", lambda _: Secret("")).files}
+    before = near.exec(f"cat /{DROPBEAR}").stdout_bytes
+    for path in (AUTHORIZED_KEYS, LINKS_PATH, DROPBEAR):
+        write(near, path, rendered[path].content, rendered[path].mode)
+    near.exec("reload_config").check("reload dropbear")
+    key = tmp_path / "id_ed25519"
+    key.write_bytes(private)
+    key.chmod(0o600)
+    shown = near.exec("dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key").stdout
+    (host_key,) = (line for line in shown.splitlines() if line.startswith("ssh-ed25519 "))
+    (tmp_path / "known_hosts").write_text(f"near {host_key}\n")
+    endpoint = mesh.endpoint("10.42.0.2")
+    radio = Radio("near", endpoint.host, endpoint.port)
+    document = {
+        "version": 1,
+        "robot": "alice",
+        "radios": [{"name": "near", "host": radio.host, "port": radio.port, "user": "root"}],
+        "robots": {"base": ["base"], "bob": ["far"]},
+        "key": key.name,
+        "known_hosts": "known_hosts",
+        "names": "names.json",
+        "macs": {},
+        "load_mbit_s": 2.0,
+        "interval_s": 0.3,
+    }
+    (tmp_path / "collector.json").write_text(json.dumps(document))
+    (tmp_path / "names.json").write_text(json.dumps({mac_of(mesh, name): name for name in LINE}))
+    with two_daemons() as (alice, _):
+        yield Team(mesh, alice, radio, Login(key, tmp_path / "known_hosts"), tmp_path / "collector.json")
+    mesh.link("near", "far", signal_dbm=-58)
+    near.wait_up()
+    write(near, DROPBEAR, before, 0o644)
+    near.exec(f"rm -f /{AUTHORIZED_KEYS} /{LINKS_PATH}; sync; reload_config").check("remove the key")
+
+
+def write(node: VirtualNode, path: str, content: bytes, mode: int) -> None:
+    words = f"mkdir -p /{Path(path).parent} && cat >/{path} && chmod {mode:o} /{path} && sync"
+    node.exec(words, stdin=content).check(f"write {path}")
+
+
+def test_conditions_have_the_radio_path_of_each_peer(team: Team) -> None:
+    assert team.path() is None
+    with team.collector():
+        until(lambda: team.path() is not None, "the radio path to bob")
+        path = team.path()
+        assert path is not None
+        assert (path["source"], path["radio"], path["next_hop"], path["signal_dbm"]) == ("near", "near", "far", -58)
+        assert path["quality"] == pytest.approx(200 / 255, abs=0.05)
+        assert 0.0 <= path["age_s"] < 10.0
+        assert path["margin_db"] > 10.0
+        neighbors = {one["name"]: one["signal_dbm"] for one in team.conditions()["radio"]["neighbors"]}
+        assert neighbors == {"base": -61, "far": -58}
+        # bob drives away
+        team.fleet.link("near", "far", signal_dbm=-84)
+        until(lambda: team.signal_dbm() == -84, "the weaker signal")
+        until(lambda: margin_db(team) < 0.0, "no margin")
+        (bob,) = team.conditions()["peers"]
+        assert decide(bob, Need(1.0, 9, margin_db=3.0), before=False).turn_back
+        assert not decide(bob, Need(1.0, 9), before=False).turn_back
+        # a daemon that restarts knows nothing, and is told again
+        team.alice.stop()
+        team.alice.start()
+        until(lambda: team.path() is not None, "the radio path after a restart")
+    until(lambda: team.conditions()["radio"] is None, "the collector's silence")
+    assert team.path() is None
+
+
+def margin_db(team: Team) -> float:
+    path = team.path()
+    assert path is not None
+    return float(path["margin_db"])
+
+
+def test_a_radio_that_is_off_is_named_and_asked_again(team: Team) -> None:
+    with team.collector():
+        until(lambda: team.path() is not None, "the radio path to bob")
+        team.near.power_cut(back=False)
+        until(lambda: "near does not answer: " in team.problem(), "the silent radio")
+        until(lambda: team.path() is None, "the end of its values")
+        # the collector lives
+        assert team.conditions()["radio"]["source"] == "near"
+        team.near.power_on()
+        until(lambda: team.path() is not None, "the radio path after a boot", wait_s=90.0)
+        assert team.problem() == ""
+
+
+def test_the_key_of_a_collector_runs_nothing_else(team: Team) -> None:
+    command = [*ssh_command(team.radio, team.login)[:-1], "touch /tmp/run-by-a-collector"]
+    done = subprocess.run(
+        command, input=b"meshctl-1\n$(touch /tmp/run-by-a-collector)\n", capture_output=True, check=False
+    )
+    assert done.stdout.startswith(b"meshctl-1 begin iw.stations mesh0\n")
+    assert team.near.exec("ls /tmp/run-by-a-collector").exit_status != 0
+    # neither a terminal nor a tunnel
+    tunnel = [*ssh_command(team.radio, team.login)[:-2], "-W", "127.0.0.1:22", team.radio.host]
+    refused = subprocess.run(tunnel, input=b"", capture_output=True, check=False, timeout=60)
+    assert refused.returncode != 0
+    assert b"SSH-2.0" not in refused.stdout
+
+
+def test_a_changed_host_key_is_refused_and_named(team: Team) -> None:
+    _, other = new_key_pair("another radio")
+    team.login.known_hosts.write_text(f"near {other}\n")
+    with team.collector():
+        until(lambda: "near does not answer: " in team.problem(), "the refusal")
+        assert "Host key verification failed" in team.problem()
