@@ -38,14 +38,18 @@ from meshctl.device.connection import Connection
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet import Event, EventKind, Observer, Outcome, Result, Tee, outcome_of_error, run, silent
 from meshctl.fleet.journal import RunRecord
+from meshctl.inventory.edit import Editor, save
 from meshctl.inventory.secrets import SecretStore
 from meshctl.model import Fleet, Secret
+from meshctl.nodes.collect import known_macs
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.render.daemon import daemon_keys
 from meshctl.robots.bundle import UNIT_TITLES, configuration
+from meshctl.robots.collector_release import RadioKnowledge, own_radios
 from meshctl.robots.connection import RobotConnector, selected_robots
-from meshctl.robots.deploy import DeployOptions, Wheelhouse, claim, deploy, roll_back
+from meshctl.robots.deploy import COLLECTOR_KEY, DeployOptions, Wheelhouse, claim, deploy, roll_back
 from meshctl.robots.host import Host
+from meshctl.robots.preconditions import computer_of
 from meshctl.robots.wheels import stock_units
 
 Robots = Annotated[
@@ -207,11 +211,22 @@ def robots_context(
     """A context in an open session."""
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
-    options = DeployOptions(fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s)
+    options = DeployOptions(
+        fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s, radios=_radios(opened)
+    )
     lab = "" if opened.lab is None else str(opened.lab.directory)
     connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner, lab)
     selected = selected_robots(fleet, robots, read_selection, limits or ())
     return RobotsContext(opened, connector, selected, options, inventory, wheels, as_json)
+
+
+def _radios(opened: Session) -> RadioKnowledge:
+    """What the fleet's pins and the journal tell of radios, for the robots' collectors."""
+
+    def names() -> dict[str, str]:
+        return known_macs(opened.fleet, opened.journal.last_known(opened.fleet.name))
+
+    return RadioKnowledge(opened.trust.pinned, names)
 
 
 def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -253,7 +268,30 @@ def run_command(context: RobotsContext, command: str, **parameters: Any) -> Jour
         "wait_s": context.options.wait_s,
         "wheels": str(context.wheels.resolve()) if context.wheels else "",
     }
-    return context.run_journaled(command, lambda opened: _task_for(command, opened, parameters), parameters)
+    journaled = context.run_journaled(command, lambda opened: _task_for(command, opened, parameters), parameters)
+    _write_collector_keys(context, journaled.outcomes)
+    return journaled
+
+
+def _write_collector_keys(context: RobotsContext, outcomes: Mapping[str, Outcome]) -> None:
+    """Write new public keys of collectors into the inventory, for the radios to accept."""
+    new = {
+        robot: key
+        for robot, outcome in outcomes.items()
+        if (key := outcome.facts.get(COLLECTOR_KEY, "")) and key != computer_of(context.fleet, robot).collector_key
+    }
+    if not new:
+        return
+    editor = Editor.open(context.inventory, environ=os.environ)
+    for robot, key in new.items():
+        editor.set(("robots", robot, "computer", "collector_key"), key)
+    changes = editor.changes()
+    save(changes)
+    if not context.as_json:
+        for change in changes:
+            echo(f"{', '.join(new)}: collector_key written to {change.file}")
+        radios = [node.name for robot in new for node in own_radios(context.fleet, context.fleet.robots[robot])]
+        echo(f"let their radios accept it: meshctl provision {' '.join(radios)}")
 
 
 def _task_for(command: str, context: RobotsContext, parameters: Parameters) -> RobotTask:

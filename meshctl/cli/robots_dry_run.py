@@ -18,6 +18,7 @@ from meshctl.cli.robots_context import RobotsContext, RobotTask
 from meshctl.errors import ExitCode
 from meshctl.fleet import Outcome, Result
 from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME, UNIT_TITLES
+from meshctl.robots.collector_release import COLLECTOR_UNIT_NAME
 from meshctl.robots.deploy import plan_deploy
 from meshctl.robots.expected_release import ExpectedRelease
 from meshctl.robots.facts import RobotFacts, collect_facts
@@ -85,7 +86,12 @@ def command_differences(command: str, *, purge: bool = False) -> RobotTask:
 
 
 def _service_changes(facts: RobotFacts, verb: str) -> tuple[str, ...]:
-    units = {UNIT_NAME: facts.service, BRIDGE_UNIT_NAME: facts.bridge, HOSTS_UNIT_NAME: facts.hosts}
+    units = {
+        UNIT_NAME: facts.service,
+        BRIDGE_UNIT_NAME: facts.bridge,
+        HOSTS_UNIT_NAME: facts.hosts,
+        COLLECTOR_UNIT_NAME: facts.collector,
+    }
     return (
         *(
             f"would {verb} {UNIT_TITLES[name]}, which is {unit.active or 'not installed'}"

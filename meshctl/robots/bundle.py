@@ -17,6 +17,16 @@ from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1, ROS_2, ROS_TOO_OLD
 from meshctl.render.bridge import BRIDGE_CONFIG_NAME, bridge_config
 from meshctl.render.daemon import CONFIG_NAME, KEY_NAME, RELAY_KEY_NAME, daemon_config, daemon_keys, relay_keys
+from meshctl.robots.collector_release import (
+    COLLECTOR_UNIT_NAME,
+    LAUNCHER_NAME,
+    collector_config,
+    collector_launcher,
+    collector_unit,
+    collector_wheel,
+    has_collector,
+)
+from meshctl.robots.collector_release import CONFIG_NAME as COLLECTOR_CONFIG_NAME
 from meshctl.robots.scripts import shipped
 from meshctl.robots.wheels import Wheel
 
@@ -28,7 +38,10 @@ UNIT_TITLES: Mapping[str, str] = {
     UNIT_NAME: "the service",
     BRIDGE_UNIT_NAME: "the ROS bridge",
     HOSTS_UNIT_NAME: "the service for /etc/hosts",
+    COLLECTOR_UNIT_NAME: "the collector",
 }
+# Those that only some robots have.
+OPTIONAL_UNITS = (BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, COLLECTOR_UNIT_NAME)
 _CURRENT = "/opt/udp-mesh/current"
 # 64 bits of the SHA-256: short enough to read, long enough against accidental collisions.
 _ID_DIGITS = 16
@@ -107,8 +120,10 @@ def bundle(
 ) -> Bundle:
     """The bundle for one robot; `executable` is the absolute path of its Python, `units` the shipped unit files.
 
-    Raises InvalidInput for settings the daemon would reject, and for missing keys.
+    `wheels` are those of the daemon. Raises InvalidInput for settings the daemon would reject, and for missing keys.
     """
+    if has_collector(fleet, robot):
+        wheels = (*wheels, collector_wheel())
     listed = "".join(f"{wheel.sha256}  {wheel.stored}\n" for wheel in wheels).encode()
     tree = hashlib.sha256(listed + executable.encode()).hexdigest()[:_ID_DIGITS]
     files = [
@@ -141,6 +156,13 @@ def configuration(
     if fleet.udp_mesh.etc_hosts:
         hosts = f"{_CURRENT}/bin/udp-mesh hosts --write /etc/hosts"
         files.append(File(HOSTS_UNIT_NAME, service_unit(units[HOSTS_UNIT_NAME], hosts).encode()))
+    if has_collector(fleet, robot):
+        command = f"{_CURRENT}/bin/{LAUNCHER_NAME}"
+        files += [
+            File(f"bin/{LAUNCHER_NAME}", collector_launcher().encode(), 0o755),
+            File(f"etc/{COLLECTOR_CONFIG_NAME}", collector_config(fleet, robot)),
+            File(COLLECTOR_UNIT_NAME, service_unit(collector_unit(), command).encode()),
+        ]
     if has_bridge(fleet, robot):
         reductions = bridge_config(fleet)
         files += [

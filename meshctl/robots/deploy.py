@@ -19,6 +19,7 @@ from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1
 from meshctl.robots.bundle import Bundle, bundle, has_bridge
+from meshctl.robots.collector_release import RadioKnowledge, has_collector, missing_pins, own_radios, radio_archive
 from meshctl.robots.host import Host, ScriptRefused
 from meshctl.robots.preconditions import (
     HostFacts,
@@ -29,11 +30,14 @@ from meshctl.robots.preconditions import (
     route_warning,
     routed_peers,
     unmet_disk_space,
+    unmet_for_collector,
     unmet_preconditions,
 )
 from meshctl.robots.wheel_tags import Target
 from meshctl.robots.wheels import Wheel, cache_wheels, download_wheels, has_all, select_wheels, stock_units
 
+COLLECTOR_KEY = "collector_key"
+"""The fact of an outcome with the collector's public key."""
 _WHEEL_DIRECTORY = "/opt/udp-mesh/wheels"
 PROBE_TIMEOUT_S = 120.0
 # Unpacking and compiling cryptography on a small ARM board with a slow card.
@@ -76,8 +80,8 @@ class DeployOptions:
     """What all robots of one deploy share.
 
     `now_s` returns our clock (Unix time); `wait_s` is the time a daemon has to become healthy; `only_configuration`
-    refuses robots that would get other code; `step` is entered with robot, step name and detail, and left when the step
-    ends.
+    refuses robots that would get other code; `radios` is for their collectors; `step` is entered with robot, step name
+    and detail, and left when the step ends.
     """
 
     fleet: Fleet
@@ -86,6 +90,7 @@ class DeployOptions:
     now_s: Callable[[], float]
     wait_s: int = 30
     only_configuration: bool = False
+    radios: RadioKnowledge = field(default_factory=RadioKnowledge)
     step: Callable[[str, str, str], AbstractContextManager[None]] = lambda robot, name, text: nullcontext()
 
 
@@ -108,6 +113,10 @@ def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFac
     facts = probe(host, options.fleet, robot)
     computer = computer_of(options.fleet, robot)
     reasons = list(unmet_preconditions(facts, robot=robot, arch=computer.arch, python=computer.python))
+    if computer.collector:
+        radios = [node.name for node in own_radios(options.fleet, options.fleet.robots[robot])]
+        without_pin = missing_pins(options.fleet, robot, options.radios)
+        reasons += unmet_for_collector(facts, robot=robot, radios=radios, without_pin=without_pin)
     if reasons:
         return _refused(robot, reasons)
     try:
@@ -133,7 +142,9 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
         return plan
     facts, release = plan
     if facts.current == release.id and facts.is_sound:
-        same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id})
+        with claim(host, current=facts.current) if has_collector(options.fleet, robot) else nullcontext():
+            key = _prepare_collector(host, robot, options)
+        same = Outcome(robot, Result.UNCHANGED, f"already runs {release.id}", facts={"release": release.id, **key})
         return _with_warnings(same, facts, options)
     if options.only_configuration and not _only_configuration(facts, release):
         return _refused(robot, [_more_than_configuration(facts, release)])
@@ -144,10 +155,11 @@ def deploy(host: Host, robot: str, options: DeployOptions) -> Outcome:
         return _refused(robot, full)
     with claim(host, current=facts.current):
         sent = _transfer(host, robot, options, release, is_new=is_new, with_wheels=needed > 0)
+        key = _prepare_collector(host, robot, options)
         how = "reload" if _only_configuration(facts, release) else "restart"
         with options.step(robot, "switch", f"to {release.id} ({how})"):
             outcome = switch(host, robot, release.id, how, options.wait_s)
-    details = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent)}
+    details = {**outcome.facts, "release": release.id, "how": how, "sent_bytes": str(sent), **key}
     return _with_warnings(replace(outcome, facts=details), facts, options)
 
 
@@ -165,6 +177,15 @@ def _transfer(
         with options.step(robot, "install", release.id):
             host.run("install", release.id, release.tree, stdin=release.archive(), timeout_s=INSTALL_TIMEOUT_S)
     return sent
+
+
+def _prepare_collector(host: Host, robot: str, options: DeployOptions) -> dict[str, str]:
+    """What is known of the radios by now goes to the robot's collector. Returns its public key as a fact, if it has
+    one."""
+    if not has_collector(options.fleet, robot):
+        return {}
+    archive = radio_archive(options.fleet, robot, options.radios)
+    return {COLLECTOR_KEY: host.run("collector", robot, stdin=archive, timeout_s=PROBE_TIMEOUT_S).strip()}
 
 
 def _with_warnings(outcome: Outcome, facts: HostFacts, options: DeployOptions) -> Outcome:

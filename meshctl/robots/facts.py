@@ -13,7 +13,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, UNIT_NAME
+from meshctl.robots.bundle import BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME, OPTIONAL_UNITS, UNIT_NAME
+from meshctl.robots.collector_release import COLLECTOR_UNIT_NAME
 from meshctl.robots.expected_release import ExpectedRelease
 from meshctl.robots.host import Host
 from meshctl.robots.position_facts import PositionFacts, positions_in
@@ -103,7 +104,8 @@ class RobotFacts:
     """One robot at `seen_s` (our clock, Unix time).
 
     `error` is why the computer could not be queried; all else is empty then. `drift` has one line per difference from
-    the inventory. `bridge` and `hosts` (the service for /etc/hosts) are None if neither expected nor installed.
+    the inventory. `bridge`, `hosts` (the service for /etc/hosts) and `collector` are None if neither expected nor
+    installed.
     `answering` are the pinged addresses that answered (None: it has no ping). `status` is the output of `udp-mesh
     status --json`, empty if the daemon does not answer.
     """
@@ -114,6 +116,7 @@ class RobotFacts:
     service: ServiceFacts = ServiceFacts()
     bridge: ServiceFacts | None = None
     hosts: ServiceFacts | None = None
+    collector: ServiceFacts | None = None
     release: str = ""
     previous: str = ""
     is_proven: bool = True
@@ -149,7 +152,7 @@ class RobotFacts:
     @property
     def is_healthy(self) -> bool:
         """Whether all expected services run and are proven; drift does not count."""
-        others = (service for service in (self.bridge, self.hosts) if service is not None)
+        others = (service for service in (self.bridge, self.hosts, self.collector) if service is not None)
         services_are_up = self.service.is_up and all(service.is_up for service in others)
         return not self.error and services_are_up and self.is_proven and self.answers
 
@@ -169,6 +172,8 @@ class RobotFacts:
             problems.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
         if self.hosts is not None and not self.hosts.is_up:
             problems.append(f"the service for /etc/hosts is {self.hosts.active or 'absent'}")
+        if self.collector is not None and not self.collector.is_up:
+            problems.append(f"the collector is {self.collector.active or 'absent'}")
         problems += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
         away = [peer.name for peer in self.peers if not peer.online]
         problems += [f"offline peers: {', '.join(away)}"] if away else []
@@ -202,6 +207,7 @@ def parse_robot_facts(robot: str, text: str, expected: ExpectedRelease, *, now_s
         service=services.get(UNIT_NAME, ServiceFacts()),
         bridge=optional(BRIDGE_UNIT_NAME),
         hosts=optional(HOSTS_UNIT_NAME),
+        collector=optional(COLLECTOR_UNIT_NAME),
         release=_last(release, "current"),
         previous=_last(release, "previous"),
         is_proven=_last(release, "proven") != "no",
@@ -229,14 +235,11 @@ def drift(
     here = {path: digest for digest, _, path in (row.partition("  ") for row in release.get("file", ()))}
     lines = [f"changed on the robot: {path}" for path in release.get("damaged", ())]
     lines += [f"differs from the inventory: {path}" for path, sha in expected.files.items() if here.get(path) != sha]
-    lines += [
-        f"not in the inventory: {unit}"
-        for unit in (BRIDGE_UNIT_NAME, HOSTS_UNIT_NAME)
-        if unit in here and unit not in expected.units
-    ]
+    lines += [f"not in the inventory: {unit}" for unit in OPTIONAL_UNITS if unit in here and unit not in expected.units]
     wheels = {row.split()[0] for row in release.get("wheel", ()) if row.strip()}
-    if expected.wheel and expected.wheel not in wheels:
-        lines.append("another version of udp-mesh than in this meshctl")
+    lines += [
+        f"another version of {name} than in this meshctl" for name, sha in expected.wheels.items() if sha not in wheels
+    ]
     for unit in expected.units:
         if services.get(unit, ServiceFacts()).enabled != "enabled":
             lines.append(f"{unit} will not start at boot")

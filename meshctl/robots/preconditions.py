@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from meshctl.errors import InputError
@@ -50,6 +50,7 @@ class HostFacts:
     is_proven: bool = True
     services: tuple[tuple[str, str, str], ...] = ()
     no_route: tuple[str, ...] = ()
+    has_ssh: bool = True
 
     @property
     def units(self) -> tuple[tuple[str, str, str], ...]:
@@ -116,6 +117,7 @@ def parse_facts(text: str) -> HostFacts:
         is_proven=one.get("proven") == "yes",
         services=tuple(_service(row) for row in many.get("unit", ())),
         no_route=tuple(many.get("no_route", ())),
+        has_ssh="no_ssh" not in one,
     )
 
 
@@ -215,6 +217,20 @@ def unmet_preconditions(facts: HostFacts, *, robot: str, arch: str, python: str)
     if facts.masked:
         hint = f"find out why, then run `systemctl unmask {' '.join(facts.masked)}` there"
         yield f"masked units: {', '.join(facts.masked)}", hint
+
+
+def unmet_for_collector(
+    facts: HostFacts, *, robot: str, radios: Sequence[str], without_pin: Sequence[str]
+) -> Iterator[tuple[str, str]]:
+    """Why the computer cannot run a collector for these radios: (reason, how to fix it)."""
+    otherwise = f"remove `collector` from robots.{robot}.computer"
+    if not radios:
+        yield "its collector has no radio to ask", f"name the robot's radios in robots.{robot}.nodes, or {otherwise}"
+    if not facts.has_ssh:
+        yield "its collector needs ssh and ssh-keygen", f"install openssh-client there, or {otherwise}"
+    if without_pin:
+        names = " ".join(without_pin)
+        yield f"no host key is pinned of its radios {', '.join(without_pin)}", f"run `meshctl trust {names}`"
 
 
 def _unmet_python(facts: HostFacts, robot: str, python: str) -> Iterator[tuple[str, str]]:

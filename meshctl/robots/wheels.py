@@ -90,14 +90,26 @@ def build_wheel(package: Path) -> Wheel:
     }
     stated = re.search(rb'^__version__ = "([^"]+)"', files[f"{_PACKAGE}/__init__.py"], re.MULTILINE)
     version = stated[1].decode() if stated else "0"
-    info = f"{_PACKAGE}-{version}.dist-info"
-    files[f"{info}/METADATA"] = (
-        f"Metadata-Version: 2.1\nName: udp-mesh\nVersion: {version}\nRequires-Python: >=3.11\n"
-        "License: Apache-2.0\nRequires-Dist: cryptography>=42\n"
+    metadata = (
+        "Requires-Python: >=3.11\nLicense: Apache-2.0\nRequires-Dist: cryptography>=42\n"
         "Requires-Dist: backports.zstd>=1.0; python_version < '3.14'\n"
-    ).encode()
-    files[f"{info}/WHEEL"] = b"Wheel-Version: 1.0\nGenerator: meshctl\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    )
+    info = dist_info("udp-mesh", version)
     files[f"{info}/entry_points.txt"] = b"[console_scripts]\nudp-mesh = udp_mesh.cli.main:main\n"
+    return wheel_of("udp-mesh", version, files, metadata)
+
+
+def dist_info(project: str, version: str) -> str:
+    """The directory of a wheel's metadata."""
+    return f"{project.replace('-', '_')}-{version}.dist-info"
+
+
+def wheel_of(project: str, version: str, contents: Mapping[str, bytes], metadata: str) -> Wheel:
+    """A reproducible wheel of these files for any Python; `metadata` are further lines of METADATA."""
+    info = dist_info(project, version)
+    files = dict(contents)
+    files[f"{info}/METADATA"] = f"Metadata-Version: 2.1\nName: {project}\nVersion: {version}\n{metadata}".encode()
+    files[f"{info}/WHEEL"] = b"Wheel-Version: 1.0\nGenerator: meshctl\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
     record = "".join(f"{name},sha256={_urlsafe(content)},{len(content)}\n" for name, content in files.items())
     files[f"{info}/RECORD"] = f"{record}{info}/RECORD,,\n".encode()
     out = io.BytesIO()
@@ -107,7 +119,7 @@ def build_wheel(package: Path) -> Wheel:
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content)
-    return _wheel(f"{_PACKAGE}-{version}-py3-none-any.whl", out.getvalue())
+    return _wheel(f"{info.removesuffix('.dist-info')}-py3-none-any.whl", out.getvalue())
 
 
 def _urlsafe(content: bytes) -> str:

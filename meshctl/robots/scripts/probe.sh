@@ -17,6 +17,7 @@ for tool in systemctl sha256sum tar flock readlink df awk; do
 	command -v "$tool" >/dev/null 2>&1 || missing="$missing $tool"
 done
 echo "missing=${missing# }"
+for tool in ssh ssh-keygen; do command -v "$tool" >/dev/null 2>&1 || echo no_ssh=yes; done
 [ -z "$ros" ] || [ -e "/opt/ros/$ros/setup.bash" ] || echo "no_ros=/opt/ros/$ros/setup.bash"
 
 if path=$(command -v "$python" 2>/dev/null); then

@@ -12,7 +12,7 @@ was=$(release_of current)
 
 # bring HOW: run the units of the current release, and remove our other units.
 bring() {
-	for service in $hosts_unit $bridge_unit $unit; do
+	for service in $collector_unit $hosts_unit $bridge_unit $unit; do
 		if [ -e "$root/current/$service" ]; then
 			cp "$root/current/$service" "$units/$service.new" && mv -f "$units/$service.new" "$units/$service" || return 1
 		elif [ -e "$units/$service" ]; then
@@ -31,6 +31,8 @@ bring() {
 
 # takes_over UNIT: reload a running service without an interruption, if possible.
 takes_over() {
+	# it reads its configuration when it starts, and keeps nothing
+	[ "$1" != "$collector_unit" ] || return 1
 	# the others read none of them
 	[ "$1" = "$unit" ] || return 0
 	changes=$(mesh reload 2>&1) || return 1
@@ -81,7 +83,7 @@ if well "$how"; then
 fi
 why=$reason
 journalctl --sync 2>/dev/null
-log=$(journalctl -u "$unit" -u "$bridge_unit" -u "$hosts_unit" -n 12 --no-pager -o cat 2>/dev/null | sed 's/^/log=/')
+log=$(journalctl -u "$unit" -u "$bridge_unit" -u "$hosts_unit" -u "$collector_unit" -n 12 --no-pager -o cat 2>/dev/null | sed 's/^/log=/')
 
 if [ -n "$was" ] && [ "$was" != "$id" ] && [ -d "$root/releases/$was" ]; then
 	point current "$was"

@@ -13,7 +13,7 @@ from meshctl.robots.scripts import script
 from meshctl.robots.status_table import table
 
 NOW_S = 1_800_000_000.0
-WANTED = ExpectedRelease({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, wheel="9999")
+WANTED = ExpectedRelease({"etc/udp-mesh.toml": "1111", "udp-mesh.service": "2222"}, {"udp-mesh": "9999"})
 
 _SERVICES = """\
 == services
@@ -134,7 +134,7 @@ def test_drift_lists_inventory_differences_and_manual_changes() -> None:
 
 
 def test_a_robot_without_its_wanted_bridge_running_is_unhealthy() -> None:
-    wanted = ExpectedRelease({**WANTED.files, "udp-mesh-ros1.service": "e" * 64}, WANTED.wheel)
+    wanted = ExpectedRelease({**WANTED.files, "udp-mesh-ros1.service": "e" * 64}, WANTED.wheels)
     facts = _facts(wanted=wanted)
     assert facts.bridge is not None
     assert not facts.is_healthy

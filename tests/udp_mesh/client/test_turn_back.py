@@ -94,7 +94,7 @@ def test_rates_are_shown_with_their_unit() -> None:
 
 
 def test_the_program_of_the_guide_says_go_and_then_to_turn_back_when_the_peer_is_gone() -> None:
-    [words] = re.findall(r"^ *\$ python3 (-m udp_mesh\.client\.turn_back .*)$", GUIDE.read_text(), re.MULTILINE)
+    words, _ = re.findall(r"^ *\$ python3 (-m udp_mesh\.client\.turn_back .*)$", GUIDE.read_text(), re.MULTILINE)
     command = [sys.executable, *words.replace(" base ", " bob ").split()]
     with two_daemons() as (alice, bob):
         program = subprocess.Popen(
