@@ -140,6 +140,12 @@ class RobotFacts:
         return bool(self.status)
 
     @property
+    def collector_problem(self) -> str:
+        """Why the radios give the collector no new values; empty if they do."""
+        radio = _within(_within(self.status, "conditions"), "radio")
+        return str(radio.get("problem") or "")
+
+    @property
     def online(self) -> tuple[str, ...]:
         return tuple(peer.name for peer in self.peers if peer.online)
 

@@ -48,6 +48,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "restarts": "its daemon crashed and was restarted since the last snapshot",
         "ros-bridge": "its ROS bridge is down",
         "hosts": "the service that keeps the peers' names in /etc/hosts is down",
+        "collector": "its collector is down, or its radios do not answer it",
         "version": "its daemon version differs from most others",
         "key": "another robot cannot decrypt its messages",
         "unkeyed": "it neither encrypts nor authenticates",

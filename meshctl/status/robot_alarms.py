@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot
 from meshctl.report.duration import duration
-from meshctl.robots.facts import RobotFacts
+from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status.thin_alarms import thin_alarms
 from meshctl.status.topics import is_urgent, urgent_priorities
 from meshctl.status.values import Alarm, Level, TopicStatus
@@ -88,6 +88,17 @@ def _daemon(seen: RobotAlarmInput) -> Iterator[Alarm]:
     if facts.hosts is not None and not facts.hosts.is_up:
         text = f"its service for /etc/hosts is {facts.hosts.active or 'absent'}"
         yield Alarm(Level.WARNING, "hosts", text, f"meshctl robots logs {name}; then meshctl robots restart {name}")
+    if facts.collector is not None:
+        yield from _collector(facts.collector, facts.collector_problem, name)
+
+
+def _collector(service: ServiceFacts, problem: str, name: str) -> Iterator[Alarm]:
+    if not service.is_up:
+        hint = f"meshctl robots logs {name}; then meshctl robots restart {name}"
+        yield Alarm(Level.WARNING, "collector", f"its collector is {service.active or 'absent'}", hint)
+    elif problem:
+        hint = "see with meshctl plan whether its radios accept its key; then check their power and cables"
+        yield Alarm(Level.WARNING, "collector", f"its collector: {problem}", hint)
 
 
 def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:
