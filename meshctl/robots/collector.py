@@ -23,7 +23,7 @@ from typing import Any, Protocol
 from meshctl.device.link_table import LinkTable
 from meshctl.robots.local_daemon import DaemonError, LocalDaemon, socket_path
 from meshctl.robots.radio_report import Names, RadioTracker
-from meshctl.robots.radio_session import Login, Radio, RadioError, RadioSession, ssh_command
+from meshctl.robots.radio_session import OwnRadio, RadioError, RadioLogin, RadioSession, ssh_command
 
 VERSION = 1
 INTERVAL_S = 1.0
@@ -47,9 +47,9 @@ class Configuration:
     observed: MAC -> node."""
 
     robot: str
-    radios: tuple[Radio, ...]
+    radios: tuple[OwnRadio, ...]
     robots: Mapping[str, tuple[str, ...]]
-    login: Login
+    login: RadioLogin
     names: Path
     macs: Mapping[str, str]
     load_mbit_s: float
@@ -65,11 +65,11 @@ def load(path: Path) -> Configuration:
         return Configuration(
             robot=str(document["robot"]),
             radios=tuple(
-                Radio(str(one["name"]), str(one["host"]), int(one["port"]), str(one["user"]))
+                OwnRadio(str(one["name"]), str(one["host"]), int(one["port"]), str(one["user"]))
                 for one in document["radios"]
             ),
             robots={str(robot): tuple(map(str, nodes)) for robot, nodes in document["robots"].items()},
-            login=Login(path.parent / document["key"], path.parent / document["known_hosts"]),
+            login=RadioLogin(path.parent / document["key"], path.parent / document["known_hosts"]),
             names=path.parent / document["names"],
             macs={str(mac).lower(): str(node) for mac, node in document["macs"].items()},
             load_mbit_s=float(document["load_mbit_s"]),
@@ -83,7 +83,7 @@ def load(path: Path) -> Configuration:
         raise ConfigurationError(f"{path}: expected a collector's configuration: {error}") from error
 
 
-class Session(Protocol):
+class LinkSource(Protocol):
     """What is asked for a radio's links."""
 
     def ask(self) -> LinkTable:
@@ -97,8 +97,8 @@ class Session(Protocol):
 class RadioPoller:
     """Asks one radio at an interval in a thread, until it is stopped. `latest` and `problem` are read by others."""
 
-    radio: Radio
-    session: Session
+    radio: OwnRadio
+    session: LinkSource
     interval_s: float
     latest: LinkTable | None = None
     problem: str = "not asked yet"
@@ -136,8 +136,8 @@ def pause_s(interval_s: float, took_s: float, failures: int) -> float:
 
 
 @dataclass(slots=True)
-class Collector:
-    """Brings the tables of all radios together. `say` is told what changes, for the log."""
+class LinkCollector:
+    """Brings the tables of all radios together. `say` gets what changes, for the log."""
 
     configuration: Configuration
     pollers: Sequence[RadioPoller]
@@ -217,13 +217,13 @@ def daemon_problem(error: DaemonError) -> str:
     return f"the daemon does not take the values: {error}"
 
 
-def collector(configuration: Configuration, daemon: LocalDaemon, say: Callable[[str], None]) -> Collector:
+def collector(configuration: Configuration, daemon: LocalDaemon, say: Callable[[str], None]) -> LinkCollector:
     """A collector with a session for each radio."""
     pollers = [
         RadioPoller(radio, RadioSession(ssh_command(radio, configuration.login)), configuration.interval_s)
         for radio in configuration.radios
     ]
-    return Collector(configuration, pollers, daemon, say)
+    return LinkCollector(configuration, pollers, daemon, say)
 
 
 def run(

@@ -1,4 +1,4 @@
-"""What a robot's radios tell of its links -> the report that its daemon adds to its conditions. Pure.
+"""The links that a robot's radios measure -> the report that its daemon adds to its conditions. Pure.
 
 `RadioTracker.take` gets each table of a radio, `report` gives the payload of the daemon's request `set-radio`
 (docs/local-api.md). Only the robot's own radios are asked, so that a margin is that of its next hop, in the direction

@@ -31,7 +31,7 @@ class RadioError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Radio:
+class OwnRadio:
     """A radio of this robot, as its computer reaches it. Its host key is pinned under `name`."""
 
     name: str
@@ -41,14 +41,14 @@ class Radio:
 
 
 @dataclass(frozen=True, slots=True)
-class Login:
+class RadioLogin:
     """The private key, and a file of pinned host keys."""
 
     key: Path
     known_hosts: Path
 
 
-def ssh_command(radio: Radio, login: Login, program: str = "ssh") -> list[str]:
+def ssh_command(radio: OwnRadio, login: RadioLogin, program: str = "ssh") -> list[str]:
     """The system's `ssh` with nothing of the user's or the system's configuration."""
     options = {
         "BatchMode": "yes",

@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 
 from meshctl.device.authentication import new_key_pair
-from meshctl.inventory import load
+from meshctl.inventory import load_fleet
 from meshctl.model import Secret
 from meshctl.render import LINKS_PATH, render_node
-from meshctl.robots.radio_session import Login, Radio, ssh_command
+from meshctl.robots.radio_session import OwnRadio, RadioLogin, ssh_command
 from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshlab.conftest import LINE
 from tests.meshlab.test_ground_on_fleet import mac_of
@@ -63,8 +63,8 @@ class Team:
 
     fleet: VirtualFleet
     alice: RunningDaemon
-    radio: Radio
-    login: Login
+    radio: OwnRadio
+    login: RadioLogin
     file: Path
 
     @property
@@ -104,7 +104,7 @@ def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
     near = mesh.node("near")
     private, public = new_key_pair("collector of alice")
     (tmp_path / "fleet.yaml").write_text(INVENTORY.format(key=public))
-    fleet = load(tmp_path / "fleet.yaml").fleet
+    fleet = load_fleet(tmp_path / "fleet.yaml")
     rendered = {file.path: file for file in render_node(fleet, "near", lambda _: Secret("")).files}
     before = near.exec(f"cat /{DROPBEAR}").stdout_bytes
     for path in (AUTHORIZED_KEYS, LINKS_PATH, DROPBEAR):
@@ -117,7 +117,7 @@ def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
     (host_key,) = (line for line in shown.splitlines() if line.startswith("ssh-ed25519 "))
     (tmp_path / "known_hosts").write_text(f"near {host_key}\n")
     endpoint = mesh.endpoint("10.42.0.2")
-    radio = Radio("near", endpoint.host, endpoint.port)
+    radio = OwnRadio("near", endpoint.host, endpoint.port)
     document = {
         "version": 1,
         "robot": "alice",
@@ -133,7 +133,7 @@ def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
     (tmp_path / "collector.json").write_text(json.dumps(document))
     (tmp_path / "names.json").write_text(json.dumps({mac_of(mesh, name): name for name in LINE}))
     with two_daemons() as (alice, _):
-        yield Team(mesh, alice, radio, Login(key, tmp_path / "known_hosts"), tmp_path / "collector.json")
+        yield Team(mesh, alice, radio, RadioLogin(key, tmp_path / "known_hosts"), tmp_path / "collector.json")
     mesh.link("near", "far", signal_dbm=-58)
     near.wait_up()
     write(near, DROPBEAR, before, 0o644)
@@ -164,7 +164,7 @@ def test_conditions_have_the_radio_path_of_each_peer(team: Team) -> None:
         (bob,) = team.conditions()["peers"]
         assert decide(bob, Need(1.0, 9, margin_db=3.0), before=False).turn_back
         assert not decide(bob, Need(1.0, 9), before=False).turn_back
-        # a daemon that restarts knows nothing, and is told again
+        # a daemon that restarts knows nothing, and gets the next report
         team.alice.stop()
         team.alice.start()
         until(lambda: team.path() is not None, "the radio path after a restart")

@@ -21,9 +21,9 @@ from meshctl.robots.collector import (
     MAX_BACKOFF_S,
     MAX_PAUSE_S,
     NAMES_EVERY_S,
-    Collector,
     Configuration,
     ConfigurationError,
+    LinkCollector,
     RadioPoller,
     load,
     main,
@@ -31,7 +31,7 @@ from meshctl.robots.collector import (
     run,
 )
 from meshctl.robots.local_daemon import LocalDaemon
-from meshctl.robots.radio_session import Login, Radio, RadioError, RadioSession, ssh_command
+from meshctl.robots.radio_session import OwnRadio, RadioError, RadioLogin, RadioSession, ssh_command
 from tests.waiting import until
 
 BASE_MAC = "02:00:00:00:00:01"
@@ -117,11 +117,11 @@ def at(taken_s: float) -> LinkTable:
 @contextmanager
 def collector(
     folder: Path, daemon: Daemon, said: list[str], **changes: object
-) -> Iterator[tuple[Collector, RadioPoller]]:
+) -> Iterator[tuple[LinkCollector, RadioPoller]]:
     settings = configuration(folder, **changes)
     poller = RadioPoller(settings.radios[0], NoSession(), settings.interval_s)
     with closing(LocalDaemon(daemon.path)) as client:
-        yield Collector(settings, [poller], client, said.append), poller
+        yield LinkCollector(settings, [poller], client, said.append), poller
 
 
 def test_the_daemon_gets_what_the_radio_tells_and_its_age(tmp_path: Path, daemon: Daemon) -> None:
@@ -257,7 +257,7 @@ def test_a_program_that_is_missing_is_an_error_of_the_radio() -> None:
 
 
 def test_ssh_uses_nothing_but_what_is_deployed() -> None:
-    words = ssh_command(Radio("husky1-front", "fd00::1"), Login(Path("/var/lib/a key%1"), Path("/etc/known")))
+    words = ssh_command(OwnRadio("husky1-front", "fd00::1"), RadioLogin(Path("/var/lib/a key%1"), Path("/etc/known")))
     assert words[:4] == ["ssh", "-T", "-F", "none"]
     assert 'IdentityFile="/var/lib/a key%%1"' in words
     assert "HostKeyAlias=husky1-front" in words

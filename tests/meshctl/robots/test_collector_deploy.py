@@ -55,8 +55,8 @@ def test_a_collector_gets_a_key_that_its_radio_accepts_for_links_alone(fleet: Ro
     assert "run `meshctl trust base`" in refused
     TrustStore(fleet.directory / "known_hosts").replace("base", radio.host_key)
 
-    told = fleet.deploy()
-    assert "let their radios accept it: meshctl provision base" in told
+    output = fleet.deploy()
+    assert "let their radios accept it: meshctl provision base" in output
     key = fleet.shell("husky1", "cat /var/lib/udp-mesh/collector/id_ed25519.pub").strip()
     (written,) = (one for one in fleet.file.read_text().splitlines() if "collector_key: " in one)
     assert key in written
