@@ -22,6 +22,7 @@ from meshctl.inventory.fields import is_name
 from meshctl.inventory.yaml_text import Value
 from meshctl.model import Fleet, HardwareProfile, Mesh, Secret
 from meshctl.model.ip import IpInterface
+from meshctl.render.rendered import LINKS_PATH
 from meshctl.uci import Section
 
 Path = tuple[str, ...]
@@ -133,7 +134,9 @@ def _fleet_sections(draft: _Draft, name: str, radios: Iterable[ExistingRadio]) -
     draft.values[("meshctl",)] = 1
     draft.values[("fleet",)] = options.fleet or device.marker.get("fleet", "") or as_name(f"{name}-fleet")
     draft.values[("country",)] = country
-    keys = device.authorized_keys or ((options.operator_key,) if options.operator_key else ())
+    # that of a collector may do nothing but print links, and is no operator's
+    logins = tuple(key for key in device.authorized_keys if LINKS_PATH not in key)
+    keys = logins or ((options.operator_key,) if options.operator_key else ())
     operators: dict[str, Value] = {"ssh_keys": list(keys)}
     section = next(device.package("dropbear").of_type("dropbear"), Section("dropbear"))
     # stock OpenWrt allows passwords; meshctl's own choice is one only on its nodes, or without a key to log in with

@@ -57,7 +57,7 @@ def ssh_command(radio: OwnRadio, login: RadioLogin, program: str = "ssh") -> lis
         "IdentityFile": _path(login.key),
         "PreferredAuthentications": "publickey",
         "UserKnownHostsFile": _path(login.known_hosts),
-        "GlobalKnownHostsFile": "none",
+        "GlobalKnownHostsFile": "/dev/null",
         "StrictHostKeyChecking": "yes",
         "HostKeyAlias": radio.name,
         "CheckHostIP": "no",

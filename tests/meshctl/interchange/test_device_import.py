@@ -227,6 +227,14 @@ def test_a_recorded_observation_of_every_release_is_imported(release: str, tmp_p
     assert str(node.address.ip).startswith("10.42.0.")
 
 
+def test_the_key_of_a_collector_is_no_operators(tmp_path: Path) -> None:
+    device = observed_device(observed(RECORDED / "24.10" / "mesh"))
+    (operator, *_) = device.authorized_keys
+    collector = f'command="sh /etc/meshctl/links.sh",no-pty {operator.rsplit(" ", 1)[0]} collector of husky1'
+    made = new_inventory(replace(device, authorized_keys=(operator, collector)), tmp_path, country="US")
+    assert made.fleet.operators.ssh_keys == (operator,)
+
+
 def test_lists_are_kept_only_where_a_text_of_words_means_the_same() -> None:
     own = Package("firewall", (Section("defaults", None, {"helpers": ("a", "b")}),))
     target = Package("firewall", (Section("defaults", None, {"input": "REJECT"}),))

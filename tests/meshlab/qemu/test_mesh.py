@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 import pytest
 
+from meshctl.device.link_table import answering_script, is_complete, parse_links
+from meshctl.device.parse.sections import split_sections
+from meshctl.robots.radio_report import Names, RadioTracker
 from meshlab.qemu import control
 from tests.meshlab.qemu.conftest import NODES, Lab, until
 
@@ -136,6 +140,30 @@ def test_status_shows_what_the_kernels_radios_measure(lab: Lab) -> None:
             known = any(radio["noise_dbm"] is not None for radio in node["radios"])
             assert neighbor["snr_db"] == (neighbor["signal_dbm"] + 92 if known else None)
             assert neighbor["tx_bitrate_kbit_s"] > 0
+
+
+def test_a_robot_reads_its_radio_path_from_the_kernels_tables(lab: Lab) -> None:
+    names = Names(lab.names(), {"base-station": ("base",)})
+    tracker = RadioTracker(load_mbit_s=2.0)
+    nonces = ("meshctl-1", "meshctl-2")
+
+    def found() -> list[dict[str, Any]]:
+        """As the collector asks: twice over one shell, here that of the node's console."""
+        for name in ("husky-front", "husky-rear"):
+            output = lab.node(name).exec(answering_script(), stdin="".join(f"{nonce}\n" for nonce in nonces).encode())
+            assert is_complete(output.stdout_bytes, nonces[1])
+            table = parse_links(split_sections(output.stdout_bytes, nonces[1]), (), taken_s=time.monotonic())
+            assert table.paths is not None
+            tracker.take(name, table)
+        paths: list[dict[str, Any]] = tracker.report(names, "husky", "", time.monotonic())["paths"]
+        return paths
+
+    until(lambda: [path["next_hop"] for path in found()] == ["b02"], "the path to the base through b02")
+    (path,) = found()
+    assert path["peer"] == "base-station"
+    assert path["quality"] > 0.5
+    assert path["signal_dbm"] < 0
+    assert path["bottleneck_bits_per_s"] > 0
 
 
 def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
