@@ -109,6 +109,11 @@ class RadioPoller:
         self._thread = threading.Thread(target=self._run, name=f"radio-{self.radio.name}", daemon=True)
         self._thread.start()
 
+    def check(self) -> None:
+        """Raises RuntimeError if the thread has failed: a new process asks again."""
+        if self._thread is not None and not self._thread.is_alive():
+            raise RuntimeError(f"the thread that asks {self.radio.name} has ended")
+
     def stop(self) -> None:
         self._stop.set()
         if self._thread is not None:
@@ -230,24 +235,21 @@ def run(
     configuration: Configuration,
     daemon: LocalDaemon,
     *,
-    count: int | None = None,
     say: Callable[[str], None],
     show: Callable[[Mapping[str, Any]], None] = lambda report: None,
 ) -> None:
-    """Report at the interval, for ever or `count` times; `show` gets each report."""
+    """Report at the interval until an exception; `show` gets each report."""
     this = collector(configuration, daemon, say)
     for poller in this.pollers:
         poller.start()
     try:
-        done = 0
         next_s = time.monotonic()
         while True:
             next_s = max(next_s + configuration.interval_s, time.monotonic())
             time.sleep(max(0.0, next_s - time.monotonic()))
+            for poller in this.pollers:
+                poller.check()
             show(this.step(time.monotonic()))
-            done += 1
-            if count is not None and done >= count:
-                return
     finally:
         for poller in this.pollers:
             poller.stop()

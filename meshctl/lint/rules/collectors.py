@@ -76,7 +76,8 @@ def collector_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     "A collector's key may do more than ask for links",
     why="""The key lies on the robot, which may be lost. As the key of an operator, or of a site's worker, it would open
     every radio; as that of two robots, it could not be withdrawn from one of them.""",
-    fix="Remove `collector_key` and the key file on the computer, and run `meshctl robots deploy`.",
+    fix="""Remove `collector_key` and, on the computer, /var/lib/udp-mesh/collector, and run `meshctl robots deploy`,
+    which generates another key.""",
     failing=f"""
         operators: {{ssh_keys: ["{_KEY}"]}}
         robots: {{husky1: {{computer: {{collector: true, collector_key: "{_KEY}"}}}}}}

@@ -6,7 +6,7 @@ import json
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -267,12 +267,27 @@ def test_ssh_uses_nothing_but_what_is_deployed() -> None:
 
 def test_pollers_run_until_the_last_report(tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("meshctl.robots.collector.ssh_command", lambda *_: ["sh", "-c", answering_script()])
-    shown: list[object] = []
-    settings = configuration(tmp_path, interval_s=0.05)
-    run(settings, LocalDaemon(daemon.path), count=40, say=lambda _: None, show=shown.append)
-    assert len(shown) == len(daemon.reports) == 40
-    assert daemon.reports[-1]["problem"] == ""
+
+    class Answered(Exception):
+        """The radio's first answer is in a report."""
+
+    def look(report: Mapping[str, Any]) -> None:
+        assert daemon.reports[-1] == report
+        if not report["problem"]:
+            raise Answered
+
+    with pytest.raises(Answered):
+        run(configuration(tmp_path, interval_s=0.05), LocalDaemon(daemon.path), say=lambda _: None, show=look)
     until(lambda: not [one for one in threading.enumerate() if one.name == "radio-husky1-front"], "the thread's end")
+
+
+def test_a_thread_that_fails_ends_the_process_which_systemd_starts_again(
+    tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("meshctl.robots.collector.RadioSession", lambda _: NoSession())
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    with pytest.raises(RuntimeError, match="the thread that asks husky1-front has ended"):
+        run(configuration(tmp_path, interval_s=0.05), LocalDaemon(daemon.path), say=lambda _: None)
 
 
 @pytest.mark.parametrize(

@@ -199,3 +199,11 @@ def test_the_build_files_name_every_message() -> None:
     for path in (FOLDER / "msg").glob("*.msg"):
         assert f'"msg/{path.name}"' in build
         assert f" {path.name}" in build
+
+
+def test_the_values_of_a_collector_are_in_the_json_and_change_no_type(conditions: dict[str, Any]) -> None:
+    (peer,) = conditions["peers"]
+    radio = {"next_hop": "b02", "margin_db": 12.0}
+    text, typed = to_ros({**conditions, "peers": [{**peer, "radio": radio}], "radio": None}, "/alice", 1, (1, 2))
+    assert b'"radio": {"margin_db": 12.0, "next_hop": "b02"}' in text.payload.replace(b'\\"', b'"')
+    assert typed == to_ros(conditions, "/alice", 1, (1, 2))[1]
