@@ -101,7 +101,7 @@ class RadioPoller:
     session: LinkSource
     interval_s: float
     latest: LinkTable | None = None
-    problem: str = "not asked yet"
+    problem: str = ""
     _stop: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
 
@@ -179,11 +179,9 @@ class LinkCollector:
         for poller in self.pollers:
             name, reason = poller.radio.name, poller.problem
             text = f"{name} does not answer: {reason}" if reason else ""
-            # in the first seconds nothing is wrong yet
-            if poller.latest is not None or reason != "not asked yet":
-                self._say_once(name, text)
+            self._say_once(name, text)
             problems.append(text)
-        if not any(problems) and not self._names(now_s).nodes:
+        if self._taken and not any(problems) and not self._names(now_s).nodes:
             problems.append("no radio is known by name: run `meshctl status`, then `meshctl robots deploy`")
         return "; ".join(text for text in problems if text)
 
