@@ -1,14 +1,14 @@
 """Health checks after a change: observations before and after it -> the conditions not met yet. Pure.
 
 A change is confirmed only when its services have reloaded (`_reload`), packages are installed (`_packages`), the LAN is
-up (`_lan`), radios have joined their cells (`_radios`), enough mesh neighbors are heard (`_neighbors`) and the base is
-reachable (`_base`).
+up (`_lan`), radios have joined their cells (`_radios`) and are part of batman-adv (`_batman`), enough mesh neighbors
+are heard (`_neighbors`) and the base is reachable (`_base`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 
@@ -24,6 +24,8 @@ MIN_NEIGHBOR_SHARE = 0.5
 RELOADING = "its services are still reloading"
 # scripts/reload.sh: the window was about to end
 _RELOAD_WAS_LATE = 75
+# netifd, proto.c (proto_attach_interface): a protocol without a handler
+_UNKNOWN_PROTOCOL = "INVALID_PROTO"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,7 @@ def unmet(expected: Expectation, after: Observation, *, since_s: float | None = 
         *_packages(expected, after),
         *_lan(expected, after),
         *_radios(expected, after),
+        *_batman(expected, after),
         *_neighbors(expected, after, fresh_ms),
         *_base(expected, after, fresh_ms),
     )
@@ -134,14 +137,21 @@ def _device(network: Package, name: str) -> Section | None:
 def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
     if expected.wireless is None or after.links is None:
         return ()
-    devices = {section.name: section for section in expected.wireless.of_type("wifi-device")}
     problems = []
-    for iface in expected.wireless.of_type("wifi-iface"):
-        device = devices.get(iface.get("device"))
-        if device is None or "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
-            continue
+    for iface, device in _enabled(expected.wireless):
         problems += _radio(iface, device.get("channel"), after)
     return tuple(problems)
+
+
+def _enabled(wireless: Package | None) -> Iterator[tuple[Section, Section]]:
+    """Each enabled wifi-iface with its wifi-device."""
+    if wireless is None:
+        return
+    devices = {section.name: section for section in wireless.of_type("wifi-device")}
+    for iface in wireless.of_type("wifi-iface"):
+        device = devices.get(iface.get("device"))
+        if device is not None and "1" not in (device.get("disabled", "0"), iface.get("disabled", "0")):
+            yield iface, device
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
@@ -164,6 +174,26 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     if bssid and link.bssid is not None and link.bssid.lower() != bssid:
         return [f"{name} is in cell {link.bssid}, not {bssid}"]
     return []
+
+
+def _batman(expected: Expectation, after: Observation) -> tuple[str, ...]:
+    """A node that is alone hears no neighbor anyway: without this check, it would be found deaf only in the field."""
+    states = {state.name: state for state in after.interfaces or ()}
+    hard = None if after.mesh is None else after.mesh.hard_interfaces
+    problems = []
+    for iface, _ in _enabled(expected.wireless):
+        section = None if expected.network is None else expected.network.section(iface.get("network"))
+        if section is None or section.get("proto") != "batadv_hardif":
+            continue
+        name, master = iface.get("ifname"), section.get("master")
+        state = states.get(iface.get("network"))
+        if state is not None and _UNKNOWN_PROTOCOL in state.errors:
+            problems.append("netifd does not know batman-adv: /lib/netifd/proto/batadv_hardif.sh is missing or fails")
+        elif after.macs is not None and master not in after.macs:
+            problems.append(f"{master} does not exist")
+        elif hard is not None and name not in hard:
+            problems.append(f"{name} is not part of {master}")
+    return tuple(dict.fromkeys(problems))
 
 
 def _neighbors(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:

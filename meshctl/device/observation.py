@@ -92,7 +92,7 @@ class WirelessLink:
     width: str = ""
     tx_power_dbm: float | None = None
     joined: bool | None = None
-    """From `iw dev IF link`: whether an IBSS is joined; None if iw does not report it for this mode."""
+    """Whether an IBSS (`iw dev IF link`) or a mesh point (`iw dev`) has joined; None for another mode."""
     phy: str = ""
     """The radio it runs on, as /sys/class/ieee80211 names it: `phy0`."""
 
@@ -182,7 +182,8 @@ class MeshInfo:
 
     version: str = ""
     algorithm: str = ""
-    hard_interfaces: tuple[str, ...] = ()
+    hard_interfaces: tuple[str, ...] | None = None
+    """Of all batman-adv interfaces; None: not known."""
     settings: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -148,7 +148,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         stations=stations,
         surveys=surveys,
         sensors=reader.read("sensors", system.parse_sensors, required=False),
-        supplicants=reader.read("supplicants", lambda text: tuple(text.split()), required=False),
+        supplicants=reader.read("supplicants", _supplicants, required=False),
         interfaces=reader.read("ubus.interfaces", ubus.parse_interfaces),
         bridges=reader.read("bridges", system.parse_bridges),
         lan_filter=reader.read("lan_filter", nft.parse_lan_filter, required=False),
@@ -227,7 +227,7 @@ def _mesh(
     if not names:
         return None, None, None, None
     info: MeshInfo | None = None
-    hard: list[str] = []
+    hard: list[tuple[str, ...] | None] = []
     known = reader.read("macs", system.parse_indexes, required=False) or {}
     neighbours: list[MeshNeighbour] | None = None
     originators: list[Originator] | None = None
@@ -238,16 +238,14 @@ def _mesh(
             seen = reader.read(f"batctl.originators {name}", batctl.parse_mesh_header)
             near = reader.read(f"batctl.neighbors {name}", batctl.parse_neighbours_text)
             far = reader.read(f"batctl.originators {name}", batctl.parse_originators_text)
-            hard += reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text) or ()
+            hard.append(reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text))
         else:
             seen = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
             near = reader.read(f"batctl.neighbors_json {name}", lambda text: batctl.parse_neighbours_json(text, known))
             far = reader.read(
                 f"batctl.originators_json {name}", lambda text: batctl.parse_originators_json(text, known)
             )
-            hard += (
-                reader.read(f"batctl.hardifs_json {name}", lambda text: batctl.parse_hardifs_json(text, known)) or ()
-            )
+            hard.append(reader.read(f"batctl.hardifs_json {name}", lambda text: batctl.parse_hardifs_json(text, known)))
         info = info or seen
         neighbours = (neighbours or []) + list(near) if near is not None else neighbours
         originators = (originators or []) + list(far) if far is not None else originators
@@ -255,11 +253,17 @@ def _mesh(
             far, reader.read(f"batctl.transglobal {name}", batctl.parse_transglobal, required=False)
         )
     return (
-        None if info is None else replace(info, hard_interfaces=tuple(dict.fromkeys(hard))),
+        None if info is None else replace(info, hard_interfaces=_all(hard)),
         None if neighbours is None else tuple(neighbours),
         None if originators is None else tuple(originators),
         MappingProxyType(tables),
     )
+
+
+def _all(lists: list[tuple[str, ...] | None]) -> tuple[str, ...] | None:
+    """Every name once; None if one of the lists could not be read."""
+    known = [names for names in lists if names is not None]
+    return tuple(dict.fromkeys(name for names in known for name in names)) if len(known) == len(lists) else None
 
 
 def _table_sizes(paths: tuple[Originator, ...] | None, translations: tuple[int, int] | None) -> MeshTableSizes:
@@ -280,6 +284,10 @@ def _statistics(reader: _OutputReader) -> Mapping[str, Mapping[str, int]] | None
         if (counters := reader.read(f"batctl.statistics {name}", batctl.parse_statistics, required=False))
     }
     return MappingProxyType(found) if found else None
+
+
+def _supplicants(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.removeprefix("wpa_supplicant.") for name in text.split()))
 
 
 def _uci(reader: _OutputReader) -> Mapping[str, str] | None:

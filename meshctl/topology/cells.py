@@ -31,7 +31,8 @@ def within(seen: Observation, node: Node, mesh: str) -> Observation:
     if len(node.meshes) < 2:
         return seen
     names = {name for name, joined in node.mesh_interfaces.items() if joined == mesh}
-    hard = None if seen.mesh is None else tuple(name for name in seen.mesh.hard_interfaces if name in names)
+    all_hard = None if seen.mesh is None else seen.mesh.hard_interfaces
+    hard = None if all_hard is None else tuple(name for name in all_hard if name in names)
     return replace(
         seen,
         macs={name: mac for name, mac in (seen.macs or {}).items() if name in names},
@@ -39,7 +40,7 @@ def within(seen: Observation, node: Node, mesh: str) -> Observation:
         stations=tuple(station for station in seen.stations or () if station.ifname in names),
         neighbours=None if seen.neighbours is None else tuple(n for n in seen.neighbours if n.ifname in names),
         originators=None if seen.originators is None else tuple(o for o in seen.originators if o.ifname in names),
-        mesh=None if seen.mesh is None or hard is None else replace(seen.mesh, hard_interfaces=hard),
+        mesh=None if seen.mesh is None else replace(seen.mesh, hard_interfaces=hard),
     )
 
 

@@ -42,8 +42,8 @@ def _heard(mac: str, last_seen_ms: int, signal_dbm: int | None, paths: Mapping[s
 
 def mesh_macs(seen: Observation) -> tuple[str, ...]:
     """The MACs by which neighbors know it: those of batman-adv's hard interfaces, and of every mesh radio."""
-    hard = seen.mesh.hard_interfaces if seen.mesh is not None else ()
-    macs = [(seen.macs or {}).get(name, "") for name in hard]
+    hard = seen.mesh.hard_interfaces if seen.mesh is not None else None
+    macs = [(seen.macs or {}).get(name, "") for name in hard or ()]
     macs += [link.mac for link in seen.links or () if link.mode.lower() in ("ibss", "mesh point")]
     return tuple(dict.fromkeys(mac.lower() for mac in macs if mac))
 

@@ -60,7 +60,7 @@ def test_a_node_without_batman_has_no_mesh(mesh: VirtualFleet) -> None:
     dump = json.loads(near.exec("ubus call network.interface dump").stdout)["interface"]
     bat0 = next(one for one in dump if one["interface"] == "bat0")
     assert bat0["up"] is False
-    assert bat0["errors"][0]["code"] == "NO_PROTO_HANDLER"
+    assert bat0["errors"][0]["code"] == "INVALID_PROTO"
 
 
 def test_a_down_link_stalls_a_connection_without_closing_it(mesh: VirtualFleet) -> None:
@@ -149,6 +149,15 @@ def test_nodes_with_different_keys_do_not_mesh(mesh: VirtualFleet) -> None:
         )
         mesh.node(name).exec(command).check("encrypt")
     until(lambda: in_mesh(mesh) == {"near"}, "the two with the same key")
+
+
+def test_a_second_set_up_deletes_the_supplicants_socket_but_not_the_supplicant(mesh: VirtualFleet) -> None:
+    near = mesh.node("near")
+    near.exec("uci set wireless.mesh0.encryption=psk2+ccmp; uci set wireless.mesh0.key=first-secret; uci commit; wifi")
+    sockets = "ls /var/run/wpa_supplicant; ubus list 'wpa_supplicant.*'"
+    until(lambda: near.exec(sockets).stdout == "mesh0\nwpa_supplicant.mesh0\n", "the supplicant")
+    near.exec("uci set wireless.radio0.txpower=17; uci commit; reload_config").check("change the power")
+    until(lambda: near.exec(sockets).stdout == "wpa_supplicant.mesh0\n", "the second set-up")
 
 
 def test_the_same_release_encrypts_only_with_a_full_supplicant(mesh: VirtualFleet) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from meshctl.device.observation import ChannelSurvey, Station, WirelessLink
 
+MESH_POINT = "mesh point"
 _INTERFACE = re.compile(r"^\s*Interface (\S+)$")
 _CHANNEL = re.compile(r"channel (\d{1,3}) \((\d{3,6})(?:\.\d+)? MHz\)(?:, width: ([^,]+))?")
 _STATION = re.compile(r"^Station ((?:[0-9a-f]{2}:){5}[0-9a-f]{2}) \(on (\S+)\)$", re.IGNORECASE)
@@ -39,15 +40,18 @@ def _interface(name: str, lines: list[str], phy: str) -> WirelessLink:
     fields = {words[0]: words[1] for line in lines if len(words := line.strip().split(" ", 1)) == 2}
     channel = next((found for line in lines if (found := _CHANNEL.search(line))), None)
     power = re.match(r"-?\d{1,3}(?:\.\d+)?", fields.get("txpower", ""))
+    mode = fields.get("type", "")
     return WirelessLink(
         ifname=name,
-        mode=fields.get("type", ""),
+        mode=mode,
         mac=fields.get("addr", "").lower(),
         ssid=unescape_ssid(fields["ssid"]) if "ssid" in fields else None,
         channel=int(channel[1]) if channel else None,
         frequency_mhz=int(channel[2]) if channel else None,
         width=(channel[3] or "").strip() if channel else "",
         tx_power_dbm=float(power[0]) if power else None,
+        # `iw link` says `Not connected.` of every mesh point; one that has joined has a channel (cfg80211, nl80211.c)
+        joined=channel is not None if mode == MESH_POINT else None,
         phy=phy,
     )
 
@@ -56,7 +60,7 @@ def with_link(link: WirelessLink, text: str) -> WirelessLink:
     """The interface completed by its `iw dev IF link`: the BSSID, and whether it has joined.
 
     An IBSS that is `up` may still be searching: then iw says `Not connected.`. It says so for a mesh point always, so
-    there `joined` stays None.
+    there `joined` stays what `iw dev` showed.
     """
     first = text.strip().splitlines()[:1]
     found = _JOINED.match(first[0]) if first else None

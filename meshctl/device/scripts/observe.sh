@@ -68,8 +68,11 @@ packages() {
 }
 
 # the radio interfaces that wpa_supplicant runs, by their control sockets
+# Its control sockets, and its objects on the bus: netifd's scripts delete the socket of an interface that they set up once
+# more, while the supplicant goes on (hostapd.sh: wpa_supplicant_teardown_interface, up to 24.10).
 supplicants() {
 	for socket in /var/run/wpa_supplicant/*; do [ ! -e "$socket" ] || echo "${socket##*/}"; done
+	[ ! -e /var/run/wpa_supplicant ] || ubus list 'wpa_supplicant.*'
 }
 
 listed_radios() {

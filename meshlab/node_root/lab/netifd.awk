@@ -214,7 +214,11 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 		# an IBSS cannot choose its channel, and encrypts only with a full supplicant; 25.12 then joins open, silently
 		if (mode == "adhoc" && algo != "none" && series == "25.12") { algo = "none"; key = "" }
 		joined = freq && (algo == "none" || ibss_rsn)
-		if (joined && algo != "none") encrypted[ifname] = 1
+		if (joined && algo != "none") {
+			encrypted[ifname] = 1
+			# hostapd.sh deletes the socket at each set-up, and wpa_supplicant.uc adds only an interface that differs
+			socket[ifname] = anew || series !~ /^(23.05|24.10)$/ ? "made" : differs[device] ? "deleted" : "kept"
+		}
 		width = get(id_of(device), "htmode", "NOHT")
 		iw_line = iw_line ifname "\t" mode "\t" mac[ifname] "\t" phy "\t" freq "\t" get(id_of(device), "channel", "0") "\t" width "\t" \
 			(mode == "mesh" ? get(id, "mesh_id", "") : get(id, "ssid", "OpenWrt")) "\t" get(id, "bssid", "00:00:00:00:00:00") "\t" \
@@ -294,12 +298,12 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 		device = id in device_of ? device_of[id] : get(id, "device", get(id, "ifname", ""))
 		sub(/ .*/, "", device)
 		address = ""; errors = ""; up = 0
-		if (proto == "batadv") { device = label[id]; up = batman ? 1 : 0; if (!up) errors = "NO_PROTO_HANDLER" }
+		if (proto == "batadv") { device = label[id]; up = batman ? 1 : 0; if (!up) errors = "INVALID_PROTO" }
 		else if (proto == "batadv_hardif") {
 			ifname = ""
 			for (j = 1; j <= ncells; j++) if (network_of[cells[j]] == label[id]) ifname = cells[j]
 			if (ifname == "" && device in exists) ifname = device
-			if (!batman) errors = "NO_PROTO_HANDLER"
+			if (!batman) errors = "INVALID_PROTO"
 			else if (ifname != "" && get(id, "master", "") in is_soft) {
 				up = 1; device = ifname
 				master[ifname] = get(id, "master", "")
@@ -325,7 +329,7 @@ function interfaces(    i, id, proto, device, n, list, j, ifname, separator, add
 		if (device != "") dump = dump ",\n\t\t\t\"device\": " json(device)
 		if (up) dump = dump ",\n\t\t\t\"metric\": 0,\n\t\t\t\"ipv4-address\": [" (address == "" ? "" : \
 			"\n\t\t\t\t{\n\t\t\t\t\t\"address\": " json(address) ",\n\t\t\t\t\t\"mask\": " prefix(mask) "\n\t\t\t\t}\n\t\t\t") "]"
-		if (errors != "") dump = dump ",\n\t\t\t\"errors\": [\n\t\t\t\t{\n\t\t\t\t\t\"subsystem\": \"interface\",\n\t\t\t\t\t\"code\": " json(errors) "\n\t\t\t\t}\n\t\t\t]"
+		if (errors != "") dump = dump ",\n\t\t\t\"errors\": [\n\t\t\t\t{\n\t\t\t\t\t\"subsystem\": \"proto\",\n\t\t\t\t\t\"code\": " json(errors) "\n\t\t\t\t}\n\t\t\t]"
 		dump = dump "\n\t\t}"
 		if (up) up_device[label[id]] = device
 		separator = ",\n"
@@ -407,8 +411,13 @@ function sys_script(    d, file, port, n, i, list, dir) {
 	# remove what the last run created and this one does not
 	print "for d in *; do case \" lo " ports " \" in *\" $d \"*) ;; *) [ -e '/tmp/run/netifd/has.'\"$d\" ] || rm -rf \"$d\" ;; esac; done" > (run "/sys.end")
 	close(run "/sys.end")
-	printf "rm -f /tmp/run/netifd/has.* /var/run/wpa_supplicant/*; [ -d /var/run/wpa_supplicant ] || mkdir -p /var/run/wpa_supplicant\n" > file
-	for (d in encrypted) printf ": >/var/run/wpa_supplicant/%s\n", d > file
+	printf "rm -f /tmp/run/netifd/has.*; [ -d /var/run/wpa_supplicant ] || mkdir -p /var/run/wpa_supplicant\n" > file
+	kept = ""
+	for (d in encrypted) if (socket[d] == "kept") kept = kept " " d
+	print "for d in /var/run/wpa_supplicant/*; do case \"" kept " \" in *\" ${d##*/} \"*) ;; *) rm -f \"$d\" ;; esac; done" > file
+	for (d in encrypted) if (socket[d] == "made") printf ": >/var/run/wpa_supplicant/%s\n", d > file
+	printf "" > (run "/supplicants")
+	for (d in encrypted) print d > (run "/supplicants")
 	for (d in exists) {
 		printf ": >/tmp/run/netifd/has.%s\n", d > file
 		printf "[ -d %s ] || mkdir %s\necho %s >%s/address\necho %s >%s/operstate\necho %s >%s/mtu\necho 1 >%s/carrier\n", \

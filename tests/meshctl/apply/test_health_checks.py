@@ -11,6 +11,7 @@ from meshctl.apply.health_checks import expectation, unmet
 from meshctl.device.observation import (
     Bridge,
     ChangeStatus,
+    MeshInfo,
     MeshNeighbour,
     NetInterface,
     Observation,
@@ -23,6 +24,7 @@ from tests.meshctl.plan.support import fleet, running, wanted
 
 BASE = "02:00:00:00:00:01"
 OTHER = "02:00:00:00:00:02"
+LAN = (NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.101/24",)),)
 
 
 def good() -> Observation:
@@ -32,8 +34,10 @@ def good() -> Observation:
         neighbours=(BASE, OTHER),
         originators=(Originator(BASE, BASE, "mesh0", 200, True, 250),),
         links=(WirelessLink("mesh0", "IBSS", bssid="02:ca:fe:00:00:01", channel=6, joined=True),),
-        interfaces=(NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.101/24",)),),
+        interfaces=LAN,
         bridges=(Bridge("br-lan", ("bat0", "eth0")),),
+        macs={"eth0": "02:00:00:00:00:10", "bat0": "02:00:00:00:00:20"},
+        mesh=MeshInfo("2024.3", "BATMAN_IV", hard_interfaces=("mesh0",)),
         change=ChangeStatus("applied", "c1", window_s=60, left_s=40.0, reload_status=0),
     )
 
@@ -85,6 +89,22 @@ def test_a_node_that_regained_everything_passes_the_health_check() -> None:
             replace(good(), links=(WirelessLink("mesh0", "IBSS", bssid="06:00:00:00:00:07", channel=6),)),
             "mesh0 is in cell 06:00:00:00:00:07, not 02:ca:fe:00:00:01",
         ),
+        # 25.12.5: a supplicant that cannot join a mesh, and is restarted every few seconds
+        (
+            replace(good(), links=(WirelessLink("mesh0", "mesh point", joined=False),)),
+            "mesh0 has not joined its cell",
+        ),
+        # proto.c of netifd: a protocol without a handler
+        (
+            replace(
+                good(),
+                interfaces=(*LAN, NetInterface("mesh0", False, False, "batadv_hardif", errors=("INVALID_PROTO",))),
+            ),
+            "netifd does not know batman-adv: /lib/netifd/proto/batadv_hardif.sh is missing or fails",
+        ),
+        (replace(good(), macs={"eth0": "02:00:00:00:00:10"}, mesh=None), "bat0 does not exist"),
+        (replace(good(), mesh=MeshInfo(hard_interfaces=())), "mesh0 is not part of bat0"),
+        (replace(good(), mesh=MeshInfo(hard_interfaces=("mesh1",))), "mesh0 is not part of bat0"),
         (replace(good(), neighbours=()), "it hears 0 mesh neighbors of the 2 it had"),
         (replace(good(), originators=()), "it has no route to the base"),
     ],

@@ -267,6 +267,15 @@ def test_an_apk_database_is_read_by_the_script(connection: SshConnection, node: 
     assert seen.packages == {"batctl-full": "2025.4-r1", "iw": "6.17-r1"}
 
 
+def test_a_supplicant_whose_socket_was_deleted_is_found_on_the_bus(connection: SshConnection, node: Sandbox) -> None:
+    """24.10.7: netifd's scripts delete the socket of an interface that they set up once more (hostapd.sh)."""
+    node.put("/var/run/wpa_supplicant/global", "")
+    node.put(
+        "/usr/bin/ubus", "#!/bin/sh\n[ \"$1 $2\" = 'list wpa_supplicant.*' ] && echo wpa_supplicant.mesh0\n", 0o755
+    )
+    assert observe(connection).supplicants == ("global", "mesh0")
+
+
 TRANSGLOBAL = """\
  * 66:0f:2c:9e:01:0c   -1 [....] (  3) 02:15:6d:00:00:21 (  3) (0x8b1d5a3f)
    66:0f:2c:9e:01:0c    1 [.W..] (  3) 02:15:6d:00:00:22 (  3) (0x8b1d5a3f)
