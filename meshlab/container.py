@@ -25,6 +25,9 @@ FLAGS = ns.CLONE_NEWNS | ns.CLONE_NEWPID | ns.CLONE_NEWNET | ns.CLONE_NEWUTS | n
 _DEVICES = ("null", "zero", "full", "random", "urandom", "tty")
 # /tmp is limited to half of the memory, the default of the kernel's tmpfs
 _TMP_SHARE = 2
+# of the machine (machine_root/init); its own processes count upwards from 1, and see those of all nodes
+PID_MAX = 4194304
+_PIDS_PER_NODE = 65536
 _ENVIRONMENT = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/", "TERM": "vt102"}
 
 
@@ -39,6 +42,8 @@ class Container:
     deny_setgroups: bool
     # its network devices are real ones of the kernel; otherwise they are files in /sys
     real_devices: bool = False
+    last_pid: int = 0
+    """Process ids after process 1 begin behind this one: see `last_pid`."""
 
     @property
     def home(self) -> Path:
@@ -47,6 +52,16 @@ class Container:
     @property
     def mount_point(self) -> Path:
         return self.fleet / "mnt" / self.name
+
+
+def last_pid(number: int) -> int:
+    """A start of the process ids of each node, so that no two nodes of one kernel have a process with the same id.
+
+    cfg80211 knows the owner of a mesh or an IBSS, wpa_supplicant, by its netlink socket's id, which is the id of the
+    process. When such a socket closes in any namespace, it leaves the cells whose owner has this id (nl80211.c,
+    nl80211_netlink_notify): an `iw` on one node ended the mesh of another.
+    """
+    return PID_MAX - (number + 1) * _PIDS_PER_NODE
 
 
 def prepare(container: Container) -> None:
@@ -142,6 +157,8 @@ def _mount_all(container: Container) -> None:
     ns.mount("proc", f"{root}/proc", "proc", ns.MS_NOSUID | ns.MS_NODEV | ns.MS_NOEXEC)
     ns.bind(str(home / "proc" / "boot_id"), f"{root}/proc/sys/kernel/random/boot_id")
     ns.bind(str(home / "proc" / "meminfo"), f"{root}/proc/meminfo")
+    if container.last_pid:
+        Path("/proc/sys/kernel/ns_last_pid").write_text(f"{container.last_pid}\n", encoding="ascii")
     ns.pivot_root(str(root))
     ns.bind("/", "/overlay")
 

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from meshlab import namespaces as ns
-from meshlab.container import FLAGS, Container, become_node
+from meshlab.container import FLAGS, Container, become_node, last_pid
 from meshlab.errors import LabError
 
 # the longest request or event; the longest are commands of `lab shell NODE -- ...`
@@ -105,6 +105,7 @@ class NodeRunner:
             memory_kib=request["memory_kib"],
             deny_setgroups=request["deny_setgroups"],
             real_devices=self._attach_devices is not None,
+            last_pid=last_pid(request["number"]) if self._attach_devices is not None else 0,
         )
         console = os.open(container.home / "console.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         silence = os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC)

@@ -152,6 +152,7 @@ class Supervisor:
             {
                 "do": "boot",
                 "node": state.spec.name,
+                "number": state.number,
                 "fleet": str(self.directory),
                 "overlay_kib": container.overlay_kib,
                 "memory_kib": container.memory_kib,

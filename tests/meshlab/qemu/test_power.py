@@ -33,6 +33,12 @@ def test_a_node_boots_while_its_old_network_namespace_is_still_in_use(lab: Lab) 
     lab.settle()
 
 
+def test_no_two_nodes_have_a_process_with_the_same_id(lab: Lab) -> None:
+    """Otherwise an `iw` on one node ends the mesh that wpa_supplicant runs on another: see container.last_pid."""
+    starts = {name: int(lab.node(name).exec("sh -c 'echo $$'").stdout) >> 16 for name in lab.NODES}
+    assert len(set(starts.values())) == len(lab.NODES), starts
+
+
 @pytest.mark.proof
 @pytest.mark.timeout(7200)
 def test_every_node_survives_two_hundred_power_cycles(lab: Lab) -> None:
