@@ -20,7 +20,8 @@ from tests.waiting import until
 PATIENCE_S = 120.0
 # Becomes the program in the terminal's session. Between fork and exec of a process with threads no Python may run,
 # so what must be done there is done after an exec. A run of tests in the background may have Ctrl-C switched off. A
-# `shell` is what lets a stopped program go on.
+# `shell` is what lets a stopped program go on. The program itself takes the terminal before it shows anything: its
+# parent may be late, and may not move it to another process group after the exec (setpgid(2), EACCES).
 _ENTER = """\
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -28,11 +29,11 @@ os.login_tty(int(sys.argv[1]))
 if sys.argv[2] == "shell":
     program = os.fork()
     if program:
-        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-        os.setpgid(program, program)
-        os.tcsetpgrp(0, program)
         sys.exit(os.waitstatus_to_exitcode(os.waitpid(program, 0)[1]))
     os.setpgid(0, 0)
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
+    os.tcsetpgrp(0, os.getpid())
+    signal.signal(signal.SIGTTOU, signal.SIG_DFL)
 os.execv(sys.argv[3], sys.argv[3:])
 """
 # Tail of the output that a failed expectation reports.
