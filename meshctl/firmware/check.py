@@ -11,10 +11,10 @@ import hashlib
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
+from meshctl.file_access import special_file
 from meshctl.firmware.metadata import Metadata, read_metadata
 from meshctl.firmware.trailer import DamagedImage
 from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, verify
-from meshctl.inventory.file_access import special_file
 from meshctl.model import HardwareProfile
 
 # The codes are documented in docs/render.md.

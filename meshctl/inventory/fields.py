@@ -134,6 +134,8 @@ def _interface(value: object) -> IpInterface:
 
 def _network(value: object) -> IpNetwork:
     text = _text(value)
+    if "/" not in text:
+        raise expected_error("a network with its prefix length such as 10.42.0.0/24 or fd42::/64")
     try:
         return ip_network(text)
     except ValueError:

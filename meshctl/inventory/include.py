@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic, Position
+from meshctl.file_access import HINT, Boundary
 from meshctl.inventory import codes
 from meshctl.inventory.compose import MAX_VALUES, compose
-from meshctl.inventory.file_access import HINT, Boundary
 from meshctl.inventory.source import Reader, Source, read_bytes, read_source
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 

@@ -235,7 +235,7 @@ class _Building:
 
     def _prefix_length(self, address: IpAddress, network: IpNetwork | None) -> int:
         """The prefix length of the node's mesh, or that of a mesh with the address; else all bits."""
-        if network is None:
+        if network is None or network.version != address.version:
             network = next((mesh.network for mesh in self.meshes.values() if address in mesh.network), None)
         return address.max_prefixlen if network is None else network.prefixlen
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, assert_never
 from meshctl import event_log
 from meshctl.diagnostics import Position
 from meshctl.errors import InputError
+from meshctl.file_access import special_file
 from meshctl.inventory.compose import compose
-from meshctl.inventory.file_access import special_file
 from meshctl.inventory.source import Source
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import UnionType
@@ -35,6 +36,25 @@ _BOUNDS = {
     "less_than_equal": ("at most", "le"),
     "less_than": ("less than", "lt"),
 }
+# The end of a key's name, and the unit of its value.
+_UNITS = {
+    "_bytes_per_s": "bytes per second",
+    "bits_per_s": "bits per second",
+    "_bytes": "bytes",
+    "_db": "dB",
+    "_dbi": "dBi",
+    "_dbm": "dBm",
+    "_deg": "degrees",
+    "_hz": "Hz",
+    "_kbps": "kbit/s",
+    "_kib": "KiB",
+    "_m": "meters",
+    "_mib": "MiB",
+    "_ms": "milliseconds",
+    "_s": "seconds",
+    "_tu": "time units of 1.024 ms",
+}
+_WITH_UNIT = re.compile(r"[-+]?[0-9.,]+ ?[A-Za-z]{1,8}(/s)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +97,7 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
         return codes.error(codes.UNKNOWN_KEY, place, f"unknown key '{printable(wrong)}'", path=dotted, hint=hint)
     expected = expected_value(error)
     found = f"'{printable(str(path[-1]))}'" if is_key else _found(root, path, kind)
-    hint = _enum_hint(root, path, error) if kind == "enum" else ""
+    hint = _enum_hint(root, path, error) if kind == "enum" else _unit_hint(root, path)
     return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
 
 
@@ -148,6 +168,17 @@ def _enum_hint(root: MappingNode, path: tuple[int | str, ...], error: ErrorDetai
     found = _found(root, path, "enum").strip("'")
     known = [word for word in str(error.get("ctx", {}).get("expected", "")).split("'") if word.strip(", or")]
     return did_you_mean(found, known)
+
+
+def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
+    """For a number with a unit (`20 dBm`, `2.5s`): what the key's name says about it."""
+    tree: Tree | None = root
+    for part in path:
+        tree = None if tree is None else child(tree, part)
+    if not isinstance(tree, Scalar) or not _WITH_UNIT.fullmatch(tree.text):
+        return ""
+    unit = next((unit for suffix, unit in _UNITS.items() if str(path[-1]).endswith(suffix)), "")
+    return f"write the number alone; it is in {unit}" if unit else ""
 
 
 def _known_keys(path: tuple[int | str, ...]) -> list[str]:

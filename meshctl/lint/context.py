@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from meshctl.diagnostics import Diagnostic
+from meshctl.lint.trial_rendering import TrialRendering
 from meshctl.model import HardwareProfile, Secret, SecretRef
 from meshctl.regdb import Regdb
 
@@ -58,3 +59,4 @@ class LintContext:
     files: Files
     secret: SecretLookup = no_secret
     secret_problem: SecretProblem = no_problem
+    trial: TrialRendering = field(default_factory=TrialRendering)

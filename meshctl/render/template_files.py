@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.inventory.file_access import HINT, Boundary
+from meshctl.file_access import HINT, Boundary
 from meshctl.render.rendered import CONFIG_FOLDER
 from meshctl.resources import shipped
 

@@ -21,7 +21,7 @@ from jinja2 import (
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.inventory.file_access import Boundary
+from meshctl.file_access import Boundary
 from meshctl.model import Backend, MeshMode, OperatorParts, Release
 from meshctl.render.quoting import quoted, require_quoted, revealed
 from meshctl.render.template_files import (

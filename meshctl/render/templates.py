@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.inventory.file_access import Boundary
+from meshctl.file_access import Boundary
 from meshctl.model import Backend, Fleet, OperatorParts
 from meshctl.render.sandbox import LimitExceeded, SandboxRenderer
 from meshctl.render.template_files import COMMON, NO_TEMPLATE, TEMPLATE, TemplateFile, refuse_outside

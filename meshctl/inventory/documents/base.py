@@ -42,7 +42,7 @@ class SecretDocument(Document):
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if sum(map(bool, (self.env, self.file, self.age))) != 1:
-            raise expected_error("exactly one of env, file and age")
+            raise expected_error("exactly one of env, file and age, not empty")
         if self.env and (self.key or self.identity):
             raise expected_error("no key and identity with env")
         if self.file and self.identity:

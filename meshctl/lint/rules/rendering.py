@@ -6,51 +6,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from meshctl import uci
-from meshctl.diagnostics import InvalidInput, Severity
+from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
-from meshctl.model import Fleet, Node, Secret, SecretRef
-from meshctl.render import Rendered, Templates, render
+from meshctl.lint.trial_rendering import kinds, placeholder
+from meshctl.model import Fleet, Node
+from meshctl.render import Rendered
 from meshctl.render.extra import EXTRA
 from meshctl.render.template_files import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 from meshctl.resolve.intent import BACKBONE, LAN
 
-# replaces every secret: a valid passphrase that never leaves this module
-_PLACEHOLDER = Secret("placeholder-for-lint")
 # a path in the inventory can be very long
 _MAX_SHOWN_CHARACTERS = 200
 _TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
-
-
-def _placeholder(_ref: SecretRef) -> Secret:
-    return _PLACEHOLDER
-
-
-def _kinds(fleet: Fleet) -> Iterator[Node]:
-    """One managed node of every kind: nodes that differ only in name and address render alike."""
-    seen = set()
-    for node in fleet.managed():
-        if not all(name in fleet.meshes for name in node.meshes):
-            continue
-        kind = (
-            node.hardware.name,
-            node.release,
-            tuple((radio.mesh, radio.tx_power_dbm) for radio in node.radios),
-            node.lan_ports,
-            tuple(node.extra_uci.items()),
-            node.gateway is None,
-            node.lan_address is None,
-        )
-        if kind not in seen:
-            seen.add(kind)
-            yield node
-
-
-def _holds_own_text(fleet: Fleet, node: Node) -> bool:
-    """Whether the node uses templates or options of the operator; the shipped templates are tested with meshctl."""
-    own_templates = (Path(fleet.base) / "templates").is_dir()
-    return own_templates or bool(node.extra_uci) or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
 
 
 @fleet_rule(
@@ -67,9 +36,9 @@ def _holds_own_text(fleet: Fleet, node: Node) -> bool:
         "apply: {max_down: 1}", files={"templates/common/etc/config/extra.j2": "config led\n\toption name 'mesh'\n"}
     ),
 )
-def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+def template_fails(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     seen = set()
-    for _, outcome in _rendered(fleet):
+    for node, outcome in context.trial.of(fleet):
         if isinstance(outcome, Rendered):
             continue
         if isinstance(outcome, OSError):
@@ -79,7 +48,21 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for item in outcome.diagnostics:
             if item.code in _TEMPLATE_CODES and (item.position, item.message) not in seen:
                 seen.add((item.position, item.message))
-                yield Finding((), item.message, item.expected, item.found, item.hint, item.position)
+                yield _named_folder(fleet, node, item) or Finding(
+                    (), item.message, item.expected, item.found, item.hint, item.position
+                )
+
+
+def _named_folder(fleet: Fleet, node: Node, item: Diagnostic) -> Finding | None:
+    """The finding about a folder of operator parts, at the line of the inventory that names it."""
+    for name in node.meshes:
+        parts = fleet.meshes[name].operator_parts
+        if parts.templates and item.position.file == str(Path(parts.base) / parts.templates):
+            path = ("meshes", name, "operator_parts", "templates")
+            found = item.found and f"no folder {parts.templates}"[:_MAX_SHOWN_CHARACTERS]
+            hint = item.hint or "Create the folder, or correct its path: it is relative to this file."
+            return Finding(path, item.message, item.expected, found, hint)
+    return None
 
 
 @fleet_rule(
@@ -94,8 +77,8 @@ def template_fails(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     failing="nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}",
     passing="nodes: {b01: {extra_uci: {firewall.management.masq: '1'}}}",
 )
-def management_shut_out(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    for node, outcome in _rendered(fleet):
+def management_shut_out(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for node, outcome in context.trial.of(fleet):
         if not isinstance(outcome, Rendered):
             continue
         for file in outcome.files:
@@ -116,24 +99,6 @@ def _lets_in(firewall: uci.Package, network: str) -> bool:
     return False
 
 
-def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OSError]]:
-    """Every kind of node with its files, or the error that prevents rendering."""
-    templates = Templates.of(fleet)
-    for node in _kinds(fleet):
-        if not _holds_own_text(fleet, node):
-            continue
-        try:
-            intent = resolve(fleet, node, _placeholder)
-        except InvalidInput:
-            # MC903 reports invalid values
-            continue
-        try:
-            outcome: Rendered | InvalidInput | OSError = render(intent, templates)
-        except (InvalidInput, OSError) as error:
-            outcome = error
-        yield node, outcome
-
-
 @fleet_rule(
     "MC903",
     Severity.ERROR,
@@ -148,9 +113,9 @@ def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Rendered | InvalidInput | OS
 )
 def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     seen = set()
-    for node in _kinds(fleet):
+    for node in kinds(fleet):
         try:
-            resolve(fleet, node, _placeholder)
+            resolve(fleet, node, placeholder)
         except InvalidInput as error:
             for item in error.diagnostics:
                 if (item.position, item.path) not in seen:

@@ -40,8 +40,11 @@ def junit(findings: Findings, moment: datetime | None = None) -> str:
 
 
 def _now() -> datetime:
-    written = os.environ.get("SOURCE_DATE_EPOCH", "")
-    return datetime.fromtimestamp(int(written), UTC) if written.isdecimal() else datetime.now(UTC)
+    try:
+        return datetime.fromtimestamp(int(os.environ["SOURCE_DATE_EPOCH"]), UTC)
+    except (KeyError, ValueError, OverflowError, OSError):
+        # not set, or no time that a timestamp can have
+        return datetime.now(UTC)
 
 
 def _suite(file: str, items: list[Diagnostic], stamp: str) -> ElementTree.Element:

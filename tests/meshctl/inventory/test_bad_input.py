@@ -301,6 +301,41 @@ def test_the_rest_of_an_unquoted_text_with_commas_gets_a_hint(tmp_path: Path) ->
     assert "known keys" in first.hint
 
 
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("udp_mesh: {offline_after_s: 2min}", "write the number alone; it is in seconds"),
+        ("apply: {quorum: 80 percent}", ""),
+        ("defaults: {radios: {radio0: {tx_power_dbm: 500 mW}}}", "write the number alone; it is in dBm"),
+        ("topics: {t: {priority: 1, size_bytes: 16MiB}}", "write the number alone; it is in bytes"),
+        ("topics: {t: {priority: 1, rate_limit_bytes_per_s: 20 kB/s}}", "it is in bytes per second"),
+        ("topics: {t: {priority: 1, deadline_s: soon}}", ""),
+    ],
+)
+def test_a_number_with_a_unit_gets_a_hint(text: str, hint: str, tmp_path: Path) -> None:
+    found = [item for item in errors_of(tmp_path, text + "\n") if "number" in item.expected]
+    assert len(found) == 1
+    assert hint in found[0].hint
+    assert bool(hint) == bool(found[0].hint)
+
+
+def test_a_network_without_its_prefix_length_is_refused(tmp_path: Path) -> None:
+    text = HEAD.replace("10.42.0.0/24", "10.42.0.0")
+    assert text != HEAD
+    (found,) = load_text(tmp_path, text).diagnostics
+    assert "expected a network with its prefix length" in found.text
+
+
+@pytest.mark.parametrize(("network", "address"), [("fd42::/64", "10.42.0.1"), ("10.42.0.0/24", "fd42::1")])
+def test_a_node_s_address_of_another_ip_version_than_its_mesh_loads(network: str, address: str, tmp_path: Path) -> None:
+    """MC202 reports it."""
+    text = HEAD.replace("10.42.0.0/24", network)
+    loaded = load_text(tmp_path, text + f"nodes: {{n: {{hardware: rocket, address: '{address}'}}}}\n")
+    assert loaded.fleet is not None
+    interface = loaded.fleet.nodes["n"].address
+    assert interface.network.num_addresses == 1
+
+
 @pytest.mark.parametrize("target", ["/etc/shadow", "/dev/zero", "outside.yaml"])
 def test_an_inventory_that_leads_out_of_its_tree_is_refused_unread(target: str, tmp_path: Path) -> None:
     (tmp_path / "outside.yaml").write_text("root:$y$hash:1: {}\n", encoding="utf-8")

@@ -6,11 +6,13 @@ import pytest
 
 from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import load_fleet
-from meshctl.lint import Example, check_path
+from meshctl.lint import Example, check_path, trial_rendering
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
 from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_package
 from meshctl.lint.zones import is_posix, zones
 from meshctl.regdb import SHIPPED, load
+from meshctl.render import Rendered, Templates, render
+from meshctl.resolve import Intent
 
 _REGDB = load(SHIPPED)
 _KEY = ENVIRONMENT["UDP_MESH_KEY"]
@@ -119,6 +121,36 @@ def test_two_cells_under_one_meshmerize_interface_share_their_network(tmp_path: 
     assert _codes(Example(_SECOND_CELL, files=files), tmp_path) == []
     other = _SECOND_CELL.replace("interface: mm0", "interface: mm1", 1)
     assert "MC205" in _codes(Example(other, files=files), tmp_path)
+
+
+def test_a_missing_folder_of_operator_parts_is_reported_where_the_inventory_names_it(tmp_path: Path) -> None:
+    (finding,) = _found(_SECOND_CELL, tmp_path)
+    assert (finding.code, finding.found) == ("MC901", "no folder parts")
+    assert finding.path == "meshes.main.operator_parts.templates"
+    assert _at(finding, tmp_path).startswith("parts")
+    assert "Create the folder" in finding.hint
+
+
+def test_a_misspelled_back_end_in_the_templates_is_one_finding_among_others(tmp_path: Path) -> None:
+    files = {"templates/comon/etc/config/extra.j2": "config led\n"}
+    found = _found(Example("apply: {stop_after_failures: 9}", files=files), tmp_path)
+    assert [item.code for item in found] == ["MC616", "MC901"]
+    assert "found comon" in found[1].text
+
+
+def test_own_templates_are_rendered_once_for_all_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered = []
+
+    def counted(intent: Intent, templates: Templates) -> Rendered:
+        rendered.append(intent.node)
+        return render(intent, templates)
+
+    monkeypatch.setattr(trial_rendering, "render", counted)
+    files = {"templates/common/etc/config/extra.j2": "config led\n"}
+    assert _codes(Example("nodes: {b01: {extra_uci: {firewall.management.input: REJECT}}}", files=files), tmp_path) == [
+        "MC902"
+    ]
+    assert len(rendered) == len(set(rendered)) > 1
 
 
 def test_a_relay_whose_first_radio_is_in_another_network_may_keep_its_address(tmp_path: Path) -> None:

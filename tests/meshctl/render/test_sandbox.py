@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from meshctl.diagnostics import InvalidInput
-from meshctl.inventory.file_access import VARIABLE, Boundary
+from meshctl.file_access import VARIABLE, Boundary
 from meshctl.model import OperatorParts
 from meshctl.render import sandbox
 from meshctl.render.node import render_node

@@ -197,6 +197,12 @@ def test_junit_uses_source_date_epoch_as_timestamp(monkeypatch: pytest.MonkeyPat
     assert 'timestamp="1970-01-02T00:00:00"' in junit(_NOTHING)
 
 
+@pytest.mark.parametrize("moment", ["", "soon", "9" * 20, "-1e9"])
+def test_junit_ignores_an_unusable_source_date_epoch(moment: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", moment)
+    assert 'timestamp="20' in junit(_NOTHING)
+
+
 def test_junit_has_a_passed_case_for_a_clean_file() -> None:
     root = ElementTree.fromstring(junit(_NOTHING).encode())
     (case,) = root.iter("testcase")

@@ -1,0 +1,84 @@
+"""Render every kind of node for rules that judge the result, with a placeholder for each secret."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from meshctl.diagnostics import InvalidInput
+from meshctl.model import Fleet, Node, Secret, SecretRef
+from meshctl.render import Rendered, Templates, render
+from meshctl.resolve import resolve
+
+Outcome = Rendered | InvalidInput | OSError
+
+# a valid passphrase that never leaves lint
+_PLACEHOLDER = Secret("placeholder-for-lint")
+
+
+class TrialRendering:
+    """The outcomes for the last fleet, so that several rules share them: an inventory's own templates are rendered in
+    a process of their own, which takes longer to start than all other rules together."""
+
+    def __init__(self) -> None:
+        self._fleet: Fleet | None = None
+        self._outcomes: tuple[tuple[Node, Outcome], ...] = ()
+
+    def of(self, fleet: Fleet) -> tuple[tuple[Node, Outcome], ...]:
+        """Every kind of node with own templates or options, and its files or the error that prevents rendering."""
+        if self._fleet is not fleet:
+            self._outcomes = tuple(_rendered(fleet))
+            self._fleet = fleet
+        return self._outcomes
+
+
+def placeholder(_ref: SecretRef) -> Secret:
+    """Stands for every secret."""
+    return _PLACEHOLDER
+
+
+def kinds(fleet: Fleet) -> Iterator[Node]:
+    """One managed node of every kind: nodes that differ only in name and address render alike."""
+    seen = set()
+    for node in fleet.managed():
+        if not all(name in fleet.meshes for name in node.meshes):
+            continue
+        kind = (
+            node.hardware.name,
+            node.release,
+            tuple((radio.mesh, radio.tx_power_dbm) for radio in node.radios),
+            node.lan_ports,
+            tuple(node.extra_uci.items()),
+            node.gateway is None,
+            node.lan_address is None,
+        )
+        if kind not in seen:
+            seen.add(kind)
+            yield node
+
+
+def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Outcome]]:
+    templates: Templates | None = None
+    for node in kinds(fleet):
+        if not _holds_own_text(fleet, node):
+            continue
+        try:
+            templates = templates or Templates.of(fleet)
+        except (InvalidInput, OSError) as error:
+            yield node, error
+            return
+        try:
+            intent = resolve(fleet, node, placeholder)
+        except InvalidInput:
+            # MC903 reports invalid values
+            continue
+        try:
+            yield node, render(intent, templates)
+        except (InvalidInput, OSError) as error:
+            yield node, error
+
+
+def _holds_own_text(fleet: Fleet, node: Node) -> bool:
+    """Whether the node uses templates or options of the operator; the shipped templates are tested with meshctl."""
+    own_templates = (Path(fleet.base) / "templates").is_dir()
+    return own_templates or bool(node.extra_uci) or any(fleet.meshes[m].operator_parts.templates for m in node.meshes)
