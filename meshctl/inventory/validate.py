@@ -36,6 +36,13 @@ _BOUNDS = {
     "less_than_equal": ("at most", "le"),
     "less_than": ("less than", "lt"),
 }
+_PATTERNS = {
+    "^([a-z0-9]+(-[a-z0-9]+)*)?$": "a driver's name such as ath10k-ct",
+    "^([0-9a-fA-F]{64})?$": "64 hexadecimal digits",
+    "^(BATMAN_IV|BATMAN_V)$": "one of 'BATMAN_IV', 'BATMAN_V'",
+    "^(off|client|server)$": "one of 'off', 'client', 'server'",
+    "^([A-Za-z_][A-Za-z0-9_]*)?$": "the name of an environment variable such as MESH_KEY",
+}
 # The end of a key's name, and the unit of its value.
 _UNITS = {
     "_bytes_per_s": "bytes per second",
@@ -145,7 +152,7 @@ def expected_value(error: ErrorDetails) -> str:
         words, key = _BOUNDS[kind]
         return f"{words} {context[key]:.15g}"
     if kind == "string_pattern_mismatch":
-        return f"text that matches {context['pattern']}"
+        return _PATTERNS.get(context["pattern"], f"text that matches {context['pattern']}")
     if "expected" in context:
         expected = str(context["expected"])
         return "one of " + expected.replace("' or '", "', '") if kind == "enum" else expected

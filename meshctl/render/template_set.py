@@ -50,6 +50,11 @@ class TemplateSet:
                 )
                 raise InvalidInput([found])
             refuse_outside(own, boundary)
+            if next(own.rglob(f"*{SUFFIX}"), None) is None:
+                expected = f"templates below it, such as etc/config/{backend.value}{SUFFIX}"
+                raise InvalidInput(
+                    [Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", expected, "none")]
+                )
             layers.append((backend.value, own))
             loaders.append(PrefixLoader({backend.value: _BoundedLoader(own, boundary)}))
         for folder in folders:

@@ -59,8 +59,8 @@ def _named_folder(fleet: Fleet, node: Node, item: Diagnostic) -> Finding | None:
         parts = fleet.meshes[name].operator_parts
         if parts.templates and item.position.file == str(Path(parts.base) / parts.templates):
             path = ("meshes", name, "operator_parts", "templates")
-            found = item.found and f"no folder {parts.templates}"[:_MAX_SHOWN_CHARACTERS]
-            hint = item.hint or "Create the folder, or correct its path: it is relative to this file."
+            found = item.found and f"{item.found} at {parts.templates}"[:_MAX_SHOWN_CHARACTERS]
+            hint = item.hint or "Add what is missing, or correct the path: it is relative to this file."
             return Finding(path, item.message, item.expected, found, hint)
     return None
 

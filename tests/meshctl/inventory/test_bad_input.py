@@ -7,10 +7,13 @@ import os
 from pathlib import Path
 
 import pytest
+from pydantic_core import ErrorDetails
 
 from meshctl.inventory import load
 from meshctl.inventory.codes import MAX_DIAGNOSTICS, MEANINGS
+from meshctl.inventory.documents.base import Document
 from meshctl.inventory.source import MAX_FILE_BYTES
+from meshctl.inventory.validate import expected_value
 from tests.meshctl.inventory.inventories import HEAD, errors_of, load_text
 
 _BOMB = "a: &a [x,x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -317,6 +320,26 @@ def test_a_number_with_a_unit_gets_a_hint(text: str, hint: str, tmp_path: Path) 
     assert len(found) == 1
     assert hint in found[0].hint
     assert bool(hint) == bool(found[0].hint)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("udp_mesh: {keys: [{env: $MESH_KEY}]}", "the name of an environment variable such as MESH_KEY"),
+        ("udp_mesh: {keys: [{env: 9}, {file: x}]}", "the name of an environment variable such as MESH_KEY"),
+    ],
+)
+def test_what_is_expected_is_said_in_words(text: str, expected: str, tmp_path: Path) -> None:
+    assert [item.expected for item in errors_of(tmp_path, text + "\n")] == [expected]
+
+
+def test_no_message_shows_a_regular_expression() -> None:
+    fields = [field for model in Document.__subclasses__() for field in model.model_fields.values()]
+    patterns = {item.pattern for field in fields for item in field.metadata if getattr(item, "pattern", None)}
+    assert len(patterns) > 3
+    for pattern in patterns:
+        error = ErrorDetails(type="string_pattern_mismatch", loc=(), msg="", input="", ctx={"pattern": pattern})
+        assert "^" not in expected_value(error)
 
 
 def test_a_network_without_its_prefix_length_is_refused(tmp_path: Path) -> None:

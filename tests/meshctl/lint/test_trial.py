@@ -125,10 +125,15 @@ def test_two_cells_under_one_meshmerize_interface_share_their_network(tmp_path: 
 
 def test_a_missing_folder_of_operator_parts_is_reported_where_the_inventory_names_it(tmp_path: Path) -> None:
     (finding,) = _found(_SECOND_CELL, tmp_path)
-    assert (finding.code, finding.found) == ("MC901", "no folder parts")
+    assert (finding.code, finding.found) == ("MC901", "none at parts")
     assert finding.path == "meshes.main.operator_parts.templates"
     assert _at(finding, tmp_path).startswith("parts")
-    assert "Create the folder" in finding.hint
+
+
+def test_a_folder_of_operator_parts_without_templates_is_reported(tmp_path: Path) -> None:
+    (finding,) = _found(Example(_SECOND_CELL, files={"parts/etc/config/mm": "config mm\n"}), tmp_path)
+    assert (finding.code, finding.path) == ("MC901", "meshes.main.operator_parts.templates")
+    assert finding.expected == "templates below it, such as etc/config/meshmerize.j2"
 
 
 def test_a_misspelled_back_end_in_the_templates_is_one_finding_among_others(tmp_path: Path) -> None:
