@@ -50,6 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # looking for some; a caller's process keeps its own thresholds
     if arguments is None:
         gc.set_threshold(*GC_THRESHOLD)
+        # paramiko imports it for `Match exec` of an ssh_config, which meshctl does not read, and does without it; that
+        # was a quarter of paramiko's start
+        sys.modules.setdefault("invoke", None)  # type: ignore[arg-type]
     # no plugin takes part in reading an inventory, and to look for some reads the metadata of all installed packages
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,24 @@ def test_help_and_version_import_only_typer_and_the_command_table(words: list[st
     assert packages(imported) - {"meshctl"} <= TYPER
     # each takes milliseconds, and none is needed
     assert not imported & {"asyncio", "email", "importlib.metadata", "json", "sqlite3", "ssl"}
+
+
+def test_commands_over_ssh_do_without_the_package_that_paramiko_imports_for_ssh_config() -> None:
+    script = "import sys; sys.argv = ['meshctl', 'status', '--help']; from meshctl.cli.main import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", script], capture_output=True, text=True, check=True
+    )
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "paramiko.config" in imported
+    assert "invoke.context" not in imported
+
+
+def test_the_process_that_renders_templates_imports_no_loader_of_inventories() -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "meshctl.render.sandbox_worker", "1", str(1 << 30)]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True)
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "jinja2" in imported
+    assert not imported & {"pydantic", "yaml", "meshctl.inventory"}
 
 
 def test_lint_of_shipped_templates_imports_no_ssh_no_cryptography_and_no_jinja(tmp_path: Path) -> None:
