@@ -259,7 +259,7 @@ def profile_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Findi
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
     nodes: {base: {address: 10.43.0.1, radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
-    robots: {base-station: {computer: {address: 10.43.0.100/24}}}
+    robots: {base-station: {computer: {address: 10.43.0.100/24, links: [{address: 10.42.0.100}]}}}
     """,
 )
 def switch_on_other_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Networks: overlaps, public and unusable ranges, room, prefixes (MC205 to MC215)."""
+"""Networks: overlaps, public and unusable ranges, room, prefixes, the base station's (MC205 to MC221)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from ipaddress import ip_network
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, overlaps
+from meshctl.lint.grouping import group_by_key, join_limited, overlaps
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import meshes_of, networks, stations
-from meshctl.model import Backend, Fleet, Mesh
+from meshctl.lint.rules.team import reached_from_base
+from meshctl.model import Backend, Fleet, Mesh, Role
 from meshctl.model.ip import IpAddress, IpNetwork
 
 # RFC 1918, RFC 6598 (carrier-grade NAT), and RFC 4193 (unique local IPv6)
@@ -197,3 +198,59 @@ def node_prefix_differs(fleet: Fleet, _context: LintContext) -> Iterator[Finding
             expected = f"/{holding[0].network.prefixlen} as in mesh {holding[0].name}"
             path = ("nodes", node.name, "address")
             yield Finding(path, "prefix length differs from the mesh's", expected, f"/{node.address.network.prefixlen}")
+
+
+@fleet_rule(
+    "MC221",
+    Severity.WARNING,
+    "The base station has no address in a mesh's network",
+    why="""Radios route nothing between the networks of two meshes: a robot with a radio in each joins them to one
+    Ethernet segment that carries both networks. A base station without an address in such a network reaches none of its
+    radios: `provision` and `status` report them as unreachable, although the mesh works.""",
+    fix="""Give the base station's computer a second address, in that network, and list it under its `links`; or give
+    these radios a `gateway`, `ssh.jump` or `ssh.host`.""",
+    failing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      husky1-front: {radios: {radio1: {mesh: second}}}
+      b01: {address: 10.43.0.101, radios: {radio0: {mesh: null}, radio1: {mesh: second}}}
+    """,
+    passing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes:
+      husky1-front: {radios: {radio1: {mesh: second}}}
+      b01: {address: 10.43.0.101, radios: {radio0: {mesh: null}, radio1: {mesh: second}}}
+    robots: {base-station: {computer: {links: [{address: 10.43.0.100}]}}}
+    """,
+)
+def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    bases = [robot for robot in fleet.robots.values() if robot.is_base and robot.computer is not None]
+    own = {name for robot in bases for name in robot.nodes}
+    known = [node.address.ip for node in fleet.managed() if node.role is Role.BASE or node.name in own]
+    for robot in bases:
+        for _, _, computer in robot.all_computers():
+            if any(link.address is None for link in computer.links):
+                # a link by the name of its interface has an address that the inventory does not know
+                return
+            known += [computer.address.ip, *(link.address for link in computer.links if link.address is not None)]
+    if not bases:
+        return
+    # MC601 reports the other meshes
+    reached = reached_from_base(fleet)
+    cut_off = (
+        (mesh.name, node.name)
+        for node in fleet.managed()
+        if node.gateway is None and not node.site and not node.ssh.host and not node.ssh.jump
+        for mesh in meshes_of(fleet, node)
+        if mesh.name in reached and node.address.ip in mesh.network
+        if not any(address in mesh.network for address in known)
+    )
+    for name, nodes in group_by_key(cut_off).items():
+        network = fleet.meshes[name].network
+        message = f"only an address in it reaches {join_limited(nodes)}"
+        expected = f"a base station's computer in {network}"
+        yield Finding(("meshes", name, "network"), message, expected, join_limited(sorted(map(str, known))))

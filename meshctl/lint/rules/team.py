@@ -41,7 +41,7 @@ from meshctl.model import Fleet, NodeState, Role
     """,
 )
 def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    reached = _reached_from_base(fleet)
+    reached = reached_from_base(fleet)
     if not reached:
         return
     members_of = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
@@ -53,7 +53,7 @@ def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             yield Finding(path, message, f"a radio in {join_limited(sorted(reached))} as well", "none")
 
 
-def _reached_from_base(fleet: Fleet) -> set[str]:
+def reached_from_base(fleet: Fleet) -> set[str]:
     """The base's meshes, and those connected to them by a node or robot that is in both."""
     start = {
         mesh

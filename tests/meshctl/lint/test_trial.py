@@ -167,8 +167,31 @@ meshes:
 nodes:
   base: {radios: {radio1: {mesh: second}}}
   relay: {role: beacon, address: 10.43.0.7, radios: {radio1: {mesh: second}}}
+robots: {base-station: {computer: {links: [{address: 10.43.0.100}]}}}
 """
     assert _codes(fragment, tmp_path) == []
+
+
+_BEHIND_A_ROBOT = """
+meshes:
+  second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
+           encryption: psk2+ccmp, key: {env: MESH_KEY}}
+nodes:
+  husky1-front: {radios: {radio1: {mesh: second}}}
+  b01: {address: 10.43.0.101, SETTINGS radios: {radio0: {mesh: null}, radio1: {mesh: second}}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("settings", "codes"),
+    [("", ["MC221"]), ("ssh: {host: 192.0.2.1},", []), ("ssh: {jump: husky1-front},", [])],
+)
+def test_a_mesh_in_whose_network_the_base_station_has_no_address_is_reported(
+    settings: str, codes: list[str], tmp_path: Path
+) -> None:
+    found = _found(_BEHIND_A_ROBOT.replace("SETTINGS", settings), tmp_path)
+    assert [item.code for item in found] == codes
+    assert all(_at(item, tmp_path).startswith("10.43.0.0/24") for item in found)
 
 
 _UAV = """
