@@ -207,6 +207,8 @@ def _plug(directory: Path | None, names: list[str] | None, plugged: bool) -> Non
     for node in (fleet.node(name) for name in names) if names else fleet.nodes:
         if names or plugged or not node.is_base:
             node.plug(plugged)
+            if node.is_base and not plugged:
+                echo(f"{node.name} is the base: no node is reached now, until `meshctl lab plug {node.name}`")
 
 
 def _row(node: dict[str, Any]) -> tuple[str, ...]:

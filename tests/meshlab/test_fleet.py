@@ -139,6 +139,8 @@ def test_the_command_line_drives_a_fleet(tmp_path: Path) -> None:
         lab("unplug", *place)
         plugged = {node["name"]: node["plugged"] for node in json.loads(lab("status", "--json", *place))["nodes"]}
         assert plugged == {"base": True, "rover1": False}
+        # the operator's own cable
+        assert "`meshctl lab plug base`" in lab("unplug", "base", *place)
     finally:
         runner.invoke(app, ["down", *place])
     image = tmp_path / "image.bin"

@@ -6,13 +6,13 @@ import argparse
 import importlib
 import os
 import sys
-import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, hosts, inspect, serve, traffic
 from udp_mesh.cli.argument_types import count, ping_s, positive
+from udp_mesh.cli.command_parser import CommandParser, HelpFormatter
 from udp_mesh.cli.hints import hint
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, MeshError
@@ -58,19 +58,14 @@ FORWARDED = {"report": "udp_mesh.report", "sim": "udp_mesh.sim"}
 """Commands that parse their own arguments: `main(argv)` of the package is called."""
 
 
-class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Does not break paths and examples at hyphens."""
-
-    def _split_lines(self, text: str, width: int) -> list[str]:
-        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False, break_long_words=False)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the process's exit code."""
     prepare_streams()
     command: Command | None = None
     try:
         arguments = list(sys.argv[1:] if argv is None else argv)
+        if arguments[:1] == ["help"]:
+            arguments = [*arguments[1:], "--help"]
         if arguments and arguments[0] in FORWARDED:
             return _forward(FORWARDED[arguments[0]], arguments[1:])
         parsed = build_parser().parse_args(arguments)
@@ -103,7 +98,7 @@ def _forward(package: str, arguments: list[str]) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = CommandParser(
         prog="udp-mesh",
         description="Send prioritized messages between robots over lossy, intermittent links.",
         epilog=EPILOG,

@@ -106,6 +106,11 @@ def keygen(arguments: argparse.Namespace) -> int:
     path: Path = arguments.file
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        print_error(
+            f"{path}: exists, and is not overwritten: choose another file, or delete it if no robot uses this key"
+        )
+        return Exit.FAILED
     except OSError as error:
         print_error(f"{path}: {error.strerror}")
         return Exit.FAILED

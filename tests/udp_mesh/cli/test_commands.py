@@ -295,6 +295,7 @@ def test_keygen_writes_an_owner_only_key_and_never_overwrites_it(
     assert path.stat().st_mode & 0o777 == 0o600
     assert key.secret.hex() not in capsys.readouterr().out
     assert main(["keygen", str(path)]) == Exit.FAILED
+    assert "choose another file" in capsys.readouterr().err
 
 
 def test_check_reports_configuration_errors_as_text_and_json(
@@ -334,6 +335,29 @@ def _commands(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[st
         yield words
     for group in groups:
         yield from (found for name, below in group.choices.items() for found in _commands(below, *words, name))
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [(["statu"], "'status'"), (["recrod", "start", "x"], "'record'"), (["run", "--log-level", "deubg"], "'debug'")],
+)
+def test_an_unknown_word_gets_the_nearest_known_one(
+    words: list[str], meant: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
+
+
+@pytest.mark.parametrize("words", [[], ["status"], ["sim"]])
+def test_help_and_a_command_is_that_command_s_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["help", *words], [*words, "--help"]):
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0
+    one, other = capsys.readouterr().out.split("usage: ")[1:]
+    assert one == other
 
 
 @pytest.mark.parametrize("words", sorted(_commands(build_parser())))
