@@ -241,13 +241,17 @@ def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         return
     # MC601 reports the other meshes
     reached = reached_from_base(fleet)
+    others = {
+        mesh.name
+        for mesh in fleet.meshes.values()
+        if mesh.name in reached and not any(address in mesh.network for address in known)
+    }
     cut_off = (
         (mesh.name, node.name)
         for node in fleet.managed()
         if node.gateway is None and not node.site and not node.ssh.host and not node.ssh.jump
         for mesh in meshes_of(fleet, node)
-        if mesh.name in reached and node.address.ip in mesh.network
-        if not any(address in mesh.network for address in known)
+        if mesh.name in others and node.address.ip in mesh.network
     )
     for name, nodes in group_by_key(cut_off).items():
         network = fleet.meshes[name].network
