@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -15,7 +15,7 @@ from meshctl.diagnostics import Diagnostic, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import printable
 from meshctl.inventory.documents import InventoryDocument, SecretDocument
-from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.suggest import did_you_mean, nearest
 from meshctl.inventory.tree import MappingNode, Scalar, Tree, child, describe, key_position, plain_data, position
 
 _REFERENCE = "a reference: {env: NAME}, {file: PATH, key: NAME} or {age: PATH, key: NAME}"
@@ -78,10 +78,19 @@ def validate(root: MappingNode) -> Validated:
         return Validated(InventoryDocument.model_validate(plain_data(root)), ())
     except ValidationError as reason:
         errors = reason.errors(include_url=False, include_input=False)
-        problems = [_diagnostic(root, error) for error in errors[: codes.MAX_DIAGNOSTICS]]
-        if len(errors) > len(problems):
+        problems = [_diagnostic(root, error) for error in _without_misspelled(errors[: codes.MAX_DIAGNOSTICS])]
+        if len(errors) > codes.MAX_DIAGNOSTICS:
             problems.append(codes.too_many(problems[-1].position))
         return Validated(None, tuple(problems))
+
+
+def _without_misspelled(errors: list[ErrorDetails]) -> list[ErrorDetails]:
+    """Without keys that are missing because they are misspelled: the unknown key is the mistake."""
+    meant = {
+        (*parent, nearest(str(wrong), _known_keys(parent)))
+        for *parent, wrong in (error["loc"] for error in errors if error["type"] == "extra_forbidden")
+    }
+    return [error for error in errors if error["type"] != "missing" or error["loc"] not in meant]
 
 
 def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
@@ -188,7 +197,7 @@ def _unit_hint(root: MappingNode, path: tuple[int | str, ...]) -> str:
     return f"write the number alone; it is in {unit}" if unit else ""
 
 
-def _known_keys(path: tuple[int | str, ...]) -> list[str]:
+def _known_keys(path: Iterable[int | str]) -> list[str]:
     """The keys of the model at `path`."""
     kind: Any = InventoryDocument
     for part in path:

@@ -304,6 +304,13 @@ def test_the_rest_of_an_unquoted_text_with_commas_gets_a_hint(tmp_path: Path) ->
     assert "known keys" in first.hint
 
 
+def test_a_misspelled_key_that_is_required_is_one_error(tmp_path: Path) -> None:
+    (found,) = errors_of(tmp_path, "topics:\n  t: {priorty: 3, rate_hz: 1}\n")
+    assert (found.code, found.hint) == ("INV020", "did you mean 'priority'?")
+    # another unknown key explains no missing one
+    assert [item.code for item in errors_of(tmp_path, "topics: {t: {colour: red}}\n")] == ["INV022", "INV020"]
+
+
 @pytest.mark.parametrize(
     ("text", "hint"),
     [

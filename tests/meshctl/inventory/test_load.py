@@ -226,7 +226,7 @@ def test_a_computer_has_no_root_login_by_default(tmp_path: Path) -> None:
 
 
 def test_load_fleet_raises_every_diagnostic_at_once(tmp_path: Path) -> None:
-    (tmp_path / "fleet.yaml").write_text("meshctl: 1\nfleet: f\ncuntry: US\n")
+    (tmp_path / "fleet.yaml").write_text("meshctl: 1\ncuntry: US\n")
     with pytest.raises(InvalidInput) as caught:
         load_fleet(tmp_path)
     assert [item.code for item in caught.value.diagnostics] == ["INV022", "INV020"]
