@@ -16,6 +16,7 @@ from typing import Any
 from benchmarks.cells import QUICK, SETS, Cell, cells, measure
 from benchmarks.link.laboratory import laboratory
 from benchmarks.page import fill
+from benchmarks.peers import PEERS, peer_called
 from benchmarks.tables import report
 
 RESULTS = Path(__file__).with_name("results") / "transports.jsonl"
@@ -30,7 +31,13 @@ def wanted(arguments: argparse.Namespace) -> list[Cell]:
     chosen = [cell for name in names for cell in cells(name)]
     if arguments.quick:
         chosen = [cell for cell in chosen if cell.name in QUICK.get(cell.set, (cell.name,))]
-    return [cell for cell in chosen if not arguments.peer or cell.peer in arguments.peer]
+    return [cell for cell in chosen if (not arguments.peer or cell.peer in arguments.peer) and is_installed(cell.peer)]
+
+
+def is_installed(peer: str) -> bool:
+    """Whether the interpreter that a transport needs is there."""
+    python = peer_called(peer).python
+    return python is None or python.exists()
 
 
 def main() -> None:
@@ -44,6 +51,8 @@ def main() -> None:
     parser.add_argument("--tables", action="store_true", help="only print the tables of existing results")
     arguments = parser.parse_args()
     results = finished(arguments.results)
+    if missing := [name for name in PEERS if not is_installed(name)]:
+        print(f"left out, because scripts/setup-ros2 has not run: {', '.join(missing)}", file=sys.stderr)
     if not arguments.tables:
         arguments.results.parent.mkdir(parents=True, exist_ok=True)
         known = Counter((r["set"], r["peer"], r["name"]) for r in results)

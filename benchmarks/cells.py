@@ -55,6 +55,8 @@ def cells(set_name: str) -> list[Cell]:
     """The cells of a set; raises KeyError for an unknown set."""
     peers = list(PEERS)
     rivals = [OURS, "TCP cubic", "TCP BBR", "QUIC (aioquic, cubic)", "Zenoh (TCP cubic)", "Zenoh (TCP BBR)"]
+    # the transports of robots; those with a fixed rate are set to that of the base link
+    all_rivals = [name for name in peers if name != "udp_mesh, window 3"]
     makers: dict[str, Iterator[Cell]] = {
         "loss": _compared(
             "loss", {f"{share:.0%}": replace(BASE, loss=share) for share in (0, 0.01, 0.05, 0.1, 0.2)}, SATURATED, peers
@@ -76,14 +78,14 @@ def cells(set_name: str) -> list[Cell]:
         ),
         "bursts": chain(
             _compared("bursts", {f"{name}, bulk alone": link for name, link in _BURSTS.items()}, BULK_ALONE, rivals),
-            _compared("bursts", _BURSTS, SATURATED, rivals),
+            _compared("bursts", _BURSTS, SATURATED, all_rivals),
         ),
-        "cut": _compared("cut", {"5 s cut, 5 %": replace(BASE, loss=0.05)}, CUT, rivals),
+        "cut": _compared("cut", {"5 s cut, 5 %": replace(BASE, loss=0.05)}, CUT, all_rivals),
         "change": iter(
             Cell("change", peer, name, replace(BASE, loss=0.02),
                  replace(SATURATED, seconds=22.0, change_after_s=8.0, change=after))
             for name, after in _CHANGED.items()
-            for peer in rivals
+            for peer in all_rivals
         ),
         "radio": _compared("radio", {"half duplex, radio's own retries": RADIO}, SATURATED, rivals),
         "in-flight": iter(

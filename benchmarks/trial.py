@@ -89,10 +89,11 @@ def run(lab: Laboratory, peer: str, link: Link, load: Load) -> Measured:
         _ready(ends[1])
         lab.become(link)
         lab.reset()
-        assert ends[1].stdin is not None
         went_s = time.monotonic()
-        ends[1].stdin.write(b"go\n")
-        ends[1].stdin.flush()
+        for end in ends:
+            assert end.stdin is not None
+            end.stdin.write(b"go\n")
+            end.stdin.flush()
         changed_s = _while_it_runs(lab, load)
         ends[0].wait(receive_s + READY_TIMEOUT_S)
         count = lab.count()
@@ -122,13 +123,14 @@ def _while_it_runs(lab: Laboratory, load: Load) -> float | None:
 
 
 def _start(lab: Laboratory, host: int, peer: str, role: str, *words: str) -> subprocess.Popen[bytes]:
-    """Start an end in its host, with the congestion control of the peer."""
-    environ = dict(os.environ)
-    chosen = peer_called(peer).congestion_control
-    if chosen:
+    """Start an end in its host, with the interpreter, the settings and the congestion control of the peer."""
+    described = peer_called(peer)
+    environ = {**os.environ, **described.environment}
+    if described.congestion_control:
         library = compiled(_CONGESTION_CONTROL, lab.directory, "-shared", "-fPIC")
-        environ |= {"LD_PRELOAD": str(library), "BENCHMARK_CONGESTION_CONTROL": chosen}
-    command = [sys.executable, "-m", "benchmarks.peers.end", role, peer, *words]
+        environ |= {"LD_PRELOAD": str(library), "BENCHMARK_CONGESTION_CONTROL": described.congestion_control}
+    python = str(described.python or sys.executable)
+    command = [python, "-m", "benchmarks.peers.end", role, peer, *words]
     return subprocess.Popen(lab.inside(host, command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environ)
 
 

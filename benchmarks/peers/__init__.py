@@ -8,12 +8,16 @@ header of `benchmarks.peers.message`.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 PORT = 7447
+_HERE = Path(__file__).parent
+ROS2_PYTHON = _HERE.parents[1] / ".venv-ros2" / "bin" / "python"
+"""The interpreter that scripts/setup-ros2 makes: its wheels exist for one version of Python."""
 
 
 class Sender(Protocol):
@@ -41,6 +45,26 @@ class Peer:
     variant: str
     # set on every TCP socket of a program that cannot configure it
     congestion_control: str = ""
+    # the interpreter of both ends; None: the one that runs the benchmark
+    python: Path | None = None
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+def _fast_dds(kind: str, profiles: str, variant: str, congestion_control: str = "") -> Peer:
+    """ROS 2 with the settings of an XML file beside this one."""
+    environment = {
+        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
+        "RMW_FASTRTPS_USE_QOS_FROM_XML": "1",
+        "FASTDDS_DEFAULT_PROFILES_FILE": str(_HERE / profiles),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+    }
+    name = f"ROS 2 Fast DDS ({kind})"
+    return Peer(name, "benchmarks.peers.fast_dds", variant, congestion_control, ROS2_PYTHON, environment)
+
+
+def _cyclone_dds() -> Peer:
+    environment = {"CYCLONEDDS_URI": f"file://{_HERE / 'cyclone_dds.xml'}"}
+    return Peer("Cyclone DDS", "benchmarks.peers.cyclone_dds", "reliable", "", ROS2_PYTHON, environment)
 
 
 PEERS: dict[str, Peer] = {
@@ -53,6 +77,14 @@ PEERS: dict[str, Peer] = {
         Peer("QUIC (aioquic, cubic)", "benchmarks.peers.quic", "cubic"),
         Peer("Zenoh (TCP cubic)", "benchmarks.peers.zenoh_tcp", "priorities", "cubic"),
         Peer("Zenoh (TCP BBR)", "benchmarks.peers.zenoh_tcp", "priorities", "bbr"),
+        _fast_dds("UDP", "fast_dds_udp.xml", "one node"),
+        _fast_dds("TCP cubic", "fast_dds_tcp.xml", "two nodes", "cubic"),
+        _fast_dds("TCP BBR", "fast_dds_tcp.xml", "two nodes", "bbr"),
+        _cyclone_dds(),
+        Peer("nimbro_network's wire (UDP, FEC 0.25)", "benchmarks.peers.nimbro", "fec 0.25"),
+        Peer("nimbro_network's wire (UDP, FEC 0.5)", "benchmarks.peers.nimbro", "fec 0.5"),
+        Peer("nimbro_network's wire (bulk TCP BBR)", "benchmarks.peers.nimbro", "tcp", "bbr"),
+        Peer("Pound's wire", "benchmarks.peers.pound", "1240"),
     )
 }
 

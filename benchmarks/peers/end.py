@@ -3,15 +3,16 @@
 usage: python -m benchmarks.peers.end receive PEER RESULT SECONDS BULK_BYTES
        python -m benchmarks.peers.end send PEER ADDRESS RESULT SECONDS BULK_BYTES URGENT_HZ
 
-The receiver prints `ready`, then records every message's arrival until SECONDS have passed, or BULK_BYTES (> 0) of bulk
-have arrived. The sender prints `ready` once it is connected, waits for a line on its standard input, then sends bulk
-(BULK_BYTES in all; 0 none, -1 without end) and URGENT_HZ urgent messages a second. Each writes RESULT as JSON.
+Each prints `ready`, the sender once it is connected, and waits for a line on its standard input. The receiver then
+records every message's arrival until SECONDS have passed, or BULK_BYTES (> 0) of bulk have arrived. The sender sends
+bulk (BULK_BYTES in all; 0 none, -1 without end) and URGENT_HZ urgent messages a second. Each writes RESULT as JSON.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import os
 import resource
 import sys
 import time
@@ -26,8 +27,15 @@ _LINGER_S = 0.2
 
 
 def cpu_s() -> float:
+    """Of this process and of those that it runs."""
     used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+    total = used.ru_utime + used.ru_stime
+    for task in Path("/proc/self/task").iterdir():
+        for child in (task / "children").read_text().split():
+            # user and system time after the name, which may contain spaces
+            fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+            total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
 
 
 def say_ready() -> None:
@@ -56,8 +64,9 @@ async def receive(name: str, result: Path, seconds: float, bulk_bytes: int) -> N
             loop.call_soon_threadsafe(done.set)
 
     async with peers.transport(name).receiver(on_message):
-        started_cpu_s = cpu_s()
         say_ready()
+        await asyncio.to_thread(sys.stdin.readline)
+        started_cpu_s = cpu_s()
         try:
             await asyncio.wait_for(done.wait(), seconds)
             await asyncio.sleep(_LINGER_S)
