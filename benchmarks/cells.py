@@ -55,7 +55,7 @@ def cells(set_name: str) -> list[Cell]:
     """The cells of a set; raises KeyError for an unknown set."""
     peers = list(PEERS)
     rivals = [OURS, "TCP cubic", "TCP BBR", "QUIC (aioquic, cubic)", "Zenoh (TCP cubic)", "Zenoh (TCP BBR)"]
-    # the transports of robots; those with a fixed rate are set to that of the base link
+    # with the transports of ROS 2 and ROS 1, of which some have a fixed rate, set to that of the base link
     all_rivals = [name for name in peers if name != "udp_mesh, window 3"]
     makers: dict[str, Iterator[Cell]] = {
         "loss": _compared(

@@ -11,6 +11,7 @@ bulk (BULK_BYTES in all; 0 none, -1 without end) and URGENT_HZ urgent messages a
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import resource
@@ -27,11 +28,12 @@ _LINGER_S = 0.2
 
 
 def cpu_s() -> float:
-    """Of this process and of those that it runs."""
+    """Of this process and of the processes that its main thread started."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     total = used.ru_utime + used.ru_stime
-    for task in Path("/proc/self/task").iterdir():
-        for child in (task / "children").read_text().split():
+    for child in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+        # it may end now
+        with contextlib.suppress(FileNotFoundError):
             # user and system time after the name, which may contain spaces
             fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
             total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
