@@ -1,8 +1,9 @@
 """Discovery on the wire: `python -m benchmarks.discovery_traffic [--kinds fast-dds,...] [--sizes 10,50] [--fill]`.
 
 Each member of a team is a process in a network namespace of its own, all on one bridge without loss: ROS 2 nodes with
-Fast DDS, Cyclone DDS participants, or nodes of udp_mesh. All start at one moment. Counted is what the members send,
-each multicast or broadcast once, as on a radio channel: during the start, and then for a minute without publications.
+Fast DDS, Cyclone DDS participants, or nodes of udp_mesh. They start at one moment, or one after the other over some
+seconds (`--spread`), which leaves the machine time for each. Counted is what the members send, each multicast or
+broadcast once, as on a radio channel: during the start, and then for a minute without publications.
 """
 
 from __future__ import annotations
@@ -156,24 +157,36 @@ def members(kind: str, namespaces: Sequence[str]) -> Iterator[list[subprocess.Po
 
 
 def _line(process: subprocess.Popen[bytes], until_s: float) -> str | None:
-    """The next line, or None if there is none by then."""
+    """The next line, or None if there is none by then. Raises RuntimeError if the process has ended."""
     assert process.stdout is not None
     readable, _, _ = select.select([process.stdout], [], [], max(0.0, until_s - time.monotonic()))
-    return process.stdout.readline().decode().strip() if readable else None
+    if not readable:
+        return None
+    line = process.stdout.readline().decode().strip()
+    if not line:
+        raise RuntimeError(f"{process.args!r} ended")
+    return line
 
 
 def measure(
-    kind: str, size: int, min_start_s: float = MIN_START_S, settle_s: float = SETTLE_S, rest_s: float = REST_S
+    kind: str,
+    size: int,
+    spread_s: float = 0.0,
+    min_start_s: float = MIN_START_S,
+    settle_s: float = SETTLE_S,
+    rest_s: float = REST_S,
 ) -> dict[str, Any]:
-    """Start a team and count; `known_s` is None if not all knew all others in time."""
+    """Start a team and count. `known_s` is from the last start, and None if not all knew all others in time."""
     with team(size) as network, members(kind, network.namespaces) as processes:
         before, began_s = network.sent(), time.monotonic()
         for process in processes:
+            time.sleep(spread_s / size)
             assert process.stdin is not None
             process.stdin.write(b"go\n")
-        times = [_line(process, began_s + MAX_START_S) for process in processes]
-        known_s = None if None in times else max(float(at) for at in times if at) - began_s
-        ends_s = began_s + max(min_start_s, (known_s or MAX_START_S) + settle_s)
+        last_s = time.monotonic()
+        times = [_line(process, last_s + MAX_START_S) for process in processes]
+        known_s = None if None in times else max(float(at) for at in times if at is not None) - last_s
+        ends_s = last_s + max(min_start_s, (known_s or MAX_START_S) + settle_s)
         time.sleep(max(0.0, ends_s - time.monotonic()))
         rested = network.sent()
         start_s = time.monotonic() - began_s
@@ -181,22 +194,22 @@ def measure(
         start, rest = rested.since(before), network.sent().since(rested)
     per_minute = 60.0 / rest_s
     return {
-        "kind": kind, "size": size, "known_s": known_s, "start_s": start_s, "start_frames": start.frames,
-        "start_bytes": start.bytes, "frames_per_minute": rest.frames * per_minute,
+        "kind": kind, "size": size, "spread_s": spread_s, "known_s": known_s, "start_s": start_s,
+        "start_frames": start.frames, "start_bytes": start.bytes, "frames_per_minute": rest.frames * per_minute,
         "bytes_per_minute": rest.bytes * per_minute, **this_machine(),
     }  # fmt: skip
 
 
 def table(results: Sequence[Mapping[str, Any]]) -> str:
     lines = [
-        "| members | | all know all after, s | start: frames | start: kB | at rest: frames a minute "
-        "| at rest: kB a minute | at rest: bytes per member and s |",
-        "| --- " * 8 + "|",
+        "| members | | started within, s | all know all after, s | start: frames | start: kB "
+        "| at rest: frames a minute | at rest: kB a minute | at rest: bytes per member and s |",
+        "| --- " * 9 + "|",
     ]
-    for one in sorted(results, key=lambda one: (one["size"], list(KINDS).index(one["kind"]))):
-        known = "never" if one["known_s"] is None else f"{one['known_s']:.1f}"
+    for one in sorted(results, key=lambda one: (one["size"], one["spread_s"], list(KINDS).index(one["kind"]))):
+        known = f"not in {MAX_START_S:.0f}" if one["known_s"] is None else f"{one['known_s']:.1f}"
         lines.append(
-            f"| {one['size']} | {KINDS[one['kind']]} | {known} | {one['start_frames']:,} "
+            f"| {one['size']} | {KINDS[one['kind']]} | {one['spread_s']:.0f} | {known} | {one['start_frames']:,} "
             f"| {one['start_bytes'] / 1e3:,.0f} | {one['frames_per_minute']:,.0f} "
             f"| {one['bytes_per_minute'] / 1e3:,.0f} | {one['bytes_per_minute'] / 60 / one['size']:,.0f} |"
         )
@@ -207,6 +220,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.discovery_traffic", description=__doc__)
     parser.add_argument("--kinds", default=",".join(KINDS), help=f"comma-separated, of {', '.join(KINDS)}")
     parser.add_argument("--sizes", default="10,50", help="numbers of members")
+    parser.add_argument("--spread", type=float, default=0.0, help="start the members evenly over this time in seconds")
     parser.add_argument(
         "--results", type=Path, default=RESULTS, help="file of results; what it already has is not run again"
     )
@@ -215,10 +229,10 @@ def main() -> None:
     results = [json.loads(line) for line in arguments.results.open()] if arguments.results.exists() else []
     for size in map(int, arguments.sizes.split(",")):
         for kind in arguments.kinds.split(","):
-            if any((one["kind"], one["size"]) == (kind, size) for one in results):
+            if any((one["kind"], one["size"], one["spread_s"]) == (kind, size, arguments.spread) for one in results):
                 continue
             print(f"{size} members: {KINDS[kind]}", file=sys.stderr, flush=True)
-            results.append(measure(kind, size))
+            results.append(measure(kind, size, arguments.spread))
             with arguments.results.open("a") as file:
                 file.write(json.dumps(results[-1]) + "\n")
     print(table(results))

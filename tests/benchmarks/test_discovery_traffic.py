@@ -18,4 +18,4 @@ def test_a_team_of_udp_mesh_finds_itself_and_its_datagrams_are_counted() -> None
     assert seen["start_frames"] >= 3
     assert seen["start_bytes"] > 40 * seen["start_frames"]
     assert seen["frames_per_minute"] > 0
-    assert f"| 3 | {KINDS['udp-mesh']} |" in table([seen])
+    assert f"| 3 | {KINDS['udp-mesh']} | 0 |" in table([seen])
