@@ -37,7 +37,7 @@ _IP_UDP_BYTES = 28
 # lengths of the topic's name and type, of the data, checksum, flags
 _TCP_HEADER = struct.Struct("<HHI16sI")
 _URGENT_FEC = 0.5
-_MD5 = bytes.fromhex("f82d1b37a3b5b4ee0b8f4b1ef8b2ba21")
+_MD5 = bytes.fromhex("82373f1612381bb6ee473b5cd6f5d89c")
 _TYPE = b"std_msgs/UInt8MultiArray"
 
 

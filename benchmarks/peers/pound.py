@@ -30,7 +30,7 @@ _HEADER = struct.Struct("<iiiiIIBBBxII")
 # `queue` of its configuration
 _QUEUE = 50
 # what it puts around each message of a topic of std_msgs/UInt8MultiArray: sizes, checksum, type, name; no definition
-_ENVELOPE = bytes(14) + b"f82d1b37a3b5b4ee0b8f4b1ef8b2ba21" + b"std_msgs/UInt8MultiArray" + b"/bulk"
+_ENVELOPE = bytes(14) + b"82373f1612381bb6ee473b5cd6f5d89c" + b"std_msgs/UInt8MultiArray" + b"/bulk"
 _BULK_PRIORITY, _URGENT_PRIORITY = 10, 100
 
 
