@@ -263,7 +263,9 @@ def observe_and_decide(
         change.listener.observed()
     # what is missing after the rollback is not why the node rolled back
     if change.status.state == "applied":
-        change.unmet = unmet(ctx.expected.with_base_macs(ctx.run.current_base_macs()), change.last, since_s=age_s)
+        change.unmet = unmet(
+            ctx.expected.with_base_macs(ctx.run.current_base_macs(ctx.node)), change.last, since_s=age_s
+        )
     if change.extra_s and age_s is not None and age_s < PACKAGES_SETTLE_S:
         change.unmet = (*change.unmet, "its services may still be reloading")
     return next_action(

@@ -27,7 +27,7 @@ class RunContext:
 
     `owner` identifies this process in the nodes' locks. `new_listener` makes the listener of a change on one node that
     restarts the given radios. `observations` were made before any change, of the plan's nodes and their meshes.
-    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of the base.
+    `mac_owners` maps MACs of mesh radios to nodes; `base_macs` are those of each base, by its name.
 
     `macs` are the MACs each node's radios have had during the run: OpenWrt 24.10 and 25.12 give a recreated radio
     interface a new one.
@@ -43,7 +43,7 @@ class RunContext:
     new_listener: Callable[[NodeContext, Radios], ChangeListener]
     observations: Mapping[str, Observation]
     mac_owners: Mapping[str, str]
-    base_macs: Sequence[str]
+    base_macs: Mapping[str, Sequence[str]]
     rate_bytes_per_s: float | None = None
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
@@ -56,11 +56,12 @@ class RunContext:
         """MAC -> node, including MACs learned during the run."""
         return {**self.mac_owners, **{mac: name for name, macs in self.macs.items() for mac in macs}}
 
-    def current_base_macs(self) -> frozenset[str]:
-        """The MACs of the base's mesh radios, before the run and since."""
-        base = self.fleet.base_node
-        seen = frozenset[str]() if base is None else self.macs.get(base.name, frozenset())
-        return frozenset(mac.lower() for mac in self.base_macs) | seen
+    def current_base_macs(self, node: Node) -> frozenset[str]:
+        """The MACs of the mesh radios of the node's base, before the run and since."""
+        base = self.fleet.base_of(node)
+        if base is None:
+            return frozenset()
+        return self.macs.get(base.name, frozenset()) | {mac.lower() for mac in self.base_macs.get(base.name, ())}
 
     def note(self, text: str, node: str = "") -> None:
         self.observer(Event(EventKind.NOTE, node, time.time(), text))

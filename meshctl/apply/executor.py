@@ -81,9 +81,9 @@ def execute(
 
 
 def assign_slots(prepared: Prepared, connections: ConnectionPool) -> None:
-    """Nodes that were observed in a mesh share its channel; the entry node is reached by a cable."""
+    """Nodes that were observed in a mesh share its channel; the entry nodes are reached by a cable."""
     for name, made in prepared.plan.nodes.items():
-        is_behind_mesh = made.is_meshed and bool(prepared.plan.entry) and name != prepared.plan.entry
+        is_behind_mesh = made.is_meshed and bool(prepared.plan.entries) and name not in prepared.plan.entries
         connections.slots.assign(name, made.meshes[0] if is_behind_mesh and made.meshes else "")
 
 
@@ -160,8 +160,9 @@ def _node_contexts(prepared: Prepared, run_context: RunContext) -> dict[str, Nod
 
 def _node_context(prepared: Prepared, run_context: RunContext, name: str) -> NodeContext:
     seen, desired = prepared.observed.observations[name], prepared.desired[name]
-    expected = expectation(desired, seen, run_context.base_macs)
-    return NodeContext(run_context, run_context.fleet.nodes[name], prepared.plan.nodes[name], desired, seen, expected)
+    node = run_context.fleet.nodes[name]
+    expected = expectation(desired, seen, run_context.current_base_macs(node))
+    return NodeContext(run_context, node, prepared.plan.nodes[name], desired, seen, expected)
 
 
 def _run_stage(
@@ -247,7 +248,7 @@ def _simultaneous_stage(
                 [contexts[name] for name in with_files],
                 quorum=run_context.fleet.apply.quorum,
                 parallel=min(nodes_in_work(run_context.fleet.apply.parallel), MESH_SLOTS[1]),
-                entry=plan.entry,
+                entries=plan.entries,
                 together=stage.kind is StageKind.TOGETHER,
             )
     took_s = round(time.monotonic() - began, 3)

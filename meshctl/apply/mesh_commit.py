@@ -51,13 +51,13 @@ LEFT_BEHIND = "left_behind"
 
 @dataclass(slots=True)
 class _MeshCommit:
-    """A mesh change in progress. `participants` are ordered farthest first, the entry node last."""
+    """A mesh change in progress. `participants` are ordered farthest first, the entry nodes last."""
 
     run: RunContext
     participants: Sequence[Participant]
     window_s: int
     parallel: int
-    entry: str
+    entries: Sequence[str]
     is_together: bool
     pool: ThreadPoolExecutor = field(repr=False)
 
@@ -81,14 +81,14 @@ def commit_mesh(
     *,
     quorum: float,
     parallel: int,
-    entry: str,
+    entries: Sequence[str],
     together: bool = False,
 ) -> dict[str, Outcome]:
     """Apply the file changes of these nodes simultaneously. Returns each node's outcome; raises nothing for a node."""
     participants = [Participant(ctx, together) for ctx in contexts]
     window_s = max(ctx.node.confirm_window_s for ctx in contexts)
     with ThreadPoolExecutor(max_workers=max(1, parallel), thread_name_prefix="switch") as pool:
-        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entry, together, pool)
+        commit = _MeshCommit(run_context, participants, window_s, max(1, parallel), entries, together, pool)
         # before the first is armed, because its lock ends soon after its window would
         commit.each(participants, lambda participant: _await_first_boot(commit, participant))
         if not any(participant.failure for participant in participants):
@@ -211,12 +211,9 @@ def _decide(commit: _MeshCommit, needed: Mapping[str, int]) -> dict[str, Outcome
             break
         _notify_unreachable(commit, proven)
         backoff.pause()
-    has_entry = (
-        not commit.entry
-        or any(m.name == commit.entry for m in proven)
-        or all(m.name != commit.entry for m in commit.participants)
-    )
-    why = short_of_quorum(proven, needed, commit.success) if has_entry else "the base did not come back"
+    lost = [each.name for each in commit.participants if each.name in commit.entries and each not in proven]
+    named = "the base" if len(commit.entries) == 1 else ", ".join(lost)
+    why = f"{named} did not come back" if lost else short_of_quorum(proven, needed, commit.success)
     if not why:
         return _confirm_all(commit)
     if commit.run.interrupt.leaving:

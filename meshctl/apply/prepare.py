@@ -120,7 +120,7 @@ def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
 
 
 def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
-    """Nodes that may hear the unreachable ones: their last known neighbors, and the base."""
+    """Nodes that may hear the unreachable ones: their last known neighbors, and their bases."""
     chosen = {plan.node: plan for plan in plans}
     macs = known_macs(fleet, known)
     away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
@@ -131,8 +131,7 @@ def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[st
         for mac in known[name].facts.get("neighbours", "").split()
         if mac in macs
     ]
-    base = [fleet.base_node.name] if away and fleet.base_node is not None else []
-    names = [name for name in dict.fromkeys((*near, *base)) if name not in chosen]
+    names = [name for name in dict.fromkeys((*near, *fleet.bases_of(away))) if name not in chosen]
     return tuple(fleet.nodes[name] for name in names[:MAX_QUERIED])
 
 
@@ -239,11 +238,14 @@ def other_paths(desired: DesiredState) -> tuple[str, ...]:
     return tuple(f"/{file.path}" for file in desired.files if package_of(file.path) is None)
 
 
-def base_macs(fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]) -> tuple[str, ...]:
-    """The mesh MACs of the base, observed now or last known."""
-    base = fleet.base_node
-    if base is None:
-        return ()
-    if base.name in seen:
-        return mesh_macs(seen[base.name])
-    return tuple(known[base.name].facts.get("macs", "").split()) if base.name in known else ()
+def base_macs(
+    fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]
+) -> dict[str, tuple[str, ...]]:
+    """The mesh MACs of each base, by its name: observed now or last known."""
+    found: dict[str, tuple[str, ...]] = {}
+    for base in fleet.base_nodes:
+        if base.name in seen:
+            found[base.name] = mesh_macs(seen[base.name])
+        elif base.name in known:
+            found[base.name] = tuple(known[base.name].facts.get("macs", "").split())
+    return found

@@ -122,7 +122,7 @@ class StationFlush:
     def _watch_neighbors(self, *, for_s: float) -> None:
         """Start watches on the nodes reached through this one."""
         run_context = self.ctx.run
-        hidden = routed_through(self.node, run_context.observations, run_context.base_macs)
+        hidden = routed_through(self.node, run_context.observations, run_context.current_base_macs(self.ctx.node))
         names = [name for name in self._holders if name in hidden and name not in self._restarting]
         answers = self._query(
             "watch neighbor station entries",

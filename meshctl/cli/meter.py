@@ -115,7 +115,7 @@ def meter(
 
 
 def _watch_of(fleet_view: FleetView, robot: str) -> LinkWatch:
-    """The robot's radios and the base, with the addresses of every node that answers or was seen before."""
+    """The robot's radios and their base, with the addresses of every node that answers or was seen before."""
     fleet = fleet_view.fleet
     own = own_radios(fleet, robot)
     if not own:
@@ -123,7 +123,7 @@ def _watch_of(fleet_view: FleetView, robot: str) -> LinkWatch:
         if robot in known:
             raise InputError(f"{robot} has no managed radio: the meter needs one that moves with it")
         raise InputError(f"{fleet.name} has no robot {robot!r}", hint=did_you_mean(robot, known))
-    base = fleet.base_node
+    base = fleet.base_of(own[0])
     if base is None:
         raise InputError(f"{fleet.name} has no node with the role base: the meter needs to know where paths end")
     if base in own:

@@ -204,6 +204,8 @@ def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
         echo(f"{line}: pinned now")
         return True
     echo(f"{line}: not pinned")
+    if not sys.stdin.isatty():
+        echo("  hint: not a terminal: cannot ask; compare the fingerprint with the gateway's, then pass --yes")
     return False
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from ipaddress import IPv4Address
@@ -343,6 +343,12 @@ class Fleet:
     def base_of(self, node: Node) -> Node | None:
         """The base node of its site; of a site without one, that of the fleet."""
         return next((base for base in self.base_nodes if base.site == node.site), self.base_node)
+
+    def bases_of(self, names: Iterable[str]) -> dict[str, Node]:
+        """The bases of these nodes, each once, by name."""
+        by_site = {base.site: base for base in self.base_nodes}
+        found = (by_site.get(self.nodes[name].site, self.base_node) for name in names if name in self.nodes)
+        return {base.name: base for base in found if base is not None}
 
     def managed(self) -> Iterator[Node]:
         """The nodes that are neither lost nor retired, in order."""

@@ -122,14 +122,13 @@ def query_neighbors(
     *,
     interrupt: Interrupt,
 ) -> dict[str, LastSeen]:
-    """The same, from new observations of former neighbors, the base, and some other nodes that answered before."""
+    """The same, from new observations of former neighbors, their bases, and some other nodes that answered before."""
     missing = tuple(names)
     graph = before.graph(fleet, known)
     neighbors = [other for name in missing for other in graph.neighbours.get(name, ())]
-    base = [fleet.base_node.name] if fleet.base_node is not None else []
     witnesses = [
         name
-        for name in dict.fromkeys((*neighbors, *base, *before.observations))
+        for name in dict.fromkeys((*neighbors, *fleet.bases_of(missing), *before.observations))
         if name in fleet.nodes and name not in missing
     ]
     seen = collect(

@@ -28,23 +28,23 @@ def fleet_plan(
     together: bool = False,
     pace: Pace | None = None,
 ) -> Plan:
-    """The stages for these nodes. `entry` is the node through which the mesh is reached (default: the base).
+    """The stages for these nodes. `entry` is the node through which the mesh is reached (default: the base
+    of each node's site).
 
     `unchanged` are other members of their meshes, which show the cell that the mesh runs. `leave_behind` acknowledges
     nodes that are off during a change of their mesh, `accept_cuts` cut vertices that may be flashed; `all` means any.
     `together`: all nodes of running meshes change simultaneously. `pace` is that of earlier changes.
     """
-    base = fleet.base_node
-    stand_on = entry or (base.name if base is not None else "")
+    entries = (entry,) if entry else tuple(fleet.bases_of(plans))
     found = switches(fleet, plans, unchanged=unchanged, acknowledged=leave_behind, never_meshed=never_meshed)
     surroundings = MeshContext(
-        graph, stand_on, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
+        graph, entries, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
     )
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
     in_order = stages_of(todo, surroundings, found.nodes)
     at_once = stages_together(todo, surroundings, found.nodes)
     stages = at_once if together else in_order
-    refusal, hint = _refusal(found, plans, graph, stand_on, frozenset(accept_cuts))
+    refusal, hint = _refusal(found, plans, graph, entries, frozenset(accept_cuts))
     if together and not refusal:
         refusal, hint = _refused_together(at_once, plans)
     windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
@@ -70,7 +70,7 @@ def fleet_plan(
     return Plan(
         fleet.name,
         now_s,
-        stand_on,
+        entries,
         MappingProxyType(dict(plans)),
         stages,
         tuple(notes),
@@ -106,7 +106,7 @@ def _refused_together(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) ->
 
 
 def _refusal(
-    found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entry: str, accepted: frozenset[str]
+    found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entries: tuple[str, ...], accepted: frozenset[str]
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
@@ -122,7 +122,7 @@ def _refusal(
             "part of this plan",
             f"switch them on and select them too, or acknowledge with --leave-behind {','.join(names)}",
         )
-    cuts = graph.cut_off_by(entry)
+    cuts = graph.cut_off_by_any(entries)
     for name, plan in plans.items():
         if plan.firmware is not None and plan.is_meshed and cuts.get(name) and not accepted & {name, "all"}:
             return (

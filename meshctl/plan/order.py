@@ -1,7 +1,7 @@
 """The stages of a fleet's change, each with its nodes and its reason.
 
 `stages_of` orders the nodes to change by the observed mesh: nodes outside any running mesh (nothing is cut), then
-whole-mesh changes, then the running mesh from its far end, with each cut vertex alone, and the entry node last. If the
+whole-mesh changes, then the running mesh from its far end, with each cut vertex alone, and the entry nodes last. If the
 policy asks for it, the first stage of a kind is a canary. `stages_together` changes all nodes of running meshes in one
 stage instead.
 """
@@ -19,10 +19,10 @@ from meshctl.topology import Graph, Path
 
 @dataclass(frozen=True, slots=True)
 class MeshContext:
-    """What the order depends on besides the plans: the observed mesh, its entry node, the policy, the robots."""
+    """What the order depends on besides the plans: the observed meshes, their entry nodes, the policy, the robots."""
 
     graph: Graph
-    entry: str
+    entries: tuple[str, ...]
     policy: ApplyPolicy
     robot_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -33,7 +33,7 @@ def stages_of(
     """The stages of these plans. `switches` maps meshes to the nodes that change their cell simultaneously."""
     switched = {name for nodes in (switches or {}).values() for name in nodes}
     todo = [plan for plan in plans if plan.node not in switched]
-    rank = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
+    rank = {name: position for position, name in enumerate(context.graph.farthest_first(*context.entries))}
     todo.sort(key=lambda plan: (rank.get(plan.node, -1), plan.node))
     free = [plan for plan in todo if not plan.is_meshed]
     harmless = [plan for plan in todo if plan.is_meshed and plan.cut <= Cut.LOGIN]
@@ -71,9 +71,9 @@ def stages_together(
 
 
 def _entry_last(names: Iterable[str], context: MeshContext) -> tuple[str, ...]:
-    """The farthest first, the entry node last."""
-    order = {name: position for position, name in enumerate(context.graph.farthest_first(context.entry))}
-    return tuple(sorted(names, key=lambda name: (name == context.entry, order.get(name, -1), name)))
+    """The farthest first, the entry nodes last."""
+    order = {name: position for position, name in enumerate(context.graph.farthest_first(*context.entries))}
+    return tuple(sorted(names, key=lambda name: (name in context.entries, order.get(name, -1), name)))
 
 
 def _in_parallel(plans: Sequence[NodePlan], policy: ApplyPolicy, reason: str) -> tuple[Stage, ...]:
@@ -99,10 +99,10 @@ def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
 
 
 def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ...]:
-    """From the far end inward, at most `max_down` at once, each cut vertex alone, the entry last."""
-    paths = context.graph.paths(context.entry)
-    cuts = context.graph.cut_off_by(context.entry)
-    waiting = [plan.node for plan in plans if plan.node != context.entry]
+    """From the far end inward, at most `max_down` at once, each cut vertex alone, the entries last."""
+    paths = context.graph.paths_to_any(context.entries)
+    cuts = context.graph.cut_off_by_any(context.entries)
+    waiting = [plan.node for plan in plans if plan.node not in context.entries]
     stays_up = {plan.node for plan in plans if plan.cut <= Cut.WEAK_LINKS}
     stages: list[Stage] = []
     if context.policy.canary and len(waiting) > 1:
@@ -126,11 +126,12 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
                 f"together, because they cut off no other node: {'; '.join(_distance(name, paths) for name in batch)}"
             )
         stages.append(Stage(StageKind.ROLLING, batch, reason, lost))
-    if any(plan.node == context.entry for plan in plans):
-        rest = sorted(context.graph.reachable(context.entry) - {context.entry})
-        stages.append(
-            Stage(StageKind.LAST, (context.entry,), "last, because the mesh is reached through it", tuple(rest))
-        )
+    changing = {plan.node for plan in plans}
+    for entry in context.entries:
+        if entry in changing:
+            rest = sorted(context.graph.reachable(entry) - {entry})
+            reason = "last, because the mesh is reached through it"
+            stages.append(Stage(StageKind.LAST, (entry,), reason, tuple(rest)))
     return tuple(stages)
 
 
@@ -145,7 +146,7 @@ def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tupl
         # with both radios of a robot down, the robot itself would be cut off
         if name in cuts or context.robot_of.get(name) in robots:
             continue
-        if not context.graph.cut_off_by_all(context.entry, [*batch, name]):
+        if not context.graph.cut_off_by_all(context.entries, [*batch, name]):
             batch.append(name)
     return tuple(batch)
 

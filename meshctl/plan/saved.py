@@ -60,7 +60,9 @@ def document_of(saved: SavedPlan) -> dict[str, Any]:
         "fleet": plan.fleet,
         "inventory": saved.inventory,
         "created_s": plan.created_s,
-        "entry": plan.entry,
+        # earlier versions of meshctl read `entry` alone
+        "entry": plan.entries[0] if plan.entries else "",
+        "entries": plan.entries,
         "salt": saved.salt.hex(),
         "with_firmware": saved.with_firmware,
         "refusal": plan.refusal,
@@ -71,6 +73,12 @@ def document_of(saved: SavedPlan) -> dict[str, Any]:
         "stages": [_plain(stage) for stage in plan.stages],
         "nodes": [_plain(node) for node in plan.nodes.values()],
     }
+
+
+def _entries(document: Mapping[str, Any]) -> tuple[str, ...]:
+    # plans of earlier versions have one
+    found = document.get("entries", [document["entry"]])
+    return tuple(name for name in _texts(found) if name)
 
 
 def _plain(value: Any) -> dict[str, Any]:
@@ -98,7 +106,7 @@ def from_document(document: Any, file: str) -> SavedPlan:
         plan = Plan(
             str(document["fleet"]),
             float(document["created_s"]),
-            str(document["entry"]),
+            _entries(document),
             MappingProxyType({node.node: node for node in nodes}),
             tuple(_stage(stage) for stage in document["stages"]),
             _texts(document["notes"]),

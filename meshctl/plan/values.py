@@ -118,7 +118,7 @@ class NodePlan:
 class StageKind(Enum):
     """CANARY: one node alone, as a test. FREE: interrupts nothing in use. ROLLING: at most `max_down` at a time.
     SWITCH: a whole mesh simultaneously, because its cell changes. TOGETHER: all nodes of running meshes simultaneously,
-    because the operator asked for it. LAST: the entry node."""
+    because the operator asked for it. LAST: an entry node."""
 
     CANARY = "canary"
     FREE = "free"
@@ -148,7 +148,7 @@ class Stage:
 @dataclass(frozen=True, slots=True)
 class Way:
     """One of two ways to execute a plan: `in order` or `together`. `outages` is how often the worst affected node is
-    down or without a path to the entry; `reason` is set for the recommended way."""
+    down or without a path to an entry; `reason` is set for the recommended way."""
 
     name: str
     stages: int
@@ -164,7 +164,7 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The plan of a fleet. `entry` is the node through which the mesh is reached; `notes` concern the whole fleet.
+    """The plan of a fleet. Its meshes are reached through `entries`; `notes` concern the whole fleet.
 
     `ways` are both ways to execute it, if they differ; `stages` are those of the one that was chosen. `pace` says where
     their times come from.
@@ -172,7 +172,7 @@ class Plan:
 
     fleet: str
     created_s: float
-    entry: str
+    entries: tuple[str, ...]
     nodes: Mapping[str, NodePlan] = field(default_factory=lambda: MappingProxyType({}))
     stages: tuple[Stage, ...] = ()
     notes: tuple[str, ...] = ()

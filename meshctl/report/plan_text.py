@@ -17,6 +17,7 @@ from meshctl.report.duration import duration
 from meshctl.report.terminal_escapes import clean
 
 # below this width, words are broken
+_MAX_ENTRIES = 4
 _MIN_WIDTH = 20
 
 
@@ -46,10 +47,15 @@ def plan_lines(
             yield line._replace(text=part)
 
 
+def _entries(plan: Plan) -> str:
+    more = len(plan.entries) - _MAX_ENTRIES
+    return ", ".join(plan.entries[:_MAX_ENTRIES]) + (f" and {more} more" if more > 0 else "")
+
+
 def _plan_lines(plan: Plan, *, with_diffs: bool, order: Iterable[str]) -> Iterator[Line]:
     yield Line(f"fleet {plan.fleet}: {_totals(plan)}", "bold")
-    if plan.entry:
-        yield Line(f"reached through {plan.entry}", "dim")
+    if plan.entries:
+        yield Line(f"reached through {_entries(plan)}", "dim")
     if plan.stages:
         yield Line("")
         yield Line("order", "bold")

@@ -209,8 +209,7 @@ class SiteExecution:
             # an uplink that was lost at the start leaves open whether the order arrived
             run.is_started = there is not None and there.state != "prepared"
             if there is None and run.order is None:
-                self._finish_all(run, Result.PENDING, f"site {run.site.name} does not know run {run.run}", "")
-                run.is_over = True
+                self._finish_unknown(run, run.uplink)
                 return
         if not run.is_started:
             if self.interrupt.stopping:
@@ -225,6 +224,17 @@ class SiteExecution:
             run.is_started = True
         for reply in run.uplink.follow(run.run, run.offset):
             self._read(run, reply)
+
+    def _finish_unknown(self, run: SiteRun, uplink: Uplink) -> None:
+        """The outcomes of a run that its site does not know (anymore)."""
+        site = run.site.name
+        if uplink.has_forgotten(run.run):
+            text = f"site {site} executed run {run.run} and has since deleted the record of how it ended"
+            self._finish_all(run, Result.UNCERTAIN, text, "`meshctl plan` compares its nodes with the inventory")
+        else:
+            text = f"site {site} did not start run {run.run}, unless its gateway was installed from scratch since"
+            self._finish_all(run, Result.PENDING, text, "")
+        run.is_over = True
 
     def _read(self, run: SiteRun, reply: Mapping[str, object]) -> None:
         objects = reply.get("events", [])

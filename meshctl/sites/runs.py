@@ -2,6 +2,7 @@
 
 id_ed25519           the worker's key; its public part is `worker_key` in the inventory
 operators            public keys that may sign orders, as in authorized_keys
+forgotten            the ids of runs whose directories were deleted to keep no more than MAX_RUNS
 lock                 held while a run is executed: its content says which
 images/SHA256        firmware images, kept for later runs
 state/               the journal of the site's runs
@@ -38,6 +39,7 @@ from meshctl.sites.part import REPLACED_FILE
 PREPARED_S = 3600.0
 MAX_RUNS = 50
 MAX_IMAGES = 8
+_MAX_FORGOTTEN = 10_000
 _RUN_ID = re.compile(r"[0-9a-f]{16}")
 
 
@@ -128,13 +130,30 @@ class SiteDirectory:
         for number, state in enumerate(self.runs()):
             directory = self.run(state.run)
             is_old = state.state == "prepared" and time.time() - state.began_s > PREPARED_S
-            if is_old or (number >= MAX_RUNS and state.state != "in progress"):
+            is_one_too_many = number >= MAX_RUNS and state.state != "in progress"
+            if is_one_too_many and state.state != "prepared":
+                self._note_forgotten(state.run)
+            if is_old or is_one_too_many:
                 directory.discard()
             elif state.state == "interrupted":
                 directory.forget_secrets()
         images = sorted((self.root / "images").glob("*"), key=lambda path: path.stat().st_mtime, reverse=True)
         for path in images[MAX_IMAGES:]:
             path.unlink(missing_ok=True)
+
+    def _note_forgotten(self, run: str) -> None:
+        lines = [*_text(self._forgotten).splitlines(), run][-_MAX_FORGOTTEN:]
+        new = self._forgotten.with_name(".forgotten.new")
+        new.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        new.replace(self._forgotten)
+
+    def has_forgotten(self, run: str) -> bool:
+        """Whether a run was started here of which nothing is kept."""
+        return run in _text(self._forgotten).splitlines()
+
+    @property
+    def _forgotten(self) -> Path:
+        return self.root / "forgotten"
 
     def lock(self, holder: Mapping[str, object]) -> int:
         """Take the site's lock; returns the open file that holds it, for the run's processes to inherit.

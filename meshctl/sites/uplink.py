@@ -159,6 +159,10 @@ class Uplink:
     def start(self, order: SignedOrder) -> None:
         self.ask({"do": "start", "order": order.text, "key": order.key, "signature": order.signature})
 
+    def has_forgotten(self, run: str) -> bool:
+        """Whether the site started a run and has deleted what it knew of it."""
+        return bool(self.ask({"do": "forgotten", "run": run})["forgotten"])
+
     def follow(self, run: str, offset: int) -> Iterator[dict[str, Any]]:
         """Replies with events of a run, from `offset` on; the last one has `over`."""
         self._stream.send(encode({"do": "follow", "run": run, "offset": offset}), timeout_s=SILENCE_S)

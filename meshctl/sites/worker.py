@@ -91,6 +91,8 @@ class Worker:
                 self._reply({"stopping": runner.stop(self._directory.run(str(request["run"])))})
             case "status":
                 self._reply(self._status(request))
+            case "forgotten":
+                self._reply({"forgotten": self._directory.has_forgotten(str(request["run"]))})
             case "finish":
                 self._is_finished = True
             case unknown:

@@ -86,9 +86,9 @@ class Graph:
                 found |= self.paths(entry)
         return found
 
-    def farthest_first(self, entry: str) -> tuple[str, ...]:
-        """Nodes by hops to `entry`, most first; of equals the weaker path first; unreachable ones first of all."""
-        paths = self.paths(entry)
+    def farthest_first(self, *entries: str) -> tuple[str, ...]:
+        """Nodes by hops to their entry, most first; of equals the weaker path first; unreachable ones first of all."""
+        paths = self.paths_to_any(entries)
         unreachable = len(self.neighbours)
 
         def distance(name: str) -> tuple[int, float, str]:
@@ -136,10 +136,15 @@ class Graph:
                 found |= self.cut_off_by(entry)
         return dict(sorted(found.items()))
 
-    def cut_off_by_all(self, entry: str, down: Iterable[str]) -> frozenset[str]:
-        """The nodes outside `down` that reach `entry` now and would not if all of `down` were gone at once."""
+    def cut_off_by_all(self, entries: Iterable[str], down: Iterable[str]) -> frozenset[str]:
+        """The nodes outside `down` that reach an entry now and would reach none if all of `down` were gone at once."""
         gone = frozenset(down)
-        return self.reachable(entry) - self.reachable(entry, gone) - gone
+        found: set[str] = set()
+        left: set[str] = set()
+        for entry in entries:
+            found |= self.reachable(entry)
+            left |= self.reachable(entry, gone)
+        return frozenset(found - left - gone)
 
 
 EMPTY = Graph()

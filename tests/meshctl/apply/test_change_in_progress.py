@@ -32,10 +32,10 @@ def a_change() -> ChangeInProgress:
     listener = SimpleNamespace(observed=lambda: None)
     run = SimpleNamespace(
         new_listener=lambda *_: listener,
-        current_base_macs=frozenset,
+        current_base_macs=lambda _: frozenset(),
         interrupt=SimpleNamespace(leaving=False),
     )
-    ctx = SimpleNamespace(run=run, expected=Expectation(network=parse(NETWORK, "network")))
+    ctx = SimpleNamespace(run=run, node=None, expected=Expectation(network=parse(NETWORK, "network")))
     return ChangeInProgress(
         cast("NodeContext", ctx), Change("c1", {}, "exit 0\n"), Secret("nonce"), 60, HERE, (HERE,), is_reloaded=True
     )

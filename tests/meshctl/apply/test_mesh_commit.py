@@ -106,7 +106,7 @@ def test_no_node_is_armed_while_another_one_is_in_its_first_boot(monkeypatch: py
         )
         for name in ("b01", "b02")
     ]
-    ended = commit_mesh(run, contexts, quorum=1.0, parallel=2, entry="")
+    ended = commit_mesh(run, contexts, quorum=1.0, parallel=2, entries=())
     assert armed == []
     assert (ended["b01"].result, ended["b02"].result) == (Result.PENDING, Result.FAILED)
     assert "b02 could not be armed: b02: its first boot has not ended" in ended["b01"].reason

@@ -18,7 +18,7 @@ from tests.meshctl.plan.support import fleet, running
 
 
 def prepared(verdict: Verdict) -> Prepared:
-    plan = Plan("team", 0.0, "base", MappingProxyType({"b01": NodePlan("b01", verdict, "no board")}))
+    plan = Plan("team", 0.0, ("base",), MappingProxyType({"b01": NodePlan("b01", verdict, "no board")}))
     change = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="timeout")
     return Prepared(plan, {}, FleetObservation({"b01": replace(running(fleet(), "b01"), change=change)}, {}))
 

@@ -56,7 +56,7 @@ class Neighbours:
                 fleet=fleet(),
                 observations=around,
                 current_mac_owners=lambda: {mac: name for name, mac in MACS.items()},
-                base_macs=(),
+                current_base_macs=lambda _: frozenset(),
                 interrupt=SimpleNamespace(leaving=False),
                 connections=SimpleNamespace(
                     acquire=lambda name: None, open=self._open, release=lambda name, kept: None
@@ -120,7 +120,7 @@ def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through
     route = Originator(base, MAC, "mesh0", last_seen_ms=100, best=True)
     around = {"b02": node("b02", "b01", "b03"), "b01": node("b01", "b02"), "b03": node("b03", "b02")}
     near = Neighbours({**around, "b03": replace(around["b03"], originators=(route,))}, answer="watching\n")
-    near.work.base_macs = (base,)  # type: ignore[misc]
+    near.work.current_base_macs = lambda node: frozenset({base})  # type: ignore[method-assign]
     own: list[str] = []
     connection = cast("SshConnection", SimpleNamespace(run=own.append))
     near.flushes.listener(near.job, NO_RADIOS).armed(connection, for_s=100.0)

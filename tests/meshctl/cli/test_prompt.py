@@ -65,10 +65,10 @@ def test_a_single_argument_is_passed_to_the_shell_and_several_are_quoted(command
 
 def test_a_resumed_bootstrap_advises_connecting_unreachable_nodes_on_the_bench() -> None:
     nodes = {"b01": NodePlan("b01", Verdict.AWAY, reason="no answer"), "b02": NodePlan("b02", Verdict.SAME)}
-    plan = Plan("f", 0.0, "base", nodes)
+    plan = Plan("f", 0.0, ("base",), nodes)
     assert bench_advice(run_of("bootstrap"), plan) == (
         "run 7 was a bootstrap: b01 may still have factory defaults",
         "hint: connect such a device on the bench and run `meshctl bootstrap` again",
     )
     assert bench_advice(run_of("provision"), plan) == ()
-    assert bench_advice(run_of("bootstrap"), Plan("f", 0.0, "base", {"b02": nodes["b02"]})) == ()
+    assert bench_advice(run_of("bootstrap"), Plan("f", 0.0, ("base",), {"b02": nodes["b02"]})) == ()

@@ -24,7 +24,7 @@ def changing(name: str, *, cut: Cut = Cut.MESH, is_meshed: bool = True) -> NodeP
 
 
 def around(mesh: Graph, *, max_down: int = 1, canary: bool = False, **robots: str) -> MeshContext:
-    return MeshContext(mesh, "base", ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
+    return MeshContext(mesh, ("base",), ApplyPolicy(max_down=max_down, canary=canary), MappingProxyType(robots))
 
 
 @st.composite
@@ -45,7 +45,7 @@ def test_every_node_is_in_one_stage_of_at_most_max_down_nodes(
 @given(meshes(), st.integers(1, 4))
 def test_nodes_down_together_cut_off_only_what_one_node_alone_would(mesh: Graph, max_down: int) -> None:
     for stage in stages_of([changing(name) for name in NAMES], around(mesh, max_down=max_down)):
-        lost = mesh.cut_off_by_all("base", stage.nodes)
+        lost = mesh.cut_off_by_all(["base"], stage.nodes)
         if stage.kind is not StageKind.LAST:
             assert lost == set(stage.cuts_off)
         assert not stage.cuts_off or len(stage.nodes) == 1

@@ -100,7 +100,7 @@ def large() -> Plan:
     nodes["uav1-radio"] = NodePlan("uav1-radio", Verdict.REFUSED, reason="no port eth0.1 (it has eth0)")
     nodes["gone"] = NodePlan("gone", Verdict.AWAY, reason="did not answer")
     stage = Stage(StageKind.SWITCH, (*names, "odd"), "mesh main changes its cell", mesh="main")
-    return Plan("team", 0.0, "b00", nodes, stages=(stage,))
+    return Plan("team", 0.0, ("b00",), nodes, stages=(stage,))
 
 
 ORDER = (*(f"b{number:02}" for number in range(13)), "uav1-radio", "gone", "odd")
@@ -126,7 +126,7 @@ def test_the_last_lines_repeat_the_totals_and_the_excluded_nodes() -> None:
 def test_nodes_refused_for_the_same_reason_form_one_block() -> None:
     refused = {name: NodePlan(name, Verdict.REFUSED, reason="it has no port eth9", hint="correct it") for name in ORDER}
     refused["odd"] = NodePlan("odd", Verdict.REFUSED, reason="wrong board")
-    text = read(Plan("team", 0.0, "b00", refused), order=ORDER)
+    text = read(Plan("team", 0.0, ("b00",), refused), order=ORDER)
     assert "15 nodes  refused: it has no port eth9\n  b00, b01, b02," in text
     assert text.count("it has no port eth9") == 2
     assert ", b12, uav1-radio, gone: it has no port eth9\n  refused: odd, wrong board" in text
@@ -177,10 +177,12 @@ def test_nodes_that_differ_only_in_the_digest_of_their_configuration_form_one_bl
         name: NodePlan(name, Verdict.CHANGE, files=(CHANNEL, record(name, digit)))
         for name, digit in (("b01", "1"), ("b02", "2"))
     }
-    text = read(Plan("team", 0.0, "b01", nodes))
+    text = read(Plan("team", 0.0, ("b01",), nodes))
     assert "2 nodes  each cuts" in text
     assert text.count("option channel") == 2
     assert "  changed   etc/meshctl/node: digest of its configuration\n\n" in text
     renamed = record("b01", "1")
     renamed = replace(renamed, diff=renamed.diff.replace(" node=b01", "-node=spare1\n+node=b01"))
-    assert "-node=spare1" in read(Plan("team", 0.0, "b01", {"b01": NodePlan("b01", Verdict.CHANGE, files=(renamed,))}))
+    assert "-node=spare1" in read(
+        Plan("team", 0.0, ("b01",), {"b01": NodePlan("b01", Verdict.CHANGE, files=(renamed,))})
+    )

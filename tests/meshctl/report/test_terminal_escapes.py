@@ -82,7 +82,7 @@ def test_a_plan_for_a_hostile_device_contains_no_terminal_escapes() -> None:
     node = NodePlan("b01", Verdict.CHANGE, files=files, notes=(HOSTILE,))
     refused = NodePlan("b02", Verdict.REFUSED, reason=HOSTILE, hint=HOSTILE)
     plan = Plan(
-        "lab", 0.0, "b00", {"b01": node, "b02": refused}, notes=(HOSTILE,), refusal=HOSTILE, refusal_hint=HOSTILE
+        "lab", 0.0, ("b00",), {"b01": node, "b02": refused}, notes=(HOSTILE,), refusal=HOSTILE, refusal_hint=HOSTILE
     )
     assert [steering(line.text) for line in plan_lines(plan) if steering(line.text)] == []
     saved = dump(SavedPlan(plan, b"salt", HOSTILE))

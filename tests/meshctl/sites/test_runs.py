@@ -12,7 +12,7 @@ import pytest
 from meshctl.archive import TarMember, tar_of
 from meshctl.errors import InputError
 from meshctl.fleet.process import process_of, this_process
-from meshctl.sites.runs import PREPARED_S, SiteBusy, SiteDirectory, closing, write_json
+from meshctl.sites.runs import MAX_RUNS, PREPARED_S, SiteBusy, SiteDirectory, closing, write_json
 
 _RUN = "0123456789abcdef"
 
@@ -129,6 +129,20 @@ def test_plans_that_were_not_ordered_are_deleted_after_an_hour(site: SiteDirecto
     os.utime(old.path, (before_s, before_s))
     site.clean()
     assert (old.path.exists(), new.path.exists()) == (False, True)
+
+
+def test_the_ids_of_deleted_runs_are_kept(site: SiteDirectory) -> None:
+    for number in range(MAX_RUNS + 1):
+        run = site.run(f"{number:016x}")
+        run.create(tar_of([]), {})
+        write_json(run.order, {"operator": "alice@laptop", "command": "provision"})
+        write_json(run.over, {"exit": 0})
+        os.utime(run.order, (number, number))
+    site.clean()
+    assert not site.run("0" * 16).path.exists()
+    assert site.has_forgotten("0" * 16)
+    assert not site.has_forgotten(f"{1:016x}")
+    assert len(site.runs()) == MAX_RUNS
 
 
 def test_events_are_read_by_whole_lines(site: SiteDirectory) -> None:

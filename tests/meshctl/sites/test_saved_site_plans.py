@@ -24,7 +24,7 @@ _NODES = """
 
 def _plan(*names: str) -> SavedPlan:
     nodes = {name: NodePlan(name, Verdict.SAME) for name in names}
-    return SavedPlan(Plan("trial", 1.0, "", MappingProxyType(nodes)), b"salt" * 4, "fleet.yaml", with_firmware=False)
+    return SavedPlan(Plan("trial", 1.0, (), MappingProxyType(nodes)), b"salt" * 4, "fleet.yaml", with_firmware=False)
 
 
 _PLANS = SavedSitePlans("trial", _plan("lone"), {"north": _plan("n1")}, {"south": Unplanned(("s1",), "no answer")})

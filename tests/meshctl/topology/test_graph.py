@@ -51,7 +51,7 @@ def test_cut_off_nodes_match_a_reachability_search_without_the_removed_node(grap
 def test_cut_off_by_all_with_one_node_matches_cut_off_by(graph: Graph) -> None:
     cut = graph.cut_off_by("n0")
     for name in NAMES[1:]:
-        assert graph.cut_off_by_all("n0", [name]) == frozenset(cut.get(name, ()))
+        assert graph.cut_off_by_all(["n0"], [name]) == frozenset(cut.get(name, ()))
 
 
 @given(graphs())
