@@ -14,6 +14,7 @@ from tests.meshctl.cli.speech_program import NEEDS_SPEECH, expects_speech
 from tests.meshctl.fleet.postgresql_server import NEEDS_POSTGRESQL, expects_postgresql
 from tests.meshctl.monitor.browser import CHROMIUM, NEEDS_BROWSER, expects_browser
 from tests.meshctl.monitor.prometheus_program import NEEDS_PROMETHEUS, expects_prometheus
+from tests.meshctl.sites.nats_servers import NEEDS_NATS, PROGRAM, expects_nats
 from tests.udp_mesh.bridges.interpreters import NEEDS_ROS, ROS_PYTHON, expects_ros
 from tests.udp_mesh.bridges.ros2_processes import NEEDS_ROS2, PYTHON, expects_ros2
 
@@ -59,6 +60,11 @@ NOT_TESTED = (
         expects_speech,
         "Speech: there is no espeak-ng in PATH, so tests/meshctl/cli/test_voice.py was not collected."
         f" scripts/setup-speech installs it (Debian, Ubuntu); {NEEDS_SPEECH}=1 makes it fail instead.",
+    ),
+    (
+        expects_nats,
+        f"NATS: there is no {PROGRAM} in PATH, so the tests of sites over NATS were not collected. scripts/setup-nats"
+        f" installs it (Debian, Ubuntu); {NEEDS_NATS}=1 makes them fail instead.",
     ),
     (
         expects_postgresql,

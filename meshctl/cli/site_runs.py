@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,9 @@ from meshctl.plan import NodePlan, Plan, Verdict
 from meshctl.plan.saved import dump
 from meshctl.sites.bundle import SiteBundle, site_bundle
 from meshctl.sites.dispatch import SiteExecution, SitePlan, SiteRun, by_site, prepare_sites
-from meshctl.sites.order import Order, SignedOrder, sign_order
+from meshctl.sites.order import Order, images_sha256, sign_order
+from meshctl.sites.runs import PREPARED_S
+from meshctl.sites.uplink import Parcel
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +254,14 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
         save_before(opened, run, plan.changing, plan.replaced)
         _finish_others(opened, plan, run)
         site_runs = [
-            SiteRun(site.site, site.run, site.nodes, order=orders[site.run], uplink=site.uplink)
+            SiteRun(
+                site.site,
+                site.run,
+                site.nodes,
+                parcel=orders[site.run],
+                uplink=site.uplink,
+                waits_until=_expiry(opened, site) if site.is_queued else "",
+            )
             for site in plan.sites
             if _is_to_start(site)
         ]
@@ -293,9 +303,11 @@ def _is_to_start(site: SitePlan) -> bool:
     return site.saved is not None and not site.saved.plan.refusal and not site.saved.plan.is_empty
 
 
-def _order(opened: Session, site: SitePlan, options: RunOptions) -> SignedOrder:
+def _order(opened: Session, site: SitePlan, options: RunOptions) -> Parcel:
     assert site.uplink is not None, "a site with a plan has an uplink"
+    assert site.bundle is not None, "a site with a plan has a bundle"
     plan_sha256 = hashlib.sha256(site.text.encode()).hexdigest()
+    now_s = time.time()
     order = Order(
         opened.fleet.name,
         site.site.name,
@@ -303,13 +315,27 @@ def _order(opened: Session, site: SitePlan, options: RunOptions) -> SignedOrder:
         options.command,
         owner(),
         plan_sha256,
-        site.part_sha256,
+        site.bundle.sha256,
         options.rate_kb_s,
+        now_s,
+        now_s + _lifetime_s(opened, site) if site.site.nats is not None else None,
+        images_sha256(site.bundle.images),
     )
-    accepted = site.uplink.greeting.operators
+    accepted = site.uplink.accepted_keys
     access = opened.access
     credentials = gateway_credentials(opened.fleet, site.site, access.key_files, use_agent=access.use_agent)
-    return sign_order(order, credentials, accepted)
+    signed = sign_order(order, credentials, accepted)
+    return Parcel(signed, site.run, site.bundle.archive, site.text, site.bundle.images)
+
+
+def _lifetime_s(opened: Session, site: SitePlan) -> float:
+    """How long an order waits for its site: one that was online is expected back soon."""
+    assert opened.fleet.nats is not None, "a site with `nats` and a plan has a hub"
+    return opened.fleet.nats.order_hours * 3600.0 if site.is_queued else PREPARED_S
+
+
+def _expiry(opened: Session, site: SitePlan) -> str:
+    return datetime.fromtimestamp(time.time() + _lifetime_s(opened, site), UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def _finish_others(opened: Session, plan: WholePlan, run: JournaledRun) -> None:

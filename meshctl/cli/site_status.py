@@ -21,6 +21,7 @@ from meshctl.errors import ExitCode, MeshctlError, Unreachable
 from meshctl.model import Site
 from meshctl.report.duration import duration
 from meshctl.sites.bundle import site_bundle
+from meshctl.sites.connect import open_uplink
 from meshctl.sites.dispatch import MAX_SITES_AT_ONCE, new_run_id
 from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Greeting, Uplink
@@ -50,7 +51,7 @@ def look(opened: Session, inventory: Path, sites: tuple[Site, ...], *, with_node
 
     def ask(site: Site) -> SiteStatus:
         try:
-            with Uplink(opened.fleet, site, opened.access) as uplink:
+            with open_uplink(opened.fleet, site, opened.access) as uplink:
                 nodes = _nodes(opened, inventory, site, uplink) if with_nodes else {}
                 return SiteStatus(site, uplink.greeting, nodes=nodes)
         except MeshctlError as error:

@@ -28,7 +28,8 @@ from meshctl.model import Site
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.site_gateways import PIN_PREFIX
 from meshctl.sites.gateway import Gateway, WorkerRelease, build_release, download_wheels, install, probe
-from meshctl.sites.uplink import Uplink
+from meshctl.sites.service import start_service, unit, unit_name
+from meshctl.sites.ssh_uplink import SshUplink
 
 app = typer.Typer(no_args_is_help=True)
 
@@ -37,18 +38,20 @@ _PERCENT_EVERY_S = 5.0
 SiteNames = Annotated[list[str] | None, typer.Argument(metavar="[SITES]...", help="Names of sites; default: all.")]
 
 
-def selected_sites(opened: Session, names: Iterable[str] | None) -> tuple[Site, ...]:
-    """The named sites with a gateway; all without names. Raises InputError."""
-    able = {name: site for name, site in opened.fleet.sites.items() if site.has_worker}
+def selected_sites(opened: Session, names: Iterable[str] | None, *, with_login: bool = False) -> tuple[Site, ...]:
+    """The named sites with a worker, or those whose gateway has a login; all without names. Raises InputError."""
+    sites = opened.fleet.sites
+    able = {name: site for name, site in sites.items() if (site.has_gateway if with_login else site.has_worker)}
+    setting = "sites.{}.ssh.host" if with_login else "sites.{0}.ssh.host or sites.{0}.nats"
     wanted = list(names or ())
     for name in wanted:
         if name not in opened.fleet.sites:
             hint = did_you_mean(name, opened.fleet.sites) or "the inventory's sites are in `sites`"
             raise InputError(f"no site of {opened.fleet.name} is named {name!r}", hint=hint)
         if name not in able:
-            raise InputError(f"site {name} has no gateway", hint=f"set sites.{name}.ssh.host")
+            raise InputError(f"site {name} has no gateway", hint=f"set {setting.format(name)}")
     if not able:
-        raise InputError(f"no site of {opened.fleet.name} has a gateway", hint="set sites.NAME.ssh.host")
+        raise InputError(f"no site of {opened.fleet.name} has a gateway", hint=f"set {setting.format('NAME')}")
     return tuple(able[name] for name in dict.fromkeys(wanted or able))
 
 
@@ -98,8 +101,8 @@ def install_command(
         if not opened.fleet.operators.ssh_keys:
             raise InputError("operators.ssh_keys is empty: no operator could sign an order", hint="add your public key")
         failed: list[MeshctlError] = []
-        releases: dict[Gateway, WorkerRelease] = {}
-        for site in selected_sites(opened, sites):
+        releases: dict[tuple[Gateway, str], WorkerRelease] = {}
+        for site in selected_sites(opened, sites, with_login=True):
             try:
                 public_key = _install(opened, site, wheels, releases, dry_run=dry_run)
             except MeshctlError as error:
@@ -113,7 +116,12 @@ def install_command(
 
 
 def _install(
-    opened: Session, site: Site, wheels: Path | None, releases: dict[Gateway, WorkerRelease], *, dry_run: bool
+    opened: Session,
+    site: Site,
+    wheels: Path | None,
+    releases: dict[tuple[Gateway, str], WorkerRelease],
+    *,
+    dry_run: bool,
 ) -> str:
     """Install on one gateway; returns the worker's public key, empty with `dry_run`. `releases` were made so far."""
     with opened.access.connect_gateway(site) as connection:
@@ -122,17 +130,31 @@ def _install(
         if dry_run:
             echo(f"{site.name}: meshctl {__version__} would be installed")
             return ""
-        if gateway not in releases:
+        extra = "nats" if site.nats is not None else ""
+        if (gateway, extra) not in releases:
             with tempfile.TemporaryDirectory() as scratch:
-                directory = Path(scratch) if wheels is not None else _cache(str(gateway.target))
-                releases[gateway] = build_release(gateway, download_wheels(gateway.target, directory, wheels))
-        release = releases[gateway]
+                directory = Path(scratch) if wheels is not None else _cache(f"{gateway.target} {extra}".strip())
+                collected = download_wheels(gateway.target, directory, wheels, extra)
+                releases[gateway, extra] = build_release(gateway, collected)
+        release = releases[gateway, extra]
         echo(f"{site.name}: sending meshctl {__version__}, {len(release.archive) >> 20} MiB")
         install(connection, gateway, release, _Percent(site.name))
-    with Uplink(opened.fleet, site, opened.access) as uplink:
+    with SshUplink(opened.fleet, site, opened.access) as uplink:
         public_key = uplink.install(opened.fleet.operators.ssh_keys)
+    _start_permanent_worker(opened, site)
     echo(f"{site.name}: installed; its worker has the key {public_key}")
     return public_key
+
+
+def _start_permanent_worker(opened: Session, site: Site) -> None:
+    """Start or restart the worker of a site with `nats`, as a service of its gateway."""
+    if site.nats is None or opened.fleet.nats is None:
+        return
+    name = unit_name(opened.fleet.name, site.name)
+    text = unit(opened.fleet.name, site.name, site.nats, opened.fleet.nats)
+    with opened.access.connect_gateway(site) as connection:
+        left = start_service(connection, name, text)
+    echo(f"{site.name}: {name} is running" if not left else f"{site.name}: {name} is written; {left}")
 
 
 class _Percent:
@@ -178,7 +200,9 @@ def trust_command(
     Example: meshctl sites trust north
     """
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        results = [_pin(opened, site, may_replace=change, yes=yes) for site in selected_sites(opened, sites)]
+        results = [
+            _pin(opened, site, may_replace=change, yes=yes) for site in selected_sites(opened, sites, with_login=True)
+        ]
     if not all(results):
         raise typer.Exit(ExitCode.FINDINGS)
 

@@ -236,7 +236,7 @@ def ssh_arguments(opened: Session, node: Node) -> list[str]:
         jump = opened.fleet.nodes[node.ssh.jump]
         through = replace(jump, ssh=replace(jump.ssh, jump=""))
         hop = ssh_arguments(opened, through)
-    elif (site := opened.fleet.worker_site(node)) is not None:
+    elif (site := opened.fleet.gateway_site(node)) is not None:
         hop = _gateway_arguments(opened, site)
     if hop:
         arguments += ["-o", f"ProxyCommand={shlex.join([*hop[:-1], '-W', '%h:%p', hop[-1]])}"]

@@ -20,6 +20,7 @@ from meshctl.inventory.documents import (
     InventoryDocument,
     LanDocument,
     MeshDocument,
+    NatsHubDocument,
     OtherComputerDocument,
     RobotDocument,
     SecretDocument,
@@ -44,6 +45,7 @@ from meshctl.model import (
     Fleet,
     HardwareProfile,
     Mesh,
+    NatsHub,
     OperatorParts,
     Operators,
     RadioHardware,
@@ -51,6 +53,7 @@ from meshctl.model import (
     SecretKind,
     SecretRef,
     Site,
+    SiteNats,
     SshSettings,
     SystemSettings,
     UdpMesh,
@@ -117,6 +120,7 @@ def build(
         files=tuple(str(path) for path in files),
         base=str(files[0].parent),
         sites=MappingProxyType({name: _site(name, item) for name, item in document.sites.items()}),
+        nats=_nats_hub(document.nats),
     )
     return Built(fleet, ())
 
@@ -321,7 +325,17 @@ def _other_computer(document: OtherComputerDocument) -> Computer:
 
 
 def _site(name: str, document: SiteDocument) -> Site:
-    return Site(name, _computer_ssh(document.ssh), document.worker_key)
+    nats = None
+    if document.nats is not None:
+        there = document.nats
+        nats = SiteNats(there.domain or name, there.url, there.credentials, there.ca)
+    return Site(name, _computer_ssh(document.ssh), document.worker_key, nats)
+
+
+def _nats_hub(document: NatsHubDocument | None) -> NatsHub | None:
+    if document is None:
+        return None
+    return NatsHub(document.url, document.credentials, document.ca, document.domain, document.order_hours)
 
 
 def _computer_ssh(document: SshLayer) -> SshSettings:

@@ -19,8 +19,6 @@ from meshctl.model.fleet import (
     Radio,
     Robot,
     Role,
-    Site,
-    SshSettings,
     SystemSettings,
     UdpMesh,
 )
@@ -28,6 +26,7 @@ from meshctl.model.hardware import AntennaKind, Band, Firmware, HardwareProfile,
 from meshctl.model.mesh import Backend, Batman, Encryption, Mesh, MeshMode, OperatorParts
 from meshctl.model.release import RELEASES, PackageTool, Release
 from meshctl.model.secret import MASK, Secret, SecretKind, SecretRef
+from meshctl.model.site import NatsHub, Site, SiteNats, SshSettings
 from meshctl.model.thin import ThinBand, ThinFraming, ThinLink, ThinPorts, ThinPreset
 from meshctl.model.topic import JpegEncoding, Outbox, Reduction, Topic, TopicClass, TopicLog
 
@@ -51,6 +50,7 @@ __all__ = [
     "Mesh",
     "MeshMode",
     "MissingOrigin",
+    "NatsHub",
     "Node",
     "NodeState",
     "OperatorParts",
@@ -68,6 +68,7 @@ __all__ = [
     "SecretKind",
     "SecretRef",
     "Site",
+    "SiteNats",
     "SshSettings",
     "SystemSettings",
     "ThinBand",

@@ -14,6 +14,7 @@ from meshctl.model.ip import IpAddress, IpInterface, IpNetwork
 from meshctl.model.mesh import Mesh
 from meshctl.model.release import Release
 from meshctl.model.secret import SecretRef
+from meshctl.model.site import OWN_ADDRESS, NatsHub, Site, SshSettings
 from meshctl.model.thin import ThinLink, ThinPorts
 from meshctl.model.topic import Topic
 
@@ -78,17 +79,6 @@ class Radio:
 
 
 @dataclass(frozen=True, slots=True)
-class SshSettings:
-    """SSH access to a device: an empty `host` means its own address; `jump` is a node used as jump host."""
-
-    host: str = ""
-    port: int = 22
-    user: str = "root"
-    key_files: tuple[str, ...] = ()
-    jump: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class FixedPosition:
     """Where a device stands for the whole mission, in meters in the frame of the fleet's map; `z_m` None: unknown."""
 
@@ -122,7 +112,7 @@ class Node:
     address: IpInterface
     radios: tuple[Radio, ...]
     lan_ports: tuple[str, ...]
-    ssh: SshSettings = SshSettings()
+    ssh: SshSettings = OWN_ADDRESS
     robot: str = ""
     label: str = ""
     serial: str = ""
@@ -181,7 +171,7 @@ class Computer:
     radios for their links, with the private part of the SSH key `collector_key`."""
 
     address: IpInterface
-    ssh: SshSettings = SshSettings()
+    ssh: SshSettings = OWN_ADDRESS
     python: str = "python3"
     arch: str = "x86_64"
     ros: str = ""
@@ -223,20 +213,6 @@ class Robot:
             yield ("computer",), f"the computer of {self.name}", self.computer
         for name, computer in self.computers.items():
             yield ("computers", name), f"{name} of {self.name}", computer
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """A place with nodes of its own. `ssh` is the login to its gateway, where a worker provisions them; without a host
-    there is no worker. The nodes accept the SSH public key `worker_key`."""
-
-    name: str
-    ssh: SshSettings = SshSettings()
-    worker_key: str = ""
-
-    @property
-    def has_worker(self) -> bool:
-        return bool(self.ssh.host)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,6 +289,7 @@ class Fleet:
     files: tuple[str, ...] = ()
     base: str = ""
     sites: Mapping[str, Site] = field(default_factory=lambda: MappingProxyType({}))
+    nats: NatsHub | None = None
 
     def where(self, *path: str) -> Origin:
         """The origin of a value, or of its innermost container that has one.
@@ -364,10 +341,15 @@ class Fleet:
         site = self.sites.get(node.site)
         return site if site is not None and site.has_worker else None
 
+    def gateway_site(self, node: Node) -> Site | None:
+        """The site through whose gateway the node is reached; None without one."""
+        site = self.sites.get(node.site)
+        return site if site is not None and site.has_gateway else None
+
     def robot_site(self, robot: Robot) -> Site | None:
-        """The site with a worker where the robot's radios are; None without one."""
+        """The site with a gateway where the robot's radios are; None without one."""
         radios = (self.nodes.get(name) for name in robot.nodes)
-        return next((site for node in radios if node is not None and (site := self.worker_site(node))), None)
+        return next((site for node in radios if node is not None and (site := self.gateway_site(node))), None)
 
     def members(self, mesh: str) -> Iterator[Node]:
         """The managed nodes with at least one radio in `mesh`."""

@@ -138,7 +138,7 @@ class ConnectionPool:
 
     def _via(self, node: Node) -> SshConnection | None:
         if not node.ssh.jump:
-            site = self.fleet.worker_site(node)
+            site = self.fleet.gateway_site(node)
             return self.gateway(site) if site is not None and self.use_gateways else None
         through = self.fleet.nodes.get(node.ssh.jump)
         if through is None:

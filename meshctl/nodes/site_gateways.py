@@ -32,7 +32,7 @@ def local_user(place: str) -> str:
 
 def gateway_endpoint(site: Site) -> Endpoint:
     """Raises InputError for a site without a gateway."""
-    if not site.has_worker:
+    if not site.has_gateway:
         raise InputError(f"site {site.name} has no gateway", hint=f"set sites.{site.name}.ssh.host")
     user = site.ssh.user or local_user(f"sites.{site.name}.ssh.user")
     return Endpoint(site.ssh.host, site.ssh.port, user, identity=f"{PIN_PREFIX}{site.name}")

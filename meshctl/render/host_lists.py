@@ -35,7 +35,7 @@ def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
             node.name,
             node.name,
             node.ssh.host or str(node.address.ip),
-            _through(node.ssh, fleet.worker_site(node)),
+            _through(node.ssh, fleet.gateway_site(node)),
             tuple(dict.fromkeys((f"role_{node.role.value}", f"state_{node.state.value}", *node.groups))),
             is_openwrt=True,
             has_sha1_rsa_only=node.release is Release.V19_07,
@@ -57,7 +57,7 @@ def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
     gateways = [
         HostEntry(_gateway(site), _gateway(site), site.ssh.host, site.ssh, ("gateways",), is_openwrt=False)
         for site in fleet.sites.values()
-        if site.has_worker
+        if site.has_gateway
     ]
     return (*radios, *computers, *gateways)
 

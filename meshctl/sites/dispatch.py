@@ -22,9 +22,10 @@ from meshctl.model import Fleet, Node, Site
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.plan.saved import SavedPlan, load
 from meshctl.sites.bundle import SiteBundle
+from meshctl.sites.connect import open_uplink
 from meshctl.sites.events import events_of, final_outcomes
-from meshctl.sites.order import SignedOrder
-from meshctl.sites.uplink import Uplink
+from meshctl.sites.nats_uplink import SiteOffline
+from meshctl.sites.uplink import Parcel, Uplink
 
 # Uplinks wait far more than they work.
 MAX_SITES_AT_ONCE = 64
@@ -68,7 +69,9 @@ class SitePlan:
     saved: SavedPlan | None = None
     text: str = field(default="", repr=False)
     replaced: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    part_sha256: str = ""
+    bundle: SiteBundle | None = field(default=None, repr=False)
+    # the site is offline: the order waits for it, and what of the saved plan applies is found out there
+    is_queued: bool = False
     error: MeshctlError | None = None
     uplink: Uplink | None = field(default=None, repr=False)
 
@@ -94,16 +97,20 @@ def prepare_sites(
         try:
             bundle = bundle_of(plan.site.name)
             saved = (agreed or {}).get(plan.site.name, "")
-            plan.part_sha256 = bundle.sha256
+            plan.bundle = bundle
             for attempt in range(PLAN_ATTEMPTS):
                 try:
-                    plan.uplink = Uplink(fleet, plan.site, access)
+                    plan.uplink = open_uplink(fleet, plan.site, access)
                     plan.uplink.send_images(bundle.image_files)
                     text, plan.replaced = plan.uplink.plan(
                         plan.run, bundle.archive, bundle.images, plan.nodes, options, saved
                     )
                     break
                 except Unreachable:
+                    if plan.uplink is None and saved and plan.site.nats is not None and not bundle.images:
+                        plan.uplink, text = open_uplink(fleet, plan.site, access, must_answer=False), saved
+                        plan.is_queued = True
+                        break
                     # an uplink that comes and goes is tried again; one that is not there is reported at once
                     if plan.uplink is None or attempt + 1 == PLAN_ATTEMPTS:
                         raise
@@ -137,7 +144,9 @@ class SiteRun:
     run: str
     nodes: tuple[str, ...]
     outcomes: dict[str, Outcome] = field(default_factory=dict)
-    order: SignedOrder | None = field(default=None, repr=False)
+    parcel: Parcel | None = field(default=None, repr=False)
+    # for an order that waits for its site: until when, in words
+    waits_until: str = ""
     uplink: Uplink | None = field(default=None, repr=False)
     offset: int = 0
     is_started: bool = False
@@ -176,7 +185,7 @@ class SiteExecution:
                 offset = run.offset
                 self._stay(run)
             except Unreachable as error:
-                if run.uplink is not None:
+                if run.uplink is not None and run.uplink.has_contact:
                     contact_s = time.monotonic()
                 if run.offset != offset:
                     wait_s = _FIRST_WAIT_S
@@ -204,11 +213,20 @@ class SiteExecution:
     def _stay(self, run: SiteRun) -> None:
         """Connect if necessary, start the run if it has not been, and follow it to its end."""
         if run.uplink is None:
-            run.uplink = Uplink(self.fleet, run.site, self.access)
-            there = run.uplink.greeting.run(run.run)
+            run.uplink = open_uplink(self.fleet, run.site, self.access, must_answer=False)
+        if not run.is_started:
             # an uplink that was lost at the start leaves open whether the order arrived
-            run.is_started = there is not None and there.state != "prepared"
-            if there is None and run.order is None:
+            try:
+                state = run.uplink.state_of(run.run)
+            except SiteOffline:
+                if run.parcel is None:
+                    raise
+                state = ""
+            if state == "waiting" and (run.parcel is None or run.waits_until):
+                self._finish_waiting(run)
+                return
+            run.is_started = state not in ("", "prepared", "waiting")
+            if not state and run.parcel is None:
                 self._finish_unknown(run, run.uplink)
                 return
         if not run.is_started:
@@ -216,14 +234,24 @@ class SiteExecution:
                 self._finish_all(run, Result.PENDING, "interrupted before it started", "")
                 run.is_over = True
                 return
-            if run.order is None:
+            if run.parcel is None:
                 self._finish_all(run, Result.PENDING, f"run {run.run} was not started at site {run.site.name}", "")
                 run.is_over = True
                 return
-            run.uplink.start(run.order)
+            run.uplink.start(run.parcel)
+            if run.waits_until:
+                self._finish_waiting(run)
+                return
             run.is_started = True
         for reply in run.uplink.follow(run.run, run.offset):
             self._read(run, reply)
+
+    def _finish_waiting(self, run: SiteRun) -> None:
+        """The outcomes of a run whose order waits for its site."""
+        until = f" until {run.waits_until}" if run.waits_until else ""
+        text = f"site {run.site.name} is offline: the order waits for it{until}"
+        self._finish_all(run, Result.PENDING, text, "run `meshctl resume` later to see how it ended")
+        run.is_over = True
 
     def _finish_unknown(self, run: SiteRun, uplink: Uplink) -> None:
         """The outcomes of a run that its site does not know (anymore)."""
@@ -256,6 +284,8 @@ class SiteExecution:
         over = reply.get("over")
         if isinstance(over, Mapping):
             reason, hint = str(over.get("error", "")), str(over.get("hint", ""))
+            if over.get("is_refused"):
+                self._finish_all(run, Result.REFUSED, f"site {run.site.name}: {reason}", hint)
             self._end(run, reason, hint)
             run.is_over = True
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import re
 import subprocess
 import sys
 import zipfile
@@ -183,12 +184,20 @@ def _tree(folder: Path, name: str) -> Iterator[TarMember]:
             yield TarMember(f"{name}/{path.relative_to(folder).as_posix()}", path.read_bytes(), mode)
 
 
-def requirements() -> tuple[str, ...]:
-    """What meshctl itself requires, as in its package's metadata."""
-    return tuple(line for line in distribution(_DISTRIBUTION).requires or () if "extra ==" not in line)
+def requirements(extra: str = "") -> tuple[str, ...]:
+    """What meshctl itself requires, as in its package's metadata, and one of its extras."""
+    found: list[str] = []
+    for line in distribution(_DISTRIBUTION).requires or ():
+        requirement, _, marker = line.partition(";")
+        named = re.search(r"extra == ['\"]([\w-]+)['\"]", marker)
+        if named is None:
+            found.append(line)
+        elif named[1] == extra:
+            found.append(requirement.strip())
+    return tuple(found)
 
 
-def download_wheels(target: Target, directory: Path, named: Path | None) -> tuple[Path, ...]:
+def download_wheels(target: Target, directory: Path, named: Path | None, extra: str = "") -> tuple[Path, ...]:
     """The wheels of all requirements for a target, in `directory`: from the directory `named` if given, else with pip
     from its index, once. Raises InputError."""
     directory.mkdir(parents=True, exist_ok=True)
@@ -196,7 +205,7 @@ def download_wheels(target: Target, directory: Path, named: Path | None) -> tupl
         return kept
     source = [] if named is None else ["--no-index", "--find-links", str(named)]
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
-    command += ["--only-binary", ":all:", "--dest", str(directory), *source, *pip_options(target), *requirements()]
+    command += ["--only-binary", ":all:", "--dest", str(directory), *source, *pip_options(target), *requirements(extra)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:

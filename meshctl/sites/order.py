@@ -9,21 +9,40 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 
 from meshctl.device.authentication import is_signed_by, sign
 from meshctl.device.connection import Credentials, fingerprint_of
 from meshctl.device.trust import HostKey, parse_key
-from meshctl.errors import InputError
+from meshctl.errors import InputError, MeshctlError
 
 # In front of what is signed: such a signature is none of an SSH login, whose data starts with a length.
 _PURPOSE = b"meshctl-order-1\n"
 
 
+# By how much the clocks of an operator and of a gateway may differ.
+MAX_CLOCK_DIFFERENCE_S = 300.0
+
+
 class OrderRefused(InputError):
     """An order that a worker does not execute."""
+
+
+class ClockBehind(MeshctlError):
+    """The worker's clock is wrong: whether an order has expired is known once it is right."""
+
+
+def images_sha256(images: Mapping[str, str]) -> str:
+    """The hash of firmware images: paths in the part, and the SHA-256 of each."""
+    return hashlib.sha256(json.dumps(dict(images), sort_keys=True).encode()).hexdigest()
+
+
+def _moment(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +57,24 @@ class Order:
     plan_sha256: str
     part_sha256: str
     rate_kb_s: float | None = None
+    # of an order that may wait for its site, by the operator's clock (Unix time)
+    signed_s: float = 0.0
+    expires_s: float | None = None
+    # the hash of the firmware images' paths and hashes, and who may read what the run replaces
+    images_sha256: str = ""
+    reply_to: str = ""
+
+    def check_time(self, now_s: float) -> None:
+        """Raises OrderRefused for an order that has expired, and ClockBehind if that cannot be known."""
+        if self.expires_s is None:
+            return
+        if now_s > self.expires_s:
+            raise OrderRefused(
+                f"the order expired at {_moment(self.expires_s)}, before the site got it; nothing was changed",
+                hint="plan and order it again",
+            )
+        if now_s < self.signed_s - MAX_CLOCK_DIFFERENCE_S:
+            raise ClockBehind(f"the clock here says {_moment(now_s)}, and the order is of {_moment(self.signed_s)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ REPLACED_FILE = "replaced.json"
 # Names the folder of both to a command that a worker starts.
 FILES_VARIABLE = "MESHCTL_SITE_FILES"
 # Sections that concern robots' computers and the operator's other sites.
-_REMOVED_SECTIONS = ("include", "topics", "sites")
+_REMOVED_SECTIONS = ("include", "topics", "sites", "nats")
 # The entry of a secret that the site does not get. Nothing there asks for it.
 _WITHHELD = "withheld"
 

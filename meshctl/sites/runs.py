@@ -9,8 +9,10 @@ state/               the journal of the site's runs
 runs/RUN/inventory/  the site's part of the inventory, with secrets; deleted when the run is over
 runs/RUN/plan.json   the plan that was shown to the operator
 runs/RUN/order.json  the signed order; a run without one was only prepared
+runs/RUN/refused.json why a stored order was not executed, instead
 runs/RUN/events      the run's events, one JSON object a line
 runs/RUN/over.json   how the run ended
+runs/RUN/published.json  how much of that is in the leaf node's stream
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from typing import Any
 from meshctl.device.authentication import new_key_pair
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet.process import process_lives
+from meshctl.sites.events import condensed
 from meshctl.sites.part import REPLACED_FILE
 
 # A plan that was prepared longer ago is made again before it is executed; its inventory, with secrets, is deleted.
@@ -49,7 +52,8 @@ class SiteBusy(MeshctlError):
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """`state` is `prepared`, `in progress`, `over`, or `interrupted`: the gateway or the run's process died."""
+    """`state` is `prepared`, `in progress`, `over`, `refused`, or `interrupted`: the gateway or the run's process
+    died."""
 
     run: str
     state: str
@@ -208,6 +212,14 @@ class RunDirectory:
         return self.path / "order.json"
 
     @property
+    def refused(self) -> Path:
+        return self.path / "refused.json"
+
+    @property
+    def published(self) -> Path:
+        return self.path / "published.json"
+
+    @property
     def process(self) -> Path:
         return self.path / "process"
 
@@ -262,6 +274,10 @@ class RunDirectory:
             began_s = self.path.stat().st_mtime if not self.order.exists() else self.order.stat().st_mtime
         except OSError:
             began_s = 0.0
+        if refused := read_json(self.refused):
+            return RunState(
+                run, "refused", str(refused["operator"]), str(refused["command"]), float(refused["refused_s"])
+            )
         order = read_json(self.order)
         if not order:
             return RunState(run, "prepared", began_s=began_s)
@@ -284,6 +300,29 @@ class RunDirectory:
 
     def discard(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
+
+    def refuse(self, operator: str, command: str, error: MeshctlError) -> None:
+        """Record that the run is never executed, also if its order is delivered again."""
+        self.forget_secrets()
+        self.path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        recorded = {"error": str(error), "hint": error.hint, "operator": operator, "command": command}
+        write_json(self.refused, {**recorded, "refused_s": time.time()})
+
+    def next_reply(self, offset: int, limit: int) -> dict[str, Any] | None:
+        """What a follower that has `offset` bytes of the events gets next: events, or how the run ended (`over`)."""
+        if refused := read_json(self.refused):
+            error, hint = str(refused["error"]), str(refused["hint"])
+            return {"offset": offset, "over": {"error": error, "hint": hint, "is_refused": True}}
+        # its end is looked up before the events: those written before it are then read as well
+        over, is_alive = read_json(self.over), self.is_alive()
+        if events := self.new_events(offset, limit):
+            return {"offset": offset + len(events), "events": condensed(events)}
+        if over:
+            return {"offset": offset, "over": over}
+        if not is_alive and not self.over.exists():
+            text = "the run's process ended without a result: the gateway was switched off, or it was killed"
+            return {"offset": offset, "over": {"error": text, "hint": ""}}
+        return None
 
     def new_events(self, offset: int, limit: int) -> bytes:
         """The complete lines after `offset` (bytes), at most about `limit` bytes."""

@@ -1,29 +1,20 @@
-"""The operator's connection to a site's worker: SSH to the gateway -> `meshctl worker --stdio` -> requests."""
+"""The operator's side of a site's worker: requests, whatever carries them (`ssh_uplink`, `nats_uplink`)."""
 
 from __future__ import annotations
 
 import base64
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from meshctl import __version__
-from meshctl.device.errors import CommandEnded, ConnectionLost
-from meshctl.device.ssh_stream import LineStream
-from meshctl.device.upload import upload
 from meshctl.errors import InputError
-from meshctl.model import Fleet, Site
-from meshctl.nodes.connections import ConnectionPool
-from meshctl.sites.gateway import WORKER_PROGRAM
+from meshctl.model import Site
 from meshctl.sites.order import SignedOrder
-from meshctl.sites.protocol import PROTOCOL, SILENCE_S, decode, encode, raise_error
-
-_FINISH_S = 2.0
-# Of a shell that cannot start a command (POSIX, Shell Command Language, 2.8.2).
-_NOT_THERE = (126, 127)
+from meshctl.sites.protocol import PROTOCOL
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,81 +41,71 @@ class Greeting:
         return next((each for each in self.runs if each.run == run), None)
 
 
-class Uplink:
-    """One worker process at a site. Not shared between threads; `close` may come from any."""
+@dataclass(frozen=True, slots=True)
+class Parcel:
+    """What a site needs to execute an order: the order, and what it names by its hashes. A worker that has planned the
+    run has the rest already."""
 
-    def __init__(self, fleet: Fleet, site: Site, access: ConnectionPool) -> None:
-        """Connect and start the worker. Raises what `ssh.connect` raises, WorkerError and ConnectionLost."""
-        self.site = site
-        self._fleet = fleet
-        self._connection = access.connect_gateway(site)
-        try:
-            self._stream = self._start()
-            self.greeting = self._greet()
-        except BaseException:
-            self._connection.close()
-            raise
+    order: SignedOrder
+    run: str
+    part: bytes = field(default=b"", repr=False)
+    plan: str = field(default="", repr=False)
+    images: Mapping[str, str] = field(default_factory=dict)
 
-    def _start(self) -> LineStream:
-        return self._connection.stream(f"exec {WORKER_PROGRAM} --stdio {self._fleet.name}/{self.site.name}")
 
-    def _greet(self) -> Greeting:
-        try:
-            said = self.ask({"do": "hello"})
-        except CommandEnded as error:
-            if error.exit_status in _NOT_THERE:
-                raise InputError(
-                    f"site {self.site.name}: meshctl is not installed on its gateway {self.site.ssh.host}",
-                    hint=f"run `meshctl sites install {self.site.name}`",
-                ) from error
-            raise
-        if said.get("protocol") != PROTOCOL or said.get("meshctl") != __version__:
-            raise InputError(
-                f"site {self.site.name}: its worker is meshctl {said.get('meshctl')}, here is {__version__}",
-                hint=f"run `meshctl sites install {self.site.name}`",
-            )
-        return Greeting(
-            str(said["meshctl"]),
-            str(said["directory"]),
-            tuple(map(str, said["operators"])),
-            tuple(
-                RemoteRun(
-                    str(each["run"]),
-                    str(each["state"]),
-                    str(each["operator"]),
-                    str(each["command"]),
-                    float(each["began_s"]),
-                )
-                for each in said["runs"]
-            ),
-        )
+class Uplink(ABC):
+    """The connection to the worker of one site. Not shared between threads; `close` may come from any."""
 
+    site: Site
+
+    @property
+    @abstractmethod
+    def greeting(self) -> Greeting:
+        """What the worker said of itself. Raises Unreachable if it has not yet, and does not now."""
+
+    @abstractmethod
     def ask(self, request: Mapping[str, object]) -> dict[str, Any]:
         """Send a request and wait for its reply for as long as the worker is alive. Raises WorkerError."""
-        self._stream.send(encode(request), timeout_s=SILENCE_S)
-        return self._reply()
 
-    def _reply(self) -> dict[str, Any]:
-        return self._reply_on(self._stream)
+    @property
+    @abstractmethod
+    def accepted_keys(self) -> tuple[str, ...]:
+        """The fingerprints of the keys whose orders the worker accepts."""
 
-    def _reply_on(self, stream: LineStream) -> dict[str, Any]:
-        while True:
-            message = decode(stream.receive(timeout_s=SILENCE_S))
-            raise_error(message, self.site.name)
-            reply = message.get("reply")
-            if isinstance(reply, dict):
-                return reply
+    @property
+    def has_contact(self) -> bool:
+        """Whether the worker itself has answered since this uplink was made."""
+        return True
+
+    @abstractmethod
+    def send_images(self, images: Mapping[str, Path]) -> None:
+        """Upload the images (by SHA-256) that the gateway lacks."""
+
+    @abstractmethod
+    def start(self, parcel: Parcel) -> None:
+        """Order a run, once, however often this is repeated."""
+
+    @abstractmethod
+    def follow(self, run: str, offset: int) -> Iterator[dict[str, Any]]:
+        """Replies with events of a run, from `offset` on; the last one has `over`."""
+
+    @abstractmethod
+    def stop(self, run: str) -> bool:
+        """Ask a run to stop, also while another thread follows it; whether it is in progress."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the uplink, and let the worker delete what it planned and was not ordered."""
+
+    def state_of(self, run: str) -> str:
+        """The state of a run as in `runs.RunState`, `waiting` for an order that has not reached its site, or empty for
+        a run that is not known."""
+        there = self.greeting.run(run)
+        return "" if there is None else there.state
 
     def install(self, operators: Sequence[str]) -> str:
         """Let these public keys sign orders; returns the worker's own public key, which it makes if it has none."""
         return str(self.ask({"do": "install", "operators": list(operators)})["public_key"])
-
-    def send_images(self, images: Mapping[str, Path]) -> None:
-        """Upload the images (by SHA-256) that the gateway lacks, resuming an interrupted upload."""
-        if images:
-            missing = self.ask({"do": "images", "sha256": list(images)})["missing"]
-            for sha256 in missing:
-                upload(self._connection, images[sha256], f"{self.greeting.directory}/images/{sha256}")
 
     def plan(
         self,
@@ -156,39 +137,9 @@ class Uplink:
         request = {"do": "status", "run": run, "part": encoded, "nodes": list(nodes), "options": list(options)}
         return str(self.ask(request)["status"])
 
-    def start(self, order: SignedOrder) -> None:
-        self.ask({"do": "start", "order": order.text, "key": order.key, "signature": order.signature})
-
     def has_forgotten(self, run: str) -> bool:
         """Whether the site started a run and has deleted what it knew of it."""
         return bool(self.ask({"do": "forgotten", "run": run})["forgotten"])
-
-    def follow(self, run: str, offset: int) -> Iterator[dict[str, Any]]:
-        """Replies with events of a run, from `offset` on; the last one has `over`."""
-        self._stream.send(encode({"do": "follow", "run": run, "offset": offset}), timeout_s=SILENCE_S)
-        while True:
-            reply = self._reply()
-            yield reply
-            if "over" in reply:
-                return
-
-    def stop(self, run: str) -> bool:
-        """Ask a run to stop, through a worker of its own: this one may be followed by another thread."""
-        with self._start() as stream:
-            stream.send(encode({"do": "stop", "run": run}), timeout_s=SILENCE_S)
-            return bool(self._reply_on(stream)["stopping"])
-
-    def close(self) -> None:
-        """Close the connection, and let the worker delete what it planned and was not ordered."""
-        if self._connection.is_open:
-            with suppress(ConnectionLost):
-                self._stream.send(encode({"do": "finish"}), timeout_s=_FINISH_S)
-        self.abandon()
-
-    def abandon(self) -> None:
-        """Close the connection as if it were lost."""
-        self._stream.close()
-        self._connection.close()
 
     def __enter__(self) -> Uplink:
         return self
@@ -197,3 +148,19 @@ class Uplink:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def greeting_of(said: Mapping[str, Any], site: str) -> Greeting:
+    """The answer to `hello`. Raises InputError for a worker of another version."""
+    if said.get("protocol") != PROTOCOL or said.get("meshctl") != __version__:
+        raise InputError(
+            f"site {site}: its worker is meshctl {said.get('meshctl')}, here is {__version__}",
+            hint=f"run `meshctl sites install {site}`",
+        )
+    runs = (
+        RemoteRun(
+            str(each["run"]), str(each["state"]), str(each["operator"]), str(each["command"]), float(each["began_s"])
+        )
+        for each in said["runs"]
+    )
+    return Greeting(str(said["meshctl"]), str(said["directory"]), tuple(map(str, said["operators"])), tuple(runs))

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import base64
 import binascii
+import hashlib
 import subprocess
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import PurePosixPath
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 from meshctl import __version__
 from meshctl.device.connection import fingerprint_of
 from meshctl.errors import InputError, MeshctlError
 from meshctl.sites import runner
-from meshctl.sites.events import condensed
 from meshctl.sites.order import SignedOrder, operator_keys
 from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, PROTOCOL, WorkerError, decode, encode, error_message
-from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json
+from meshctl.sites.runs import RunDirectory, SiteDirectory
 
 _POLL_S = 0.25
 # How long a plan waits for an order whose uplink was lost.
@@ -31,10 +31,20 @@ LINGER_S = 600.0
 _MAX_ERROR_LINES = 20
 
 
+class ReplyStream(Protocol):
+    """Where replies are written, whole lines. Raises OSError or ValueError once no one reads them."""
+
+    def write(self, data: bytes, /) -> object: ...
+
+    def flush(self) -> None: ...
+
+
 class Worker:
     """Serves one uplink. `environ` is the process environment."""
 
-    def __init__(self, directory: SiteDirectory, environ: Mapping[str, str], requests: BinaryIO, out: BinaryIO) -> None:
+    def __init__(
+        self, directory: SiteDirectory, environ: Mapping[str, str], requests: Iterable[bytes], out: ReplyStream
+    ) -> None:
         self._directory = directory
         self._environ = environ
         self._requests = requests
@@ -93,8 +103,11 @@ class Worker:
                 self._reply(self._status(request))
             case "forgotten":
                 self._reply({"forgotten": self._directory.has_forgotten(str(request["run"]))})
+            case "image":
+                self._reply({"size": self._image(request)})
             case "finish":
                 self._is_finished = True
+                self._finish(tuple(map(str, request.get("runs", ()))))
             case unknown:
                 raise InputError(f"unknown request {unknown!r}", hint="run `meshctl sites install`")
 
@@ -148,6 +161,32 @@ class Worker:
             raise _failure(done)
         return {"status": done.stdout.decode("utf-8", "replace"), "exit": done.returncode}
 
+    def _image(self, request: Mapping[str, Any]) -> int:
+        """Take a piece of a firmware image; returns how much of it is here."""
+        new = self._directory.image(f".{_file_name(request['sha256'])}")
+        new.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        size = new.stat().st_size if new.exists() else 0
+        data = _bytes_of(request["data"])
+        if data and int(request["offset"]) == size:
+            with new.open("ab") as file:
+                file.write(data)
+            size += len(data)
+        if request.get("is_last"):
+            with new.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+            if found != request["sha256"]:
+                new.unlink()
+                raise InputError("the firmware image was damaged on its way", hint="repeat the command")
+            new.replace(self._directory.image(found))
+        return size
+
+    def _finish(self, runs: tuple[str, ...]) -> None:
+        """Delete these plans of an operator who will not order them."""
+        for name in runs:
+            run = self._directory.run(name)
+            if run.inventory.exists() and not run.order.exists() and not run.refused.exists():
+                run.discard()
+
     def _command(self, run: RunDirectory, *words: str) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
             runner.meshctl_command(*words),
@@ -164,25 +203,18 @@ class Worker:
 
     def _follow(self, run: RunDirectory, offset: int) -> None:
         """Send the run's events from `offset` (bytes) on until it is over."""
-        if not run.order.exists():
+        if not run.order.exists() and not run.refused.exists():
             raise InputError(f"run {run.path.name} has not been started at this site")
         while not self._is_lost:
             self._reap()
-            # its end is looked up before the events: those written before it are then read as well
-            over, is_alive = read_json(run.over), run.is_alive()
-            events = run.new_events(offset, MAX_EVENTS_BYTES)
-            if events:
-                offset += len(events)
-                self._reply({"offset": offset, "events": condensed(events)})
-            elif over:
-                self._reply({"offset": offset, "over": over})
-                return
-            elif not is_alive and not run.over.exists():
-                text = "the run's process ended without a result: the gateway was switched off, or it was killed"
-                self._reply({"offset": offset, "over": {"error": text, "hint": ""}})
-                return
-            else:
+            reply = run.next_reply(offset, MAX_EVENTS_BYTES)
+            if reply is None:
                 time.sleep(_POLL_S)
+                continue
+            offset = int(reply["offset"])
+            self._reply(reply)
+            if "over" in reply:
+                return
 
     def _reap(self) -> None:
         self._runners = [each for each in self._runners if each.poll() is None]

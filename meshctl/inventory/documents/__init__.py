@@ -35,7 +35,7 @@ from meshctl.inventory.documents.robot import (
     UdpMeshDocument,
 )
 from meshctl.inventory.documents.root import InventoryDocument
-from meshctl.inventory.documents.site import SiteDocument
+from meshctl.inventory.documents.site import NatsHubDocument, SiteDocument
 
 __all__ = [
     "NOT_WRITTEN",
@@ -50,6 +50,7 @@ __all__ = [
     "LanDocument",
     "LanFilterLayer",
     "MeshDocument",
+    "NatsHubDocument",
     "NodeDocument",
     "NodeLayer",
     "OperatorPartsDocument",

@@ -17,7 +17,7 @@ from meshctl.inventory.documents.robot import (
     TopicDocument,
     UdpMeshDocument,
 )
-from meshctl.inventory.documents.site import SiteDocument
+from meshctl.inventory.documents.site import NatsHubDocument, SiteDocument
 from meshctl.inventory.fields import Country, Name, Text, Version, empty_mapping
 
 _Entry = TypeVar("_Entry")
@@ -58,6 +58,8 @@ class InventoryDocument(Document):
     """Nodes by name; `b[01-12]` expands to twelve."""
     sites: Section[OrEmpty[SiteDocument]] = Field(default_factory=dict)
     """Sites by name, each with a worker for its nodes."""
+    nats: NatsHubDocument | None = None
+    """The NATS server that stores orders for sites."""
     robots: Section[OrEmpty[RobotDocument]] = Field(default_factory=dict)
     """Robots by name."""
     udp_mesh: UdpMeshDocument = Field(default_factory=UdpMeshDocument)

@@ -1,4 +1,4 @@
-"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC136)."""
+"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC137)."""
 
 from __future__ import annotations
 
@@ -157,3 +157,25 @@ def worker_key_invalid(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
                 parse_authorized_key(site.worker_key)
             except BadKey as reason:
                 yield Finding(("sites", name, "worker_key"), "", "an SSH public key", str(reason))
+
+
+@fleet_rule(
+    "MC137",
+    Severity.ERROR,
+    "A site uses NATS, and the fleet has no hub",
+    why="Orders for the site have no server to wait at, so its permanent worker cannot be reached.",
+    fix="Set `nats.url` to the address of the hub, or remove `nats` from the site.",
+    failing=f"""
+    sites: {{north: {{nats: {{}}, worker_key: {_KEY}}}}}
+    defaults: {{site: north}}
+    """,
+    passing=f"""
+    nats: {{url: "tls://hub.example.org:4222"}}
+    sites: {{north: {{nats: {{}}, worker_key: {_KEY}}}}}
+    defaults: {{site: north}}
+    """,
+)
+def nats_without_hub(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for name, site in fleet.sites.items():
+        if site.nats is not None and fleet.nats is None:
+            yield Finding(("sites", name, "nats"), "the fleet has no NATS hub", "`nats.url` in the inventory", "none")

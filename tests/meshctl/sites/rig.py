@@ -95,7 +95,7 @@ class Ended:
 class Started:
     """A meshctl process that is still running; its output goes to a file, which can be read meanwhile."""
 
-    def __init__(self, rig: SitesRig, words: tuple[str, ...], number: int) -> None:
+    def __init__(self, rig: FleetRig, words: tuple[str, ...], number: int) -> None:
         self.out = rig.directory / f"command-{number}.out"
         self._err = rig.directory / f"command-{number}.err"
         with self.out.open("wb") as out, self._err.open("wb") as err:
@@ -122,14 +122,13 @@ class Started:
         return Ended(code, self.out.read_text(), self._err.read_text())
 
 
-class SitesRig:
-    """Use it in a `with` block: the nodes are bootstrapped, the workers installed and accepted by the nodes."""
+class FleetRig:
+    """A virtual fleet, its inventory, and an operator with a home of their own. Use it in a `with` block."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.key = keypair(directory / "operator")
         self.lab = directory / "lab"
-        self.gateway = directory / "gateway"
         self.environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith("MESHCTL_")},
             "MESHCTL_LAB": str(self.lab),
@@ -141,15 +140,13 @@ class SitesRig:
         }
         self.environment.pop("SSH_AUTH_SOCK", None)
         self._count = 0
-        self.sshd = openssh(self.gateway, public(self.key), f"SetEnv MESHCTL_LAB={self.lab}", host_key_type="ed25519")
-        self.uplinks = {site: CuttableUplink(self.sshd.port) for site in SECRETS}
 
     @property
     def inventory(self) -> Path:
         return self.lab / "inventory" / "fleet.yaml"
 
     def site_directory(self, site: str) -> Path:
-        return self.gateway / "root/.local/state/meshctl/sites/mines" / site
+        raise NotImplementedError
 
     def __enter__(self) -> Self:
         try:
@@ -160,20 +157,13 @@ class SitesRig:
         return self
 
     def _set_up(self) -> None:
-        secrets = self.directory / "secrets.yaml"
-        secrets.write_text(json.dumps(SECRETS))
-        secrets.chmod(0o600)
+        raise NotImplementedError
+
+    def start_lab(self, inventory: str) -> None:
         written = self.directory / "inventory"
         written.mkdir()
-        ports = {site: uplink.port for site, uplink in self.uplinks.items()}
-        text = INVENTORY.format(key=public(self.key).read_text().strip(), private=self.key, secrets=secrets, **ports)
-        (written / "fleet.yaml").write_text(text)
+        (written / "fleet.yaml").write_text(inventory)
         self.run("lab", "up", str(written), "--dir", str(self.lab), expected=0)
-        self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
-        self.run("lab", "unplug", expected=0)
-        self.run("sites", "trust", "--yes", expected=0)
-        self.run("sites", "install", "--wheels", str(required_wheels(self.directory / "wheels")), expected=0)
-        self.run("provision", "--direct", "--yes", "--json", expected=0)
 
     def run(self, *words: str, expected: int | None = None) -> Ended:
         ended = self.start(*words).end()
@@ -208,6 +198,41 @@ class SitesRig:
         said = json.loads(self.run("sites", "status", site, "--json", expected=0).out)
         return {run["run"]: run["state"] for run in said[0]["runs"]}
 
+    def close(self) -> None:
+        if (self.lab / "inventory").exists():
+            self.run("lab", "down")
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class SitesRig(FleetRig):
+    """The nodes are bootstrapped, the workers installed over SSH and accepted by the nodes."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(directory)
+        self.gateway = directory / "gateway"
+        self.sshd = openssh(self.gateway, public(self.key), f"SetEnv MESHCTL_LAB={self.lab}", host_key_type="ed25519")
+        self.uplinks = {site: CuttableUplink(self.sshd.port) for site in SECRETS}
+
+    def site_directory(self, site: str) -> Path:
+        return self.gateway / "root/.local/state/meshctl/sites/mines" / site
+
+    def _set_up(self) -> None:
+        secrets = self.directory / "secrets.yaml"
+        secrets.write_text(json.dumps(SECRETS))
+        secrets.chmod(0o600)
+        ports = {site: uplink.port for site, uplink in self.uplinks.items()}
+        key = public(self.key).read_text().strip()
+        self.start_lab(INVENTORY.format(key=key, private=self.key, secrets=secrets, **ports))
+        self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
+        self.run("lab", "unplug", expected=0)
+        self.run("sites", "trust", "--yes", expected=0)
+        self.run("sites", "install", "--wheels", str(required_wheels(self.directory / "wheels")), expected=0)
+        self.run("provision", "--direct", "--yes", "--json", expected=0)
+
     def kill(self, pid_there: int) -> None:
         """Kill a process of a run by its number in the gateway's own process namespace."""
         inside = (path for path in Path("/proc").glob("[0-9]*/status") if _is_worker(path))
@@ -217,16 +242,10 @@ class SitesRig:
                 os.kill(int(numbers[0]), signal.SIGKILL)
 
     def close(self) -> None:
-        if (self.lab / "inventory").exists():
-            self.run("lab", "down")
+        super().close()
         for uplink in self.uplinks.values():
             uplink.close()
         self.sshd.stop()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def _is_worker(status: Path) -> bool:

@@ -1,0 +1,22 @@
+"""The uplink to a site by what the inventory says of it: NATS, or else SSH to its gateway."""
+
+from __future__ import annotations
+
+from meshctl.errors import Unreachable
+from meshctl.model import Fleet, Site
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.sites.nats_uplink import NatsUplink
+from meshctl.sites.ssh_uplink import SshUplink
+from meshctl.sites.uplink import Uplink
+
+
+def open_uplink(fleet: Fleet, site: Site, access: ConnectionPool, *, must_answer: bool = True) -> Uplink:
+    """The uplink; without `must_answer` also to a permanent worker that is offline. Raises Unreachable, InputError."""
+    if site.nats is None:
+        return SshUplink(fleet, site, access)
+    try:
+        return NatsUplink(fleet, site, access, must_answer=must_answer)
+    except Unreachable:
+        if not site.has_gateway:
+            raise
+    return SshUplink(fleet, site, access)

@@ -1,0 +1,353 @@
+"""A connection to a NATS server with JetStream, for threads: nats-py runs in an event loop of its own.
+
+Needs nats-py (the extra `nats`) and nats-server 2.9 or newer. Every error is a MeshctlError; a server or a stream that
+cannot be reached is a `NatsLost`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import ssl
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from meshctl.errors import InputError, Unreachable
+from meshctl.sites.chunks import HEADER, Chunk, chunks_of, parse_chunk
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.js import JetStreamContext
+
+CONNECT_S = 5.0
+# of one exchange with a server
+ANSWER_S = 5.0
+# how often a lost server is tried again
+_RECONNECT_S = 1.0
+_KEEPALIVE_S = 5
+_T = TypeVar("_T")
+
+
+class NatsLost(Unreachable):
+    """The NATS server, or the stream behind it, cannot be reached."""
+
+
+class NoListener(NatsLost):
+    """The server says that no one listens to a subject."""
+
+
+@dataclass(frozen=True, slots=True)
+class NatsServer:
+    """Where a server is, and our credentials there. `name` is what the server lists us as."""
+
+    url: str
+    credentials: Path | None = None
+    ca: Path | None = None
+    name: str = "meshctl"
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMessage:
+    """A message of a stream. `acknowledge` tells the stream to delete it; `later` to deliver it again."""
+
+    subject: str
+    chunk: Chunk
+    acknowledge: Callable[[], None]
+    later: Callable[[float], None]
+
+
+class NatsClient:
+    """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`,
+    unless `waits_at_start` is False: then the first connection must succeed."""
+
+    def __init__(self, server: NatsServer, *, waits_at_start: bool = False) -> None:
+        self._server = server
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, name="nats", daemon=True).start()
+        try:
+            self._client: Client = self._run(self._connect(waits_at_start), None if waits_at_start else CONNECT_S * 2)
+        except BaseException:
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            raise
+
+    async def _connect(self, waits_at_start: bool) -> Client:
+        try:
+            import nats
+            from nats.errors import Error
+        except ImportError as error:
+            raise InputError(
+                f"sites over NATS need nats-py: {error}", hint="pip install 'meshctl-fleet[nats]'"
+            ) from error
+        options: dict[str, Any] = {
+            "name": self._server.name,
+            "connect_timeout": CONNECT_S,
+            "reconnect_time_wait": _RECONNECT_S,
+            "max_reconnect_attempts": -1,
+            "ping_interval": _KEEPALIVE_S,
+            "max_outstanding_pings": 2,
+            # what is sent while the server is away is lost, not sent later by surprise
+            "pending_size": -1,
+            "error_cb": _ignore,
+            "inbox_prefix": b"_INBOX",
+            **_login(self._server.credentials),
+        }
+        if self._server.ca is not None:
+            options["tls"] = _tls(self._server.ca)
+        while True:
+            try:
+                # allow_reconnect would try for ever, and without a word
+                return await asyncio.wait_for(nats.connect(self._server.url, **options), CONNECT_S)
+            except (TimeoutError, Error, OSError) as error:
+                if not waits_at_start:
+                    text = str(error) or f"no answer within {CONNECT_S:g} s"
+                    raise NatsLost(f"NATS server {self._server.url}: {text}", hint=_HINT) from error
+                await asyncio.sleep(_RECONNECT_S)
+
+    def _run(self, work: Coroutine[Any, Any, _T], timeout_s: float | None = ANSWER_S * 2) -> _T:
+        """Run in the event loop, and translate errors."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result(timeout_s)
+        except TimeoutError as error:
+            future.cancel()
+            raise NatsLost(f"NATS server {self._server.url}: no answer", hint=_HINT) from error
+        except BaseException as error:
+            translated = _translated(error, self._server.url)
+            if translated is None:
+                raise
+            raise translated from error
+
+    @property
+    def is_connected(self) -> bool:
+        return bool(self._client.is_connected)
+
+    def _check_connected(self) -> None:
+        if not self.is_connected:
+            raise NatsLost(f"NATS server {self._server.url}: the connection is lost", hint=_HINT)
+
+    def publish(self, subject: str, data: bytes) -> None:
+        """Send a message that is not stored."""
+        self._check_connected()
+        self._run(self._client.publish(subject, data))
+
+    def send_chunks(self, subject: str, message: str, data: bytes, reply: str = "") -> None:
+        """Send a message of any size that is not stored."""
+        self._check_connected()
+        for chunk in chunks_of(message, data):
+            self._run(self._client.publish(subject, chunk.data, reply=reply, headers={HEADER: chunk.header}))
+
+    @contextmanager
+    def listening(self, subject: str) -> Iterator[queue.Queue[Msg]]:
+        """The messages of a subject while the block runs."""
+        received: queue.Queue[Msg] = queue.Queue()
+
+        async def put(message: Msg) -> None:
+            received.put(message)
+
+        subscription = self._run(self._client.subscribe(subject, cb=put))
+        try:
+            self._run(self._client.flush(int(ANSWER_S)))
+            yield received
+        finally:
+            with suppress(Unreachable):
+                self._run(subscription.unsubscribe())
+
+    def new_inbox(self) -> str:
+        return str(self._client.new_inbox())
+
+    def _jetstream(self, domain: str) -> JetStreamContext:
+        return self._client.jetstream(domain=domain or None, timeout=ANSWER_S)
+
+    def ensure_stream(self, domain: str = "", **config: Any) -> None:
+        """Make a stream, unless there is one of this name."""
+        from nats.js.errors import NotFoundError
+
+        async def ensure() -> None:
+            js = self._jetstream(domain)
+            try:
+                await js.stream_info(config["name"])
+            except NotFoundError:
+                await js.add_stream(**config)
+
+        self._check_connected()
+        self._run(ensure())
+
+    def ensure_mirror(self, stream: str, domain: str, **limits: Any) -> None:
+        """Copy a stream of another JetStream domain, under its name, unless that is done already."""
+        from nats.js.api import ExternalStream, StreamSource
+
+        external = ExternalStream(api=f"$JS.{domain}.API", deliver="")
+        self.ensure_stream(name=stream, mirror=StreamSource(name=stream, external=external), **limits)
+
+    def store(self, subject: str, message: str, data: bytes, domain: str = "") -> None:
+        """Store a message in the stream of its subject; the same `message` again changes nothing."""
+
+        async def store() -> None:
+            js = self._jetstream(domain)
+            for chunk in chunks_of(message, data):
+                headers = {HEADER: chunk.header, "Nats-Msg-Id": f"{message}-{chunk.number}"}
+                await js.publish(subject, chunk.data, headers=headers)
+
+        self._check_connected()
+        self._run(store(), None)
+
+    def queued(self, stream: str, subject: str) -> int:
+        """How many messages of a subject a stream has."""
+
+        async def count() -> int:
+            from nats.js.errors import NotFoundError
+
+            js = self._jetstream("")
+            try:
+                info = await js.stream_info(stream, subjects_filter=subject)
+            except NotFoundError:
+                return 0
+            return sum((info.state.subjects or {}).values())
+
+        self._check_connected()
+        return self._run(count())
+
+    def work(self, stream: str, subject: str, domain: str, consumer: str) -> Iterator[StoredMessage]:
+        """The messages of a work queue, forever, whether or not it can be reached."""
+        from nats.errors import Error
+        from nats.js.api import AckPolicy, ConsumerConfig
+
+        async def subscribe() -> JetStreamContext.PullSubscription:
+            config = ConsumerConfig(ack_policy=AckPolicy.EXPLICIT, ack_wait=60, max_ack_pending=1000)
+            return await self._jetstream(domain).pull_subscribe(subject, consumer, stream=stream, config=config)
+
+        async def fetch(subscription: JetStreamContext.PullSubscription) -> list[Msg]:
+            try:
+                return await subscription.fetch(1, timeout=ANSWER_S)
+            except TimeoutError:
+                return []
+
+        subscription = None
+        while not self._loop.is_closed():
+            try:
+                self._check_connected()
+                if subscription is None:
+                    subscription = self._run(subscribe())
+                messages = self._run(fetch(subscription), ANSWER_S * 3)
+            except (Unreachable, Error):
+                subscription = None
+                threading.Event().wait(_RECONNECT_S)
+                continue
+            for message in messages:
+                yield self._stored(message)
+
+    def _stored(self, message: Msg) -> StoredMessage:
+        def acknowledge() -> None:
+            # one that does not arrive lets the message be delivered again, which is harmless
+            with suppress(Unreachable):
+                self._run(message.ack())
+
+        def later(delay_s: float) -> None:
+            with suppress(Unreachable):
+                self._run(message.nak(delay=delay_s))
+
+        try:
+            chunk = parse_chunk((message.headers or {}).get(HEADER, ""), message.data)
+        except ValueError:
+            chunk = Chunk("", 1, 1, message.data)
+        return StoredMessage(message.subject, chunk, acknowledge, later)
+
+    def read(self, stream: str, subject: str, is_ended: Callable[[], bool]) -> Iterator[bytes | None]:
+        """The stored messages of a subject, from the first on, and those that are stored from now on; None whenever
+        none came for a second."""
+        from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
+
+        async def subscribe() -> JetStreamContext.PullSubscription:
+            config = ConsumerConfig(
+                ack_policy=AckPolicy.NONE, deliver_policy=DeliverPolicy.ALL, inactive_threshold=60, mem_storage=True
+            )
+            return await self._jetstream("").pull_subscribe(subject, stream=stream, config=config)
+
+        async def fetch() -> list[Msg]:
+            try:
+                return await subscription.fetch(16, timeout=1)
+            except TimeoutError:
+                return []
+
+        self._check_connected()
+        subscription = self._run(subscribe())
+        try:
+            while not is_ended():
+                self._check_connected()
+                messages = self._run(fetch())
+                if not messages:
+                    yield None
+                for message in messages:
+                    yield message.data
+        finally:
+            with suppress(Unreachable):
+                self._run(subscription.unsubscribe())
+
+    def close(self) -> None:
+        with suppress(Unreachable, TimeoutError):
+            self._run(self._client.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+
+_HINT = "check the address, the credentials and the network; `nats.url` in the inventory"
+
+
+async def _ignore(error: Exception) -> None:
+    """What the client does about it shows in `is_connected`."""
+
+
+def _login(credentials: Path | None) -> dict[str, Any]:
+    if credentials is None:
+        return {}
+    try:
+        text = credentials.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{credentials}: cannot be read: {error.strerror}") from error
+    if "BEGIN NATS USER JWT" in text:
+        return {"user_credentials": str(credentials)}
+    return {"nkeys_seed_str": text.strip()}
+
+
+def _tls(ca: Path) -> ssl.SSLContext:
+    try:
+        return ssl.create_default_context(cafile=str(ca))
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(f"{ca}: not a certificate authority: {error}") from error
+
+
+def _translated(error: BaseException, url: str) -> Unreachable | None:
+    from nats.errors import Error, NoRespondersError
+    from nats.js.errors import APIError
+
+    match error:
+        case NoRespondersError():
+            return NoListener(f"NATS server {url}: no one listens")
+        case APIError():
+            return NatsLost(f"NATS server {url}: {error.description or error}", hint=_HINT)
+        case Error() | asyncio.TimeoutError() | OSError():
+            return NatsLost(f"NATS server {url}: {error}", hint=_HINT)
+        case _:
+            return None
+
+
+def stream_settings(days: int, max_bytes: int) -> dict[str, Any]:
+    """The limits of a stream."""
+    return {"max_age": days * 86_400, "max_bytes": max_bytes, "duplicate_window": 3600}
+
+
+def shared(server: NatsServer) -> NatsClient:
+    """The client of this process for a server. Raises NatsLost."""
+    with _shared_lock:
+        found = _shared.get(server)
+        if found is None:
+            found = _shared[server] = NatsClient(server)
+        return found
+
+
+_shared: dict[NatsServer, NatsClient] = {}
+_shared_lock = threading.Lock()

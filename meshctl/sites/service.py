@@ -1,0 +1,73 @@
+"""The permanent worker of a site as a systemd unit of the gateway's login user, which needs no root."""
+
+from __future__ import annotations
+
+import shlex
+
+from meshctl.device.connection import Connection
+from meshctl.model import NatsHub, SiteNats
+from meshctl.sites.gateway import GATEWAY_ROOT
+
+_TIMEOUT_S = 60.0
+# argv: the unit's name; standard input: the unit
+_START = """
+set -eu
+umask 077
+directory=${XDG_CONFIG_HOME:-$HOME/.config}/systemd/user
+mkdir -p "$directory"
+cat > "$directory/$1"
+command -v systemctl >/dev/null || exit 3
+# without a login session the user's systemd is not in the environment
+export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-/run/user/$(id -u)}"
+loginctl enable-linger 2>/dev/null || echo no-linger
+systemctl --user daemon-reload
+systemctl --user enable --quiet "$1"
+systemctl --user restart "$1"
+"""
+_UNIT = """\
+# Written by `meshctl sites install`.
+[Unit]
+Description=meshctl worker of site {name}
+Documentation=man:meshctl-worker(1)
+
+[Service]
+ExecStart={command}
+Restart=always
+RestartSec=5
+# a run continues while the worker is restarted or updated
+KillMode=process
+
+[Install]
+WantedBy=default.target
+"""
+
+
+def unit_name(fleet: str, site: str) -> str:
+    return f"meshctl-worker-{fleet}-{site}.service"
+
+
+def unit(fleet: str, site: str, nats: SiteNats, hub: NatsHub) -> str:
+    """The text of the unit."""
+    words = [f"%h/{GATEWAY_ROOT}/current/bin/meshctl", "worker", f"{fleet}/{site}"]
+    options = {"--nats": nats.url, "--credentials": nats.credentials, "--ca": nats.ca, "--hub": hub.domain}
+    for option, value in options.items():
+        if value:
+            words += [option, _quoted(value)]
+    return _UNIT.format(name=f"{fleet}/{site}", command=" ".join(words))
+
+
+def _quoted(word: str) -> str:
+    """A word of a command line in a unit, see systemd.service(5)."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    return f'"{escaped}"'
+
+
+def start_service(connection: Connection, name: str, text: str) -> str:
+    """Write the unit and start it, or restart it with a new release; returns what the administrator has to do, if
+    anything."""
+    script = f"printf %s {shlex.quote(text)} | sh -c {shlex.quote(_START)} sh {shlex.quote(name)}"
+    done = connection.run(script, timeout_s=_TIMEOUT_S)
+    if done.exit_status == 0:
+        return "run `loginctl enable-linger` there, as root" if "no-linger" in done.stdout else ""
+    reason = (done.stderr.strip().splitlines() or ["there is no systemd"])[-1]
+    return f"start {name} there ({reason}), or the command in it"

@@ -1,0 +1,125 @@
+"""Permanent workers are reached over a real NATS hub and leaf nodes, whose uplinks are cut.
+
+Each test ends with all nodes as the inventory has them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.meshctl.sites.nats_rig import NatsRig
+from tests.meshctl.sites.rig import NORTH, SECRETS, SOUTH, Ended
+from tests.waiting import until
+
+pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("nats"), pytest.mark.timeout(600)]
+_EVERY = (*NORTH, *SOUTH)
+_PROVISION = ("provision", "--yes", "--json")
+_AT_WORK = '"node": "n[12]", "at_s": [0-9.]*, "text": "apply"'
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NatsRig]:
+    with NatsRig(tmp_path_factory.mktemp("nats")) as started:
+        yield started
+
+
+@pytest.fixture
+def rig(shared: NatsRig) -> NatsRig:
+    for uplink in shared.uplinks.values():
+        uplink.mend()
+    until(lambda: shared.run("sites", "status").code == 0, "both workers to answer", wait_s=120)
+    return shared
+
+
+def _reasons(ended: Ended) -> set[str]:
+    return {event["outcome"]["reason"] for event in ended.events if event["event"] == "finished"}
+
+
+def test_sites_change_over_nats_and_its_servers_get_no_secret(rig: NatsRig) -> None:
+    power_dbm = rig.change_power()
+    done = rig.run(*_PROVISION, expected=0)
+    assert done.results == dict.fromkeys(_EVERY, "done")
+    assert set(rig.powers().values()) == {str(power_dbm)}
+    assert json.loads(rig.run("history", "--json", expected=0).out)[0]["state"] == "4 done"
+    stored = [path.read_bytes() for path in (rig.directory / "nats").rglob("*") if path.is_file()]
+    assert any(b"n-base" in content for content in stored), "the events are in the streams"
+    assert not any(secret.encode() in content for content in stored for secret in SECRETS.values())
+    status = rig.run("sites", "status", "--nodes", expected=0).out
+    assert re.search(r"north  3 ok; meshctl \S+, provision by \S+ .* ago: over", status)
+
+
+def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path) -> None:
+    file = tmp_path / "plan.json"
+    power_dbm = rig.change_power()
+    rig.run("plan", "--out", str(file), "--brief", expected=0)
+    rig.uplinks["south"].cut()
+    until(lambda: rig.run("plan", "site:south").code, "the site to be offline", wait_s=60)
+    assert rig.run("provision", "site:south", "--yes", "--json").results == dict.fromkeys(SOUTH, "unreachable")
+    ordered = rig.run("apply", str(file), "--json")
+    assert ordered.results == {**dict.fromkeys(NORTH, "done"), **dict.fromkeys(SOUTH, "pending")}
+    assert any("site south is offline: the order waits for it until 20" in reason for reason in _reasons(ordered))
+    run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+    waiting = rig.run("resume", str(run), "--yes", "--json")
+    assert any("the order waits for it" in reason for reason in _reasons(waiting))
+    rig.uplinks["south"].mend()
+    until(lambda: list(rig.site_directory("south").glob("runs/*/over.json")), "the end of its run", wait_s=120)
+    until(lambda: rig.run("resume", str(run), "--yes").code == 0, "the operator to know", wait_s=60)
+    outcomes = json.loads(rig.run("history", str(run), "--json", expected=0).out)["outcomes"]
+    assert {outcome["node"]: outcome["result"] for outcome in outcomes} == dict.fromkeys(_EVERY, "done")
+    assert set(rig.powers().values()) == {str(power_dbm)}
+
+
+def test_events_wait_at_the_site_while_its_uplink_is_cut_and_its_worker_killed(rig: NatsRig) -> None:
+    rig.change_power()
+    first = rig.start(*_PROVISION)
+    first.wait_for(_AT_WORK)
+    refused = rig.run("provision", *NORTH, "--yes", "--json")
+    assert refused.code == 1
+    assert all("is in progress at this site" in reason for reason in _reasons(refused)), refused
+    run = rig.started_run("north")
+    rig.uplinks["north"].cut()
+    rig.stop_worker("north")
+    first.wait_for("connecting again, the site continues on its own")
+    until(lambda: (run / "over.json").exists(), "the end of the run at the site", wait_s=120)
+    rig.start_worker("north")
+    until(lambda: (run / "published.json").exists(), "its events in the leaf node", wait_s=60)
+    rig.uplinks["north"].mend()
+    ended = first.end()
+    assert (ended.code, ended.results) == (0, dict.fromkeys(_EVERY, "done"))
+
+
+def test_a_run_whose_operator_died_is_met_again_from_the_hub_alone(rig: NatsRig) -> None:
+    power_dbm = rig.change_power()
+    started = rig.start(*_PROVISION)
+    started.wait_for(_AT_WORK)
+    os.killpg(started.process.pid, signal.SIGKILL)
+    started.process.wait()
+    for site in SECRETS:
+        run = next(path.parent for path in sorted(rig.site_directory(site).glob("runs/*/order.json"), key=_age)[-1:])
+        _await_publication(run)
+    for site in SECRETS:
+        rig.stop_worker(site)
+    met = rig.run("resume", "--yes", expected=0)
+    assert "is finished: nothing to resume" in met.out
+    for site in SECRETS:
+        rig.start_worker(site)
+    assert set(rig.powers().values()) == {str(power_dbm)}
+
+
+def _await_publication(run: Path) -> None:
+    until(lambda: '"is_over": true' in _text(run / "published.json"), "its end to be published", wait_s=120)
+
+
+def _age(path: Path) -> float:
+    return path.stat().st_mtime
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
