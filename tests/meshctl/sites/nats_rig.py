@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from meshctl.sites.runs import SiteDirectory
 from tests.meshctl.device.servers import public
 from tests.meshctl.sites.nats_servers import NatsSites
+from tests.meshctl.sites.recorded_site import MODULE as RECORDED
 from tests.meshctl.sites.rig import INVENTORY, NORTH, SECRETS, SOUTH, FleetRig
-
-_SITES = "sites:\n"
-_DEFAULTS = "defaults:"
 
 
 class NatsRig(FleetRig):
-    """Use it in a `with` block: the nodes are bootstrapped and accept the workers, which run."""
+    """Use it in a `with` block: the nodes are bootstrapped and accept the workers, which run. `recorded` are further
+    sites, with so many nodes each that are recordings; `with_lab` False: only those."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, recorded: Mapping[str, int] | None = None, *, with_lab: bool = True) -> None:
         super().__init__(directory)
-        self.servers = NatsSites(directory / "nats", SECRETS)
+        self.recorded = {site: _names(site, count) for site, count in (recorded or {}).items()}
+        self.real: dict[str, tuple[str, ...]] = {"north": NORTH, "south": SOUTH} if with_lab else {}
+        if not with_lab:
+            self.environment.pop("MESHCTL_LAB")
+        self.servers = NatsSites(directory / "nats", self.nodes)
         self.uplinks = self.servers.uplinks
         self._gateway_environment = {
             **self.environment,
@@ -31,6 +34,11 @@ class NatsRig(FleetRig):
         }
         self._workers: dict[str, subprocess.Popen[bytes]] = {}
 
+    @property
+    def nodes(self) -> dict[str, tuple[str, ...]]:
+        """Site -> its nodes."""
+        return {**self.real, **self.recorded}
+
     def directory_of(self, site: str) -> SiteDirectory:
         return SiteDirectory.of(f"mines/{site}", self._gateway_environment)
 
@@ -38,27 +46,48 @@ class NatsRig(FleetRig):
         return self.directory_of(site).root
 
     def _set_up(self) -> None:
-        operator = public(self.key).read_text().strip()
-        secrets = self.directory / "secrets.yaml"
-        secrets.write_text(json.dumps(SECRETS))
-        secrets.chmod(0o600)
-        ports = dict.fromkeys(SECRETS, 22)
-        text = INVENTORY.format(key=operator, private=self.key, secrets=secrets, **ports)
-        head, _, rest = text.partition(_SITES)
-        _, _, tail = rest.partition(_DEFAULTS)
-        lines = [f"nats: {{url: {self.servers.hub.url}}}", "sites:"]
-        for site in SECRETS:
-            key = self.directory_of(site).install([operator])
-            ssh = f'ssh: {{key_files: ["{self.key}"]}}'
-            lines.append(f"  {site}: {{nats: {{}}, {ssh}, worker_key: {key}}}")
-        self.start_lab(head + "\n".join(lines) + f"\n{_DEFAULTS}{tail}")
-        self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
-        self.run("lab", "unplug", expected=0)
-        for site in SECRETS:
+        if self.real:
+            self.start_lab(self._text(self.real))
+            self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
+            self.run("lab", "unplug", expected=0)
+        self.inventory.parent.mkdir(parents=True, exist_ok=True)
+        if self.recorded:
+            written = self.inventory.read_text() if self.real else ""
+            self.inventory.write_text(_with_lab_keys(self._text(self.nodes), written))
+        for site in self.nodes:
             self.start_worker(site)
 
+    def _text(self, sites: Mapping[str, tuple[str, ...]]) -> str:
+        """The inventory with these sites."""
+        operator = public(self.key).read_text().strip()
+        secrets = self.directory / "secrets.yaml"
+        secrets.write_text(json.dumps(SECRETS | {site: f"a-secret-of-{site}" for site in self.recorded}))
+        secrets.chmod(0o600)
+        text = INVENTORY.format(key=operator, private=self.key, secrets=secrets, **dict.fromkeys(SECRETS, 22))
+        head, _, rest = text.partition("sites:\n")
+        groups, _, nodes = rest.partition("defaults:")[2].partition("nodes:\n")
+        meshes = lines = ""
+        if not self.real:
+            nodes = ""
+            lines = "".join(f"  {site}: {{}}\n" for site in SECRETS)
+        for number, (site, names) in enumerate(sites.items(), 1):
+            key = self.directory_of(site).install([operator])
+            lines += f'  {site}: {{nats: {{}}, ssh: {{key_files: ["{self.key}"]}}, worker_key: {key}}}\n'
+            if site in self.recorded:
+                meshes += (
+                    f"  {site}: {{ssid: {site}, band: 2g, channel: 1, network: 10.{100 + number}.0.0/24, "
+                    f'bssid: "02:ca:fe:01:00:{number:02x}", encryption: psk2+ccmp, '
+                    f"key: {{file: {secrets}, key: {site}}}}}\n"
+                )
+                address = f"address: {{from: 10.{100 + number}.0.1}}"
+                groups += f"  {site}: {{site: {site}, radios: {{radio0: {{mesh: {site}}}}}, {address}}}\n"
+                nodes += f"  {names[0]}: {{role: base, groups: [{site}]}}\n"
+                nodes += f"  {site}-n[01-{len(names) - 1:02}]: {{groups: [{site}]}}\n"
+        return f"{head}{meshes}nats: {{url: {self.servers.hub.url}}}\nsites:\n{lines}defaults:{groups}nodes:\n{nodes}"
+
     def start_worker(self, site: str) -> None:
-        command = [sys.executable, "-m", "meshctl", "worker", f"mines/{site}", "--nats", self.servers.leaves[site].url]
+        program = RECORDED if site in self.recorded else "meshctl"
+        command = [sys.executable, "-m", program, "worker", f"mines/{site}", "--nats", self.servers.leaves[site].url]
         with (self.directory / f"worker-{site}.log").open("ab") as log:
             self._workers[site] = subprocess.Popen(
                 command, env=self._gateway_environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
@@ -81,6 +110,13 @@ class NatsRig(FleetRig):
         self.servers.close()
 
 
-def kill_group(process: subprocess.Popen[bytes]) -> None:
-    os.killpg(process.pid, 9)
-    process.wait()
+def _with_lab_keys(text: str, written: str) -> str:
+    """The inventory with the lines in which the lab has written its keys."""
+    kept = {
+        line.partition(":")[0]: line for line in written.splitlines() if line.startswith(("operators:", "defaults:"))
+    }
+    return "".join(f"{kept.get(line.partition(':')[0], line)}\n" for line in text.splitlines())
+
+
+def _names(site: str, count: int) -> tuple[str, ...]:
+    return (f"{site}-base", *(f"{site}-n{number:02}" for number in range(1, count)))

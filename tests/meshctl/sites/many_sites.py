@@ -1,0 +1,151 @@
+"""The show of many sites: their plans are ordered while uplinks come and go, and every outcome must be right."""
+
+from __future__ import annotations
+
+import json
+import random
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.meshctl.sites.nats_rig import NatsRig
+from tests.meshctl.sites.recorded_site import answers, changes_of
+from tests.waiting import until
+
+# How long an uplink is there, and away.
+UP_S, DOWN_S = (5.0, 20.0), (1.0, 8.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How the show ended: outcomes by result, the number of cuts, and of commands until all was known."""
+
+    outcomes: Counter[str]
+    cuts: int
+    resumes: int
+    seconds: float
+
+
+def run_show(rig: NatsRig, seed: int, *, wait_s: float) -> Ended:
+    """Plan all sites, take some offline, order all, cut uplinks at random, and resume until every outcome is known.
+
+    Raises AssertionError for a wrong outcome: one that is not what happened at the site, a node that was changed twice,
+    a run that was executed twice.
+    """
+    rng = random.Random(seed)
+    power_dbm = str(rig.change_power())
+    file = rig.directory / "plan.json"
+    until(lambda: _plans_all(rig, file), "the plans of all sites", wait_s=wait_s)
+    offline = rng.sample(sorted(rig.nodes), max(1, len(rig.nodes) // 8))
+    for site in offline:
+        rig.uplinks[site].cut()
+    began_s = time.monotonic()
+    with cutting(rig, [site for site in rig.nodes if site not in offline], rng) as cuts:
+        ordered = rig.run("apply", str(file), "--json")
+        assert ordered.code in (0, 1, 3), ordered
+        for site in offline:
+            rig.uplinks[site].mend()
+        run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+        resumes = 0
+        until(lambda: all(_runs(rig, site) == ["over"] for site in rig.nodes), "the runs of all sites", wait_s=wait_s)
+        while not _knows_all(rig, run):
+            assert time.monotonic() - began_s < wait_s, "the operator does not get to know how the runs ended"
+            rig.run("resume", str(run), "--yes", "--json")
+            resumes += 1
+    outcomes = _outcomes(rig, run)
+    _check(rig, outcomes, power_dbm)
+    return Ended(Counter(outcomes.values()), len(cuts), resumes, time.monotonic() - began_s)
+
+
+def _plans_all(rig: NatsRig, file: Path) -> bool:
+    return rig.run("plan", "--out", str(file), "--brief").code == 0
+
+
+def _runs(rig: NatsRig, site: str) -> list[str]:
+    """The states of the runs that the site was ordered."""
+    states = (state.state for state in rig.directory_of(site).runs())
+    return [state for state in states if state != "prepared"]
+
+
+def _outcomes(rig: NatsRig, run: int) -> dict[str, str]:
+    found = json.loads(rig.run("history", str(run), "--json", expected=0).out)["outcomes"]
+    return {outcome["node"]: outcome["result"] for outcome in found}
+
+
+def _knows_all(rig: NatsRig, run: int) -> bool:
+    return "pending" not in _outcomes(rig, run).values()
+
+
+def _check(rig: NatsRig, outcomes: Mapping[str, str], power_dbm: str) -> None:
+    for site, nodes in rig.nodes.items():
+        at_site = _ended(next(rig.site_directory(site).glob("runs/*/events")))
+        assert {name: outcomes[name] for name in nodes} == at_site, site
+    for site, nodes in rig.recorded.items():
+        state = rig.directory_of(site).state
+        for name in nodes:
+            expected = ("done", [power_dbm]) if answers(name) else ("unreachable", [])
+            assert (outcomes[name], changes_of(state, name)) == expected, name
+    if rig.real:
+        assert set(rig.powers().values()) == {power_dbm}
+
+
+def _ended(events: Path) -> dict[str, str]:
+    """The outcomes in the last event of a site's run."""
+    last = json.loads(events.read_text().splitlines()[-1])
+    return {outcome["node"]: outcome["result"] for outcome in last["outcomes"]}
+
+
+@contextmanager
+def cutting(rig: NatsRig, sites: list[str], rng: random.Random) -> Iterator[list[str]]:
+    """Cut the uplinks of these sites at random while the block runs; yields the sites that were cut, in order."""
+    cuts: list[str] = []
+    done = threading.Event()
+
+    def cut() -> None:
+        next_s = {site: time.monotonic() + rng.uniform(*UP_S) for site in sites}
+        is_up = dict.fromkeys(sites, True)
+        while not done.wait(0.1):
+            for site in sites:
+                if time.monotonic() < next_s[site]:
+                    continue
+                is_up[site] = not is_up[site]
+                if is_up[site]:
+                    rig.uplinks[site].mend()
+                else:
+                    rig.uplinks[site].cut()
+                    cuts.append(site)
+                next_s[site] = time.monotonic() + rng.uniform(*(UP_S if is_up[site] else DOWN_S))
+
+    cutter = threading.Thread(target=cut)
+    cutter.start()
+    try:
+        yield cuts
+    finally:
+        done.set()
+        cutter.join()
+        for site in sites:
+            rig.uplinks[site].mend()
+
+
+def main() -> None:
+    """`python -m tests.meshctl.sites.many_sites RECORDED_SITES NODES_EACH [SEED]`: the show, with two sites of virtual
+    nodes."""
+    sites, nodes = map(int, sys.argv[1:3])
+    seed = int(sys.argv[3]) if len(sys.argv) > 3 else 1
+    recorded = {f"s{number:02}": nodes for number in range(1, sites + 1)}
+    with tempfile.TemporaryDirectory(prefix="sites-") as scratch, NatsRig(Path(scratch), recorded) as rig:
+        ended = run_show(rig, seed, wait_s=2400)
+    counted = ", ".join(f"{count} {result}" for result, count in ended.outcomes.most_common())
+    sys.stdout.write(
+        f"{sites + 2} sites: {counted}; {ended.cuts} cuts, {ended.resumes} times resumed, {ended.seconds:.0f} s\n"
+    )
+
+
+if __name__ == "__main__":
+    main()

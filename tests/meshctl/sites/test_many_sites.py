@@ -1,0 +1,35 @@
+"""Many sites over NATS whose uplinks come and go: a small show in every run of the tests, the large one as a proof."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.meshctl.sites.many_sites import run_show
+from tests.meshctl.sites.nats_rig import NatsRig
+
+pytestmark = [pytest.mark.xdist_group("nats")]
+_SEED = 1
+
+
+def _names(count: int) -> list[str]:
+    return [f"s{number:02}" for number in range(1, count + 1)]
+
+
+@pytest.mark.timeout(600)
+def test_four_sites_of_five_nodes_end_right(tmp_path: Path) -> None:
+    with NatsRig(tmp_path, dict.fromkeys(_names(4), 5), with_lab=False) as rig:
+        ended = run_show(rig, _SEED, wait_s=400)
+    assert ended.outcomes.total() == 20
+
+
+@pytest.mark.lab
+@pytest.mark.proof
+@pytest.mark.timeout(3600)
+def test_forty_sites_of_fifty_nodes_end_right(tmp_path: Path) -> None:
+    """Two sites of virtual nodes, the others of recorded ones."""
+    with NatsRig(tmp_path, dict.fromkeys(_names(38), 50)) as rig:
+        ended = run_show(rig, _SEED, wait_s=2400)
+    assert ended.outcomes.total() == 38 * 50 + 4
+    assert ended.cuts > 38
