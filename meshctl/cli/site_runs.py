@@ -6,7 +6,6 @@ time, in one run of the journal. `meet` finds out how the sites' parts of an ear
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
@@ -14,7 +13,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +37,15 @@ from meshctl.cli.plan_execution import (
 )
 from meshctl.cli.saved_site_plans import SavedSitePlans, Unplanned, check_placement, dump_site_plans
 from meshctl.cli.site_files import replaced_by
+from meshctl.cli.site_orders import LateReplaced, expiry, signed_order
 from meshctl.errors import ExitCode, InputError, MeshctlError, Unreachable
 from meshctl.fleet import Event, EventKind, Outcome, Result, totals
 from meshctl.fleet.journal import Run, RunRecord
-from meshctl.fleet.process import owner
-from meshctl.nodes.site_gateways import gateway_credentials
 from meshctl.plan import NodePlan, Plan, Verdict
 from meshctl.plan.saved import dump
 from meshctl.sites.bundle import SiteBundle, site_bundle
 from meshctl.sites.dispatch import SiteExecution, SitePlan, SiteRun, by_site, prepare_sites
-from meshctl.sites.order import Order, images_sha256, sign_order
-from meshctl.sites.runs import PREPARED_S
-from meshctl.sites.uplink import Parcel
+from meshctl.sites.envelope import ReplyKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +238,12 @@ def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
 def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) -> typer.Exit:
     """Execute all plans in one run; returns the exit to raise."""
     runs = {site.site.name: site.run for site in plan.sites if _is_to_start(site)}
-    orders = {site.run: _order(opened, site, options) for site in plan.sites if _is_to_start(site)}
+    keys = {site.run: ReplyKey.new() for site in plan.sites if site.is_queued}
+    orders = {
+        site.run: signed_order(opened, site, options.command, options.rate_kb_s, keys.get(site.run))
+        for site in plan.sites
+        if _is_to_start(site)
+    }
     stages = [] if plan.direct is None else [[stage.kind.value, *stage.nodes] for stage in plan.direct.plan.stages]
     undoes = {} if options.undoes is None else {"undoes": options.undoes}
     recorded = json.dumps({"choices": asdict(options.choices), "stages": stages, "sites": runs, **undoes})
@@ -252,6 +252,8 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
         opened, options.command, plan.names, changing=changing, plan=recorded, as_json=options.as_json
     ) as run:
         save_before(opened, run, plan.changing, plan.replaced)
+        late = LateReplaced(opened, run.entry)
+        late.expect(keys)
         _finish_others(opened, plan, run)
         site_runs = [
             SiteRun(
@@ -260,12 +262,12 @@ def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) ->
                 site.nodes,
                 parcel=orders[site.run],
                 uplink=site.uplink,
-                waits_until=_expiry(opened, site) if site.is_queued else "",
+                waits_until=expiry(opened, site) if site.is_queued else "",
             )
             for site in plan.sites
             if _is_to_start(site)
         ]
-        execution = SiteExecution(opened.fleet, opened.access, run.entry, run.progress, opened.interrupt)
+        execution = SiteExecution(opened.fleet, opened.access, run.entry, run.progress, opened.interrupt, late.keep)
         with ThreadPoolExecutor(1, "sites") as pool:
             at_sites = pool.submit(execution.execute, site_runs)
             if plan.direct is not None:
@@ -301,41 +303,6 @@ def change_everywhere(
 
 def _is_to_start(site: SitePlan) -> bool:
     return site.saved is not None and not site.saved.plan.refusal and not site.saved.plan.is_empty
-
-
-def _order(opened: Session, site: SitePlan, options: RunOptions) -> Parcel:
-    assert site.uplink is not None, "a site with a plan has an uplink"
-    assert site.bundle is not None, "a site with a plan has a bundle"
-    plan_sha256 = hashlib.sha256(site.text.encode()).hexdigest()
-    now_s = time.time()
-    order = Order(
-        opened.fleet.name,
-        site.site.name,
-        site.run,
-        options.command,
-        owner(),
-        plan_sha256,
-        site.bundle.sha256,
-        options.rate_kb_s,
-        now_s,
-        now_s + _lifetime_s(opened, site) if site.site.nats is not None else None,
-        images_sha256(site.bundle.images),
-    )
-    accepted = site.uplink.accepted_keys
-    access = opened.access
-    credentials = gateway_credentials(opened.fleet, site.site, access.key_files, use_agent=access.use_agent)
-    signed = sign_order(order, credentials, accepted)
-    return Parcel(signed, site.run, site.bundle.archive, site.text, site.bundle.images)
-
-
-def _lifetime_s(opened: Session, site: SitePlan) -> float:
-    """How long an order waits for its site: one that was online is expected back soon."""
-    assert opened.fleet.nats is not None, "a site with `nats` and a plan has a hub"
-    return opened.fleet.nats.order_hours * 3600.0 if site.is_queued else PREPARED_S
-
-
-def _expiry(opened: Session, site: SitePlan) -> str:
-    return datetime.fromtimestamp(time.time() + _lifetime_s(opened, site), UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def _finish_others(opened: Session, plan: WholePlan, run: JournaledRun) -> None:
@@ -383,7 +350,10 @@ def meet(opened: Session, record: RunRecord, *, as_json: bool) -> bool:
     if not as_json:
         echo(f"run {record.id}: asking {', '.join(run.site.name for run in runs)} how it ended")
     with progress_for(len(names), as_json=as_json) as progress, opened.interrupt.on_signals(progress.stopping):
-        SiteExecution(opened.fleet, opened.access, entry, progress, opened.interrupt).execute(runs)
+        execution = SiteExecution(
+            opened.fleet, opened.access, entry, progress, opened.interrupt, LateReplaced(opened, entry).keep
+        )
+        execution.execute(runs)
     entry.end(str(totals(opened.journal.outcomes(record.id))))
     if opened.interrupt.stopping:
         echo_error("interrupted before it was known")

@@ -163,6 +163,8 @@ class SiteExecution:
     entry: Run
     observer: Observer
     interrupt: Interrupt
+    # takes what a run replaces that was ordered while its site was offline, sealed
+    keep_replaced: Callable[[SiteRun, str], None]
 
     def execute(self, runs: Sequence[SiteRun]) -> dict[str, Outcome]:
         """Start (or follow) all runs and stay with them until each is over, or the operator leaves."""
@@ -280,6 +282,12 @@ class SiteExecution:
             if outcome.node in run.nodes and run.outcomes.get(outcome.node) != outcome:
                 run.outcomes[outcome.node] = outcome
                 self.entry.finish_node(outcome)
+        if "replaced" in reply:
+            try:
+                self.keep_replaced(run, str(reply["replaced"]))
+            except MeshctlError as error:
+                # a full disk must not hide how the run ended
+                self._note(f"site {run.site.name}: {error}: `meshctl rollback` will not be possible there")
         run.offset = int(str(reply["offset"]))
         over = reply.get("over")
         if isinstance(over, Mapping):

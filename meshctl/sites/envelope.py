@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -107,6 +108,15 @@ def sealed_for_reply(data: bytes, recipient: str) -> bytes:
         return bytes(pyrage.encrypt(data, [pyrage.x25519.Recipient.from_str(recipient)]))
     except (pyrage.RecipientError, pyrage.EncryptError) as error:
         raise EnvelopeRefused(f"not a key for replies: {error}") from error
+
+
+def opened_replaced(text: str, key: ReplyKey) -> dict[str, Any]:
+    """Node -> what a run replaced on it, from the message `replaced` of a run. Raises EnvelopeRefused."""
+    try:
+        found = json.loads(zlib.decompress(opened_reply(base64.b64decode(text, validate=True), key)))
+    except (ValueError, zlib.error, binascii.Error) as error:
+        raise EnvelopeRefused(f"a damaged message: {error}") from error
+    return found if isinstance(found, dict) else {}
 
 
 def opened_reply(data: bytes, key: ReplyKey) -> bytes:

@@ -184,6 +184,8 @@ class NatsUplink(Uplink):
         subject, stream = self._subjects.order(parcel.run), self._subjects.order_stream
         limits = stream_settings(KEPT_DAYS, MAX_ORDERS_BYTES)
         self._client.ensure_stream(name=stream, subjects=[self._subjects.orders], retention="workqueue", **limits)
+        # not to be deleted when this uplink is closed: the order may be on its way
+        self._planned = [run for run in self._planned if run != parcel.run]
         if self._client.queued(stream, subject):
             return
         order = parcel.order

@@ -48,7 +48,7 @@ from meshctl.sites.order import (
 from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, encode
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json, write_json
 from meshctl.sites.subjects import SiteSubjects
-from meshctl.sites.worker import Worker
+from meshctl.sites.worker import Worker, run_command
 
 if TYPE_CHECKING:
     import subprocess
@@ -224,6 +224,11 @@ class NatsWorker:
             )
         run.create(part, {path: self.directory.image(sha256) for path, sha256 in images.items()})
         run.plan.write_text(str(message["plan"]), encoding="utf-8")
+        if order.reply_to:
+            options = ["-i", str(run.inventory), *runner.key_options(self.directory)]
+            run_command(self.directory, run, self.environ, "apply", str(run.plan), "--dry-run", "--json", *options)
+            replaced = json.dumps(run.taken_replaced()).encode()
+            run.replaced.write_bytes(sealed_for_reply(zlib.compress(replaced), order.reply_to))
 
     # -- events
 
@@ -247,26 +252,26 @@ class NatsWorker:
             return
         state = read_json(run.published)
         offset = int(state.get("offset", 0))
+        if not state and run.replaced.exists():
+            replaced = base64.b64encode(run.replaced.read_bytes()).decode()
+            self._store(run, "replaced", {"end": 0, "replaced": replaced})
         while not state.get("is_over"):
             with self._starting:
                 reply = run.next_reply(offset, MAX_EVENTS_BYTES)
             if reply is None:
                 return
-            name = run.path.name
-            value = {
-                "fleet": self.directory.fleet,
-                "site": self.directory.site,
-                "run": name,
-                "end": reply["offset"],
-                **{key: each for key, each in reply.items() if key != "offset"},
-            }
-            # the same again, of a worker that was killed in between, is dropped by the server
-            mark = "over" if "over" in reply else str(offset)
-            self.client.store(self._subjects.run(name), f"{name}-{mark}", signed(EVENTS, value, self.sign))
+            value = {"end": reply["offset"], **{key: each for key, each in reply.items() if key != "offset"}}
+            self._store(run, "over" if "over" in reply else str(offset), value)
             offset = int(reply["offset"])
             state = {"offset": offset, "is_over": "over" in reply}
             write_json(run.published, state)
         self._published.add(run.path.name)
+
+    def _store(self, run: RunDirectory, mark: str, value: Mapping[str, object]) -> None:
+        """Store a message of a run; the same `mark` again, of a worker that was killed, is dropped by the server."""
+        name = run.path.name
+        whole = {"fleet": self.directory.fleet, "site": self.directory.site, "run": name, **value}
+        self.client.store(self._subjects.run(name), f"{name}-{mark}", signed(EVENTS, whole, self.sign))
 
 
 class _Replies:

@@ -12,6 +12,7 @@ runs/RUN/order.json  the signed order; a run without one was only prepared
 runs/RUN/refused.json why a stored order was not executed, instead
 runs/RUN/events      the run's events, one JSON object a line
 runs/RUN/over.json   how the run ended
+runs/RUN/replaced.age what a run replaces that was ordered while its site was offline, sealed for the operator
 runs/RUN/published.json  how much of that is in the leaf node's stream
 """
 
@@ -214,6 +215,10 @@ class RunDirectory:
     @property
     def refused(self) -> Path:
         return self.path / "refused.json"
+
+    @property
+    def replaced(self) -> Path:
+        return self.path / "replaced.age"
 
     @property
     def published(self) -> Path:

@@ -188,13 +188,7 @@ class Worker:
                 run.discard()
 
     def _command(self, run: RunDirectory, *words: str) -> subprocess.CompletedProcess[bytes]:
-        return subprocess.run(
-            runner.meshctl_command(*words),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            env=runner.environment(self._directory, run, self._environ),
-            check=False,
-        )
+        return run_command(self._directory, run, self._environ, *words)
 
     def _start(self, request: Mapping[str, Any]) -> dict[str, object]:
         signed = SignedOrder(str(request["order"]), str(request["key"]), str(request["signature"]))
@@ -235,6 +229,19 @@ class Worker:
         while not self._is_lost:
             time.sleep(BEAT_S)
             self._send({"beat": BEAT_S})
+
+
+def run_command(
+    directory: SiteDirectory, run: RunDirectory, environ: Mapping[str, str], *words: str
+) -> subprocess.CompletedProcess[bytes]:
+    """Run a command of meshctl at the site, with the inventory of a run."""
+    return subprocess.run(
+        runner.meshctl_command(*words),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        env=runner.environment(directory, run, environ),
+        check=False,
+    )
 
 
 def _bytes_of(text: object) -> bytes:

@@ -74,6 +74,12 @@ def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path)
     outcomes = json.loads(rig.run("history", str(run), "--json", expected=0).out)["outcomes"]
     assert {outcome["node"]: outcome["result"] for outcome in outcomes} == dict.fromkeys(_EVERY, "done")
     assert set(rig.powers().values()) == {str(power_dbm)}
+    # what the site replaced has come with its events
+    rolled_back = rig.run("rollback", str(run), "--yes", "--json", expected=0)
+    assert rolled_back.results == dict.fromkeys(_EVERY, "done")
+    assert str(power_dbm) not in rig.powers().values()
+    stored = [path.read_bytes() for path in (rig.directory / "nats").rglob("*") if path.is_file()]
+    assert not any(secret.encode() in content for content in stored for secret in SECRETS.values())
 
 
 def test_events_wait_at_the_site_while_its_uplink_is_cut_and_its_worker_killed(rig: NatsRig) -> None:
