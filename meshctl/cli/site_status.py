@@ -38,6 +38,8 @@ class SiteStatus:
     greeting: Greeting | None = None
     error: MeshctlError | None = None
     nodes: dict[str, Any] = field(default_factory=dict)
+    # the runs whose orders wait for the site at the hub
+    waiting: tuple[str, ...] = ()
 
     @property
     def exit_code(self) -> ExitCode:
@@ -50,12 +52,15 @@ def look(opened: Session, inventory: Path, sites: tuple[Site, ...], *, with_node
     """Ask all sites at the same time."""
 
     def ask(site: Site) -> SiteStatus:
+        waiting: tuple[str, ...] = ()
         try:
-            with open_uplink(opened.fleet, site, opened.access) as uplink:
+            with open_uplink(opened.fleet, site, opened.access, must_answer=False) as uplink:
+                waiting = uplink.waiting()
+                greeting = uplink.greeting
                 nodes = _nodes(opened, inventory, site, uplink) if with_nodes else {}
-                return SiteStatus(site, uplink.greeting, nodes=nodes)
+                return SiteStatus(site, greeting, nodes=nodes, waiting=waiting)
         except MeshctlError as error:
-            return SiteStatus(site, error=error)
+            return SiteStatus(site, error=error, waiting=waiting)
 
     with ThreadPoolExecutor(min(MAX_SITES_AT_ONCE, len(sites)), "site") as pool:
         return list(pool.map(ask, sites))
@@ -96,13 +101,20 @@ def _lines(status: SiteStatus) -> Iterator[str]:
         yield str(status.error)
         if status.error is not None and status.error.hint:
             yield f"hint: {status.error.hint}"
+        yield from _waiting_lines(status)
         return
     run = next((each for each in status.greeting.runs if each.state != "prepared"), None)
     last = "no run yet"
     if run is not None:
         last = f"{run.command} by {run.operator} {duration(max(0.0, time.time() - run.began_s))} ago: {run.state}"
     yield f"{_counts(status.nodes)}meshctl {status.greeting.version}, {last}"
+    yield from _waiting_lines(status)
     yield from _alarm_lines(status.nodes)
+
+
+def _waiting_lines(status: SiteStatus) -> Iterator[str]:
+    for run in status.waiting:
+        yield f"the order of run {run} waits; `meshctl sites cancel {status.site.name} {run}` deletes it"
 
 
 def _counts(nodes: dict[str, Any]) -> str:
@@ -128,7 +140,7 @@ def _alarm_lines(nodes: dict[str, Any]) -> Iterator[str]:
 def as_object(status: SiteStatus) -> dict[str, object]:
     if status.greeting is None:
         error = status.error or MeshctlError("no answer")
-        return {"site": status.site.name, "error": str(error), "hint": error.hint}
+        return {"site": status.site.name, "error": str(error), "hint": error.hint, "waiting": list(status.waiting)}
     runs = [
         {
             "run": each.run,
@@ -144,5 +156,6 @@ def as_object(status: SiteStatus) -> dict[str, object]:
         "meshctl": status.greeting.version,
         "operators": list(status.greeting.operators),
         "runs": runs,
+        "waiting": list(status.waiting),
         **({"status": status.nodes} if status.nodes else {}),
     }

@@ -28,6 +28,7 @@ from meshctl.model import Site
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.site_gateways import PIN_PREFIX
 from meshctl.sites.gateway import Gateway, WorkerRelease, build_release, download_wheels, install, probe
+from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.service import start_service, unit, unit_name
 from meshctl.sites.ssh_uplink import SshUplink
 
@@ -184,6 +185,30 @@ def _write_key(inventory: Path, site: str, public_key: str) -> None:
         echo(f"{site}: worker_key written to {change.file}")
     echo(f"{site}: provision its nodes once more without the worker, so that they accept the key:")
     echo(f"  meshctl provision site:{site} --direct")
+
+
+@app.command("cancel")
+def cancel_command(
+    site: Annotated[str, typer.Argument(help="Name of the site.")],
+    run: Annotated[str, typer.Argument(help="The run, as `meshctl sites status` shows it.")],
+    inventory: InventoryPath = Path(),
+    key: KeyFiles = None,
+    lab: Lab = None,
+) -> None:
+    """Delete an order that waits for a site over NATS, before the site fetches it.
+
+    Exit code: 0 deleted, 1 no such order waits: the site may have fetched it.
+
+    Example: meshctl sites cancel north 0123456789abcdef
+    """
+    with session(inventory, key_files=key or (), lab=lab) as opened:
+        (selected,) = selected_sites(opened, [site])
+        with NatsUplink(opened.fleet, selected, opened.access, must_answer=False) as uplink:
+            if uplink.cancel(run):
+                echo(f"{site}: the order of run {run} is deleted; nothing was changed")
+                return
+    echo(f"{site}: no order of run {run} waits: the site has fetched it, or it was never given")
+    raise typer.Exit(ExitCode.FINDINGS)
 
 
 @app.command("trust")

@@ -222,7 +222,10 @@ class SiteExecution:
                 state = run.uplink.state_of(run.run)
             except SiteOffline:
                 if run.parcel is None:
-                    raise
+                    text = f"site {run.site.name} is offline and has not reported how run {run.run} ended"
+                    self._finish_all(run, Result.PENDING, text, "run `meshctl resume` later")
+                    run.is_over = True
+                    return
                 state = ""
             if state == "waiting" and (run.parcel is None or run.waits_until):
                 self._finish_waiting(run)

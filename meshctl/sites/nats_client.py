@@ -10,7 +10,7 @@ import asyncio
 import queue
 import ssl
 import threading
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Generator, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,16 +68,23 @@ class NatsClient:
     def __init__(self, server: NatsServer, *, waits_at_start: bool = False) -> None:
         self._server = server
         self._loop = asyncio.new_event_loop()
-        threading.Thread(target=self._loop.run_forever, name="nats", daemon=True).start()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
+        self._thread.start()
         try:
             self._client: Client = self._run(self._connect(waits_at_start), None if waits_at_start else CONNECT_S * 2)
         except BaseException:
-            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._end_loop()
             raise
+
+    def _end_loop(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.run_until_complete(_cancel_all())
+        self._loop.close()
 
     async def _connect(self, waits_at_start: bool) -> Client:
         try:
-            import nats
+            from nats.aio.client import Client
             from nats.errors import Error
         except ImportError as error:
             raise InputError(
@@ -99,10 +106,14 @@ class NatsClient:
         if self._server.ca is not None:
             options["tls"] = _tls(self._server.ca)
         while True:
+            client = Client()
             try:
-                # allow_reconnect would try for ever, and without a word
-                return await asyncio.wait_for(nats.connect(self._server.url, **options), CONNECT_S)
+                # by itself it would try for ever, and without a word
+                await asyncio.wait_for(client.connect(self._server.url, **options), CONNECT_S)
+                return client
             except (TimeoutError, Error, OSError) as error:
+                with suppress(Error, OSError):
+                    await client.close()
                 if not waits_at_start:
                     text = str(error) or f"no answer within {CONNECT_S:g} s"
                     raise NatsLost(f"NATS server {self._server.url}: {text}", hint=_HINT) from error
@@ -110,6 +121,9 @@ class NatsClient:
 
     def _run(self, work: Coroutine[Any, Any, _T], timeout_s: float | None = ANSWER_S * 2) -> _T:
         """Run in the event loop, and translate errors."""
+        if self._loop.is_closed():
+            work.close()
+            raise NatsLost(f"NATS server {self._server.url}: the connection was closed")
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
@@ -198,19 +212,29 @@ class NatsClient:
 
     def queued(self, stream: str, subject: str) -> int:
         """How many messages of a subject a stream has."""
+        return sum(self.subjects(stream, subject).values())
 
-        async def count() -> int:
+    def subjects(self, stream: str, subject: str = ">") -> dict[str, int]:
+        """The subjects of a stream that match, with the number of their messages; none without such a stream."""
+
+        async def count() -> dict[str, int]:
             from nats.js.errors import NotFoundError
 
-            js = self._jetstream("")
             try:
-                info = await js.stream_info(stream, subjects_filter=subject)
+                info = await self._jetstream("").stream_info(stream, subjects_filter=subject)
             except NotFoundError:
-                return 0
-            return sum((info.state.subjects or {}).values())
+                return {}
+            return dict(info.state.subjects or {})
 
         self._check_connected()
         return self._run(count())
+
+    def purge(self, stream: str, subject: str) -> int:
+        """Delete the messages of a subject; how many there were."""
+        found = self.queued(stream, subject)
+        if found:
+            self._run(self._jetstream("").purge_stream(stream, subject=subject))
+        return found
 
     def work(self, stream: str, subject: str, domain: str, consumer: str) -> Iterator[StoredMessage]:
         """The messages of a work queue, forever, whether or not it can be reached."""
@@ -257,7 +281,7 @@ class NatsClient:
             chunk = Chunk("", 1, 1, message.data)
         return StoredMessage(message.subject, chunk, acknowledge, later)
 
-    def read(self, stream: str, subject: str, is_ended: Callable[[], bool]) -> Iterator[bytes | None]:
+    def read(self, stream: str, subject: str, is_ended: Callable[[], bool]) -> Generator[bytes | None, None, None]:
         """The stored messages of a subject, from the first on, and those that are stored from now on; None whenever
         none came for a second."""
         from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
@@ -291,10 +315,18 @@ class NatsClient:
     def close(self) -> None:
         with suppress(Unreachable, TimeoutError):
             self._run(self._client.close())
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._end_loop()
 
 
 _HINT = "check the address, the credentials and the network; `nats.url` in the inventory"
+
+
+async def _cancel_all() -> None:
+    """Cancel the other tasks of the loop."""
+    left = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in left:
+        task.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
 
 
 async def _ignore(error: Exception) -> None:

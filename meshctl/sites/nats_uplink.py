@@ -14,7 +14,7 @@ import secrets
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -201,6 +201,15 @@ class NatsUplink(Uplink):
         # pieces of two attempts, which are sealed differently, do not fit together
         self._client.store(subject, f"{parcel.run}-{secrets.token_hex(4)}", data)
 
+    def cancel(self, run: str) -> bool:
+        """Delete an order that waits at the hub; whether there was one."""
+        return self._client.purge(self._subjects.order_stream, self._subjects.order(run)) > 0
+
+    def waiting(self) -> tuple[str, ...]:
+        """The runs whose orders wait at the hub."""
+        subjects = self._client.subjects(self._subjects.order_stream)
+        return tuple(sorted(subject.rpartition(".")[2] for subject in subjects))
+
     def state_of(self, run: str) -> str:
         if self._client.queued(self._subjects.run_stream, self._subjects.run(run)):
             return "in progress"
@@ -213,8 +222,9 @@ class NatsUplink(Uplink):
         limits = stream_settings(KEPT_DAYS, MAX_EVENTS_BYTES)
         self._client.ensure_mirror(stream, self._nats.domain, **limits)
         heard_s = time.monotonic()
-        with self._client.listening(self._subjects.beat) as beats:
-            for data in self._client.read(stream, self._subjects.run(run), lambda: self._is_closed):
+        messages = self._client.read(stream, self._subjects.run(run), lambda: self._is_closed)
+        with self._client.listening(self._subjects.beat) as beats, closing(messages):
+            for data in messages:
                 if data is None and beats.empty():
                     self._check_heard(heard_s)
                     continue

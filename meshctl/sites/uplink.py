@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from meshctl import __version__
 from meshctl.errors import InputError
@@ -97,6 +97,10 @@ class Uplink(ABC):
     def close(self) -> None:
         """End the uplink, and let the worker delete what it planned and was not ordered."""
 
+    def waiting(self) -> tuple[str, ...]:
+        """The runs whose orders have not reached the site."""
+        return ()
+
     def state_of(self, run: str) -> str:
         """The state of a run as in `runs.RunState`, `waiting` for an order that has not reached its site, or empty for
         a run that is not known."""
@@ -141,7 +145,7 @@ class Uplink(ABC):
         """Whether the site started a run and has deleted what it knew of it."""
         return bool(self.ask({"do": "forgotten", "run": run})["forgotten"])
 
-    def __enter__(self) -> Uplink:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

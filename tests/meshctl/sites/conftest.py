@@ -4,4 +4,5 @@ from __future__ import annotations
 
 from tests.meshctl.sites.nats_servers import expects_nats
 
-collect_ignore = [] if expects_nats() else ["test_sites_over_nats.py", "test_many_sites.py"]
+_NEED_SERVER = ["test_many_sites.py", "test_nats_authorization.py", "test_sites_over_nats.py"]
+collect_ignore = [] if expects_nats() else _NEED_SERVER

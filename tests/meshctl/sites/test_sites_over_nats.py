@@ -56,9 +56,10 @@ def test_sites_change_over_nats_and_its_servers_get_no_secret(rig: NatsRig) -> N
 
 
 def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path) -> None:
-    file = tmp_path / "plan.json"
+    file, of_south = tmp_path / "plan.json", tmp_path / "south.json"
     power_dbm = rig.change_power()
     rig.run("plan", "--out", str(file), "--brief", expected=0)
+    rig.run("plan", *SOUTH, "--out", str(of_south), "--brief", expected=0)
     rig.uplinks["south"].cut()
     until(lambda: rig.run("plan", "site:south").code, "the site to be offline", wait_s=60)
     assert rig.run("provision", "site:south", "--yes", "--json").results == dict.fromkeys(SOUTH, "unreachable")
@@ -66,18 +67,27 @@ def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path)
     assert ordered.results == {**dict.fromkeys(NORTH, "done"), **dict.fromkeys(SOUTH, "pending")}
     assert any("site south is offline: the order waits for it until 20" in reason for reason in _reasons(ordered))
     run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+    (waiting_run,) = json.loads(rig.run("sites", "status", "south", "--json").out)[0]["waiting"]
+    canceled = rig.run("sites", "cancel", "south", waiting_run, expected=0)
+    assert "nothing was changed" in canceled.out
+    assert rig.run("sites", "cancel", "south", waiting_run).code == 1
+    after = rig.run("resume", str(run), "--yes", "--json")
+    assert any("is offline and has not reported" in reason for reason in _reasons(after)), after
+    rig.run("apply", str(of_south), "--json")
+    run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
     waiting = rig.run("resume", str(run), "--yes", "--json")
     assert any("the order waits for it" in reason for reason in _reasons(waiting))
     rig.uplinks["south"].mend()
     until(lambda: list(rig.site_directory("south").glob("runs/*/over.json")), "the end of its run", wait_s=120)
     until(lambda: rig.run("resume", str(run), "--yes").code == 0, "the operator to know", wait_s=60)
     outcomes = json.loads(rig.run("history", str(run), "--json", expected=0).out)["outcomes"]
-    assert {outcome["node"]: outcome["result"] for outcome in outcomes} == dict.fromkeys(_EVERY, "done")
+    assert {outcome["node"]: outcome["result"] for outcome in outcomes} == dict.fromkeys(SOUTH, "done")
     assert set(rig.powers().values()) == {str(power_dbm)}
     # what the site replaced has come with its events
     rolled_back = rig.run("rollback", str(run), "--yes", "--json", expected=0)
-    assert rolled_back.results == dict.fromkeys(_EVERY, "done")
-    assert str(power_dbm) not in rig.powers().values()
+    assert rolled_back.results == dict.fromkeys(SOUTH, "done")
+    powers = rig.powers()
+    assert {name for name, power in powers.items() if power == str(power_dbm)} == set(NORTH)
     stored = [path.read_bytes() for path in (rig.directory / "nats").rglob("*") if path.is_file()]
     assert not any(secret.encode() in content for content in stored for secret in SECRETS.values())
 
