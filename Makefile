@@ -39,6 +39,7 @@ $(VENV)-docs/.ready: pyproject.toml
 # real radios.
 proof: setup
 	scripts/setup-ros
+	scripts/setup-nats
 	$(BIN)/pytest -m proof
 
 # `make bench QUICK=1` runs only the most informative cells. DDS is left out where ROS 2's wheels cannot be installed.

@@ -21,7 +21,7 @@ from meshctl.errors import ExitCode, MeshctlError, Unreachable
 from meshctl.model import Site
 from meshctl.report.duration import duration
 from meshctl.sites.bundle import site_bundle
-from meshctl.sites.connect import open_uplink
+from meshctl.sites.connect import open_uplink, waiting_orders
 from meshctl.sites.dispatch import MAX_SITES_AT_ONCE, new_run_id
 from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Greeting, Uplink
@@ -54,11 +54,10 @@ def look(opened: Session, inventory: Path, sites: tuple[Site, ...], *, with_node
     def ask(site: Site) -> SiteStatus:
         waiting: tuple[str, ...] = ()
         try:
-            with open_uplink(opened.fleet, site, opened.access, must_answer=False) as uplink:
-                waiting = uplink.waiting()
-                greeting = uplink.greeting
+            waiting = waiting_orders(opened.fleet, site, opened.access)
+            with open_uplink(opened.fleet, site, opened.access) as uplink:
                 nodes = _nodes(opened, inventory, site, uplink) if with_nodes else {}
-                return SiteStatus(site, greeting, nodes=nodes, waiting=waiting)
+                return SiteStatus(site, uplink.greeting, nodes=nodes, waiting=waiting)
         except MeshctlError as error:
             return SiteStatus(site, error=error, waiting=waiting)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -18,12 +17,6 @@ def worker(
         bool, typer.Option("--stdio", help="Answer an operator's requests on standard input and output.")
     ] = False,
     nats: Annotated[str, typer.Option("--nats", metavar="URL", help="Serve permanently at this NATS leaf node.")] = "",
-    credentials: Annotated[
-        Path | None, typer.Option("--credentials", metavar="FILE", help="Credentials there: .creds or an nkey seed.")
-    ] = None,
-    ca: Annotated[
-        Path | None, typer.Option("--ca", metavar="FILE", help="Certificate authority of the leaf node.")
-    ] = None,
     hub: Annotated[str, typer.Option("--hub", metavar="DOMAIN", help="JetStream domain of the hub.")] = "hub",
     execute: Annotated[
         str, typer.Option("--execute", metavar="RUN", help="Execute a run that was ordered, to its end.")
@@ -42,18 +35,18 @@ def worker(
     if sum((stdio, bool(execute), bool(nats))) != 1:
         raise InputError("expected --stdio, --nats URL or --execute RUN", hint="`meshctl provision` starts it")
     if nats:
-        _serve_nats(site, nats, credentials, ca, hub)
+        _serve_nats(site, nats, hub)
         return
     if execute:
         raise typer.Exit(serving.execute(site, execute, os.environ))
     serving.serve(site, os.environ, sys.stdin.buffer, sys.stdout.buffer)
 
 
-def _serve_nats(site: str, url: str, credentials: Path | None, ca: Path | None, hub: str) -> None:
+def _serve_nats(site: str, url: str, hub: str) -> None:
     from meshctl.sites.nats_client import NatsClient, NatsServer
     from meshctl.sites.nats_worker import NatsWorker
     from meshctl.sites.runs import SiteDirectory
 
     directory = SiteDirectory.of(site, os.environ)
-    server = NatsServer(url, credentials, ca, f"meshctl worker {site}")
+    server = NatsServer(url, name=f"meshctl worker {site}")
     NatsWorker(directory, os.environ, NatsClient(server, waits_at_start=True), hub).serve()

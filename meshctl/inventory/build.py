@@ -327,8 +327,7 @@ def _other_computer(document: OtherComputerDocument) -> Computer:
 def _site(name: str, document: SiteDocument) -> Site:
     nats = None
     if document.nats is not None:
-        there = document.nats
-        nats = SiteNats(there.domain or name, there.url, there.credentials, there.ca)
+        nats = SiteNats(document.nats.domain or name, document.nats.url)
     return Site(name, _computer_ssh(document.ssh), document.worker_key, nats)
 
 

@@ -33,13 +33,10 @@ class NatsHub:
 
 @dataclass(frozen=True, slots=True)
 class SiteNats:
-    """The NATS leaf node of a site: `url`, `credentials` and `ca` as its worker there uses them, its JetStream
-    `domain`."""
+    """The NATS leaf node of a site: `url` as its worker there uses it, and its JetStream `domain`."""
 
     domain: str
     url: str = "nats://127.0.0.1:4222"
-    credentials: str = ""
-    ca: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,3 +20,14 @@ def open_uplink(fleet: Fleet, site: Site, access: ConnectionPool, *, must_answer
         if not site.has_gateway:
             raise
     return SshUplink(fleet, site, access)
+
+
+def waiting_orders(fleet: Fleet, site: Site, access: ConnectionPool) -> tuple[str, ...]:
+    """The runs whose orders wait for the site at the hub; none if the hub cannot be asked. Raises InputError."""
+    if site.nats is None:
+        return ()
+    try:
+        with NatsUplink(fleet, site, access, must_answer=False) as uplink:
+            return uplink.waiting()
+    except Unreachable:
+        return ()

@@ -185,7 +185,8 @@ def _tree(folder: Path, name: str) -> Iterator[TarMember]:
 
 
 def requirements(extra: str = "") -> tuple[str, ...]:
-    """What meshctl itself requires, as in its package's metadata, and one of its extras."""
+    """What meshctl itself requires, as in its package's metadata, and what one of its extras does, without extras of
+    that: they are for operators."""
     found: list[str] = []
     for line in distribution(_DISTRIBUTION).requires or ():
         requirement, _, marker = line.partition(";")
@@ -193,7 +194,7 @@ def requirements(extra: str = "") -> tuple[str, ...]:
         if named is None:
             found.append(line)
         elif named[1] == extra:
-            found.append(requirement.strip())
+            found.append(re.sub(r"\[[^]]*\]", "", requirement).strip())
     return tuple(found)
 
 

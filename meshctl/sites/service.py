@@ -49,10 +49,7 @@ def unit_name(fleet: str, site: str) -> str:
 def unit(fleet: str, site: str, nats: SiteNats, hub: NatsHub) -> str:
     """The text of the unit."""
     words = [f"%h/{GATEWAY_ROOT}/current/bin/meshctl", "worker", f"{fleet}/{site}"]
-    options = {"--nats": nats.url, "--credentials": nats.credentials, "--ca": nats.ca, "--hub": hub.domain}
-    for option, value in options.items():
-        if value:
-            words += [option, _quoted(value)]
+    words += ["--nats", _quoted(nats.url), "--hub", _quoted(hub.domain)]
     return _UNIT.format(name=f"{fleet}/{site}", command=" ".join(words))
 
 

@@ -97,10 +97,6 @@ class Uplink(ABC):
     def close(self) -> None:
         """End the uplink, and let the worker delete what it planned and was not ordered."""
 
-    def waiting(self) -> tuple[str, ...]:
-        """The runs whose orders have not reached the site."""
-        return ()
-
     def state_of(self, run: str) -> str:
         """The state of a run as in `runs.RunState`, `waiting` for an order that has not reached its site, or empty for
         a run that is not known."""

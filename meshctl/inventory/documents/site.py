@@ -29,10 +29,6 @@ class SiteNatsDocument(Document):
 
     url: Line = "nats://127.0.0.1:4222"
     """Its address on the gateway."""
-    credentials: Line = ""
-    """File on the gateway with the worker's credentials: a `.creds` file or an nkey seed."""
-    ca: Line = ""
-    """Certificate authority of the leaf node, a PEM file on the gateway."""
     domain: Name = ""
     """JetStream domain of the leaf node; default: the site's name."""
 
