@@ -5,7 +5,7 @@ from __future__ import annotations
 from meshctl.errors import Unreachable
 from meshctl.model import Fleet, Site
 from meshctl.nodes.connections import ConnectionPool
-from meshctl.sites.nats_uplink import NatsUplink
+from meshctl.sites.nats_uplink import NatsUplink, SiteOffline
 from meshctl.sites.ssh_uplink import SshUplink
 from meshctl.sites.uplink import Uplink
 
@@ -16,10 +16,14 @@ def open_uplink(fleet: Fleet, site: Site, access: ConnectionPool, *, must_answer
         return SshUplink(fleet, site, access)
     try:
         return NatsUplink(fleet, site, access, must_answer=must_answer)
-    except Unreachable:
+    except Unreachable as error:
         if not site.has_gateway:
             raise
-    return SshUplink(fleet, site, access)
+        offline = error
+    try:
+        return SshUplink(fleet, site, access)
+    except Unreachable as error:
+        raise SiteOffline(f"{offline}; over SSH: {error}", hint=offline.hint) from error
 
 
 def waiting_orders(fleet: Fleet, site: Site, access: ConnectionPool) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import queue
+import re
 import ssl
 import threading
 from collections.abc import Callable, Coroutine, Generator, Iterator
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from meshctl.errors import InputError, Unreachable
+from meshctl.errors import InputError, MeshctlError, Unreachable
 from meshctl.sites.chunks import HEADER, Chunk, chunks_of, parse_chunk
 
 if TYPE_CHECKING:
@@ -62,8 +63,8 @@ class StoredMessage:
 
 
 class NatsClient:
-    """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`,
-    unless `waits_at_start` is False: then the first connection must succeed."""
+    """`close` ends it. A connection that is lost is made again in the background; meanwhile everything is `NatsLost`.
+    The first one is `NatsLost`, too, if it fails; with `waits_at_start` it is tried until it succeeds."""
 
     def __init__(self, server: NatsServer, *, waits_at_start: bool = False) -> None:
         self._server = server
@@ -87,9 +88,7 @@ class NatsClient:
             from nats.aio.client import Client
             from nats.errors import Error
         except ImportError as error:
-            raise InputError(
-                f"sites over NATS need nats-py: {error}", hint="pip install 'meshctl-fleet[nats]'"
-            ) from error
+            raise _not_installed(error) from error
         options: dict[str, Any] = {
             "name": self._server.name,
             "connect_timeout": CONNECT_S,
@@ -111,6 +110,9 @@ class NatsClient:
                 # by itself it would try for ever, and without a word
                 await asyncio.wait_for(client.connect(self._server.url, **options), CONNECT_S)
                 return client
+            except ImportError as error:
+                # nats-py needs nkeys for credentials
+                raise _not_installed(error) from error
             except (TimeoutError, Error, OSError) as error:
                 with suppress(Error, OSError):
                     await client.close()
@@ -318,6 +320,7 @@ class NatsClient:
         self._end_loop()
 
 
+_SEED = re.compile(r"SU[A-Z2-7]{56}")
 _HINT = "check the address, the credentials and the network; `nats.url` in the inventory"
 
 
@@ -333,6 +336,10 @@ async def _ignore(error: Exception) -> None:
     """What the client does about it shows in `is_connected`."""
 
 
+def _not_installed(error: ImportError) -> InputError:
+    return InputError(f"sites over NATS need nats-py: {error}", hint="pip install 'meshctl-fleet[nats]'")
+
+
 def _login(credentials: Path | None) -> dict[str, Any]:
     if credentials is None:
         return {}
@@ -342,6 +349,8 @@ def _login(credentials: Path | None) -> dict[str, Any]:
         raise InputError(f"{credentials}: cannot be read: {error.strerror}") from error
     if "BEGIN NATS USER JWT" in text:
         return {"user_credentials": str(credentials)}
+    if not _SEED.fullmatch(text.strip()):
+        raise InputError(f"{credentials}: expected a .creds file or the seed of a user's nkey (SU...)")
     return {"nkeys_seed_str": text.strip()}
 
 
@@ -353,6 +362,8 @@ def _tls(ca: Path) -> ssl.SSLContext:
 
 
 def _translated(error: BaseException, url: str) -> Unreachable | None:
+    if isinstance(error, MeshctlError):
+        return None
     from nats.errors import Error, NoRespondersError
     from nats.js.errors import APIError
 

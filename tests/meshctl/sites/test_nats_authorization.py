@@ -16,6 +16,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from meshctl.errors import InputError
 from meshctl.sites.nats_client import NatsClient, NatsLost, NatsServer, stream_settings
 from meshctl.sites.subjects import SiteSubjects
 from tests.meshctl.monitor.prometheus_program import free_tcp_port
@@ -129,6 +130,15 @@ def test_orders_and_events_pass_and_a_site_cannot_delete_orders(servers: Servers
         assert next(data for data in read if data is not None) == b"event"
     operator.close()
     site.close()
+
+
+def test_a_file_that_has_no_credentials_is_named(servers: Servers, tmp_path: Path) -> None:
+    file = tmp_path / "operator.nk"
+    with pytest.raises(InputError, match=r"operator.nk: cannot be read"):
+        servers.at_hub(file, servers.ca)
+    file.write_text("password\n")
+    with pytest.raises(InputError, match=r"expected a .creds file or the seed"):
+        servers.at_hub(file, servers.ca)
 
 
 @pytest.mark.parametrize(("has_key", "has_ca"), [(False, True), (True, False)])
