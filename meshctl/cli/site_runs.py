@@ -186,6 +186,8 @@ def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:
         show(plan.direct.plan, opened.fleet, brief=brief)
     for site in plan.sites:
         echo(f"site {site.site.name}:")
+        if site.is_queued:
+            echo("  offline: an order would wait for it; what still applies of its plan is found out there")
         if site.saved is not None:
             show(site.saved.plan, opened.fleet, brief=brief)
         if site.error is not None:

@@ -204,6 +204,8 @@ class SiteExecution:
                 self._close(run)
         if not run.is_over:
             text = f"site {run.site.name} continues on its own"
+            if run.site.nats is not None:
+                text += ", or its order still waits for it"
             if not run.is_started:
                 text = "it has not started, or the uplink was lost just then"
             self._finish_all(run, Result.PENDING, text, "run `meshctl resume` to see how it ended")
