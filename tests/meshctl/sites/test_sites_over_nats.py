@@ -88,6 +88,7 @@ def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path)
     assert rolled_back.results == dict.fromkeys(SOUTH, "done")
     powers = rig.powers()
     assert {name for name, power in powers.items() if power == str(power_dbm)} == set(NORTH)
+    rig.run(*_PROVISION, expected=0)
     stored = [path.read_bytes() for path in (rig.directory / "nats").rglob("*") if path.is_file()]
     assert not any(secret.encode() in content for content in stored for secret in SECRETS.values())
 
