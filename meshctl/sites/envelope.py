@@ -21,6 +21,7 @@ from meshctl.device.authentication import is_signed_by
 from meshctl.device.connection import fingerprint_of
 from meshctl.device.trust import HostKey, parse_key
 from meshctl.errors import InputError
+from meshctl.sites.chunks import MAX_MESSAGE_BYTES
 
 # Signs data: the public key as `TYPE BASE64`, and the signature.
 Signer = Callable[[bytes], tuple[str, bytes]]
@@ -102,6 +103,19 @@ def opened_by_worker(data: bytes, private_key: bytes) -> bytes:
         raise EnvelopeRefused(f"a message that is not sealed for this worker: {error}") from error
 
 
+def inflated(data: bytes) -> bytes:
+    """What was compressed, if it is no larger than a message may be: nothing proves yet who sent it. Raises
+    EnvelopeRefused."""
+    stream = zlib.decompressobj()
+    try:
+        found = stream.decompress(data, MAX_MESSAGE_BYTES)
+    except zlib.error as error:
+        raise EnvelopeRefused(f"a damaged message: {error}") from error
+    if not stream.eof:
+        raise EnvelopeRefused(f"a message that is cut, or larger than {MAX_MESSAGE_BYTES >> 20} MiB")
+    return found
+
+
 def sealed_for_reply(data: bytes, recipient: str) -> bytes:
     """Raises EnvelopeRefused."""
     try:
@@ -113,8 +127,8 @@ def sealed_for_reply(data: bytes, recipient: str) -> bytes:
 def opened_replaced(text: str, key: ReplyKey) -> dict[str, Any]:
     """Node -> what a run replaced on it, from the message `replaced` of a run. Raises EnvelopeRefused."""
     try:
-        found = json.loads(zlib.decompress(opened_reply(base64.b64decode(text, validate=True), key)))
-    except (ValueError, zlib.error, binascii.Error) as error:
+        found = json.loads(inflated(opened_reply(base64.b64decode(text, validate=True), key)))
+    except (ValueError, binascii.Error) as error:
         raise EnvelopeRefused(f"a damaged message: {error}") from error
     return found if isinstance(found, dict) else {}
 

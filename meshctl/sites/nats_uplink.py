@@ -33,6 +33,7 @@ from meshctl.sites.envelope import (
     REQUEST,
     EnvelopeRefused,
     ReplyKey,
+    inflated,
     opened_reply,
     sealed_for_worker,
     signed,
@@ -141,8 +142,8 @@ class NatsUplink(Uplink):
                     whole = assembler.add(parse_chunk(headers.get(HEADER, ""), message.data))
                     if whole is None:
                         continue
-                    value = verified(REPLY, zlib.decompress(opened_reply(whole, key)), (self._worker,), "the worker")
-                except (EnvelopeRefused, ValueError, zlib.error):
+                    value = verified(REPLY, inflated(opened_reply(whole, key)), (self._worker,), "the worker")
+                except (EnvelopeRefused, ValueError):
                     # not from the worker: anyone who may publish there can send it
                     continue
                 if value.get("nonce") != nonce:

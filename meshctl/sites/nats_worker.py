@@ -30,6 +30,7 @@ from meshctl.sites.envelope import (
     REPLY,
     REQUEST,
     EnvelopeRefused,
+    inflated,
     opened_by_worker,
     sealed_for_reply,
     signed,
@@ -131,7 +132,7 @@ class NatsWorker:
 
     def _answer(self, data: bytes, message: Msg) -> None:
         try:
-            value = verified(REQUEST, _inflated(self._opened(data)), self._operators(), "an operator")
+            value = verified(REQUEST, inflated(self._opened(data)), self._operators(), "an operator")
             if (value["fleet"], value["site"]) != (self.directory.fleet, self.directory.site):
                 raise EnvelopeRefused(f"a request for {value['fleet']}/{value['site']}")
             request, nonce, reply_to = dict(value["request"]), str(value["nonce"]), str(value["reply_to"])
@@ -189,7 +190,7 @@ class NatsWorker:
 
     def _execute(self, data: bytes) -> None:
         """Start the run of an order, or record why not. Raises MeshctlError for one that is no operator's."""
-        message = json.loads(_inflated(self._opened(data)))
+        message = json.loads(inflated(self._opened(data)))
         signed_order = SignedOrder(str(message["order"]), str(message["key"]), str(message["signature"]))
         fleet, site = self.directory.fleet, self.directory.site
         order = checked_order(signed_order, self._operators(), fleet=fleet, site=site)
@@ -304,13 +305,6 @@ class _Replies:
 
     def flush(self) -> None:
         """Each line is sent as it is written."""
-
-
-def _inflated(data: bytes) -> bytes:
-    try:
-        return zlib.decompress(data)
-    except zlib.error as error:
-        raise EnvelopeRefused(f"a damaged message: {error}") from error
 
 
 def _log(text: str) -> None:

@@ -16,12 +16,13 @@ from meshctl.device.connection import Credentials, fingerprint_of
 from meshctl.device.trust import parse_key
 from meshctl.errors import InputError
 from meshctl.sites import runner
-from meshctl.sites.chunks import MAX_CHUNK_BYTES, Assembler, chunks_of, parse_chunk
+from meshctl.sites.chunks import MAX_CHUNK_BYTES, MAX_MESSAGE_BYTES, Assembler, chunks_of, parse_chunk
 from meshctl.sites.envelope import (
     EVENTS,
     REQUEST,
     EnvelopeRefused,
     ReplyKey,
+    inflated,
     opened_reply,
     sealed_for_reply,
     sealed_for_worker,
@@ -169,6 +170,13 @@ def test_a_reply_is_read_with_the_key_of_its_request_alone() -> None:
         sealed_for_reply(b"", "age1none")
     with pytest.raises(InputError):
         sealed_for_worker(b"", "ecdsa-sha2-nistp256 AAAA")
+
+
+def test_a_small_message_that_would_fill_the_memory_is_refused() -> None:
+    assert inflated(zlib.compress(b"a request")) == b"a request"
+    for data in (zlib.compress(bytes(MAX_MESSAGE_BYTES + 1)), zlib.compress(b"a request")[:-4], b"not compressed"):
+        with pytest.raises(EnvelopeRefused):
+            inflated(data)
 
 
 def test_a_message_is_put_together_from_its_pieces_in_any_order() -> None:
