@@ -267,10 +267,14 @@ class TestTemplates:
             self.render(tmp_path, "config system\n", "batman_adv/etc/config/system.j2")
 
     def test_operator_templates_may_be_inside_the_template_folder(self, tmp_path: Path) -> None:
-        (tmp_path / "templates/ours").mkdir(parents=True)
+        own = tmp_path / "templates/ours/etc/motd.j2"
+        own.parent.mkdir(parents=True)
+        own.write_text("ours\n")
         parts = OperatorParts(templates="templates/ours", base=str(tmp_path))
         fleet = fleets.fleet(meshes=(fleets.mesh(operator_parts=parts),), base=str(tmp_path))
-        assert render_node(fleet, NAME, fleets.secrets).package("network")
+        file = render_node(fleet, NAME, fleets.secrets).file("etc/motd")
+        assert file is not None
+        assert file.content == b"ours\n"
 
     def test_the_operator_template_folder_must_exist(self, tmp_path: Path) -> None:
         mesh: Any = fleets.mesh()
