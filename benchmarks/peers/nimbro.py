@@ -147,13 +147,6 @@ class _Transport:
 
     @asynccontextmanager
     async def receiver(self, on_message: Callable[[bytes], None]) -> AsyncIterator[None]:
-        messages = Reassembly()
-
-        def take(datagram: bytes) -> None:
-            whole = messages.add(datagram)
-            if whole is not None:
-                on_message(whole)
-
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             try:
                 while True:
@@ -165,7 +158,8 @@ class _Transport:
                 # the sender has ended, or this end is closing
                 writer.transport.abort()
 
-        async with receiving(PORT, take), await asyncio.start_server(serve, port=PORT, limit=1 << 20):
+        datagrams_received = receiving(PORT, Reassembly().add, on_message)
+        async with datagrams_received, await asyncio.start_server(serve, port=PORT, limit=1 << 20):
             yield
 
 

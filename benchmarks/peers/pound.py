@@ -122,14 +122,7 @@ class _Transport:
 
     @asynccontextmanager
     async def receiver(self, on_message: Callable[[bytes], None]) -> AsyncIterator[None]:
-        messages = Reassembly()
-
-        def take(datagram: bytes) -> None:
-            whole = messages.add(datagram)
-            if whole is not None:
-                on_message(whole)
-
-        async with receiving(PORT, take):
+        async with receiving(PORT, Reassembly().add, on_message):
             yield
 
 
