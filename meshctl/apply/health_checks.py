@@ -8,12 +8,13 @@ are heard (`_neighbors`) and the base is reachable (`_base`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 
 from meshctl.device.observation import Observation
 from meshctl.plan import DesiredState
+from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.plan.seen import address_options
 from meshctl.topology import NEIGHBOUR_FRESH_MS
@@ -138,20 +139,9 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
     if expected.wireless is None or after.links is None:
         return ()
     problems = []
-    for iface, device in _enabled(expected.wireless):
+    for iface, device in enabled_interfaces(expected.wireless):
         problems += _radio(iface, device.get("channel"), after)
     return tuple(problems)
-
-
-def _enabled(wireless: Package | None) -> Iterator[tuple[Section, Section]]:
-    """Each enabled wifi-iface with its wifi-device."""
-    if wireless is None:
-        return
-    devices = {section.name: section for section in wireless.of_type("wifi-device")}
-    for iface in wireless.of_type("wifi-iface"):
-        device = devices.get(iface.get("device"))
-        if device is not None and "1" not in (device.get("disabled", "0"), iface.get("disabled", "0")):
-            yield iface, device
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
@@ -181,7 +171,7 @@ def _batman(expected: Expectation, after: Observation) -> tuple[str, ...]:
     states = {state.name: state for state in after.interfaces or ()}
     hard = None if after.mesh is None else after.mesh.hard_interfaces
     problems = []
-    for iface, _ in _enabled(expected.wireless):
+    for iface, _ in enabled_interfaces(expected.wireless):
         section = None if expected.network is None else expected.network.section(iface.get("network"))
         if section is None or section.get("proto") != "batadv_hardif":
             continue

@@ -5,7 +5,7 @@ wireless + network packages -> `cells` -> one `Cell` per radio; `differences` li
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 
 from meshctl.uci import Package, Section
@@ -36,18 +36,22 @@ class Cell:
 
 def cells(wireless: Package | None, network: Package | None) -> dict[str, Cell]:
     """Radio section -> its configured cell. A radio that is disabled, or not in a mesh mode, has none."""
-    found: dict[str, Cell] = {}
+    return {
+        device.name: _cell(device, iface, _routing_algo(network, iface.get("network")))
+        for iface, device in enabled_interfaces(wireless)
+        if device.name is not None and iface.get("mode") in ("adhoc", "mesh")
+    }
+
+
+def enabled_interfaces(wireless: Package | None) -> Iterator[tuple[Section, Section]]:
+    """Each wifi-iface that is enabled, with its wifi-device, which is enabled, too."""
     if wireless is None:
-        return found
+        return
     devices = {section.name: section for section in wireless.of_type("wifi-device")}
     for iface in wireless.of_type("wifi-iface"):
         device = devices.get(iface.get("device"))
-        if device is None or device.name is None or iface.get("mode") not in ("adhoc", "mesh"):
-            continue
-        if "1" in (device.get("disabled", "0"), iface.get("disabled", "0")):
-            continue
-        found[device.name] = _cell(device, iface, _routing_algo(network, iface.get("network")))
-    return found
+        if device is not None and "1" not in (device.get("disabled", "0"), iface.get("disabled", "0")):
+            yield iface, device
 
 
 def _cell(device: Section, iface: Section, routing: str) -> Cell:
