@@ -2,7 +2,7 @@
 
 A request is signed by an operator's SSH key and sealed (age) for the worker's, which is in the inventory. A reply is
 signed by the worker's key and sealed for a key that the operator made for this request. Events of a run have no
-secrets: they are signed and not sealed, so that every operator can read them.
+secrets: they are signed and not sealed, so that every operator can read them. What is sealed is compressed before.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def verified(purpose: bytes, data: bytes, accepted: Iterable[HostKey], who: str)
 def sealed_for_worker(data: bytes, worker_key: str) -> bytes:
     """Raises InputError for a key that cannot be sealed for."""
     try:
-        return bytes(pyrage.encrypt(data, [pyrage.ssh.Recipient.from_str(worker_key)]))
+        return bytes(pyrage.encrypt(zlib.compress(data), [pyrage.ssh.Recipient.from_str(worker_key)]))
     except (pyrage.RecipientError, pyrage.EncryptError) as error:
         raise InputError(f"nothing can be sealed for the worker's key: {error}") from error
 
@@ -98,9 +98,10 @@ def sealed_for_worker(data: bytes, worker_key: str) -> bytes:
 def opened_by_worker(data: bytes, private_key: bytes) -> bytes:
     """Raises EnvelopeRefused."""
     try:
-        return bytes(pyrage.decrypt(data, [pyrage.ssh.Identity.from_buffer(private_key)]))
+        opened = bytes(pyrage.decrypt(data, [pyrage.ssh.Identity.from_buffer(private_key)]))
     except (pyrage.DecryptError, pyrage.IdentityError) as error:
         raise EnvelopeRefused(f"a message that is not sealed for this worker: {error}") from error
+    return inflated(opened)
 
 
 def inflated(data: bytes) -> bytes:
@@ -119,7 +120,7 @@ def inflated(data: bytes) -> bytes:
 def sealed_for_reply(data: bytes, recipient: str) -> bytes:
     """Raises EnvelopeRefused."""
     try:
-        return bytes(pyrage.encrypt(data, [pyrage.x25519.Recipient.from_str(recipient)]))
+        return bytes(pyrage.encrypt(zlib.compress(data), [pyrage.x25519.Recipient.from_str(recipient)]))
     except (pyrage.RecipientError, pyrage.EncryptError) as error:
         raise EnvelopeRefused(f"not a key for replies: {error}") from error
 
@@ -127,7 +128,7 @@ def sealed_for_reply(data: bytes, recipient: str) -> bytes:
 def opened_replaced(text: str, key: ReplyKey) -> dict[str, Any]:
     """Node -> what a run replaced on it, from the message `replaced` of a run. Raises EnvelopeRefused."""
     try:
-        found = json.loads(inflated(opened_reply(base64.b64decode(text, validate=True), key)))
+        found = json.loads(opened_reply(base64.b64decode(text, validate=True), key))
     except (ValueError, binascii.Error) as error:
         raise EnvelopeRefused(f"a damaged message: {error}") from error
     return found if isinstance(found, dict) else {}
@@ -136,6 +137,7 @@ def opened_replaced(text: str, key: ReplyKey) -> dict[str, Any]:
 def opened_reply(data: bytes, key: ReplyKey) -> bytes:
     """Raises EnvelopeRefused."""
     try:
-        return bytes(pyrage.decrypt(data, [key.identity]))
+        opened = bytes(pyrage.decrypt(data, [key.identity]))
     except pyrage.DecryptError as error:
         raise EnvelopeRefused(f"a reply to another request: {error}") from error
+    return inflated(opened)

@@ -12,7 +12,6 @@ import json
 import queue
 import secrets
 import time
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
@@ -33,7 +32,6 @@ from meshctl.sites.envelope import (
     REQUEST,
     EnvelopeRefused,
     ReplyKey,
-    inflated,
     opened_reply,
     sealed_for_worker,
     signed,
@@ -118,7 +116,7 @@ class NatsUplink(Uplink):
             "reply_to": key.recipient,
             "request": dict(request),
         }
-        return sealed_for_worker(zlib.compress(signed(REQUEST, value, self._sign)), self.site.worker_key)
+        return sealed_for_worker(signed(REQUEST, value, self._sign), self.site.worker_key)
 
     def ask(self, request: Mapping[str, object]) -> dict[str, Any]:
         key, nonce = ReplyKey.new(), secrets.token_hex(8)
@@ -142,7 +140,7 @@ class NatsUplink(Uplink):
                     whole = assembler.add(parse_chunk(headers.get(HEADER, ""), message.data))
                     if whole is None:
                         continue
-                    value = verified(REPLY, inflated(opened_reply(whole, key)), (self._worker,), "the worker")
+                    value = verified(REPLY, opened_reply(whole, key), (self._worker,), "the worker")
                 except (EnvelopeRefused, ValueError):
                     # not from the worker: anyone who may publish there can send it
                     continue
@@ -198,7 +196,7 @@ class NatsUplink(Uplink):
             "plan": parcel.plan,
             "images": dict(parcel.images),
         }
-        data = sealed_for_worker(zlib.compress(json.dumps(value).encode()), self.site.worker_key)
+        data = sealed_for_worker(json.dumps(value).encode(), self.site.worker_key)
         # pieces of two attempts, which are sealed differently, do not fit together
         self._client.store(subject, f"{parcel.run}-{secrets.token_hex(4)}", data)
 

@@ -14,7 +14,6 @@ import json
 import sys
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -30,7 +29,6 @@ from meshctl.sites.envelope import (
     REPLY,
     REQUEST,
     EnvelopeRefused,
-    inflated,
     opened_by_worker,
     sealed_for_reply,
     signed,
@@ -132,7 +130,7 @@ class NatsWorker:
 
     def _answer(self, data: bytes, message: Msg) -> None:
         try:
-            value = verified(REQUEST, inflated(self._opened(data)), self._operators(), "an operator")
+            value = verified(REQUEST, self._opened(data), self._operators(), "an operator")
             if (value["fleet"], value["site"]) != (self.directory.fleet, self.directory.site):
                 raise EnvelopeRefused(f"a request for {value['fleet']}/{value['site']}")
             request, nonce, reply_to = dict(value["request"]), str(value["nonce"]), str(value["reply_to"])
@@ -190,7 +188,7 @@ class NatsWorker:
 
     def _execute(self, data: bytes) -> None:
         """Start the run of an order, or record why not. Raises MeshctlError for one that is no operator's."""
-        message = json.loads(inflated(self._opened(data)))
+        message = json.loads(self._opened(data))
         signed_order = SignedOrder(str(message["order"]), str(message["key"]), str(message["signature"]))
         fleet, site = self.directory.fleet, self.directory.site
         order = checked_order(signed_order, self._operators(), fleet=fleet, site=site)
@@ -229,7 +227,7 @@ class NatsWorker:
             options = ["-i", str(run.inventory), *runner.key_options(self.directory)]
             run_command(self.directory, run, self.environ, "apply", str(run.plan), "--dry-run", "--json", *options)
             replaced = json.dumps(run.taken_replaced()).encode()
-            run.replaced.write_bytes(sealed_for_reply(zlib.compress(replaced), order.reply_to))
+            run.replaced.write_bytes(sealed_for_reply(replaced, order.reply_to))
 
     # -- events
 
@@ -297,7 +295,7 @@ class _Replies:
         self._count += 1
         value = {"nonce": self._nonce, "message": json.loads(data)}
         try:
-            sealed = sealed_for_reply(zlib.compress(signed(REPLY, value, self._worker.sign)), self._reply_to)
+            sealed = sealed_for_reply(signed(REPLY, value, self._worker.sign), self._reply_to)
             self._worker.client.send_chunks(self._inbox, f"{self._nonce}-{self._count}", sealed)
         except Unreachable as error:
             raise OSError(str(error)) from error

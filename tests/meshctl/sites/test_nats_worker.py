@@ -71,7 +71,7 @@ class Site:
         made = sign_order(ordered, Credentials((own,), use_agent=False), [fingerprint])
         value = {"order": made.text, "key": made.key, "signature": made.signature, "plan": "{}", "images": {}}
         value |= {"part": base64.b64encode(_PART).decode(), **changes}
-        return sealed_for_worker(zlib.compress(json.dumps(value).encode()), self.worker_key)
+        return sealed_for_worker(json.dumps(value).encode(), self.worker_key)
 
     def execute(self, data: bytes) -> None:
         self.worker._execute(data)
