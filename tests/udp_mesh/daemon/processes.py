@@ -182,6 +182,8 @@ def collect(client: MeshClient, count: int) -> list[Message]:
         found.append(message)
         if len(found) == count:
             break
+    received = [(message.source, message.topic, len(message.payload)) for message in found]
+    assert len(found) == count, f"expected {count} messages within {WAIT_S:g} s, found {len(found)}: {received}"
     return found
 
 

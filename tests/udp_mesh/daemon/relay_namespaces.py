@@ -7,7 +7,9 @@ Anything that is not as it should be raises.
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tests.udp_mesh.daemon.processes import KEY, RATES, RunningDaemon, collect, outcomes, poll, wait_online
@@ -32,6 +34,21 @@ def _via(daemon: RunningDaemon, name: str) -> list[str]:
     return next((route["via"] for route in routes if route["name"] == name and route["in_use"]), [])
 
 
+@contextlib.contextmanager
+def _explained(daemons: Iterable[RunningDaemon]) -> Iterator[None]:
+    """Adds what each daemon that still runs knows, and what every one logged, to an error."""
+    try:
+        yield
+    except Exception as error:
+        for daemon in daemons:
+            assert daemon.process is not None
+            if daemon.process.poll() is None:
+                with daemon.client() as client:
+                    error.add_note(f"{daemon.name}: {json.dumps(client.request('status'))}")
+            error.add_note(f"log of {daemon.name}: {daemon.log.read_text()}")
+        raise
+
+
 def main() -> None:
     """They meet through a relay, exchange messages, and go on through the other one when the first is killed."""
     with tempfile.TemporaryDirectory(prefix="udp-mesh-") as path, contextlib.ExitStack() as stack:
@@ -41,6 +58,7 @@ def main() -> None:
         for left, right, network in LINKS:
             join(daemons, left, right, network)
             connect(daemons, left, right)
+        stack.enter_context(_explained(daemons.values()))
         alice, bob = daemons["alice"], daemons["bob"]
         wait_online(alice, "bob")
         wait_online(bob, "alice")

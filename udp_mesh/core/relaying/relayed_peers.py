@@ -42,6 +42,13 @@ class RelayedPeers:
         session = self._state.peer_table.sessions.get(boot_id)
         return session is not None and session.is_current and session.path.link == RELAY_LINK
 
+    def _is_any_in_use(self) -> bool:
+        """What the core sends to such a peer must end here, in the count of what was not reached."""
+        return any(
+            session.is_current and session.path.link == RELAY_LINK
+            for session in self._state.peer_table.sessions.values()
+        )
+
     def on_carried(self, carry: Carry) -> None:
         """Remember which relays a datagram for us came through."""
         self.paths.pop(carry.origin, None)
@@ -74,7 +81,7 @@ class RelayedPeers:
         state = self._state
         if active:
             self.open_link()
-        elif not state.relay_targets:
+        elif not state.relay_targets and not self._is_any_in_use():
             state.links.pop(RELAY_LINK, None)
         for boot_id in boot_ids:
             route = routes.get(boot_id)

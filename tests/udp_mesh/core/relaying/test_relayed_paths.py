@@ -223,3 +223,16 @@ def test_the_path_mtu_behind_a_relay_is_known_before_anything_is_lost() -> None:
     topology.run(3)
     assert topology.networks["narrow"].dropped == 0
     assert len(reported(topology, "d", MessageReceived)) == 1
+
+
+def test_what_is_sent_to_a_node_whose_only_relay_died_is_counted_and_leaves_on_no_link() -> None:
+    topology = hidden_ends(RelaySettings(("uav",)))
+    assert topology.run(10, lambda: online(topology, "base", "uav") and online(topology, "uav", "base"))
+    topology.stop("husky")
+    before = relaying(topology, "base").counters.dropped_unreachable
+    topology.send("base", "map", bytes(50_000), destination="uav")
+    # The network refuses a link that it does not have.
+    topology.run(40)
+    assert relaying(topology, "base").counters.dropped_unreachable > before
+    topology.add(node("husky", RelaySettings(("uav",))), ["mesh"])
+    assert topology.run(20, lambda: len(reported(topology, "uav", MessageReceived)) == 1)
