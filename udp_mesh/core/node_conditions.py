@@ -83,7 +83,7 @@ def _peer_conditions(state: State, peer: Peer, sender: Sender, via: tuple[str, .
         last_heard,
         sender.rtt.smoothed_rtt,
         sender.rtt.min_rtt,
-        sender.loss,
+        sender.loss.rate,
         _bits_per_s(meters.sent, now) if meters is not None else 0.0,
         _bits_per_s(meters.delivered, now) if meters is not None else 0.0,
         _bits_per_s(meters.received, now) if meters is not None else 0.0,
@@ -155,7 +155,7 @@ def _available_bits_per_s(sender: Sender, capacity_bits_per_s: float | None, now
     for level in sender.levels:
         available.append(float(round(max(0.0, left_bits_per_s))))
         if level.sent is not None:
-            left_bits_per_s -= _bits_per_s(level.sent, now) * (1 - sender.loss)
+            left_bits_per_s -= _bits_per_s(level.sent, now) * (1 - sender.loss.rate)
     return tuple(available)
 
 

@@ -97,7 +97,7 @@ def update_pmtu(state: State, peer: Peer, sender: Sender, session: Session, now:
         peer.online
         and path.confirmed
         and sender.state is not SendState.UNRESPONSIVE
-        and size.probe.due(now, sender.loss)
+        and size.probe.due(now, sender.loss.rate)
     ):
         for room, mtu in larger.items():
             token = state.rng.getrandbits(64)

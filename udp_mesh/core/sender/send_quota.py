@@ -94,7 +94,7 @@ def next_send_at(sender: Sender, room: int, now: float, packets_per_s: float | N
 
 def ack_spacing(sender: Sender) -> int:
     """Packets between two requests for an immediate acknowledgement."""
-    loss_factor = max(MIN_LOSS_FACTOR, 1.0 - LOSS_WEIGHT * sender.loss)
+    loss_factor = max(MIN_LOSS_FACTOR, 1.0 - LOSS_WEIGHT * sender.loss.rate)
     return max(2, min(MAX_ACK_SPACING, int(sender.congestion.cwnd * ACK_SPACING_FRACTION * loss_factor)))
 
 

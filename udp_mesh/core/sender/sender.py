@@ -17,6 +17,7 @@ from udp_mesh.core.congestion.delay_based import DelayBasedController
 from udp_mesh.core.congestion.pacer import Pacer
 from udp_mesh.core.congestion.rtt import INITIAL_PTO_S, RttEstimator
 from udp_mesh.core.events import ExpiryReason
+from udp_mesh.core.sender.loss_estimate import LossEstimate
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packing import Packing
 from udp_mesh.core.sender.pending import PendingMessages
@@ -48,9 +49,6 @@ MAX_ACK_WAIT_S = 1.0
 
 EXPIRE_INTERVAL_S = 0.005
 """Between two checks for timed-out packets."""
-
-LOSS_MEMORY_PACKETS = 256
-"""Packets over which loss is smoothed."""
 
 NON_URGENT_RTT_VALID_S = 1.0
 """While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
@@ -101,9 +99,7 @@ class Sender(PendingMessages):
         self.ack_requested_at = float("-inf")
         """When the end of the queue last requested one."""
         self.packing = Packing()
-        self.loss = 0.0
-        self.send_twice = False
-        """Loss was seen recently: small urgent messages are sent twice."""
+        self.loss = LossEstimate()
         self.delivered_packets = 0
         self.delivered_at = 0.0
         self.delivered_sent_at = 0.0
@@ -187,20 +183,14 @@ class Sender(PendingMessages):
                 app_limited=app_limited,
                 ahead=ahead,
                 lost=len(lost),
-                loss=self.loss,
+                loss=self.loss.rate,
                 now=now,
             )
         if lost:
             self.pmtu.on_lost(lost)
             self._requeue(lost)
         lost_packets = len(lost) + timed_out
-        total = len(acknowledged) + lost_packets
-        if total:
-            if self.loss >= self.rates.twice_loss:
-                self.send_twice = True
-            elif self.loss < self.rates.twice_loss / 4:
-                self.send_twice = False
-            self.loss += (lost_packets - self.loss * total) / max(total, LOSS_MEMORY_PACKETS)
+        self.loss.add(lost_packets, len(acknowledged) + lost_packets, self.rates.twice_loss)
 
     def _sample(self, round_trip_s: float, now: float, *, urgent: bool) -> bool:
         """Add a round trip sample. True if it counts for the congestion window."""
@@ -258,8 +248,8 @@ class Sender(PendingMessages):
             position,
             now,
             gap_s=self.rates.twice_gap_s,
-            twice=self.send_twice,
-            loss=self.loss,
+            twice=self.loss.send_twice,
+            loss=self.loss.rate,
             urgent_timeout_s=self.urgent_timeout_s(),
         )
 
@@ -278,6 +268,8 @@ class Sender(PendingMessages):
                 at = self.probed_at + self._probe_interval_s()
         elif self.in_flight.outstanding:
             at = self._expiry_at()
+        elif self._is_timed_out_due():
+            at = self.expired_at + EXPIRE_INTERVAL_S
         deadline = self.next_deadline()
         if deadline is not None and (at is None or deadline < at):
             at = deadline
@@ -308,6 +300,8 @@ class Sender(PendingMessages):
             elif now >= self._expiry_at():
                 self.expired_at = now
                 self._declare_timed_out(now - timeout)
+        elif self._is_timed_out_due():
+            self._requeue_timed_out()
 
     def _expiry_at(self) -> float:
         """When to check for packets whose acknowledgement is overdue."""
@@ -336,6 +330,12 @@ class Sender(PendingMessages):
             self.pmtu.on_lost((packet,))
         if self.timed_out and not self.scheduler.waiting:
             self._requeue_timed_out()
+
+    def _is_timed_out_due(self) -> bool:
+        """Whether timed-out fragments are all that is left to send, with nothing in flight whose acknowledgement or age
+        would return them. When they timed out something waited, but needed no sending: it was acknowledged late, or a
+        batch had ended with the last of it and its level was still marked."""
+        return bool(self.timed_out) and not self.in_flight.outstanding and not self.scheduler.waiting
 
     def _requeue_timed_out(self) -> None:
         timed_out, self.timed_out = self.timed_out, []
