@@ -210,7 +210,8 @@ def _set_relayed_aside(state: State, priority: int, out: list[Datagram], start: 
 def _send_broadcasts(state: State, priority: int, now: float, out: list[Datagram]) -> None:
     rates = state.settings.rates
     urgent = priority <= rates.urgent_priority
-    twice = urgent and any(peer.sender is not None and peer.sender.loss.send_twice for peer in state.peer_table.online())
+    senders = [peer.sender for peer in state.peer_table.online()] if urgent else []
+    twice = any(sender is not None and sender.loss.send_twice for sender in senders)
     paths: list[tuple[str, Address | None]] = [
         (link.name, link.broadcast) for link in state.links.values() if link.kind is LinkKind.BROADCAST
     ]
