@@ -8,7 +8,7 @@ from itertools import pairwise
 from meshctl.model import Fleet, Node, Robot, Role
 from meshctl.resolve import computer_gateway, lan_filter_needs
 from meshlab.errors import LabError
-from meshlab.spec import MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
+from meshlab.spec import DEFAULT_DRIVER, MESH_PACKAGES, FleetSpec, LanSpec, LinkSpec, Medium, NodeSpec, RadioSpec
 
 # the default topology is a chain up to this size, a tree above
 _MAX_CHAIN_NODES = 12
@@ -81,6 +81,7 @@ def _node_spec(node: Node, number: int) -> NodeSpec:
             band=radio.hardware.band.value,
             mac=radio.mac or _MAC.format(number // 256, number % 256, 16 + place),
             max_tx_power_dbm=radio.hardware.max_drive_dbm,
+            driver=radio.hardware.driver or DEFAULT_DRIVER,
         )
         for place, radio in enumerate(node.radios)
     )

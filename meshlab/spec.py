@@ -30,15 +30,21 @@ class Medium(Enum):
     BASE = "base"
 
 
+# it supports both modes of a mesh
+DEFAULT_DRIVER = "ath9k"
+
+
 @dataclass(frozen=True, slots=True)
 class RadioSpec:
-    """One radio of the board: UCI section, device path in the kernel, band (`2g` or `5g`), MAC address."""
+    """One radio of the board: UCI section, device path in the kernel, band (`2g` or `5g`), MAC address, driver by its
+    name in OpenWrt."""
 
     name: str = "radio0"
     path: str = "platform/ahb/18100000.wmac"
     band: str = "2g"
     mac: str = ""
     max_tx_power_dbm: int = 27
+    driver: str = DEFAULT_DRIVER
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ def write_board(state: NodeState, radios_mac: str, seed: int = 0) -> None:
     radios = []
     for place, radio in enumerate(spec.radios):
         mac = radio.mac or _next_mac(radios_mac, place + 1)
-        radios.append(f"{radio.name},{radio.path},{radio.band},{mac},{radio.max_tx_power_dbm}")
+        radios.append(f"{radio.name},{radio.path},{radio.band},{mac},{radio.max_tx_power_dbm},{radio.driver}")
     facts = {
         "BOARD_NAME": "virtual,other-board" if state.wrong_board else spec.board,
         "MODEL": spec.model,

@@ -98,6 +98,22 @@ class WirelessLink:
 
 
 @dataclass(frozen=True, slots=True)
+class RadioChip:
+    """What a radio can do, whatever it is configured for (`iw phy`, /sys/class/ieee80211)."""
+
+    phy: str
+    """By its number, as `WirelessLink.phy`: `phy0`."""
+    path: str = ""
+    """As UCI's `path` has it; empty if unknown."""
+    driver: str = ""
+    """As the kernel names it: `ath9k`, `ath10k_pci`."""
+    modes: tuple[str, ...] = ()
+    """As iw writes them: `IBSS`, `mesh point`, `AP`; empty if unknown."""
+    frequencies_mhz: tuple[int, ...] = ()
+    """Of all its channels, also those that the country forbids; empty if unknown."""
+
+
+@dataclass(frozen=True, slots=True)
 class Station:
     """One station entry of a radio (`iw dev IF station dump`)."""
 
@@ -286,6 +302,7 @@ class Observation:
     """Interface name -> the kernel's index; a recreated interface has a new one."""
     radios: tuple[RadioState, ...] | None = None
     links: tuple[WirelessLink, ...] | None = None
+    chips: tuple[RadioChip, ...] | None = None
     stations: tuple[Station, ...] | None = None
     surveys: tuple[ChannelSurvey, ...] | None = None
     """One per interface whose driver reports one."""

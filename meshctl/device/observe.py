@@ -25,6 +25,7 @@ from meshctl.device.observation import (
     MeshTableSizes,
     Observation,
     Originator,
+    RadioChip,
     ReleaseInfo,
     Space,
     Station,
@@ -145,6 +146,7 @@ def interpret(sections: Mapping[str, OutputSection], *, asked_at_s: float, answe
         ifindexes=MappingProxyType({name: index for index, name in indexes.items()}) if indexes else None,
         radios=reader.read("ubus.wireless", ubus.parse_wireless),
         links=links,
+        chips=_chips(reader),
         stations=stations,
         surveys=surveys,
         sensors=reader.read("sensors", system.parse_sensors, required=False),
@@ -212,6 +214,18 @@ def _wireless(
         if (survey := iw.parse_survey((reader.body(f"iw.survey {name}") or b"").decode("utf-8", "replace")))
     ]
     return joined, tuple(stations), tuple(surveys) if reader.names("iw.survey") else None
+
+
+def _chips(reader: _OutputReader) -> tuple[RadioChip, ...] | None:
+    """The radios by either source; None if both are missing."""
+    places = reader.read("phys", system.parse_phys, required=False) or {}
+    able = {chip.phy: chip for chip in reader.read("iw.phy", iw.parse_phys, required=False) or ()}
+    found = tuple(
+        replace(able.get(phy, RadioChip(phy)), path=place[0], driver=place[1])
+        for phy in sorted(places.keys() | able.keys())
+        for place in (places.get(phy, ("", "")),)
+    )
+    return found or None
 
 
 def _mesh(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from meshctl.device.connection import OwnKey
 from meshctl.device.observation import Observation
 from meshctl.model import Node
+from meshctl.plan.abilities import lacking_abilities
 from meshctl.plan.cell import cells, partitions
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
@@ -84,7 +85,10 @@ def node_plan(
     )
     firmware = firmware_step(node, seen) if with_firmware else None
     packages = package_step(desired.needs, seen, node.hardware.package_files)
-    problem = failed_precondition(node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages)
+    lacking = lacking_abilities(node, seen, before.get("wireless"), after.get("wireless"))
+    problem = failed_precondition(
+        node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages, lacking=lacking
+    )
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
     files = file_changes(desired.files, seen)
@@ -112,6 +116,8 @@ def node_plan(
             *_tagged_ports(node, seen, after.get("network")),
             *_lacking_scripts(node, seen, basis, firmware),
             *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
+            *(f"{text}; the new firmware must bring another driver" for text in lacking),
+            *_other_target(node, seen),
         ),
     )
 
@@ -148,6 +154,18 @@ def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: F
     return (
         f"it lacks {package}: without its /usr/share/hostap/wdev.uc OpenWrt {node.release} brings up no mesh "
         "interface, and the node would roll back. Build the image with it",
+    )
+
+
+def _other_target(node: Node, seen: Observation) -> tuple[str, ...]:
+    """A note if the device runs an image of another target. Releases rename targets, so a flash is not refused; the
+    image's own check compares its boards (`sysupgrade`)."""
+    found = seen.release.target if seen.release else ""
+    if not found or not node.hardware.target or found == node.hardware.target:
+        return ()
+    return (
+        f"it runs an image for {found}, its profile says {node.hardware.target}: an image for another chip does not "
+        "boot; correct target in its hardware profile",
     )
 
 

@@ -27,6 +27,7 @@ class _Checked:
     owner: str
     is_flashed: bool
     packages: PackageStep | None
+    lacking: tuple[str, ...]
 
 
 def failed_precondition(
@@ -37,9 +38,11 @@ def failed_precondition(
     owner: str,
     is_flashed: bool,
     packages: PackageStep | None,
+    lacking: tuple[str, ...],
 ) -> FailedPrecondition | None:
-    """The first precondition that this node fails, or None. `owner` is our name in the node's lock."""
-    case = _Checked(node, seen, uci, owner, is_flashed, packages)
+    """The first precondition that this node fails, or None. `owner` is our name in the node's lock, `lacking` what its
+    radios cannot do of what they get."""
+    case = _Checked(node, seen, uci, owner, is_flashed, packages, lacking)
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
 
@@ -91,6 +94,16 @@ def _radio_paths(case: _Checked) -> FailedPrecondition | None:
                 "copy the path from the device into its hardware profile",
             )
     return None
+
+
+def _radio_abilities(case: _Checked) -> FailedPrecondition | None:
+    """Firmware may bring another driver, so a node that is flashed gets a note (`plan.node`)."""
+    if case.is_flashed or not case.lacking:
+        return None
+    return FailedPrecondition(
+        "; ".join(case.lacking),
+        "change the mesh's mode or channel, or use another radio; ath10k has ad-hoc mode with ath10k-ct's firmware",
+    )
 
 
 def _lan_ports(case: _Checked) -> FailedPrecondition | None:
@@ -152,6 +165,7 @@ _CHECKS: tuple[Callable[[_Checked], FailedPrecondition | None], ...] = (
     _board,
     _release,
     _radio_paths,
+    _radio_abilities,
     _lan_ports,
     _packages,
     _foreign_changes,

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from meshctl.apply.change_set import reload_script
+from meshctl.device.observe import interpret, observation_script
+from meshctl.device.parse.sections import split_sections
 from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshlab.conftest import MESH, factory_reset
 from tests.waiting import until
@@ -100,3 +102,31 @@ def test_the_reload_script_removes_the_interface_of_a_disabled_radio(latest: Vir
     off = "uci set wireless.radio0.disabled=1; uci commit wireless"
     latest.exec(f"{off}\n{reload_script({WIRELESS}, ())}").check("reload")
     until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
+
+
+@pytest.mark.parametrize(
+    ("driver", "kernel_name", "has_ibss"), [("ath9k", "ath9k", True), ("ath10k", "ath10k_pci", False)]
+)
+def test_a_node_says_what_its_radio_can_do(fleet: VirtualFleet, driver: str, kernel_name: str, has_ibss: bool) -> None:
+    node = fleet.node("near")
+    node.wait_up()
+    exchange = f"""
+        mkdir -p /sys/bus/drivers/{kernel_name}
+        ln -sfn /sys/bus/drivers/{kernel_name} /sys/devices/platform/ahb/18100000.wmac/driver
+    """
+    board = fleet.directory / "nodes" / "near" / "board"
+    before = board.read_text(encoding="utf-8")
+    board.write_text(before.replace(",ath9k", f",{driver}"), encoding="utf-8")
+    try:
+        node.exec(exchange).check("exchange the radio")
+        output = node.exec(observation_script("NONCE")).stdout
+    finally:
+        board.write_text(before, encoding="utf-8")
+        node.exec(exchange.replace(kernel_name, "ath9k")).check("put the radio back")
+    seen = interpret(split_sections(output.encode(), "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
+    assert seen.chips is not None
+    (chip,) = seen.chips
+    assert (chip.path, chip.driver) == ("platform/ahb/18100000.wmac", kernel_name)
+    assert ("IBSS" in chip.modes) == has_ibss
+    assert "mesh point" in chip.modes
+    assert 2437 in chip.frequencies_mhz

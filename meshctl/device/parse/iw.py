@@ -1,4 +1,4 @@
-"""`iw`: `dev`, `dev IF link`, `station dump`, `survey dump` (iw's interface.c, link.c, station.c, survey.c)."""
+"""`iw`: `dev`, `dev IF link`, `station dump`, `survey dump` and `phy`, as in iw's own C files of these names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
-from meshctl.device.observation import ChannelSurvey, Station, WirelessLink
+from meshctl.device.observation import ChannelSurvey, RadioChip, Station, WirelessLink
 
 MESH_POINT = "mesh point"
 _INTERFACE = re.compile(r"^\s*Interface (\S+)$")
@@ -19,6 +19,12 @@ _SURVEY = re.compile(r"^Survey data from (\S+)$")
 _CHAINS = re.compile(r"\[(-?\d{1,3}(?:, -?\d{1,3})*)\]")
 # `144.4 MBit/s MCS 15 short GI`, `866.7 MBit/s VHT-MCS 9 80MHz short GI VHT-NSS 2`, `HE-MCS 11 HE-NSS 2`, EHT likewise
 _MCS = re.compile(r"((?:VHT-|HE-|EHT-)?MCS \d{1,2})\b(?:.*?\b(?:VHT|HE|EHT)-NSS (\d{1,2}))?")
+_WIPHY = re.compile(r"^Wiphy (\S+)$")
+_INDEX = re.compile(r"^\twiphy index: (\d{1,3})$")
+_MODES = "Supported interface modes:"
+_MODE = re.compile(r"^\t\t \* (\S.*)$")
+# `* 2412 MHz [1] (20.0 dBm)`; iw 5.19 and later write `2412.0 MHz`
+_FREQUENCY = re.compile(r"^\t\t\t\* (\d{3,6})(?:\.\d+)? MHz \[\d+\]")
 _ESCAPED = re.compile(rb"\\x([0-9a-fA-F]{2})")
 
 
@@ -133,6 +139,27 @@ def parse_survey(text: str) -> ChannelSurvey | None:
             transmit_ms=_integer(fields.get("channel transmit time")),
         )
     return None
+
+
+def parse_phys(text: str) -> tuple[RadioChip, ...] | None:
+    """`iw phy`: the modes and frequencies of every radio. None for text that is not iw's."""
+    if text.strip() and not re.search(r"^Wiphy ", text, re.MULTILINE):
+        return None
+    return tuple(_chip(name, lines) for name, lines in _blocks(text, _WIPHY))
+
+
+def _chip(phy: str, lines: list[str]) -> RadioChip:
+    modes: list[str] = []
+    heading = ""
+    for line in lines:
+        if found := _INDEX.match(line):
+            phy = f"phy{found[1]}"
+        elif line[:1] == "\t" != line[1:2]:
+            heading = line.strip()
+        elif heading == _MODES and (found := _MODE.match(line)):
+            modes.append(found[1])
+    frequencies = (int(found[1]) for line in lines if (found := _FREQUENCY.match(line)))
+    return RadioChip(phy, modes=tuple(modes), frequencies_mhz=tuple(frequencies))
 
 
 def unescape_ssid(text: str) -> str:

@@ -72,6 +72,12 @@ def parse_sensors(text: str) -> Sensors:
     return Sensors(MappingProxyType(queued), MappingProxyType(temperatures))
 
 
+def parse_phys(text: str) -> dict[str, tuple[str, str]]:
+    """`phy0 PATH DRIVER`, the driver possibly missing -> radio -> (path, driver)."""
+    lines = (line.split(" ") for line in text.splitlines())
+    return {words[0]: (words[1], words[2]) for words in lines if len(words) == 3}
+
+
 def parse_meminfo(text: str) -> Memory | None:
     """/proc/meminfo, in bytes; a kernel without MemAvailable counts free, buffers and cache."""
     kib = {match[1]: int(match[2]) for match in _MEMINFO.finditer(text)}

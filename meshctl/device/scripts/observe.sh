@@ -98,6 +98,32 @@ sensors() {
 		/sys/class/ieee80211/phy*/hwmon*/temp1_input /sys/class/ieee80211/phy*/device/hwmon/hwmon*/temp1_input
 }
 
+# each radio: its number, its place in the kernel's device tree, written as UCI's `path` (mac80211_phy_to_path), its driver
+phys() (
+	for phy in /sys/class/ieee80211/*; do
+		read -r number <"$phy/index" && cd -P "$phy/device" || continue
+		path=${PWD#/sys/devices/}
+		case $path in platform*/pci*) path=${path#platform/} ;; esac
+		# several radios of one device: all after the first have a number
+		count=0
+		for sibling in ieee80211/*; do
+			[ "${sibling##*/}" != "${phy##*/}" ] || break
+			count=$((count + 1))
+		done
+		[ ! -e "$sibling" ] || [ $count -eq 0 ] || path=$path+$count
+		driver=''
+		! cd -P driver || driver=${PWD##*/}
+		echo "phy$number $path $driver"
+	done
+)
+
+# what each radio can do: its modes and channels, of the several hundred lines that iw prints
+abilities() {
+	iw phy | awk '/^Wiphy |^\twiphy index:/ { print; next }
+		/^\t[^\t]/ { modes = /Supported interface modes:/; if (modes) print; next }
+		modes || /^\t\t\t\* [0-9.]+ MHz \[/'
+}
+
 # contents NAME FILE...: a section for each file, all from one process: starting one takes a small processor longer than
 # printing them. A file is one record to awk, and its last line ends as it does there.
 contents() {
@@ -171,6 +197,8 @@ for dev in /sys/class/net/bat*; do
 	[ ! -e "$dev" ] || mesh "${dev##*/}"
 done
 detail sensors sensors
+detail phys phys
+detail iw.phy abilities
 section supplicants supplicants
 section bridges bridges
 [ ! -e /etc/meshctl/lan-filter.sh ] || section lan_filter nft list table bridge meshctl_lan

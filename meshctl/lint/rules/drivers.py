@@ -45,7 +45,7 @@ _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
     not support 802.11s: the interface is never created, and the node comes up without a mesh. Community firmware for
     ath10k supports ad-hoc mode: OpenWrt's kmod-ath10k-ct with ath10k-firmware-...-ct.""",
     fix="""Use `mode: mesh` with the Qualcomm drivers, ath10k-ct instead of ath10k, or another radio. `driver` of the
-    radio names its driver.""",
+    radio names its driver; without it, only the device knows, and `meshctl plan` refuses what its radio cannot do.""",
     failing="""
     hardware: {rocket: {radios: {radio0: {driver: ath10k}}}}
     """,

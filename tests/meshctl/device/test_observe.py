@@ -121,6 +121,8 @@ PARSERS = [
     iw.parse_iw_dev,
     iw.parse_stations,
     iw.parse_survey,
+    iw.parse_phys,
+    system.parse_phys,
     batctl.parse_statistics,
     batctl.parse_transglobal,
     system.parse_sensors,
