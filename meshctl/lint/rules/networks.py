@@ -33,7 +33,8 @@ _UNUSABLE = tuple(
     "The networks of two meshes overlap",
     why="""A node in both meshes, or a robot that bridges both, has two routes to one address and uses the wrong one
     half the time.""",
-    fix="Use separate networks, or the same network for both (cells of one network share a routing interface).",
+    fix="""Use separate networks; or the same network for both, if one routing interface can carry both cells: same back
+    end, same `routing_algo`, or with operator parts the same `interface`.""",
     failing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
@@ -51,18 +52,24 @@ _UNUSABLE = tuple(
 )
 def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for (mesh, network), (other, of_other) in overlaps((mesh, mesh.network) for mesh in fleet.meshes.values()):
-        if not _routed_as_one(mesh, other):
+        difference = _routing_difference(mesh, other)
+        if mesh.network != other.network:
             message = f"overlaps {of_other} of mesh {other.name}"
+            yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(network))
+        elif difference:
+            message = f"mesh {other.name} has the same network, but no routing interface can carry both: {difference}"
             yield Finding(("meshes", mesh.name, "network"), message, "a separate network", str(network))
 
 
-def _routed_as_one(mesh: Mesh, other: Mesh) -> bool:
-    """Two cells that share a routing interface, such as one per band, share a network on purpose."""
-    if mesh.network != other.network or mesh.backend is not other.backend:
-        return False
+def _routing_difference(mesh: Mesh, other: Mesh) -> str:
+    """Why two cells cannot share a routing interface, as cells of one network do (one per band); empty if they can."""
+    if mesh.backend is not other.backend:
+        return f"{other.name} has back end {other.backend.value}, {mesh.name} {mesh.backend.value}"
     if mesh.backend is Backend.BATMAN:
-        return mesh.batman.routing_algo == other.batman.routing_algo
-    return mesh.operator_parts.interface == other.operator_parts.interface
+        option, own, theirs = "routing_algo", mesh.batman.routing_algo, other.batman.routing_algo
+    else:
+        option, own, theirs = "interface", mesh.operator_parts.interface, other.operator_parts.interface
+    return "" if own == theirs else f"{other.name} has {option} {theirs}, {mesh.name} {own}"
 
 
 @fleet_rule(

@@ -1,16 +1,19 @@
-"""Relays: daemons that pass datagrams on and further links of daemons (MC761 to MC766)."""
+"""Relays: daemons that pass datagrams on and further links of daemons (MC761 to MC767)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.rules.secrets import identity
-from meshctl.model import Fleet
+from meshctl.model import Computer, ComputerLink, Fleet
 from meshctl.render.daemon import LINK_SELECTORS, link_problems
+from meshctl.resolve import computer_gateway
 
 _ALL = "all"
 
@@ -131,3 +134,114 @@ def relay_key_is_fleet_key(fleet: Fleet, context: LintContext) -> Iterator[Findi
     for index, ref in enumerate(fleet.udp_mesh.relay_keys):
         if identity(context, ref) in fleet_keys:
             yield Finding(("udp_mesh", "relay_keys", str(index)), "also a fleet key", "a separate key", str(ref))
+
+
+@fleet_rule(
+    "MC767",
+    Severity.WARNING,
+    "A robot is reached only through one that is no relay for it",
+    why="""The base station and this robot share no network: only another robot has a link to both. A daemon passes on
+    nothing unless `relay` names one of the two ends, so neither commands nor an emergency stop arrive.""",
+    fix="""Add the robot (or `all`) to `relay` of the robot between, raise `udp_mesh.relay_hops`, or give both ends a
+    link in one network.""",
+    failing="""
+    robots:
+      husky1: {computer: {links: [{address: 10.50.0.1}]}}
+      uav1: {computer: {address: 10.50.0.2/24, ssh: {user: robot}}}
+    """,
+    passing="""
+    robots:
+      husky1: {relay: [uav1], computer: {links: [{address: 10.50.0.1}]}}
+      uav1: {computer: {address: 10.50.0.2/24, ssh: {user: robot}}}
+    """,
+)
+def reached_without_relay(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    links = _links(fleet)
+    bases = [name for name in links if fleet.robots[name].is_base]
+    lacking: dict[tuple[str, str], list[str]] = {}
+    too_far: dict[str, int] = {}
+    for base, name in ((base, name) for base in bases for name in links if name not in bases):
+        ends = {_ALL, base, name}
+        relays = {robot.name for robot in fleet.robots.values() if ends & set(robot.relay)}
+        path = _shortest_path(links, base, name, relays)
+        if path:
+            if len(path) - 1 > fleet.udp_mesh.relay_hops > 1:
+                too_far[name] = len(path) - 1
+            continue
+        for between in _shortest_path(links, base, name, set(links))[1:-1]:
+            if between not in relays:
+                lacking.setdefault((between, base), []).append(name)
+    for (between, base), names in lacking.items():
+        message = f"only through it are {join_limited(names)} and {base} connected"
+        expected = f"{', '.join(names)}, or all"
+        yield Finding(("robots", between, "relay"), message, expected, ", ".join(fleet.robots[between].relay) or "none")
+    if too_far:
+        message = f"{join_limited(tuple(too_far))} cannot be reached from the base station"
+        found = str(fleet.udp_mesh.relay_hops)
+        yield Finding(("udp_mesh", "relay_hops"), message, f"at least {max(too_far.values())}", found)
+
+
+def _links(fleet: Fleet) -> dict[str, set[str]]:
+    """The robots that each robot's daemon has a link to, by the networks of their computers.
+
+    A link that is given by its interface is in an unknown network: it counts as one to the robots that have no other.
+    """
+    computers = {name: robot.computer for name, robot in fleet.robots.items() if robot.computer is not None}
+    routed = {name for name in computers if computer_gateway(fleet, fleet.robots[name]) is not None}
+    found: dict[str, set[str]] = {name: set() for name in computers}
+    for name, computer in computers.items():
+        for other, peer in computers.items():
+            if other != name and ({name, other} <= routed or _share_network(computer, other, peer)):
+                found[name].add(other)
+                found[other].add(name)
+    alone = [name for name, others in found.items() if not others]
+    for name, computer in computers.items():
+        if any(link.interface and not link.neighbors for link in computer.links):
+            for other in alone:
+                if other != name:
+                    found[name].add(other)
+                    found[other].add(name)
+    return found
+
+
+def behind_further_links(fleet: Fleet) -> set[str]:
+    """The robots that a further link of another robot's computer leads to: they may have no radio of the fleet."""
+    links = _links(fleet)
+    computers = {name: robot.computer for name, robot in fleet.robots.items() if robot.computer is not None}
+    return {
+        name
+        for name, computer in computers.items()
+        for other in links[name]
+        if computers[other].address.ip not in computer.address.network
+        and any(_leads_to(link, name, computer) for link in computers[other].links)
+    }
+
+
+def _leads_to(link: ComputerLink, name: str, computer: Computer) -> bool:
+    if link.address is not None:
+        return link.address in computer.address.network
+    return not link.neighbors or name in link.neighbors
+
+
+def _share_network(computer: Computer, name: str, peer: Computer) -> bool:
+    """Whether the first has an address in the network of the second, named `name`, or names it as a neighbor."""
+    addresses = [computer.address.ip, *(link.address for link in computer.links if link.address is not None)]
+    return any(address in peer.address.network for address in addresses) or any(
+        name in link.neighbors for link in computer.links
+    )
+
+
+def _shortest_path(links: Mapping[str, set[str]], start: str, end: str, between: set[str]) -> tuple[str, ...]:
+    """The robots from `start` to `end`, all others on the way in `between`; empty if there is no such path."""
+    came_from = {start: ""}
+    waiting = deque([start])
+    while waiting and end not in came_from:
+        name = waiting.popleft()
+        if name == start or name in between:
+            for other in sorted(links[name] - came_from.keys()):
+                came_from[other] = name
+                waiting.append(other)
+    path = [end] if end in came_from else []
+    while path and path[-1] != start:
+        path.append(came_from[path[-1]])
+    return tuple(reversed(path))

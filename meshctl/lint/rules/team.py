@@ -9,6 +9,7 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.relays import behind_further_links
 from meshctl.model import Fleet, NodeState, Role
 
 
@@ -247,15 +248,19 @@ def carried_by_nobody(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "A robot has no radio",
     why="Without a managed node the robot is unreachable and cannot be stopped.",
-    fix="List its radio under `nodes`; a lost node does not count.",
+    fix="""List its radio under `nodes`; a lost node does not count. A robot that a further link of another robot's
+    computer (`links`) reaches needs none.""",
     failing="""
     nodes: {husky1-front: {state: lost}}
     """,
     passing="nodes: {husky1-front: {state: carried}}",
 )
 def robot_without_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    linked = behind_further_links(fleet)
     for robot in fleet.robots.values():
         known = [fleet.nodes[name] for name in robot.nodes if name in fleet.nodes]
+        if not robot.nodes and robot.name in linked:
+            continue
         if len(known) == len(robot.nodes) and not any(node.state.is_managed for node in known):
             found = join_limited([f"{node.name} ({node.state.value})" for node in known]) or "none"
             yield Finding(("robots", robot.name), "no radio is in use", "at least one managed node", found)

@@ -123,6 +123,26 @@ def test_two_cells_under_one_meshmerize_interface_share_their_network(tmp_path: 
     assert "MC205" in _codes(Example(other, files=files), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("second", "difference"),
+    [
+        ("", "main has back end meshmerize, second batman"),
+        ("backend: meshmerize, operator_parts: PARTS,", "main has interface mm0, second mm1"),
+    ],
+)
+def test_one_network_for_two_routing_interfaces_is_not_advised_again(
+    second: str, difference: str, tmp_path: Path
+) -> None:
+    """The advice was to use the same network for both, which was what the finding was about."""
+    head, _, tail = _SECOND_CELL.rpartition("backend: meshmerize, operator_parts: {")
+    parts = "{" + tail.partition("}")[0].replace("mm0", "mm1") + "}"
+    text = f"{head}{second.replace('PARTS', parts)}{tail.partition('}')[2].lstrip(', ')}"
+    found = _found(Example(text, files={"parts/etc/config/mm.j2": "config mm\n"}), tmp_path)
+    (finding,) = [one for one in found if one.code == "MC205"]
+    assert difference in finding.text
+    assert (finding.expected, finding.found) == ("a separate network", "10.42.0.0/24")
+
+
 def test_a_missing_folder_of_operator_parts_is_reported_where_the_inventory_names_it(tmp_path: Path) -> None:
     (finding,) = _found(_SECOND_CELL, tmp_path)
     assert (finding.code, finding.found) == ("MC901", "none at parts")
