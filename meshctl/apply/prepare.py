@@ -17,6 +17,7 @@ from meshctl.errors import InputError
 from meshctl.fleet import Interrupt, Observer, silent
 from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.model.ip import IpAddress
 from meshctl.nodes.collect import FleetObservation, collect, facts_of, known_macs
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
@@ -196,11 +197,21 @@ def _node_plans(
             with_firmware=choices.with_firmware,
             own_keys=None if observation is None else connections.own_keys(want.node),
         )
+        former = connections.former_addresses().get(name)
+        if former is not None and observation is not None and facts_of(observation).get("address") == str(former):
+            made = replace(made, notes=(_reached_at(renderer.fleet, want.node, former), *made.notes))
         error = seen.refused.get(name)
         if error is not None:
             made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
         plans[name] = made
     return _NodePlans(plans, desired)
+
+
+def _reached_at(fleet: Fleet, node: Node, former: IpAddress) -> str:
+    """Where a node is that has not yet got its address."""
+    mesh = next((mesh.name for mesh in fleet.meshes.values() if former in mesh.network), "")
+    place = f" in the network of mesh {mesh}" if mesh and mesh not in node.meshes else ""
+    return f"it is reached at {former}{place}, where it was last seen, and gets the address {node.address.ip}"
 
 
 def _with_fleet_plan(

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -101,6 +102,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     from meshctl.fleet.process import lock_owner
     from meshctl.inventory import load_fleet
     from meshctl.inventory.secrets import SecretStore
+    from meshctl.nodes.collect import former_addresses
     from meshctl.nodes.connections import ConnectionPool
     from meshctl.nodes.desired import Renderer
 
@@ -126,6 +128,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
     ):
         journal.move_lab_runs(fleet.name, lab_of)
+        access.former_addresses = cache(lambda: former_addresses(fleet, journal.last_known(fleet.name)))
         yield Session(
             fleet,
             Renderer.of(fleet, SecretStore(os.environ, Path(fleet.base)).get),

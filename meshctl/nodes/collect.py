@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 
 from meshctl.device import deadman
 from meshctl.device.errors import NodeRefused
@@ -21,8 +22,10 @@ from meshctl.fleet import Interrupt, Observer, Outcome, Result, run, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.fleet.process import is_dead
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.model.ip import IpAddress
 from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.plan.seen import management_address
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
 # How long a node may take to roll back a change of a dead process: its files, and a reload.
@@ -74,6 +77,19 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
     for node in fleet.nodes.values():
         macs.update({radio.mac.lower(): node.name for radio in node.radios if radio.mac})
     return with_alternates(macs)
+
+
+def former_addresses(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, IpAddress]:
+    """The management addresses at which nodes were last seen, where the inventory has another one by now: a node that
+    was off, or that could not be changed, still answers there, on the mesh that it was in."""
+    taken = {one.ip for node in fleet.managed() for one in (node.address, node.lan_address) if one is not None}
+    found = {}
+    for name, last in known.items():
+        with suppress(ValueError):
+            address = ip_address(last.facts.get("address", ""))
+            if name in fleet.nodes and address not in taken:
+                found[name] = address
+    return found
 
 
 def collect(
@@ -143,7 +159,9 @@ def _clear(connection: SshConnection, change: ChangeStatus) -> None:
 
 def facts_of(seen: Observation) -> dict[str, str]:
     """The facts of a node that the journal stores: how to find it again, and its last known state."""
+    address = management_address((seen.uci or {}).get("network"))
     facts = {
+        "address": "" if address is None else str(address),
         "macs": " ".join(mesh_macs(seen)),
         "boot_id": seen.boot_id or "",
         "uptime_s": "" if seen.uptime_s is None else f"{seen.uptime_s:.0f}",

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -20,7 +20,7 @@ from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.traffic import TrafficMeter
 from meshctl.device.trust import HostKeyPolicy, TrustStore
-from meshctl.errors import InputError, Unreachable
+from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.inventory.file_paths import file_path
 from meshctl.model import Fleet, Node, Site
 from meshctl.model.ip import IpAddress
@@ -62,6 +62,8 @@ class ConnectionPool:
     bench_endpoints: dict[str, Endpoint] = field(default_factory=dict)
     # node -> local interface it was discovered on, tried first for its new address
     interfaces: dict[str, str] = field(default_factory=dict)
+    # node -> the address at which it was last seen, where the inventory has another one by now
+    former_addresses: Callable[[], Mapping[str, IpAddress]] = dict
     meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
     # off on the bench, where a device is on a cable of the operator's
     use_gateways: bool = True
@@ -113,28 +115,41 @@ class ConnectionPool:
         credentials: Credentials | None = None,
         deadlines: Deadlines | None = None,
     ) -> SshConnection:
-        """A new connection, owned by the caller. Raises what `ssh.connect` raises."""
+        """A new connection, owned by the caller. Raises what `ssh.connect` raises.
+
+        Without `endpoint`, the node's candidates are tried, then its former address, where only its pinned key is
+        accepted: another device may have that address.
+        """
+
+        def connect_to(where: Endpoint) -> SshConnection:
+            via = self._via(node)
+            began_s = time.monotonic()
+            connection = connect(
+                where,
+                credentials=credentials or self.credentials(node, where),
+                trust=policy or self.policy or self.trust,
+                deadlines=deadlines or self.deadlines,
+                via=via,
+                release=node.release,
+                meter=self.meter,
+            )
+            self.slots.login_ended(node.name, time.monotonic() - began_s)
+            return connection
+
         places = (endpoint,) if endpoint is not None else self.candidates(node)
         while True:
             where, *places_left = places
             try:
-                via = self._via(node)
-                began_s = time.monotonic()
-                connection = connect(
-                    where,
-                    credentials=credentials or self.credentials(node, where),
-                    trust=policy or self.policy or self.trust,
-                    deadlines=deadlines or self.deadlines,
-                    via=via,
-                    release=node.release,
-                    meter=self.meter,
-                )
-                self.slots.login_ended(node.name, time.monotonic() - began_s)
-                return connection
+                return connect_to(where)
             except Unreachable:
-                if not places_left:
-                    raise
                 places = tuple(places_left)
+                if not places:
+                    is_pinned_only = policy is None and self.policy is None
+                    former = self.former_addresses().get(node.name) if endpoint is None and is_pinned_only else None
+                    if former is not None:
+                        with suppress(NodeError):
+                            return connect_to(self.endpoint(node, former))
+                    raise
 
     def _via(self, node: Node) -> SshConnection | None:
         if not node.ssh.jump:
