@@ -55,10 +55,17 @@ nodes:
 {robots}topics:
 {topics}"""
 _RADIO = """#!/bin/sh
-# Stand-in for a radio: the first line of the input has the nonce; the answer is prepared.
+# Stand-in for a radio: the first line of the input has the nonce; the answer is prepared, and compressed if the script
+# that is sent does so.
 IFS= read -r first
 set -- $SSH_CONNECTION
-exec sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$3"
+answer() {{ sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$1"; }}
+if grep -q 'gzip -c'; then
+	echo "${{first#N=}} gzip"
+	answer $3 | gzip -c
+else
+	answer $3
+fi
 """
 _DAEMON = """#!/bin/sh
 # Stand-in for the release's Python that queries the daemon: its answer, by the address of the connection.

@@ -24,6 +24,7 @@ from meshctl.device.connection import Completed, Connection, Credentials, Endpoi
 from meshctl.device.deadman import Change, NewFile, Payload
 from meshctl.device.observe import observation_script, observe
 from meshctl.device.openwrt import measure_uptime
+from meshctl.device.parse.sections import split_sections
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey
 from meshctl.render import DeviceFacts
@@ -74,7 +75,7 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
     node, change, nonce = rig.fleet.node(name), change_of(rig, name), new_nonce()
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
-        observation = connection.run(observation_script("NONCE")).stdout
+        observation = plain_text(connection.run(observation_script("NONCE")).stdout_bytes)
         deadman.change(connection, OWNER, Payload.of(change), nonce=nonce, window_s=90, ttl_s=120, await_reload_s=0)
         with counting(node, "reload", costs):
             time.sleep(RELOAD_LIMIT_S)
@@ -83,6 +84,12 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
         deadman.status(connection)
         deadman.confirm(connection, change.change_id, nonce=nonce, owner=OWNER)
     return observation
+
+
+def plain_text(output: bytes) -> str:
+    """An observation's sections, not compressed."""
+    sections = split_sections(output, "NONCE")
+    return "".join(f"NONCE begin {name}\n{one.text}\nNONCE end {one.status}\n" for name, one in sections.items())
 
 
 def scheduled_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:

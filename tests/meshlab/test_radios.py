@@ -119,11 +119,12 @@ def test_a_node_says_what_its_radio_can_do(fleet: VirtualFleet, driver: str, ker
     board.write_text(before.replace(",ath9k", f",{driver}"), encoding="utf-8")
     try:
         node.exec(exchange).check("exchange the radio")
-        output = node.exec(observation_script("NONCE")).stdout
+        output = node.exec(observation_script("NONCE")).stdout_bytes
     finally:
         board.write_text(before, encoding="utf-8")
         node.exec(exchange.replace(kernel_name, "ath9k")).check("put the radio back")
-    seen = interpret(split_sections(output.encode(), "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
+    seen = interpret(split_sections(output, "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
+    assert output.startswith(b"NONCE gzip\n")
     assert seen.chips is not None
     (chip,) = seen.chips
     assert (chip.path, chip.driver) == ("platform/ahb/18100000.wmac", kernel_name)

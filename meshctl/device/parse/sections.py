@@ -1,8 +1,16 @@
-"""The frame of observe.sh's output: `NONCE begin NAME`, bytes as they are, a newline, `NONCE end STATUS`."""
+"""The frame of observe.sh's output: `NONCE begin NAME`, bytes as they are, a newline, `NONCE end STATUS`.
+
+After a line `NONCE gzip`, the rest is compressed.
+"""
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
+
+# The limit of an answer that is not compressed (ssh_channel.MAX_OUTPUT_BYTES); the rest of a longer one is cut off.
+MAX_INFLATED_BYTES = 16 << 20
+_GZIP_WBITS = 16 + zlib.MAX_WBITS
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +28,9 @@ class OutputSection:
 def split_sections(output: bytes, nonce: str) -> dict[str, OutputSection]:
     """All sections by name, in order. A name that comes twice keeps its first; what is outside sections is dropped."""
     found: dict[str, OutputSection] = {}
+    _, is_compressed, packed = output.partition(f"{nonce} gzip\n".encode())
+    if is_compressed:
+        output = _inflated(packed)
     begin, end = f"{nonce} begin ".encode(), f"{nonce} end ".encode()
     name: str | None = None
     body: list[bytes] = []
@@ -34,6 +45,14 @@ def split_sections(output: bytes, nonce: str) -> dict[str, OutputSection]:
     if name is not None:
         found.setdefault(name, OutputSection(b"\n".join(body), -1))
     return found
+
+
+def _inflated(packed: bytes) -> bytes:
+    """What can be read of it: all, or the beginning of an answer that was cut short."""
+    try:
+        return zlib.decompressobj(_GZIP_WBITS).decompress(packed, MAX_INFLATED_BYTES)
+    except zlib.error:
+        return b""
 
 
 def _status(text: bytes) -> int:

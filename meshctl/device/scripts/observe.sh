@@ -1,6 +1,6 @@
 # Prints all facts of a node that meshctl uses. Sent with `N` (a nonce no output can contain), `EXTRA` (further paths) and
 # `BRIEF` (not empty: only what the proof of a change needs) set before it. Each section is `N begin NAME`, the raw output
-# of a tool, a newline, `N end STATUS`. A missing or failing tool gives an empty section with its status. Nothing here
+# of a tool, a newline, `N end STATUS`; after a line `N gzip`, all of it is compressed. A missing or failing tool gives an empty section with its status. Nothing here
 # changes the node.
 
 section() { # NAME COMMAND...
@@ -169,63 +169,74 @@ mesh() { # INTERFACE
 	section "batctl.originators $1" batctl -m "$1" o
 }
 
-section uptime first_line /proc/uptime
-detail clock date +%s
-section boot_id first_line /proc/sys/kernel/random/boot_id
-section ubus.board ubus call system board
-section board_name first_line /tmp/sysinfo/board_name
-section model first_line /tmp/sysinfo/model
-section load load
-detail df df -k / /tmp
-section root root
-section macs macs
-section ubus.wireless ubus call network.wireless status
-section ubus.interfaces ubus call network.interface dump
-# all interfaces are listed before the first is asked: the list is in memory
-radios=$(iw dev 2>/dev/null)
-known=$?
-section iw.dev listed_radios
-while read -r word dev _; do
-	[ "$word" = Interface ] || continue
-	section "iw.link $dev" iw dev "$dev" link </dev/null
-	section "iw.stations $dev" iw dev "$dev" station dump </dev/null
-	detail "iw.survey $dev" survey "$dev" </dev/null
-done <<-END
-	$radios
-END
-for dev in /sys/class/net/bat*; do
-	[ ! -e "$dev" ] || mesh "${dev##*/}"
-done
-detail sensors sensors
-detail phys phys
-detail iw.phy abilities
-section supplicants supplicants
-section bridges bridges
-[ ! -e /etc/meshctl/lan-filter.sh ] || section lan_filter nft list table bridge meshctl_lan
-section package_tool package_tool
-section packages packages
-detail uci.changes uci changes
-section config.list listed_configuration
-set -- openwrt_release /etc/openwrt_release board.json /etc/board.json meminfo /proc/meminfo
-for conf in /etc/config/*; do
-	[ ! -f "$conf" ] || set -- "$@" "config ${conf##*/}" "$conf"
-done
-if [ -f /etc/dropbear/authorized_keys ]; then
-	set -- "$@" authorized_keys /etc/dropbear/authorized_keys
+report() {
+	section uptime first_line /proc/uptime
+	detail clock date +%s
+	section boot_id first_line /proc/sys/kernel/random/boot_id
+	section ubus.board ubus call system board
+	section board_name first_line /tmp/sysinfo/board_name
+	section model first_line /tmp/sysinfo/model
+	section load load
+	detail df df -k / /tmp
+	section root root
+	section macs macs
+	section ubus.wireless ubus call network.wireless status
+	section ubus.interfaces ubus call network.interface dump
+	# all interfaces are listed before the first is asked: the list is in memory
+	radios=$(iw dev 2>/dev/null)
+	known=$?
+	section iw.dev listed_radios
+	while read -r word dev _; do
+		[ "$word" = Interface ] || continue
+		section "iw.link $dev" iw dev "$dev" link </dev/null
+		section "iw.stations $dev" iw dev "$dev" station dump </dev/null
+		detail "iw.survey $dev" survey "$dev" </dev/null
+	done <<-END
+		$radios
+	END
+	for dev in /sys/class/net/bat*; do
+		[ ! -e "$dev" ] || mesh "${dev##*/}"
+	done
+	detail sensors sensors
+	detail phys phys
+	detail iw.phy abilities
+	section supplicants supplicants
+	section bridges bridges
+	[ ! -e /etc/meshctl/lan-filter.sh ] || section lan_filter nft list table bridge meshctl_lan
+	section package_tool package_tool
+	section packages packages
+	detail uci.changes uci changes
+	section config.list listed_configuration
+	set -- openwrt_release /etc/openwrt_release board.json /etc/board.json meminfo /proc/meminfo
+	for conf in /etc/config/*; do
+		[ ! -f "$conf" ] || set -- "$@" "config ${conf##*/}" "$conf"
+	done
+	if [ -f /etc/dropbear/authorized_keys ]; then
+		set -- "$@" authorized_keys /etc/dropbear/authorized_keys
+	else
+		section authorized_keys true
+	fi
+	contents "$@"
+	detail host_keys host_keys
+	for path in $EXTRA; do
+		section "mode $path" ls -lnd "$path"
+		[ ! -f "$path" ] || section "hash $path" sha256sum "$path"
+		# enough for any configuration; of a larger file only the hash counts
+		[ ! -f "$path" ] || section "text $path" head -c 65536 "$path"
+	done
+	if [ -x /usr/sbin/meshctl-deadman ]; then
+		section deadman /usr/sbin/meshctl-deadman status
+	else
+		section deadman echo absent
+	fi
+	section done true
+}
+
+# The tables of a large mesh are long and repeat themselves: compressed, those of a node among 220 are less than a tenth. A
+# short answer is sent as it is, without two more processes.
+if [ -z "$BRIEF" ] && command -v gzip >/dev/null; then
+	echo "$N gzip"
+	report | gzip -c
 else
-	section authorized_keys true
+	report
 fi
-contents "$@"
-detail host_keys host_keys
-for path in $EXTRA; do
-	section "mode $path" ls -lnd "$path"
-	[ ! -f "$path" ] || section "hash $path" sha256sum "$path"
-	# enough for any configuration; of a larger file only the hash counts
-	[ ! -f "$path" ] || section "text $path" head -c 65536 "$path"
-done
-if [ -x /usr/sbin/meshctl-deadman ]; then
-	section deadman /usr/sbin/meshctl-deadman status
-else
-	section deadman echo absent
-fi
-section done true

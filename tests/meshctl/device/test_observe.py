@@ -6,7 +6,9 @@ The cases in recorded/ were composed after the tools' sources (docs/facts/openwr
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
+import random
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,9 +21,10 @@ from meshctl.device.observation import Observation, Originator
 from meshctl.device.observe import interpret, observation_script, observe
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
 from meshctl.device.parse.deadman import parse_answer, parse_status
-from meshctl.device.parse.sections import OutputSection, split_sections
+from meshctl.device.parse.sections import MAX_INFLATED_BYTES, OutputSection, split_sections
 from meshctl.device.scripts import script
 from meshctl.device.ssh import SshConnection
+from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
 from meshctl.model import RELEASES
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import host_key
@@ -177,6 +180,47 @@ def test_arbitrary_sections_yield_an_observation(sections: dict[str, OutputSecti
 def test_sections_keep_every_byte(bodies: list[bytes]) -> None:
     output = b"".join(b"NONCE begin s%d\n%s\nNONCE end %d\n" % (n, body, n) for n, body in enumerate(bodies))
     assert split_sections(output, "NONCE") == {f"s{n}": OutputSection(body, n) for n, body in enumerate(bodies)}
+
+
+@given(st.integers(0, 60_000))
+def test_a_compressed_answer_is_read_like_any_other_wherever_it_is_cut(at: int) -> None:
+    whole = (RECORDED / "24.10" / "mesh" / "observe.out").read_bytes()
+    packed = b"a banner\nNONCE gzip\n" + gzip.compress(whole, mtime=0)
+    cut = split_sections(packed[:at], "NONCE")
+    every = split_sections(whole, "NONCE")
+    if at >= len(packed):
+        assert cut == every
+        return
+    # the last one may be cut, even in its name
+    complete = list(cut)[:-1]
+    assert complete == list(every)[: len(complete)]
+    assert all(cut[name] == every[name] for name in complete)
+
+
+def test_the_originators_of_a_large_mesh_shrink_to_a_tenth() -> None:
+    chance = random.Random(1)
+    macs = [f"02:15:6d:{chance.randrange(1 << 24):06x}" for _ in range(220)]
+    rows = [
+        {"hard_ifindex": 7, "hard_ifname": "mesh0", "orig_address": mac, "last_seen_msecs": chance.randrange(1000),
+         "neigh_address": macs[via], "tq": chance.randrange(1, 256)}
+        for mac in macs
+        for via in range(4)
+    ]  # fmt: skip
+    table = json.dumps(rows).encode()
+    assert len(table) > 100_000
+    assert len(gzip.compress(table, 6)) < len(table) / 10
+
+
+@pytest.mark.parametrize("packed", [b"", b"no gzip", gzip.compress(b"")[:5], b"\x1f\x8b" + bytes(40)])
+def test_what_is_not_compressed_although_it_says_so_has_no_sections(packed: bytes) -> None:
+    assert split_sections(b"NONCE gzip\n" + packed, "NONCE") == {}
+
+
+def test_a_compressed_answer_is_inflated_up_to_the_limit_of_an_answer() -> None:
+    bomb = gzip.compress(b"NONCE begin uptime\n" + bytes(4 * MAX_INFLATED_BYTES))
+    assert MAX_INFLATED_BYTES == MAX_OUTPUT_BYTES
+    (section,) = split_sections(b"NONCE gzip\n" + bomb, "NONCE").values()
+    assert len(section.body) < MAX_INFLATED_BYTES
 
 
 def test_section_markers_without_the_nonce_are_ignored() -> None:
