@@ -2,8 +2,8 @@
 
 `flash`: check the image (`checked_image`) and the node's memory, upload, `sysupgrade -T`, print the recovery recipe,
 start `sysupgrade -n -f` detached. The archive for the new system (`archive`, pure) holds the rendered configuration,
-the node's host keys, the dead-man's switch and a marker. Success means a new boot id, the desired revision, the board
-and the marker.
+the node's host keys, the dead-man's switch and a marker. Success means the desired revision, the board and the marker,
+which only a boot after the flash unpacks.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
             listener.unreachable()
         else:
             ctx.run.record(ctx.name, seen)
-            if seen.boot_id != ctx.before.boot_id:
+            if has_booted(ctx.before, seen, marker):
                 listener.ended(seen, rebooted=True)
-                return _verdict(ctx, seen, marker)
+                return verdict(ctx.name, ctx.node.hardware, seen, marker)
             if backoff.elapsed_s > START_TIMEOUT_S:
                 return Outcome(
                     ctx.name,
@@ -162,18 +162,31 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
     )
 
 
-def _verdict(ctx: NodeContext, seen: Observation, marker: str) -> Outcome:
-    """The outcome of a node that came back: revision, board and marker must match."""
+def has_booted(before: Observation, seen: Observation, marker: str) -> bool:
+    """Whether the node has booted since sysupgrade began. Its marker proves that by itself: nothing but a boot unpacks
+    the archive. Otherwise another boot id does, if both are known: a node that is going down may not report its own."""
+    if _has_marker(seen, marker):
+        return True
+    return None not in (before.boot_id, seen.boot_id) and seen.boot_id != before.boot_id
+
+
+def verdict(name: str, hardware: HardwareProfile, seen: Observation, marker: str) -> Outcome:
+    """The outcome of a node that came back: revision, board and marker must match. Neither a boot nor the marker alone
+    counts: a board with two slots may unpack the archive and fall back to the previous firmware."""
     running = seen.release.revision if seen.release else "unknown"
     board = seen.board.board_name if seen.board else "unknown"
-    desired = ctx.plan.firmware.to_revision if ctx.plan.firmware is not None else running
-    info = seen.files.get(MARKER_PATH)
+    desired = hardware.firmware.revision
     problems = [
         "" if is_revision(running, desired) else f"it runs {running}, not {desired}",
-        "" if board == ctx.node.hardware.board else f"its board is {board}, not {ctx.node.hardware.board}",
-        "" if info is not None and (info.text or "").strip() == marker else "its configuration is not the flashed one",
+        "" if board == hardware.board else f"its board is {board}, not {hardware.board}",
+        "" if _has_marker(seen, marker) else "its configuration is not the flashed one",
     ]
     problem_text = "; ".join(problem for problem in problems if problem)
     if problem_text:
-        return Outcome(ctx.name, Result.FAILED, f"it came back, but {problem_text}")
-    return Outcome(ctx.name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})
+        return Outcome(name, Result.FAILED, f"it came back, but {problem_text}")
+    return Outcome(name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})
+
+
+def _has_marker(seen: Observation, marker: str) -> bool:
+    info = seen.files.get(MARKER_PATH)
+    return info is not None and (info.text or "").strip() == marker
