@@ -67,12 +67,19 @@ packages() {
 	fi
 }
 
-# the radio interfaces that wpa_supplicant runs, by their control sockets
-# Its control sockets, and its objects on the bus: netifd's scripts delete the socket of an interface that they set up once
-# more, while the supplicant goes on (hostapd.sh: wpa_supplicant_teardown_interface, up to 24.10).
+# The radio interfaces that wpa_supplicant runs, by their control sockets. netifd's scripts delete the socket of an interface
+# that they set up once more, while the supplicant goes on (hostapd.sh: wpa_supplicant_teardown_interface, up to 24.10).
+# So one that netifd gave to the supplicant, by a file (hostapd.sh, 25.12: supplicant.uc), and that has no socket is looked
+# for on the bus. `ubus list` ends with 4 where nothing matches; that is no failure.
 supplicants() {
 	for socket in /var/run/wpa_supplicant/*; do [ ! -e "$socket" ] || echo "${socket##*/}"; done
-	[ ! -e /var/run/wpa_supplicant ] || ubus list 'wpa_supplicant.*'
+	for file in /var/run/wpa[_-]supplicant-*.conf; do
+		name=${file#/var/run/wpa?supplicant-}
+		[ -e "$file" ] && [ ! -e "/var/run/wpa_supplicant/${name%.conf}" ] || continue
+		ubus list 'wpa_supplicant.*'
+		break
+	done
+	return 0
 }
 
 listed_radios() {

@@ -416,6 +416,8 @@ function sys_script(    d, file, port, n, i, list, dir) {
 	for (d in encrypted) if (socket[d] == "kept") kept = kept " " d
 	print "for d in /var/run/wpa_supplicant/*; do case \"" kept " \" in *\" ${d##*/} \"*) ;; *) rm -f \"$d\" ;; esac; done" > file
 	for (d in encrypted) if (socket[d] == "made") printf ": >/var/run/wpa_supplicant/%s\n", d > file
+	# as hostapd.sh names it; 25.12: supplicant.uc. It stays when the interface goes
+	for (d in encrypted) printf ": >/var/run/wpa%ssupplicant-%s.conf\n", (series == "25.12" ? "-" : "_"), d > file
 	printf "" > (run "/supplicants")
 	for (d in encrypted) print d > (run "/supplicants")
 	for (d in exists) {
