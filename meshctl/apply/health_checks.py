@@ -1,8 +1,8 @@
 """Health checks after a change: observations before and after it -> the conditions not met yet. Pure.
 
 A change is confirmed only when its services have reloaded (`_reload`), packages are installed (`_packages`), the LAN is
-up (`_lan`), radios have joined their cells (`_radios`) and are part of batman-adv (`_batman`), enough mesh neighbors
-are heard (`_neighbors`) and the base is reachable (`_base`).
+up (`_lan`), radios have joined their cells (`_radios`) and are part of batman-adv (`_batman`), those turned off have
+left theirs (`_off`), enough mesh neighbors are heard (`_neighbors`) and the base is reachable (`_base`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from meshctl.device.observation import Observation
 from meshctl.plan import DesiredState
 from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
-from meshctl.plan.seen import address_options
+from meshctl.plan.seen import WIRELESS, address_options, packages_seen
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 
@@ -32,12 +32,14 @@ _UNKNOWN_PROTOCOL = "INVALID_PROTO"
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """What must hold after the change. `neighbors` are the MACs heard before, `base_macs` the MACs of the base's mesh
-    radios, both empty on the bench; `needs` are packages, for a change of packages."""
+    radios, both empty on the bench; `off` are radio interfaces that the change turns off; `needs` are packages, for a
+    change of packages."""
 
     wireless: Package | None = None
     network: Package | None = None
     neighbors: frozenset[str] = frozenset()
     base_macs: frozenset[str] = frozenset()
+    off: frozenset[str] = frozenset()
     needs: Needs = NO_NEEDS
 
     def with_base_macs(self, current: frozenset[str]) -> Expectation:
@@ -49,12 +51,21 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
     """What this node must have after the change; the base only if it was reachable through the mesh before."""
     trees = {file.package.name: file.package for file in desired.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
+    wireless = trees.get("wireless")
+    off = frozenset() if wireless is None else _named(packages_seen([WIRELESS], before)["wireless"]) - _named(wireless)
     return Expectation(
-        trees.get("wireless"),
+        wireless,
         trees.get("network"),
-        heard_neighbors(before),
+        # what only a radio heard that is turned off is not heard again
+        heard_neighbors(replace(before, neighbours=tuple(n for n in before.neighbours or () if n.ifname not in off))),
         frozenset(mac.lower() for mac in base_macs) & originators,
+        off,
     )
+
+
+def _named(wireless: Package | None) -> frozenset[str]:
+    """The names of the enabled radio interfaces."""
+    return frozenset(iface.get("ifname") for iface, _ in enabled_interfaces(wireless)) - {""}
 
 
 def heard_neighbors(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
@@ -73,6 +84,7 @@ def unmet(expected: Expectation, after: Observation, *, since_s: float | None = 
         *_packages(expected, after),
         *_lan(expected, after),
         *_radios(expected, after),
+        *_off(expected, after),
         *_batman(expected, after),
         *_neighbors(expected, after, fresh_ms),
         *_base(expected, after, fresh_ms),
@@ -142,6 +154,12 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
     for iface, device in enabled_interfaces(expected.wireless):
         problems += _radio(iface, device.get("channel"), after)
     return tuple(problems)
+
+
+def _off(expected: Expectation, after: Observation) -> tuple[str, ...]:
+    """25.12's scripts leave an interface in its cell that netifd reports as down (scripts/reload.sh, settle_radios)."""
+    left = [link.ifname for link in after.links or () if link.ifname in expected.off]
+    return tuple(f"{name} is turned off, but still there" for name in left)
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:

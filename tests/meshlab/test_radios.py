@@ -65,6 +65,21 @@ def test_a_disabled_open_interface_stays_in_its_cell_until_wifi_down(latest: Vir
     assert not has_joined(latest)
 
 
+# what `mesh: null` renders
+OFF = "set wireless.radio0.disabled=1\ndelete wireless.mesh0"
+
+
+def test_the_open_interface_of_a_removed_section_stays_in_its_cell_until_wifi_down(latest: VirtualNode) -> None:
+    """Seen on 25.12.5: `radio0` is down for netifd, and mesh0 is in its cell, outside bat0."""
+    before = index(latest)
+    configure(latest, OFF)
+    assert index(latest) == before
+    assert has_joined(latest)
+    latest.exec("wifi down; wifi up")
+    until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
+    assert not has_joined(latest)
+
+
 def test_reenabling_a_disabled_radio_keeps_its_remaining_interface(latest: VirtualNode) -> None:
     before = index(latest)
     configure(latest, "set wireless.radio0.disabled=1")
@@ -98,9 +113,9 @@ def test_the_reload_script_recreates_a_lost_interface(latest: VirtualNode) -> No
     until(lambda: index(latest) != "" and has_joined(latest), "mesh0 in its cell")
 
 
-def test_the_reload_script_removes_the_interface_of_a_disabled_radio(latest: VirtualNode) -> None:
-    off = "uci set wireless.radio0.disabled=1; uci commit wireless"
-    latest.exec(f"{off}\n{reload_script({WIRELESS}, ())}").check("reload")
+@pytest.mark.parametrize("off", ["set wireless.radio0.disabled=1", OFF], ids=["disabled", "removed"])
+def test_the_reload_script_removes_the_interface_of_a_radio_that_is_off(latest: VirtualNode, off: str) -> None:
+    latest.exec(f"uci -q batch <<END\n{off}\ncommit wireless\nEND\n{reload_script({WIRELESS}, ())}").check("reload")
     until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
 
 

@@ -110,21 +110,36 @@ await_netifd() {
 	until_s $NETIFD_LIMIT_S interfaces_are_set_up
 }
 
-# radio_interfaces: prints `+NAME` for each enabled radio interface and `-NAME` for each disabled one; sections without
-# an ifname are left out.
+# radio_interfaces: prints `+NAME` for each enabled radio interface and `-NAME` for each disabled one; `+` for an enabled
+# one without an ifname; `:NAME` for each disabled radio.
 radio_interfaces() {
 	uci -q show wireless | awk -F"[.=]" '
 		{ value = $0; sub(/^[^=]*=/, "", value); gsub(/\047/, "", value) }
 		NF == 3 && value == "wifi-iface" { sections[++count] = $2 }
+		NF == 3 && value == "wifi-device" { radios[$2] }
 		NF > 3 { options[$2, $3] = value }
 		END {
 			for (i = 1; i <= count; i++) {
 				section = sections[i]
-				if (options[section, "ifname"] == "") continue
 				off = options[section, "disabled"] == "1" || options[options[section, "device"], "disabled"] == "1"
-				print (off ? "-" : "+") options[section, "ifname"]
+				if (!off || options[section, "ifname"] != "") print (off ? "-" : "+") options[section, "ifname"]
 			}
+			for (radio in radios) if (options[radio, "disabled"] == "1") print ":" radio
 		}'
+}
+
+# left_over: prints `-NAME` for each mesh interface of a section that is gone. With an enabled section without an ifname it
+# is not known whose they are.
+left_over() {
+	case $NEWLINE$configured_interfaces$NEWLINE in *"$NEWLINE+$NEWLINE"*) return ;; esac
+	iw dev 2>/dev/null | while read -r word value _; do
+		case "$word $value" in
+		'Interface '*) name=$value ;;
+		'type IBSS' | 'type mesh')
+			case $NEWLINE$configured_interfaces$NEWLINE in *"$NEWLINE"[+-]"$name$NEWLINE"*) ;; *) echo "-$name" ;; esac
+			;;
+		esac
+	done
 }
 
 # no_radio_is_lost: no enabled interface has disappeared since the reload started, and no disabled one exists. One that
@@ -147,14 +162,26 @@ stay_settled() {
 	until_s $RADIO_LIMIT_S no_radio_is_lost
 }
 
-# settle_radios: waits until the radios are set up. 25.12 keeps the interface of a disabled radio, and removes the one it
-# has just created when a radio changes from wpa_supplicant to an open cell (wifi-scripts: mac80211.sh, wdev.uc). Taking
-# the radios down first clears that state.
+# clear_disabled_radios: takes the disabled radios down, which clears what they left on the air, and leaves the others alone
+clear_disabled_radios() {
+	case $configured_interfaces in *:*) ;; *) return 1 ;; esac
+	for radio in $configured_interfaces; do
+		case $radio in :*) /sbin/wifi down "${radio#:}" && /sbin/wifi up "${radio#:}" ;; esac
+	done
+	await_netifd
+	until_s $RADIO_LIMIT_S no_radio_is_lost
+}
+
+# settle_radios: waits until the radios are set up. 25.12 leaves the interface of a radio in its cell when the radio is
+# turned off, or the interface's section is gone, and removes the one that it has just created when a radio changes from
+# wpa_supplicant to an open cell (wifi-scripts: mac80211.sh, wdev.uc). Taking the radios down first clears that state.
 settle_radios() {
 	await_netifd
 	configured_interfaces=$(radio_interfaces)
+	configured_interfaces=$configured_interfaces$NEWLINE$(left_over)
 	until_s $RADIO_LIMIT_S no_radio_is_lost && stay_settled && return
 	[ -x /sbin/wifi ] || return 0
+	clear_disabled_radios && return
 	/sbin/wifi down
 	/sbin/wifi up
 	await_netifd

@@ -36,6 +36,15 @@ function read_standing(    line, part) {
 		else { was_key[part[2]] = part[3]; was_mac[part[2]] = part[4]; was_index[part[2]] = part[5]; was_on[part[2]] = part[6]; was_by[part[2]] = part[7]; was_wdev[part[2]] = part[8] }
 	}
 	close(run "/radios")
+	while ((getline line < (run "/iw")) > 0) { split(line, part, "\t"); was_iw[part[1]] = line "\n" }
+	close(run "/iw")
+	while ((getline line < (run "/effective")) > 0) if (sub(/^cell\t/, "", line)) {
+		split(line, part, "\t")
+		# without master, algorithm and index
+		sub(/\t[^\t]*\t[^\t]*\t[^\t]*$/, "", line)
+		was_cell[part[2]] = line
+	}
+	close(run "/effective")
 	last_index = 20
 	if ((getline line < (run "/last_index")) > 0) last_index = line + 0
 	close(run "/last_index")
@@ -124,7 +133,7 @@ function stand(ifname, key, address, number, device, by, wdev) {
 
 # 25.12: wdev.uc is not called where no open interface is left, so a disabled one stays on the air
 function stays(ifname, device) {
-	return series == "25.12" && !mode_down && was_by[ifname] == "wdev" && was_on[ifname] == device && !open_faces[device]
+	return series == "25.12" && !mode_down && device != taken_down && was_by[ifname] == "wdev" && was_on[ifname] == device && !open_faces[device]
 }
 # the interfaces that wdev.uc sets up
 function count_open_faces(    i, id, device) {
@@ -176,7 +185,7 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 		devices[++ndevices] = device
 		path = get(id, "path", "")
 		radio_path[device] = path
-		if (yes(get(id, "disabled", "0"))) { radio_disabled[device] = 1; continue }
+		if (yes(get(id, "disabled", "0")) || device == taken_down) { radio_disabled[device] = 1; continue }
 		if (!(path in phy_of)) { radio_failed[device] = 1; continue }
 		radio_up[device] = 1
 	}
@@ -228,6 +237,21 @@ function radio_interfaces(    i, id, device, path, phy, channel, freq, mode, ifn
 				(mode == "mesh" ? get(id, "mesh_id", "") "\t-" : get(id, "ssid", "") "\t" get(id, "bssid", "")) "\t" algo "\t" key "\t" mac[ifname]
 			cells[++ncells] = ifname
 		}
+	}
+	leftovers()
+}
+
+# 25.12: neither does wdev.uc remove an interface whose section is gone, from a radio without another open one. It stays in
+# its cell, but no longer in bat0.
+function leftovers(    ifname, device) {
+	for (ifname in was_key) {
+		device = was_on[ifname]
+		if ((ifname in exists) || (ifname in held) || (ifname in lost) || !(device in radio_path) || !stays(ifname, device)) continue
+		exists[ifname] = 1; is_radio[ifname] = 1
+		mac[ifname] = was_mac[ifname]; index_of[ifname] = was_index[ifname]
+		stand(ifname, was_key[ifname], mac[ifname], index_of[ifname], device, "wdev", was_wdev[ifname])
+		iw_line = iw_line was_iw[ifname]
+		if (ifname in was_cell) { cell[ifname] = was_cell[ifname]; cells[++ncells] = ifname }
 	}
 }
 

@@ -193,3 +193,46 @@ def test_a_router_needs_its_address_on_the_mesh_too(
     lan = NetInterface("lan", True, False, "static", "br-lan", ("10.43.1.1/24",))
     backbone = NetInterface("backbone", is_up, False, "static", "bat0", addresses)
     assert unmet(wanted_state, replace(good(), interfaces=(lan, backbone)), since_s=20.0) == gaps_found
+
+
+MESH1 = """
+config wifi-iface 'mesh1'
+	option device 'radio0'
+	option network 'mesh1'
+	option ifname 'mesh1'
+	option mode 'adhoc'
+"""
+
+
+def with_a_second_interface() -> Observation:
+    """A node with an interface that the inventory turns off, and that hears most of its neighbors over it."""
+    node = good()
+    assert node.uci is not None
+    return replace(
+        node,
+        uci={**node.uci, "wireless": node.uci["wireless"] + MESH1},
+        links=(*(node.links or ()), WirelessLink("mesh1", "IBSS", bssid="02:ca:fe:00:00:01", channel=6, joined=True)),
+        neighbours=(
+            *(node.neighbours or ()),
+            *(MeshNeighbour(f"02:00:00:00:01:{number:02x}", "mesh1", 100) for number in range(5)),
+        ),
+    )
+
+
+def test_an_interface_that_is_turned_off_must_be_gone() -> None:
+    """25.12.5: netifd reports the radio as down, and it goes on in its cell."""
+    before = with_a_second_interface()
+    expected = expectation(wanted(fleet(), "b01"), before, [BASE])
+    after = replace(before, neighbours=good().neighbours)
+    assert unmet(expected, after) == ("mesh1 is turned off, but still there",)
+    assert unmet(expected, replace(after, links=good().links)) == ()
+
+
+def test_neighbors_that_only_an_interface_heard_that_is_turned_off_are_not_waited_for() -> None:
+    expected = expectation(wanted(fleet(), "b01"), with_a_second_interface(), [BASE])
+    assert expected.neighbors == {BASE, OTHER}
+
+
+def test_an_interface_that_is_not_ours_may_stay() -> None:
+    monitor = (*(good().links or ()), WirelessLink("mon0", "monitor"))
+    assert gaps(replace(good(), links=monitor)) == ()

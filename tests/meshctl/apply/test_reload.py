@@ -47,6 +47,7 @@ class Node:
         self.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; {passing}')
         (place / "uptime").write_text("1000 0\n")
         self.tool("uci", 'cat "$HERE/wireless" 2>/dev/null')
+        self.tool("iw", 'cat "$HERE/iw" 2>/dev/null')
         self.tool("fw4", ":")
         self.tool("nft", 'cat "$HERE/rules"')
         self.service("network")
@@ -276,22 +277,22 @@ wireless.default_radio0.device='radio0'
 
 
 @pytest.mark.parametrize(
-    ("disabled", "before", "after", "is_reset"),
+    ("disabled", "before", "after", "resets"),
     [
-        (0, True, True, False),
+        (0, True, True, []),
         # taken away and never created again
-        (0, True, False, True),
+        (0, True, False, ["wifi down", "wifi up"]),
         # missing all along: not what the change did
-        (0, False, False, False),
-        # it continues to send although it is off
-        (1, True, True, True),
-        (1, True, False, False),
+        (0, False, False, []),
+        # it continues to send although it is off, whatever is done
+        (1, True, True, ["wifi down radio0", "wifi up radio0", "wifi down", "wifi up"]),
+        (1, True, False, []),
     ],
 )
 def test_lost_radios_and_disabled_radios_still_up_are_reset_once(
-    node: Node, disabled: int, before: bool, after: bool, is_reset: bool
+    node: Node, disabled: int, before: bool, after: bool, resets: list[str]
 ) -> None:
-    node.tool("wifi", 'echo "wifi $1" >>"$HERE/log"')
+    node.tool("wifi", 'echo wifi "$@" >>"$HERE/log"')
     (node.place / "wireless").write_text(WIRELESS % disabled)
     (node.place / "net" / "lo").mkdir()
     if before:
@@ -299,7 +300,45 @@ def test_lost_radios_and_disabled_radios_still_up_are_reset_once(
     if before and not after:
         node.tool("reload_config", 'rmdir "$HERE/net/mesh0"')
     assert node.reload("wireless") == (0, "")
-    assert [line for line in node.log if line.startswith("wifi")] == (["wifi down", "wifi up"] if is_reset else [])
+    assert [line for line in node.log if line.startswith("wifi")] == resets
+
+
+TWO_RADIOS = """wireless.radio0=wifi-device
+wireless.radio0.disabled='0'
+wireless.radio1=wifi-device
+wireless.radio1.disabled='1'
+wireless.mesh0=wifi-iface
+wireless.mesh0.device='radio0'
+wireless.mesh0.ifname='mesh0'
+"""
+# as `iw dev` prints it
+ON_THE_AIR = "phy#1\n\tInterface mesh1\n\t\tifindex 9\n\t\ttype %s\nphy#0\n\tInterface mesh0\n\t\ttype IBSS\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "is_removed"),
+    [
+        ("IBSS", TWO_RADIOS, True),
+        ("mesh point", TWO_RADIOS, True),
+        # someone's own
+        ("monitor", TWO_RADIOS, False),
+        # an interface without a name may be any of those
+        ("IBSS", f"{TWO_RADIOS}wireless.other=wifi-iface\nwireless.other.device='radio0'\n", False),
+    ],
+)
+def test_the_interface_of_a_removed_section_is_taken_down_alone(
+    node: Node, kind: str, settings: str, is_removed: bool
+) -> None:
+    """25.12 leaves it in its cell. The radio over which the node is reached stays up."""
+    node.tool("wifi", 'echo wifi "$@" >>"$HERE/log"; [ "$1 $2" != "down radio1" ] || rmdir "$HERE/net/mesh1"')
+    (node.place / "wireless").write_text(settings)
+    (node.place / "iw").write_text(ON_THE_AIR % kind)
+    for name in ("mesh0", "mesh1"):
+        (node.place / "net" / name).mkdir()
+    assert node.reload("wireless") == (0, "")
+    resets = ["wifi down radio1", "wifi up radio1"] if is_removed else []
+    assert [line for line in node.log if line.startswith("wifi")] == resets
+    assert (node.place / "net" / "mesh1").exists() != is_removed
 
 
 @pytest.mark.parametrize(
