@@ -220,7 +220,7 @@ def with_a_second_interface() -> Observation:
 
 
 def test_an_interface_that_is_turned_off_must_be_gone() -> None:
-    """25.12.5: netifd reports the radio as down, and it goes on in its cell."""
+    """25.12.5: netifd reports the radio as down, and it continues in its cell."""
     before = with_a_second_interface()
     expected = expectation(wanted(fleet(), "b01"), before, [BASE])
     after = replace(before, neighbours=good().neighbours)
