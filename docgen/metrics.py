@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import typing
+from collections.abc import Mapping
 from enum import Enum
 from types import NoneType
 from typing import Any
@@ -17,6 +18,7 @@ def metrics_page() -> str:
     from udp_mesh.core.conditions import Conditions
     from udp_mesh.daemon.latencies import Histogram
     from udp_mesh.daemon.metrics import render
+    from udp_mesh.daemon.radio_paths import RadioReport
     from udp_mesh.daemon.status import TopicCount
 
     latencies = {0: Histogram()}
@@ -25,6 +27,7 @@ def metrics_page() -> str:
         about={"version": "1"},
         uptime_s=1.0,
         latencies=latencies,
+        radio=_sample(RadioReport),
     )
     families: dict[str, tuple[str, str, str]] = {}
     help_texts: dict[str, str] = {}
@@ -63,6 +66,9 @@ def _sample(kind: Any) -> Any:
     origin = typing.get_origin(kind)
     if origin is tuple:
         return tuple(_sample(each) for each in arguments)
+    if origin is Mapping:
+        key, value = arguments
+        return {_sample(key): _sample(value)}
     if arguments:
         return _sample(arguments[0])
     if isinstance(kind, type) and issubclass(kind, Enum):

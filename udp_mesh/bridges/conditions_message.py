@@ -23,9 +23,13 @@ PACKAGE = "udp_mesh_msgs"
 FOLDER = Path(__file__).with_name(PACKAGE)
 NAN = float("nan")
 TRENDS = {"improving": 1, "steady": 2, "worsening": 3}
-"""The constants of PeerConditions; 0 is unknown."""
+"""The constants of PeerConditions and RadioPath; 0 is unknown."""
+_MEASURED = ("signal_dbm", "noise_dbm", "margin_db", "bottleneck_bits_per_s", "quality", "age_s")
 TEXT_TOPIC, TYPED_TOPIC = "mesh_conditions", "mesh_conditions_typed"
 """In the robot's namespace."""
+
+
+_PARTS = ("PeerConditions", "QueueConditions", "RadioPath", "RadioConditions", "RadioNeighbor")
 
 
 def _source(name: str) -> str:
@@ -35,7 +39,7 @@ def _source(name: str) -> str:
 DEFINITION = MessageDefinition(
     PACKAGE + "/Conditions",
     _source("Conditions")
-    + "".join(contained("{}/{}".format(PACKAGE, name), _source(name)) for name in ("PeerConditions", "QueueConditions"))
+    + "".join(contained("{}/{}".format(PACKAGE, name), _source(name)) for name in _PARTS)
     + contained("std_msgs/Header"),
 )
 TYPE_HASH = type_hash(DEFINITION)
@@ -50,6 +54,7 @@ def conditions_message(conditions: Mapping[str, Any], stamp: Tuple[int, int]) ->
         "sent_bits_per_s": conditions["sent_bits_per_s"],
         "heard_bits_per_s": conditions["heard_bits_per_s"],
         "peers": [_peer(peer) for peer in conditions["peers"]],
+        "radio": _radio(conditions.get("radio") or {}),
     }
 
 
@@ -81,6 +86,40 @@ def _peer(peer: Mapping[str, Any]) -> Message:
         "queues": waiting,
         "outbox_messages": peer["outbox_messages"],
         "outbox_bytes": peer["outbox_bytes"],
+        "radio": _radio_path(peer.get("radio") or {}),
+    }
+
+
+def _radio_path(radio: Mapping[str, Any]) -> Message:
+    """Of a collector's report; empty: nothing is known."""
+    trend = radio.get("trend") or {}
+    names: Message = {key: radio.get(key) or "" for key in ("source", "radio", "next_hop")}
+    measured = {key: _known(radio.get(key)) for key in _MEASURED}
+    return {
+        **names,
+        **measured,
+        "trend": TRENDS.get(trend.get("direction", ""), 0),
+        "change_db_per_s": _known(trend.get("change_db_per_s")),
+    }
+
+
+def _radio(radio: Mapping[str, Any]) -> Message:
+    """Of a collector's report as a whole; empty: there is none."""
+    neighbors: List[Message] = [
+        {
+            "name": one["name"],
+            "radio": one["radio"],
+            "signal_dbm": one["signal_dbm"],
+            "margin_db": _known(one["margin_db"]),
+            "age_s": one["age_s"],
+        }
+        for one in radio.get("neighbors") or ()
+    ]
+    return {
+        "source": radio.get("source") or "",
+        "problem": radio.get("problem") or "",
+        "age_s": _known(radio.get("age_s")),
+        "neighbors": neighbors,
     }
 
 

@@ -242,6 +242,7 @@ def render_metrics(service: Service) -> str:
         uptime_s=driver.now() - service.started,
         latencies=service.latencies.by_priority,
         broadcasts_saved=driver.node.selective.conditions().broadcasts,
+        radio=service.radio,
     )
 
 

@@ -12,6 +12,7 @@ from udp_mesh.core.thin.conditions import ThinConditions, ThinLinkConditions
 from udp_mesh.core.thin.link import ThinLinkCounters
 from udp_mesh.core.versions.conditions import VersionConditions, VersionCounters
 from udp_mesh.daemon.latencies import BOUNDS_S, Histogram
+from udp_mesh.daemon.radio_paths import RadioNeighbor, RadioPath, RadioReport
 from udp_mesh.daemon.status import TopicCount
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -69,9 +70,10 @@ def render(
     uptime_s: float,
     latencies: Mapping[int, Histogram] | None = None,
     broadcasts_saved: SavedCounters | None = None,
+    radio: RadioReport | None = None,
 ) -> str:
     """The Prometheus page; `extra` are counters of the daemon itself, `about` the labels of the info metric,
-    `latencies` those of deliveries by priority."""
+    `latencies` those of deliveries by priority, `radio` the last report of a collector."""
     lines: list[str] = []
     _family(lines, "info", "gauge", "Always 1; the labels describe the node.", [(about, 1)])
     build = {name: about[name] for name in _BUILD_LABELS if name in about}
@@ -115,6 +117,7 @@ def render(
             help_text = f"{name.capitalize()} to all, not sent because no peer's programs want them."
             _family(lines, f"broadcasts_saved_{name}_total", "counter", help_text, [({}, total)])
     lines += [] if thin is None else _thin_lines(thin)
+    lines += [] if radio is None else _radio_lines(radio, [peer.name for peer in conditions.peers], conditions.now)
     for name, number in extra.items():
         _family(lines, f"{name}_total", "counter", name.replace("_", " ").capitalize() + ".", [({}, number)])
     return "\n".join(lines) + "\n"
@@ -140,6 +143,44 @@ def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
         for reader, count in log.missing_readers
     ]
     _family(lines, "log_missing_items", "gauge", "Items that a reader is not known to have.", missing)
+    return lines
+
+
+_RADIO_PATH_GAUGES: tuple[tuple[str, str, Callable[[RadioPath], float | None]], ...] = (
+    ("signal_dbm", "Signal of the next hop, as the robot's radio hears it.", lambda path: path.signal_dbm),
+    ("noise_dbm", "Noise at the robot's radio.", lambda path: path.noise_dbm),
+    ("margin_db", "What the next hop's signal is above what the load needs.", lambda path: path.margin_db),
+    ("bottleneck_bits_per_second", "Least rate known of the path.", lambda path: path.bottleneck_bits_per_s),
+    ("quality_ratio", "Share of the routing protocol's packets that arrive.", lambda path: path.quality),
+    ("trend_db_per_second", "Change of the signal; negative: worsening.", lambda path: path.change_db_per_s),
+)
+_RADIO_NEIGHBOR_GAUGES: tuple[tuple[str, str, Callable[[RadioNeighbor], float | None]], ...] = (
+    ("signal_dbm", "Signal of a neighbor, as the radio hears it.", lambda one: one.signal_dbm),
+    ("margin_db", "What the signal of a neighbor is above what the load needs.", lambda one: one.margin_db),
+)
+
+
+def _radio_lines(radio: RadioReport, peers: Iterable[str], now: float) -> list[str]:
+    """The age and whether there is a problem remain when a collector is silent, for an alert; its values do not."""
+    lines: list[str] = []
+    age_s = round(max(0.0, now - radio.reported_at), 3)
+    _family(lines, "radio_report_age_seconds", "gauge", "Time since the collector's last report.", [({}, age_s)])
+    help_text = "1 if a radio gives the collector no new values, else 0."
+    _family(lines, "radio_problem", "gauge", help_text, [({}, float(bool(radio.problem)))])
+    paths = [path for name in peers if (path := radio.recent_path(name, now)) is not None]
+    about = [({"peer": path.peer, "radio": path.radio, "next_hop": path.next_hop}, 1.0) for path in paths]
+    _family(lines, "radio_path_info", "gauge", "Always 1; the labels describe the radio path to the peer.", about)
+    for name, help_text, read in _RADIO_PATH_GAUGES:
+        samples = [({"peer": path.peer}, value) for path in paths if (value := read(path)) is not None]
+        _family(lines, f"radio_path_{name}", "gauge", help_text, samples)
+    neighbors = {(one.name, one.radio): one for one in radio.recent_neighbors(now)}
+    for name, help_text, value_of in _RADIO_NEIGHBOR_GAUGES:
+        samples = [
+            ({"neighbor": one.name, "radio": one.radio}, value)
+            for one in neighbors.values()
+            if (value := value_of(one)) is not None
+        ]
+        _family(lines, f"radio_neighbor_{name}", "gauge", help_text, samples)
     return lines
 
 

@@ -80,10 +80,18 @@ class RadioReport:
     paths: Mapping[str, RadioPath]
     neighbors: tuple[RadioNeighbor, ...]
 
+    def recent_path(self, peer: str, now: float) -> RadioPath | None:
+        """None if nothing recent is known of its path."""
+        path = self.paths.get(peer)
+        return None if path is None or now - path.measured_at > MAX_AGE_S else path
+
+    def recent_neighbors(self, now: float) -> Iterator[RadioNeighbor]:
+        return (one for one in self.neighbors if now - one.measured_at <= MAX_AGE_S)
+
     def path_json(self, peer: str, now: float) -> Json | None:
         """For the peer's conditions; None if nothing recent is known of its path."""
-        path = self.paths.get(peer)
-        if path is None or now - path.measured_at > MAX_AGE_S:
+        path = self.recent_path(peer, now)
+        if path is None:
             return None
         trend = None
         if path.trend is not None:
@@ -117,8 +125,7 @@ class RadioReport:
                     "margin_db": one.margin_db,
                     "age_s": _age_s(one, now),
                 }
-                for one in self.neighbors
-                if now - one.measured_at <= MAX_AGE_S
+                for one in self.recent_neighbors(now)
             ],
         }
 

@@ -25,6 +25,7 @@ from udp_mesh.core.thin.conditions import ThinConditions
 from udp_mesh.core.versions.conditions import VersionConditions
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 from udp_mesh.daemon.positions import Position, position_json
+from udp_mesh.daemon.radio_paths import RadioReport, with_radio
 from udp_mesh.daemon.status import Json, conditions_json, event_json, log_json
 
 log = logging.getLogger(__name__)
@@ -132,8 +133,12 @@ class Recorder:
         versions: Iterable[VersionConditions] = (),
         logs: Iterable[LogConditions] = (),
         thin: ThinConditions | None = None,
+        radio: RadioReport | None = None,
     ) -> None:
-        fields: Json = {"t": self._at(conditions.now), "kind": "conditions", **conditions_json(conditions)}
+        measured = conditions_json(conditions)
+        if radio is not None:
+            measured = with_radio(measured, radio, conditions.now)
+        fields: Json = {"t": self._at(conditions.now), "kind": "conditions", **measured}
         if thin is not None:
             fields["thin"] = _thin_fields(thin)
         if rows := [{"topic": entry.topic, **asdict(entry.counters)} for entry in versions]:

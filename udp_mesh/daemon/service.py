@@ -301,7 +301,7 @@ class Service:
         """Records the conditions, and what only the first and the last of them contain."""
         node = self.driver.node
         conditions = self.driver.conditions()
-        recorder.conditions(conditions, node.versions(), node.logs(), node.thin_conditions(conditions.now))
+        recorder.conditions(conditions, node.versions(), node.logs(), node.thin_conditions(conditions.now), self.radio)
 
     def _announce_subscriptions(self, read: list[Subscription]) -> None:
         self.driver.node.selective.set_subscriptions(read, self.driver.now())
@@ -372,7 +372,7 @@ class Service:
             return
         conditions = self.driver.conditions()
         if self.recorder is not None:
-            self.recorder.conditions(conditions, thin=self.driver.node.thin_conditions(conditions.now))
+            self.recorder.conditions(conditions, (), (), self.driver.node.thin_conditions(conditions.now), self.radio)
         if clients:
             header: Header = {
                 "event": "conditions",

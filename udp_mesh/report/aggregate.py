@@ -13,6 +13,7 @@ from typing import Any
 
 from udp_mesh.report.bins import BinnedLines, Thinned
 from udp_mesh.report.distribution import Distribution
+from udp_mesh.report.radio_paths import RadioPathUse, RadioSample
 from udp_mesh.report.recording import (
     Gap,
     InvalidLine,
@@ -58,6 +59,8 @@ SAMPLED: tuple[tuple[str, float], ...] = (
     ("hops", 1),
 )
 """The fields of a sample that become charts, and the factor to the chart's unit."""
+RADIO_SAMPLED: tuple[tuple[str, float], ...] = (("margin_db", 1), ("signal_dbm", 1), ("bottleneck_bits_per_s", 1e-6))
+"""Likewise of a radio sample."""
 
 
 @dataclass(slots=True)
@@ -158,6 +161,8 @@ class Recording:
     """By peer: when it was heard on thin links, and heard this node."""
     thin_airtime: BinnedLines = field(default_factory=lambda: BinnedLines(BINS))
     """By link: the share of the time in which it sent, in percent."""
+    radio_paths: dict[str, RadioPathUse] = field(default_factory=dict)
+    """By peer."""
     event_counts: dict[tuple[str, str], int] = field(default_factory=dict)
     """By node and kind."""
     events: dict[str, Thinned[RecordedEvent]] = field(default_factory=dict)
@@ -168,6 +173,10 @@ class Recording:
     latencies_ms: BinnedLines = field(default_factory=lambda: BinnedLines(BINS))
     sampled: dict[str, BinnedLines] = field(default_factory=lambda: {name: BinnedLines(BINS) for name, _ in SAMPLED})
     """By field of a sample; one line per peer, in the unit of its chart."""
+    radio_sampled: dict[str, BinnedLines] = field(
+        default_factory=lambda: {name: BinnedLines(BINS) for name, _ in RADIO_SAMPLED}
+    )
+    """Likewise of a radio sample."""
     snapshots: int = 0
     """Lines with conditions."""
     missing_lines: int = 0
@@ -221,6 +230,8 @@ class Recording:
                 self._thin_link(item)
             case ThinPeerSample(t, peer, present):
                 self._mark(self.thin_present, peer, t, is_there=present)
+            case RadioSample():
+                self._radio_path(item)
             case Gap():
                 self.missing_lines += item.lines
             case InvalidLine(text):
@@ -248,6 +259,14 @@ class Recording:
         share = use.add(sample)
         if share is not None:
             self.thin_airtime.add(sample.link, sample.t, 100 * share)
+
+    def _radio_path(self, sample: RadioSample) -> None:
+        if not self._has_room(self.radio_paths, sample.peer):
+            return
+        self.radio_paths.setdefault(sample.peer, RadioPathUse()).add(sample)
+        for name, factor in RADIO_SAMPLED:
+            if (value := getattr(sample, name)) is not None:
+                self.radio_sampled[name].add(sample.peer, sample.t, value * factor)
 
     def _arrived(self, item: RecordedArrival) -> None:
         topic = self.received.get(item.topic)

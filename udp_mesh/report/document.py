@@ -20,6 +20,7 @@ from typing import Any
 from udp_mesh.report import figures
 from udp_mesh.report.aggregate import BINS, MAX_EVENTS, MAX_NAMES, MAX_SPANS, OnlineTimes, Recording
 from udp_mesh.report.bins import BinnedLines, Bins, largest, rounded
+from udp_mesh.report.radio_paths import RadioPathUse
 from udp_mesh.report.recording import RecordedEvent
 from udp_mesh.report.thin_links import ThinLinkUse
 
@@ -41,6 +42,11 @@ _SAMPLED: tuple[tuple[str, str, str], ...] = (
     ("capacity_bits_per_s", "Capacity to the peer", "Mbit/s"),
     ("outbox_messages", "Outbox for the peer", "messages"),
     ("hops", "Hops to the peer", "hops"),
+)
+_RADIO_SAMPLED: tuple[tuple[str, str, str], ...] = (
+    ("margin_db", "Radio margin of the next hop to the peer", "dB"),
+    ("signal_dbm", "Signal of the next hop to the peer", "dBm"),
+    ("bottleneck_bits_per_s", "Bottleneck of the radio path to the peer", "Mbit/s"),
 )
 
 
@@ -166,6 +172,13 @@ def _state_tables(recording: Recording) -> list[dict[str, Any]]:
             "Of the time since the peer was first heard there.",
         ),
         _table(
+            "Radio paths",
+            "peer|last radio|last next hop|#changes|#mean margin dB|#least margin dB|#least bottleneck Mbit/s"
+            "|#worsening",
+            (_radio_row(peer, use) for peer, use in sorted(recording.radio_paths.items())),
+            "Measured by the robot's own radio. Changes: of next hop or radio. Worsening: share of the samples.",
+        ),
+        _table(
             "Intervals between messages",
             "source|topic|#intervals|#median s|#deviation s|#gaps|#within 5 %",
             (
@@ -209,6 +222,19 @@ def _thin_row(link: str, use: ThinLinkUse) -> tuple[str, ...]:
     )
 
 
+def _radio_row(peer: str, use: RadioPathUse) -> tuple[str, ...]:
+    radio, next_hop = (MISSING, MISSING) if use.last is None else (use.last.radio, use.last.next_hop)
+    least = use.least_bottleneck_bits_per_s
+    return (
+        *(peer, radio, next_hop, str(use.changes), _decibels(use.mean_margin_db), _decibels(use.least_margin_db)),
+        *(MISSING if least is None else f"{least / 1e6:.1f}", f"{use.worsening_share:.1%}"),
+    )
+
+
+def _decibels(value: float | None) -> str:
+    return MISSING if value is None else f"{value:.1f}"
+
+
 def _milliseconds(seconds: float | None) -> str:
     return MISSING if seconds is None else f"{seconds * 1e3:.1f}"
 
@@ -245,6 +271,7 @@ def _charts(recording: Recording, bins: Bins) -> list[dict[str, Any]]:
         chart("Throughput by priority", "Mbit/s", "stacked", _layers(by_priority), note),
         lines("Latency to the acknowledgment", "ms", recording.latencies_ms),
         *(lines(title, unit, recording.sampled[name]) for name, title, unit in _SAMPLED),
+        *(lines(title, unit, recording.radio_sampled[name]) for name, title, unit in _RADIO_SAMPLED),
         lines("Airtime used on thin links", "%", recording.thin_airtime),
     ]
 

@@ -141,6 +141,18 @@ def summary(recording: Recording) -> dict[str, Any]:
             for name, use in sorted(recording.thin_links.items())
         ],
         "thin_present": _presence(recording.thin_present, recording.end_s),
+        "radio_paths": [
+            {
+                "peer": peer,
+                "samples": use.samples,
+                "changes": use.changes,
+                "mean_margin_db": None if use.mean_margin_db is None else round(use.mean_margin_db, 3),
+                "least_margin_db": use.least_margin_db,
+                "least_bottleneck_bits_per_s": use.least_bottleneck_bits_per_s,
+                "worsening": round(use.worsening_share, 6),
+            }
+            for peer, use in sorted(recording.radio_paths.items())
+        ],
         "online": _presence(recording.online, recording.end_s),
         "intervals": [
             {

@@ -10,7 +10,8 @@ start), `kind`, and `at` (the node whose view it is) unless that is the node of 
   `capacity_bits_per_s`, `outbox_messages`, `hops`, `saved_messages` and `saved_bytes` (totals; all but the name are
   optional); optional `versions` (by `topic`:
   `whole_sent`, `differences_sent`, `payload_bytes_sent`, `body_bytes_sent`, totals) and `logs` (by `topic` and
-  `source`: `received_items`, `known_items`, `held_bytes`), and `thin` (see `thin_links`),
+  `source`: `received_items`, `known_items`, `held_bytes`), `thin` (see `thin_links`), and `radio` here and of a peer
+  (see `radio_paths`),
 - `place`: `x`, `y` in meters (simulated runs),
 - `gap`: `lines`, the number of lines dropped here during recording.
 
@@ -25,6 +26,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from udp_mesh.report.fields import UnreadableError, integer, number, rows, text
+from udp_mesh.report.radio_paths import RadioSample, radio_problem, radio_sample
 from udp_mesh.report.thin_links import ThinLinkSample, ThinPeerSample, thin_items
 
 VERSION = 1
@@ -199,6 +201,7 @@ Item = (
     | SavedSample
     | ThinLinkSample
     | ThinPeerSample
+    | RadioSample
     | Gap
     | InvalidLine
 )
@@ -258,6 +261,7 @@ class RecordingReader:
         # Each peer's last known state: a recording may begin, or have a gap, while peers are online that no event
         # announced.
         self._online: dict[str, bool] = {}
+        self._radio_problem = ""
 
     def __iter__(self) -> Iterator[Item]:
         for line_number, entry in self._numbered:
@@ -314,6 +318,10 @@ class RecordingReader:
             if isinstance(now_online, bool) and now_online != self._online.get(name, False):
                 self._online[name] = now_online
                 yield Presence(t, at, name, now_online)
+            # The radio measures its path to an offline peer, too.
+            if (sample := radio_sample(t, name, peer_entry.get("radio"))) is not None:
+                yield sample
+        yield from self._radio(t, at, entry)
         for row in rows(entry, "versions") if "versions" in entry else ():
             counters = (integer(row, key) for key in _VERSION_KEYS)
             yield VersionSample(text(row, "topic"), VersionTotals(*counters))
@@ -322,6 +330,14 @@ class RecordingReader:
             yield LogSample(text(row, "topic"), text(row, "source"), LogProgress(*counters))
         if "thin" in entry:
             yield from thin_items(t, entry["thin"])
+
+    def _radio(self, t: float, at: str, entry: dict[str, Any]) -> Iterator[RecordedEvent]:
+        """An event when a radio stops to give new values, and when all do again."""
+        problem = radio_problem(entry.get("radio"))
+        if problem != self._radio_problem:
+            self._radio_problem = problem
+            shown = problem[:MAX_EVENT_TEXT] or "no problem any more"
+            yield RecordedEvent(t, at, "radio-problem", shown)
 
 
 def _objects(lines: Iterable[bytes]) -> Iterator[tuple[int, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,11 @@ from udp_mesh.bridges.ros2.quality import parse_quality
 from udp_mesh.bridges.type_hash import type_hash
 from udp_mesh.core.link_trend import Direction
 from udp_mesh.core.settings import Topic
+from udp_mesh.daemon.radio_paths import RadioTrend
 from udp_mesh.daemon.status import conditions_json
 
-MD5SUM = "5e59b63a7b7366ddc12c2296947d64ff"
-HASH = "RIHS01_573b47cfab59a264d0262d8d30a7cad3a2e6accfe8b934c6aacb41ed42daf9d1"
+MD5SUM = "771db149af53bb77cf8779bd1290b70c"
+HASH = "RIHS01_d07c56e6d4332572b982974bbff54906d6a10df6c420d0176bd88e73d7f5a9d7"
 KNOWN_HASHES = {
     "std_msgs/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
     "std_msgs/Empty": "20b625256f32d5dbc0d04fee44f43c41e51c70d3502f84b4a08e7a9c26a96312",
@@ -42,6 +44,20 @@ KNOWN_HASHES = {
     "tf2_msgs/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
 }
 """Of the packages of ROS 2, Jazzy."""
+RADIO_PATH = {
+    "source": "alice-radio",
+    "radio": "alice-radio",
+    "next_hop": "b02",
+    "signal_dbm": -67.0,
+    "noise_dbm": None,
+    "margin_db": 11.5,
+    "bottleneck_bits_per_s": 13e6,
+    "quality": None,
+    "trend": {"direction": "worsening", "change_db_per_s": -0.5},
+    "age_s": 1.25,
+}
+NEIGHBOR = {"name": "b03", "radio": "alice-radio", "signal_dbm": -80.5, "margin_db": None, "age_s": 2.5}
+RADIO = {"source": "alice-radio", "problem": None, "age_s": 0.25, "neighbors": [NEIGHBOR]}
 ROS1 = """
 import genmsg, io, json, sys
 import genpy.dynamic
@@ -55,6 +71,15 @@ made.deserialize(bytes.fromhex(data))
 again = io.BytesIO()
 made.serialize(again)
 print(json.dumps([genmsg.compute_md5(context, spec), made._md5sum, again.getvalue().hex(), str(made.peers[0])]))
+"""
+BUILT = """
+import json, sys
+from udp_mesh_msgs.msg import Conditions, RadioPath
+made = Conditions()
+made.deserialize(bytes.fromhex(sys.stdin.read()))
+path, (neighbor,) = made.peers[0].radio, made.radio.neighbors
+assert path.trend == RadioPath.WORSENING
+print(json.dumps([made._md5sum, path.next_hop, path.trend, neighbor.name, neighbor.signal_dbm]))
 """
 ROS2 = """
 import json, pathlib, sys
@@ -117,13 +142,27 @@ def test_a_comment_or_constant_does_not_change_the_type_hash_and_a_field_does() 
 def test_genmsg_agrees_with_the_md5sum_and_genpy_reads_the_message(tmp_path: Path, conditions: dict[str, Any]) -> None:
     # Debian installs no definitions beside the generated classes
     (tmp_path / "Header.msg").write_text("uint32 seq\ntime stamp\nstring frame_id\n")
-    _, typed = to_ros(conditions, "/alice", 1, (7, 9))
+    _, typed = to_ros(_with_radio(conditions), "/alice", 1, (7, 9))
     given = json.dumps([str(FOLDER / "msg"), str(tmp_path), DEFINITION.name, typed.definition, typed.payload.hex()])
     of_files, of_text, again, peer = json.loads(_run([ROS_PYTHON, "-c", ROS1], {"PATH": "/usr/bin:/bin"}, given))
     assert of_files == of_text == MD5SUM
     assert again == typed.payload.hex()
     assert 'name: "bob"' in peer
     assert f"trend: {TRENDS['worsening']}" in peer
+    assert "margin_db: 11.5" in peer
+
+
+@pytest.mark.proof
+@pytest.mark.skipif(not expects_ros(), reason="needs scripts/setup-ros")
+def test_catkin_builds_the_package_and_its_classes_read_the_message(tmp_path: Path, conditions: dict[str, Any]) -> None:
+    shutil.copytree(FOLDER, tmp_path / "src" / FOLDER.name)
+    environ = {"PATH": "/usr/bin:/bin", "ROS_VERSION": "1", "HOME": str(tmp_path)}
+    arguments = ["/usr/bin/catkin_make", "-C", str(tmp_path), "--cmake-args", f"-DPYTHON_EXECUTABLE={ROS_PYTHON}"]
+    _run(arguments, environ, "")
+    _, typed = to_ros(_with_radio(conditions), "/alice", 1, (7, 9))
+    built = tmp_path / "devel" / "lib" / "python3" / "dist-packages"
+    printed = _run([ROS_PYTHON, "-c", BUILT], {**environ, "PYTHONPATH": str(built)}, typed.payload.hex())
+    assert json.loads(printed) == [MD5SUM, "b02", TRENDS["worsening"], "b03", -80.5]
 
 
 @pytest.mark.skipif(not expects_ros2(), reason="needs scripts/setup-ros2")
@@ -144,6 +183,11 @@ def test_type_hashes_are_those_of_the_installed_packages() -> None:
     compared = {name: type_hash(known) for name, known in TYPES.items() if ros2_type(name) in installed}
     assert len(compared) >= len(TYPES) - 1
     assert compared == {name: installed[ros2_type(name)] for name in compared}
+
+
+def _with_radio(conditions: dict[str, Any]) -> dict[str, Any]:
+    (peer,) = conditions["peers"]
+    return {**conditions, "peers": [{**peer, "radio": RADIO_PATH}], "radio": RADIO}
 
 
 def _run(command: list[str], environ: dict[str, str], given: str) -> str:
@@ -190,8 +234,10 @@ def test_what_is_not_known_is_nan_and_an_earlier_daemon_says_less(conditions: di
 
 def test_every_direction_of_a_trend_has_its_constant() -> None:
     assert set(TRENDS) == {direction.value for direction in Direction}
-    source = (FOLDER / "msg" / "PeerConditions.msg").read_text()
-    assert all(f"uint8 {name.upper()}={number}\n" in source for name, number in TRENDS.items())
+    assert set(TRENDS) == {direction.value for direction in RadioTrend}
+    for message in ("PeerConditions", "RadioPath"):
+        source = (FOLDER / "msg" / f"{message}.msg").read_text()
+        assert all(f"uint8 {name.upper()}={number}\n" in source for name, number in TRENDS.items())
 
 
 def test_the_build_files_name_every_message() -> None:
@@ -201,9 +247,34 @@ def test_the_build_files_name_every_message() -> None:
         assert f" {path.name}" in build
 
 
-def test_the_values_of_a_collector_are_in_the_json_and_change_no_type(conditions: dict[str, Any]) -> None:
+@pytest.mark.parametrize("ros_version", [1, 2])
+def test_the_values_of_a_collector_are_in_the_json_and_in_the_message(
+    ros_version: int, conditions: dict[str, Any]
+) -> None:
+    given = _with_radio(conditions)
+    text, typed = to_ros(given, "/alice", ros_version, (1, 2))
+    assert json.loads(decode(TYPES["std_msgs/String"], text.payload, ros_version)["data"]) == given
+    message = decode(DEFINITION, typed.payload, ros_version)
+    path = message["peers"][0]["radio"]
+    same = ("source", "radio", "next_hop", "signal_dbm", "margin_db", "bottleneck_bits_per_s", "age_s")
+    assert {key: path[key] for key in same} == {key: RADIO_PATH[key] for key in same}
+    assert (path["trend"], path["change_db_per_s"]) == (TRENDS["worsening"], -0.5)
+    assert math.isnan(path["noise_dbm"])
+    assert math.isnan(path["quality"])
+    radio = message["radio"]
+    assert (radio["source"], radio["problem"], radio["age_s"]) == ("alice-radio", "", 0.25)
+    (neighbor,) = radio["neighbors"]
+    assert math.isnan(neighbor.pop("margin_db"))
+    assert neighbor == {key: value for key, value in NEIGHBOR.items() if key != "margin_db"}
+
+
+@pytest.mark.parametrize("missing", [{}, {"radio": None}])
+def test_without_a_collector_and_with_an_earlier_daemon_the_radio_is_unknown(
+    missing: dict[str, None], conditions: dict[str, Any]
+) -> None:
     (peer,) = conditions["peers"]
-    radio = {"next_hop": "b02", "margin_db": 12.0}
-    text, typed = to_ros({**conditions, "peers": [{**peer, "radio": radio}], "radio": None}, "/alice", 1, (1, 2))
-    assert b'"radio": {"margin_db": 12.0, "next_hop": "b02"}' in text.payload.replace(b'\\"', b'"')
-    assert typed == to_ros(conditions, "/alice", 1, (1, 2))[1]
+    given = {**conditions, "peers": [{**peer, **missing}], **missing}
+    message = decode(DEFINITION, encode(DEFINITION, conditions_message(given, (1, 2)), 1), 1)
+    path, radio = message["peers"][0]["radio"], message["radio"]
+    assert (path["source"], path["next_hop"], path["trend"], math.isnan(path["margin_db"])) == ("", "", 0, True)
+    assert (radio["source"], radio["problem"], radio["neighbors"], math.isnan(radio["age_s"])) == ("", "", [], True)

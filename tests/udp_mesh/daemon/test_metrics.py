@@ -6,6 +6,8 @@ end in `_total` and are never negative.
 """
 
 import asyncio
+import dataclasses
+import json
 import random
 import re
 from dataclasses import fields
@@ -23,6 +25,7 @@ from udp_mesh.daemon.interface import PING_TOPIC
 from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.metrics import render
 from udp_mesh.daemon.metrics_server import MetricsServer
+from udp_mesh.daemon.radio_paths import MAX_AGE_S, parse_report
 from udp_mesh.daemon.status import TopicCount
 
 NAME = "[a-zA-Z_:][a-zA-Z0-9_:]*"
@@ -124,6 +127,39 @@ def test_bytes_to_and_from_a_peer_grow_with_each_message() -> None:
     assert 50_000 <= sent.delivered_bytes - sent_before.delivered_bytes < sent.sent_bytes - sent_before.sent_bytes
     assert 50_000 < received.received_bytes - received_before.received_bytes < 60_000
     assert sent.sent_bytes - sent_before.sent_bytes < 60_000
+
+
+def test_what_a_collector_reports_is_exported_while_it_is_recent() -> None:
+    both = pair(Topic("map", priority=5))
+    path = {
+        "radio": "a-radio",
+        "next_hop": 'b"02',
+        "age_s": 1,
+        "signal_dbm": -67,
+        "margin_db": -1.5,
+        "trend": "worsening",
+    }
+    paths = [{**path, "peer": "b", "change_db_per_s": -0.5}, {**path, "peer": "of no peer"}]
+    heard = {"name": "b02", "radio": "a-radio", "age_s": 1, "signal_dbm": -67}
+    report = {"source": "a-radio", "problem": "c-radio is down", "paths": paths, "neighbors": [heard, heard]}
+    radio = parse_report(json.dumps(report).encode(), both.now)
+    conditions = both.a.conditions(both.now)
+    found = families(render(conditions, {}, {}, about={}, uptime_s=1.0, radio=radio))
+    assert found["udp_mesh_radio_report_age_seconds"] == [("", 0.0)]
+    assert found["udp_mesh_radio_problem"] == [("", 1.0)]
+    assert found["udp_mesh_radio_path_info"] == [('peer="b",radio="a-radio",next_hop="b\\"02"', 1.0)]
+    assert found["udp_mesh_radio_path_margin_db"] == [('peer="b"', -1.5)]
+    assert found["udp_mesh_radio_path_trend_db_per_second"] == [('peer="b"', -0.5)]
+    assert found["udp_mesh_radio_neighbor_signal_dbm"] == [('neighbor="b02",radio="a-radio"', -67.0)]
+    unknown = {"noise_dbm", "bottleneck_bits_per_second", "quality_ratio"}
+    assert not {f"udp_mesh_radio_path_{name}" for name in unknown} & set(found)
+    later = dataclasses.replace(conditions, now=both.now + MAX_AGE_S + 1)
+    silent = families(render(later, {}, {}, about={}, uptime_s=1.0, radio=radio))
+    assert silent["udp_mesh_radio_report_age_seconds"] == [("", MAX_AGE_S + 1)]
+    of_radio = {name for name in silent if name.startswith("udp_mesh_radio_")}
+    assert of_radio == {"udp_mesh_radio_report_age_seconds", "udp_mesh_radio_problem"}
+    without = families(render(conditions, {}, {}, about={}, uptime_s=1.0))
+    assert not [name for name in without if name.startswith("udp_mesh_radio_")]
 
 
 def test_latencies_are_a_cumulative_histogram_by_priority() -> None:

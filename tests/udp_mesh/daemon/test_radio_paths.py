@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,8 @@ from udp_mesh.cli.views import peers_view, status_view
 from udp_mesh.client import MeshError
 from udp_mesh.daemon.interface import CONDITIONS_TOPIC
 from udp_mesh.daemon.radio_paths import MAX_AGE_S, BadReport, parse_report, with_radio
+from udp_mesh.report.aggregate import read
+from udp_mesh.report.figures import summary
 
 pytestmark = pytest.mark.xdist_group("udp_mesh_radio_paths")
 
@@ -146,6 +149,23 @@ def test_a_daemon_attaches_the_report_to_its_conditions(pair: tuple[RunningDaemo
     assert "RADIO: alice-radio does not answer" in text
     line = next(line for line in text.splitlines() if line.startswith("bob  alice-radio") or " b02 " in line)
     assert line.split()[:9] == ["bob", "alice-radio", "b02", "-67", "dBm", "12", "dB", "13", "Mbit/s"]
+
+
+def test_a_daemon_exports_and_records_the_report(pair: tuple[RunningDaemon, RunningDaemon], tmp_path: Path) -> None:
+    alice, _ = pair
+    file = tmp_path / "run.jsonl"
+    with alice.client() as client:
+        client.request("set-radio", report())
+        client.request("record-start", path=str(file))
+        client.request("set-radio", report(paths=[{**PATH, "next_hop": "b03", "margin_db": 7.5}], problem="is down"))
+        client.request("record-stop")
+        page = client.request_frame("metrics")[1].decode()
+    assert 'udp_mesh_radio_path_margin_db{peer="bob"} 7.5' in page.splitlines()
+    found = read(file)
+    assert found.problems == []
+    (path,) = summary(found)["radio_paths"]
+    assert (path["peer"], path["changes"], path["least_margin_db"]) == ("bob", 1, 7.5)
+    assert [event.text for event in found.events["radio-problem"].items()] == ["is down"]
 
 
 def test_status_of_an_earlier_daemon_has_no_radio() -> None:
