@@ -10,10 +10,12 @@
  *   3. loss: independent (loss), or in bursts by a two-state Gilbert-Elliott chain per port (burst_enter and
  *      burst_leave per frame, burst_loss inside a burst),
  *   4. the delay line (delay_ms), and out of the port that has the destination's address, or of all others.
- * Broadcast is attempted once and lost per receiver. With up=0 every frame that would leave is lost.
+ * Broadcast is attempted once and lost per receiver. With up=0 every frame that would leave is lost, and so is one whose
+ * source and destination are in different groups (all ports begin in group 0).
  *
  * Control: one datagram per command on the Unix socket SOCKET; the answer goes to the sender's bound address.
  *   set key=value ...   rate (bit/s) delay_ms loss burst_enter burst_leave burst_loss queue overhead_us attempts half up
+ *   groups N N ...      the group of each port
  *   count               the counters as JSON
  *   reset               counters to zero
  *   quit
@@ -50,7 +52,7 @@ struct frame {
 struct port {
     int descriptor;
     struct frame *queue[MAX_QUEUE];
-    int head, waiting;
+    int head, waiting, group;
     uint64_t busy_until_ns;
     int in_burst;
     uint64_t in_frames, in_bytes, queue_drops, losses, down_drops, out_frames, out_bytes, max_waiting;
@@ -275,9 +277,9 @@ static void deliver(uint64_t time_ns)
 {
     while (heap_size && heap[0].at_ns <= time_ns) {
         struct delivery due = take_first();
-        struct port *to = &ports[due.port];
-        if (link_is.up == 0) {
-            ports[due.frame->source].down_drops++;
+        struct port *to = &ports[due.port], *from = &ports[due.frame->source];
+        if (link_is.up == 0 || from->group != to->group) {
+            from->down_drops++;
         } else if (write(to->descriptor, due.frame->bytes, (size_t)due.frame->length) > 0) {
             to->out_frames++;
             to->out_bytes += (uint64_t)(due.frame->length - ETHERNET_HEADER);
@@ -348,6 +350,20 @@ static void set(char *assignments)
     say("ok");
 }
 
+static void set_groups(char *numbers)
+{
+    int groups[MAX_PORTS], found = 0;
+    for (char *word = strtok(numbers, " \n"); word && found < MAX_PORTS; word = strtok(NULL, " \n"))
+        groups[found++] = atoi(word);
+    if (found != port_count) {
+        say("expected %d groups, found %d", port_count, found);
+        return;
+    }
+    for (int i = 0; i < port_count; i++)
+        ports[i].group = groups[i];
+    say("ok");
+}
+
 static void count(void)
 {
     say("{\"airtime_ns\":%llu,\"ports\":[", (unsigned long long)airtime_ns);
@@ -386,6 +402,8 @@ static void obey(int control)
     answer_length = 0;
     if (!strncmp(command, "set ", 4))
         set(command + 4);
+    else if (!strncmp(command, "groups ", 7))
+        set_groups(command + 7);
     else if (!strcmp(command, "count"))
         count();
     else if (!strcmp(command, "reset"))

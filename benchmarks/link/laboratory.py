@@ -160,6 +160,16 @@ class Laboratory:
         """Set all parameters of the link."""
         self.set(**link.as_settings())
 
+    def bring_together(self, *groups: Sequence[int]) -> None:
+        """Hosts reach those of their own group alone, as radios out of range of the others; one that is in none of them
+        reaches no other. Their interfaces stay up."""
+        of_host = {host: number for number, group in enumerate(groups) for host in group}
+        alone = range(len(groups), len(groups) + len(self.namespaces))
+        numbers = (of_host.get(host, alone[host]) for host in range(len(self.namespaces)))
+        answer = self._ask("groups " + " ".join(map(str, numbers)))
+        if answer != "ok":
+            raise LaboratoryError(answer)
+
     def count(self) -> Count:
         answer = json.loads(self._ask("count"))
         return Count(answer["airtime_ns"] / 1e9, tuple(PortCount(**port) for port in answer["ports"]))
@@ -208,6 +218,9 @@ class Wire(Laboratory):
 
     def set(self, **settings: float) -> None:
         """Not supported: a veth pair has no parameters."""
+
+    def bring_together(self, *groups: Sequence[int]) -> None:
+        """Not supported: a veth pair has no groups."""
 
     def count(self) -> Count:
         nothing = PortCount(0, 0, 0, 0, 0, 0, 0, 0)

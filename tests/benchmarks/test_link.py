@@ -93,3 +93,16 @@ def test_a_link_that_is_down_carries_nothing_and_a_full_queue_drops(lab: Laborat
 def test_an_unknown_setting_is_refused_by_name(lab: Laboratory) -> None:
     with pytest.raises(LaboratoryError, match="unknown setting speed"):
         lab.set(speed=1)
+
+
+def test_hosts_out_of_reach_of_each_other_lose_every_frame(lab: Laboratory) -> None:
+    lab.set(rate=1e9, delay_ms=0, loss=0, queue=10000, up=1)
+    for groups, delivered, dropped in (([[0], [1]], 0, 50), ([[0]], 0, 50), ([[0, 1]], 50, 0)):
+        lab.bring_together(*groups)
+        lab.reset()
+        send(lab, 50)
+        settled(lab, 50)
+        sender, receiver = lab.count().ports
+        assert sender.down_drops == dropped
+        # and the receiver's replies
+        assert delivered <= receiver.out_frames <= delivered + 2

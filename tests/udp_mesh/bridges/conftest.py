@@ -11,7 +11,7 @@ from tests.udp_mesh.bridges.bridge_processes import LOG_FOLDERS
 from tests.udp_mesh.bridges.interpreters import expects_ros
 from tests.udp_mesh.bridges.ros2_processes import expects_ros2
 
-collect_ignore = [] if expects_ros() else ["test_ros1_quick.py", "test_ros1_services.py"]
+collect_ignore = [] if expects_ros() else ["test_exploration.py", "test_ros1_quick.py", "test_ros1_services.py"]
 collect_ignore += [] if expects_ros2() else ["test_ros2.py"]
 
 LAST_WORDS = 3000

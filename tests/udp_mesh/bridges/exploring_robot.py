@@ -1,14 +1,14 @@
 """A robot's or the base's application for tests, in ROS's own interpreter, written from the interface of BOBCAT
 (`dan-riley/bobcat`), the autonomy of the system that inspired this one: topics, directions, and who asks whom.
 
-Once a period it broadcasts what it knows of itself and of others (`ma_data`): the newest task of each robot, and what
-each has found (artifacts, map differences). What it lacks of a robot it requests (`dm_request`) from that robot while
-it is heard, else from another one that is; the answers (`dm_response`) come one item a message. Robots pass on the
-tasks that the base gives.
+Once a period it broadcasts what it knows of itself and of others (`ma_data`): the newest task of each robot, whether
+it was taken, and what each has found (artifacts, map differences). What it lacks of a robot it requests
+(`dm_request`) from that robot while it is heard, else from another one that is; the answers (`dm_response`) come one
+item a message. Robots pass on the tasks that the base gives, and that they were taken.
 
 Commands are JSON lines: {"found": NAME, "bytes": SIZE}, an artifact or a map difference; {"task": TEXT, "robot": NAME}
 at the base; {"report": true}, answered with {"report": {"items": {ROBOT: {NAME: SHA-1}}, "tasks": {ROBOT: TEXT},
-"hears": [NAME, ...]}}.
+"taken": [ROBOT, ...], "hears": [NAME, ...]}}; `taken`: the robots known to have taken their newest task.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ class Robot:
         self.heard_at: dict[str, float] = {}
         self.tasks: dict[str, tuple[int, str]] = {}
         """By robot, the number and the text of the newest task."""
+        self.taken: dict[str, int] = {}
+        """By robot, the number of the newest task that it is known to have taken."""
         self.asked: list[str] = []
         self.answered_at: dict[tuple[str, str, str], float] = {}
         self.request_at = 0.0
@@ -71,6 +73,10 @@ class Robot:
             for robot, (number, text) in news["tasks"].items():
                 if number > self.tasks.get(robot, (0, ""))[0]:
                     self.tasks[robot] = (number, text)
+            for robot, number in news["taken"].items():
+                self.taken[robot] = max(number, self.taken.get(robot, 0))
+            if self.name in self.tasks:
+                self.taken[self.name] = self.tasks[self.name][0]
 
     def on_request(self, message: Any, source: str) -> None:
         now = time.monotonic()
@@ -100,7 +106,7 @@ class Robot:
         """Broadcast, and request what is lacking."""
         with self.lock:
             known = {**self.known, self.name: list(self.items[self.name])}
-            self.data.publish(json.dumps({"known": known, "tasks": self.tasks}))
+            self.data.publish(json.dumps({"known": known, "tasks": self.tasks, "taken": self.taken}))
             lacking = {
                 robot: missing
                 for robot, names in self.known.items()
@@ -124,7 +130,8 @@ class Robot:
                 for robot, found in self.items.items()
             }
             tasks = {robot: text for robot, (_, text) in self.tasks.items()}
-            return {"items": items, "tasks": tasks, "hears": sorted(self.hears())}
+            taken = sorted(robot for robot, (number, _) in self.tasks.items() if self.taken.get(robot) == number)
+            return {"items": items, "tasks": tasks, "taken": taken, "hears": sorted(self.hears())}
 
 
 def say(**fields: object) -> None:

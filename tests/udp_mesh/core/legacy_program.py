@@ -37,18 +37,29 @@ class LegacyProgram:
     # Sending
 
     def push(self, priority: int, data: bytes) -> None:
+        self.push_message(PriorityMeshData("old", "std_msgs/String", priority, "t", data))
+
+    def push_message(self, message: PriorityMeshData) -> None:
         self.sequence = self.sequence % LAST_SEQUENCE + 1
-        chunks = fragment_legacy(encode_mesh_data(PriorityMeshData("old", "std_msgs/String", priority, "t", data)))
+        chunks = fragment_legacy(encode_mesh_data(message))
         for place, chunk in enumerate(chunks):
             fragment = LegacyPayload(self.sequence, place, len(chunks), chunk, wants_ack=True)
-            heapq.heappush(self.queue, (priority, self.sequence, place, fragment))
+            heapq.heappush(self.queue, (message.priority, self.sequence, place, fragment))
+
+    def is_stalled(self, now: float) -> bool:
+        """Whether a fragment has been unanswered for too long; then the program declares the peer offline."""
+        return any(now - at > OFFLINE_TIMEOUT_S for at in self.in_flight.values())
+
+    def flush(self) -> None:
+        """Drops everything queued and in flight, as for a peer that is offline."""
+        self.flushed += len(self.queue)
+        self.queue.clear()
+        self.in_flight.clear()
 
     def fill_in_flight(self, now: float) -> list[LegacyPayload]:
         """The fragments sent now."""
-        if any(now - at > OFFLINE_TIMEOUT_S for at in self.in_flight.values()):
-            self.flushed += len(self.queue)
-            self.queue.clear()
-            self.in_flight.clear()
+        if self.is_stalled(now):
+            self.flush()
         out = []
         while self.queue and len(self.in_flight) < WINDOW:
             _, sequence, place, fragment = heapq.heappop(self.queue)
