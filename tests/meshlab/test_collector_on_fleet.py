@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from meshctl.model import Secret
 from meshctl.render import LINKS_PATH, render_node
 from meshctl.robots.radio_session import OwnRadio, RadioLogin, ssh_command
 from meshlab.fleet import VirtualFleet, VirtualNode
-from tests.meshlab.conftest import LINE
+from tests.meshlab.conftest import LINE, MESH
 from tests.meshlab.test_ground_on_fleet import mac_of
 from tests.udp_mesh.daemon.processes import RunningDaemon, two_daemons
 from tests.waiting import until
@@ -49,8 +49,7 @@ nodes:
   near: {{address: 10.42.0.2}}
   far: {{address: 10.42.0.3}}
 robots:
-  alice: {{nodes: [near], computer: {{address: 10.42.0.12/24, collector: true, collector_key: "{key}"}}}}
-  bob: {{nodes: [far], computer: {{address: 10.42.0.13/24}}}}
+  alice: {{nodes: [{radios}], computer: {{address: 10.42.0.12/24, collector: true, collector_key: "{key}"}}}}
 """
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
 # without a password a factory-fresh node lets everyone in
@@ -63,13 +62,18 @@ class Team:
 
     fleet: VirtualFleet
     alice: RunningDaemon
-    radio: OwnRadio
+    radios: tuple[OwnRadio, ...]
     login: RadioLogin
     file: Path
 
     @property
     def near(self) -> VirtualNode:
         return self.fleet.node("near")
+
+    @property
+    def radio(self) -> OwnRadio:
+        (found,) = self.radios
+        return found
 
     @contextmanager
     def collector(self) -> Iterator[subprocess.Popen[str]]:
@@ -99,30 +103,36 @@ class Team:
         return "" if radio is None else radio["problem"] or ""
 
 
-@pytest.fixture
-def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
-    near = mesh.node("near")
+@contextmanager
+def team_with(
+    mesh: VirtualFleet, folder: Path, radios: Sequence[str], robots: Mapping[str, Sequence[str]]
+) -> Iterator[Team]:
+    """Alice with these radios; `robots` are the radios of the others."""
     private, public = new_key_pair("collector of alice")
-    (tmp_path / "fleet.yaml").write_text(INVENTORY.format(key=public))
-    fleet = load_fleet(tmp_path / "fleet.yaml")
-    rendered = {file.path: file for file in render_node(fleet, "near", lambda _: Secret("")).files}
-    before = near.exec(f"cat /{DROPBEAR}").stdout_bytes
-    for path in (AUTHORIZED_KEYS, LINKS_PATH, DROPBEAR):
-        write(near, path, rendered[path].content, rendered[path].mode)
-    near.exec("reload_config").check("reload dropbear")
-    key = tmp_path / "id_ed25519"
+    (folder / "fleet.yaml").write_text(INVENTORY.format(radios=", ".join(radios), key=public))
+    fleet = load_fleet(folder / "fleet.yaml")
+    before, known_hosts, own = {}, "", []
+    for name in radios:
+        node = mesh.node(name)
+        rendered = {file.path: file for file in render_node(fleet, name, lambda _: Secret("")).files}
+        before[name] = node.exec(f"cat /{DROPBEAR}").stdout_bytes
+        for path in (AUTHORIZED_KEYS, LINKS_PATH, DROPBEAR):
+            write(node, path, rendered[path].content, rendered[path].mode)
+        node.exec("reload_config").check("reload dropbear")
+        shown = node.exec("dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key").stdout
+        (host_key,) = (line for line in shown.splitlines() if line.startswith("ssh-ed25519 "))
+        known_hosts += f"{name} {host_key}\n"
+        endpoint = mesh.endpoint(f"10.42.0.{LINE.index(name) + 1}")
+        own.append(OwnRadio(name, endpoint.host, endpoint.port))
+    key = folder / "id_ed25519"
     key.write_bytes(private)
     key.chmod(0o600)
-    shown = near.exec("dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key").stdout
-    (host_key,) = (line for line in shown.splitlines() if line.startswith("ssh-ed25519 "))
-    (tmp_path / "known_hosts").write_text(f"near {host_key}\n")
-    endpoint = mesh.endpoint("10.42.0.2")
-    radio = OwnRadio("near", endpoint.host, endpoint.port)
+    (folder / "known_hosts").write_text(known_hosts)
     document = {
         "version": 1,
         "robot": "alice",
-        "radios": [{"name": "near", "host": radio.host, "port": radio.port, "user": "root"}],
-        "robots": {"base": ["base"], "bob": ["far"]},
+        "radios": [{"name": one.name, "host": one.host, "port": one.port, "user": "root"} for one in own],
+        "robots": robots,
         "key": key.name,
         "known_hosts": "known_hosts",
         "names": "names.json",
@@ -130,14 +140,24 @@ def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
         "load_mbit_s": 2.0,
         "interval_s": 0.3,
     }
-    (tmp_path / "collector.json").write_text(json.dumps(document))
-    (tmp_path / "names.json").write_text(json.dumps({mac_of(mesh, name): name for name in LINE}))
-    with two_daemons() as (alice, _):
-        yield Team(mesh, alice, radio, RadioLogin(key, tmp_path / "known_hosts"), tmp_path / "collector.json")
+    (folder / "collector.json").write_text(json.dumps(document))
+    (folder / "names.json").write_text(json.dumps({mac_of(mesh, name): name for name in LINE}))
+    try:
+        with two_daemons() as (alice, _):
+            yield Team(mesh, alice, tuple(own), RadioLogin(key, folder / "known_hosts"), folder / "collector.json")
+    finally:
+        for name in radios:
+            node = mesh.node(name)
+            node.wait_up()
+            write(node, DROPBEAR, before[name], 0o644)
+            node.exec(f"rm -f /{AUTHORIZED_KEYS} /{LINKS_PATH}; sync; reload_config").check("remove the key")
+
+
+@pytest.fixture
+def team(mesh: VirtualFleet, tmp_path: Path) -> Iterator[Team]:
+    with team_with(mesh, tmp_path, ["near"], {"base": ["base"], "bob": ["far"]}) as found:
+        yield found
     mesh.link("near", "far", signal_dbm=-58)
-    near.wait_up()
-    write(near, DROPBEAR, before, 0o644)
-    near.exec(f"rm -f /{AUTHORIZED_KEYS} /{LINKS_PATH}; sync; reload_config").check("remove the key")
 
 
 def write(node: VirtualNode, path: str, content: bytes, mode: int) -> None:
@@ -211,3 +231,69 @@ def test_a_changed_host_key_is_refused_and_named(team: Team) -> None:
     with team.collector():
         until(lambda: "near does not answer: " in team.problem(), "the refusal")
         assert "Host key verification failed" in team.problem()
+
+
+def test_the_better_of_two_radios_counts_until_it_is_off(mesh: VirtualFleet, tmp_path: Path) -> None:
+    """A robot with one radio in front and one behind, and bob at the base."""
+    mesh.link("far", "base", tq=150, signal_dbm=-75)
+    with team_with(mesh, tmp_path, ["near", "far"], {"bob": ["base"]}) as team, team.collector():
+        until(lambda: radio_and_signal(team) == ("near", -61), "the path of the better radio")
+        radio = team.conditions()["radio"]
+        assert radio["source"] == "near and far"
+        heard = {(one["radio"], one["name"]) for one in radio["neighbors"]}
+        assert {("near", "base"), ("far", "base")} <= heard
+        # the robot turns round
+        mesh.link("far", "base", tq=250, signal_dbm=-55)
+        mesh.link("near", "base", tq=100, signal_dbm=-80)
+        until(lambda: radio_and_signal(team) == ("far", -55), "the path of the other radio")
+        mesh.link("near", "base", tq=240, signal_dbm=-61)
+        mesh.link("far", "base", tq=150, signal_dbm=-75)
+        until(lambda: radio_and_signal(team) == ("near", -61), "the path of the first radio again")
+        team.near.power_cut(back=False)
+        until(lambda: radio_and_signal(team) == ("far", -75), "the path of the radio that is left", wait_s=60.0)
+        assert team.problem().startswith("near does not answer: ")
+        team.near.power_on()
+        until(lambda: radio_and_signal(team) == ("near", -61), "the path after a boot", wait_s=90.0)
+        until(lambda: team.problem() == "", "no problem any more")
+
+
+def radio_and_signal(team: Team) -> tuple[str, int] | None:
+    path = team.path()
+    return None if path is None else (path["radio"], path["signal_dbm"])
+
+
+WITHOUT_ROUTING_TABLE = """
+uci -q batch <<END
+delete network.bat0
+delete network.mesh0.master
+set network.mesh0.proto=none
+commit
+END
+reload_config
+"""
+
+
+def test_a_radio_without_a_routing_table_has_the_paths_of_the_robots_that_it_hears(
+    mesh: VirtualFleet, tmp_path: Path
+) -> None:
+    """As with meshmerize: its virtual radio meshes, and has nothing that the collector could read besides stations."""
+    with team_with(mesh, tmp_path, ["near"], {"bob": ["far"], "carol": ["of no radio in reach"]}) as team:
+        team.near.plug(True)
+        team.near.exec(WITHOUT_ROUTING_TABLE).check("remove batman-adv")
+        with team.collector():
+            found: list[dict[str, Any]] = []
+
+            def is_without_quality() -> bool:
+                found[:] = [path for path in [team.path()] if path is not None and path["quality"] is None]
+                return bool(found)
+
+            until(is_without_quality, "the path to bob without a routing table")
+            (path,) = found
+            assert (path["radio"], path["next_hop"], path["signal_dbm"]) == ("near", "far", -58)
+            # what the driver expects of the hop is all that is known
+            assert path["bottleneck_bits_per_s"] > 1e6
+            assert path["margin_db"] > 10.0
+            mesh.link("near", "far", up=False)
+            until(lambda: team.path() is None, "the end of the path")
+            assert {one["name"] for one in team.conditions()["radio"]["neighbors"]} == {"base"}
+        team.near.exec(MESH.format(address="10.42.0.2", channel=6) + "sync").check("restore batman-adv")
