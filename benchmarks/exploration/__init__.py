@@ -1,0 +1,1 @@
+"""An exploration mission over udp_mesh and over the legacy transport, with ROS masters (docs/benchmarks.md)."""
