@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,11 +21,29 @@ def expects_ros2() -> bool:
     return PYTHON.exists() or bool(os.environ.get(NEEDS_ROS2))
 
 
-def environment(domain: int) -> dict[str, str]:
-    """One robot's ROS: nothing of another domain is heard, nothing leaves this machine."""
+BUILDER = Path(__file__).with_name("build_ros2_messages.py")
+
+
+def build_messages(source: Path, out: Path) -> None:
+    """Builds a package of messages, for `built` below."""
+    done = subprocess.run(
+        [str(PYTHON), str(BUILDER), str(source), str(out)],
+        env=environment(0),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def environment(domain: int, built: Path | None = None) -> dict[str, str]:
+    """One robot's ROS: nothing of another domain is heard, nothing leaves this machine. `built` has messages."""
+    more = {} if built is None else {"LD_LIBRARY_PATH": str(built / "lib")}
+    packages = [ROOT, Path(__file__).with_name("ros2_packages"), *([] if built is None else [built / "python"])]
     return {
         **{name: text for name, text in os.environ.items() if not name.startswith(("ROS_", "RMW_", "PYTHON"))},
-        "PYTHONPATH": f"{ROOT}:{Path(__file__).with_name('ros2_packages')}",
+        **more,
+        "PYTHONPATH": ":".join(map(str, packages)),
         "ROS_DOMAIN_ID": str(domain),
         # shared memory is outside of network namespaces, and a killed process leaves its segments locked there
         "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
@@ -35,9 +54,11 @@ def environment(domain: int) -> dict[str, str]:
 class Ros2Node(NodeProcess):
     """A node of a robot. `inside` goes before its command: what enters the robot's own network."""
 
-    def __init__(self, folder: Path, name: str, domain: int, inside: Sequence[str] = ()) -> None:
+    def __init__(
+        self, folder: Path, name: str, domain: int, inside: Sequence[str] = (), built: Path | None = None
+    ) -> None:
         command = [*inside, str(PYTHON), str(Path(__file__).with_name("ros2_robot.py")), name]
-        super().__init__(command, environment(domain), folder / f"{name}-ros2.log")
+        super().__init__(command, environment(domain, built), folder / f"{name}-ros2.log")
 
     def publish(self, name: str, data: object, **more: object) -> None:
         self._command(publish=name, data=data, **more)
@@ -59,14 +80,21 @@ class Ros2Bridge(BridgeProcess):
     """One robot's bridge, with `configuration` as its file."""
 
     def __init__(
-        self, daemon: RunningDaemon, domain: int, inside: Sequence[str] = (), configuration: str = "", *more: str
+        self,
+        daemon: RunningDaemon,
+        domain: int,
+        inside: Sequence[str] = (),
+        configuration: str = "",
+        *more: str,
+        built: Path | None = None,
     ) -> None:
         super().__init__(daemon.folder / f"{daemon.name}-bridge2.log")
         self._socket, self._domain, self._inside, self._more = daemon.socket, domain, inside, more
+        self._built = built
         self._file = daemon.folder / f"{daemon.name}-bridge2.yaml"
         self._file.write_text(configuration)
 
     def start(self) -> None:
         command = [str(PYTHON), "-m", "udp_mesh.bridges.ros2", "--socket", str(self._socket)]
         command += ["--config", str(self._file), *self._more]
-        self._run([*self._inside, *command], environment(self._domain))
+        self._run([*self._inside, *command], environment(self._domain, self._built))

@@ -11,7 +11,8 @@ output. It runs in the Python that has rclpy (`ros2_processes`), so it imports n
     {"is_available": NAME}                                 -> {"available": BOOL}, of the Trigger or action
 
 `type` and `fields` may stand beside `publish`, `type` beside `subscribe`: then `data` is the message as YAML, not text.
-A message with "depth" has a history of that many.
+With `parsed` beside `subscribe`, `data` is how Python shows the message. A message with "depth" has a history of that
+many.
 """
 
 from __future__ import annotations
@@ -81,10 +82,11 @@ class Robot:
             self.publishers[name].publish(bytes.fromhex(request["data"]["cdr"]))
 
     def subscribe(self, request: dict[str, Any]) -> None:
-        name, raw = request["subscribe"], "type" in request
+        name, parsed = request["subscribe"], bool(request.get("parsed"))
+        raw = "type" in request and not parsed
 
         def arrived(message: Any) -> None:
-            answer(name=name, data=bytes(message).hex() if raw else message.data)
+            answer(name=name, data=bytes(message).hex() if raw else repr(message) if parsed else message.data)
 
         made = self.node.create_subscription(message_class(request), name, arrived, profile(request), raw=raw)
         self.kept.append(made)
