@@ -6,12 +6,13 @@ snapshot, with progress on a terminal.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,11 +20,14 @@ from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, 
 from meshctl.cli.output import is_dumb, is_plain
 from meshctl.cli.robots_context import AskSudo, sudo_password
 from meshctl.device.connection import Deadlines
-from meshctl.model import Fleet, Node
+from meshctl.model import Fleet, Node, Site
 from meshctl.robots.connection import RobotConnector
 from meshctl.status.assess import Snapshot
 from meshctl.status.collect import Collector, Progress
 from meshctl.status.table import Paint, plain
+
+if TYPE_CHECKING:
+    from meshctl.status.site_observer import SiteObserver
 
 # Short, since a status should be quick: TCP sends three SYNs in this time (RFC 6298: after 1 and 3 s). Provisioning,
 # which must not give up early, waits longer.
@@ -38,12 +42,17 @@ Timeout = Annotated[
         help="Connection timeout in seconds; each later step gets twice as long.",
     ),
 ]
+Direct = Annotated[
+    bool,
+    typer.Option("--direct", help="Connect to nodes of sites from here, instead of through their workers."),
+]
 NoRobots = Annotated[bool, typer.Option("--no-robots", help="Query only the radios, not the robots' computers.")]
 
 # Options of read-only commands, by the parameters of `open_fleet_view`.
 _SHARED: Options = {
     "inventory": (InventoryPath, Path()),
     "no_robots": (NoRobots, False),
+    "direct": (Direct, False),
     "timeout": (Timeout, CONNECT_S),
     "ask_sudo": (AskSudo, False),
     "key": (KeyFiles, None),
@@ -85,6 +94,7 @@ def open_fleet_view(
     timeout: float = CONNECT_S,
     ask_sudo: bool = False,
     no_robots: bool = False,
+    direct: bool = False,
 ) -> Iterator[FleetView]:
     """Open the fleet and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     password = None if no_robots else sudo_password(ask_sudo)
@@ -92,10 +102,26 @@ def open_fleet_view(
         opened.access.deadlines = _deadlines(timeout)
         robots, skipped = _robots(opened, not no_robots)
         connector = RobotConnector(opened.fleet, opened.access, lambda: password) if robots else None
+        sites = None if direct else site_observer(opened, inventory)
         with Collector(
-            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, connector, skipped
+            opened.fleet, opened.renderer, opened.access, opened.journal, opened.owner, connector, skipped, sites
         ) as collector:
             yield FleetView(opened, collector, tuple(opened.fleet.managed()), robots)
+
+
+def site_observer(opened: Session, inventory: Path) -> SiteObserver | None:
+    """What observes the nodes of sites with a worker; None if no site has one."""
+    if not any(site.worker_key for site in opened.fleet.sites.values()):
+        return None
+    # with what only sites need
+    from meshctl.sites.bundle import site_bundle
+    from meshctl.status.site_observer import SiteObserver
+
+    def part_of(site: Site) -> bytes:
+        secrets, trust = opened.renderer.secrets, opened.trust
+        return site_bundle(inventory, opened.fleet, site.name, secrets, trust, os.environ, with_firmware=False).archive
+
+    return SiteObserver(opened.fleet, opened.access, part_of)
 
 
 def with_fleet_view(command: Callable[..., None]) -> Callable[..., None]:

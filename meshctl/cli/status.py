@@ -63,6 +63,9 @@ def status(
     topics: Annotated[bool, typer.Option("--topics", help="Also show the age of each topic's messages.")] = False,
     wide: Annotated[bool, typer.Option("--wide", help="Show all columns regardless of the terminal width.")] = False,
     as_json: AsJson = False,
+    answers: Annotated[
+        bool, typer.Option("--answers", hidden=True, help="Print what the radios say, for another meshctl to read.")
+    ] = False,
 ) -> None:
     """Show the state of every radio and robot: reachability, drift from the inventory, neighbors and alarms.
 
@@ -79,6 +82,9 @@ def status(
     attributes = {"group": group or (), "robot": robot or (), "role": role or (), "state": state or ()}
     chosen = select_devices(fleet_view.fleet, names or (), read_selection, limit or (), attributes, alarm or ())
     query = _StatusQuery(fleet_view, chosen, only, topics, wide)
+    if answers:
+        echo_json(json.dumps(query.answers()))
+        return
     if watch is None:
         found = query.status(query.collect(), time.time())
         if as_json:
@@ -110,6 +116,12 @@ class _StatusQuery:
         whole = assess(snapshot, self._nodes, time.time(), self._robots)
         self._fleet_view.opened.journal.remember_all(self._fleet_view.fleet.name, facts_to_record(whole), time.time())
         return snapshot
+
+    def answers(self) -> dict[str, object]:
+        """What the nodes say, for the operator that asked a site's worker."""
+        from meshctl.status.site_observer import answers_json
+
+        return answers_json(self._fleet_view.collector.answers(self._nodes), time.time())
 
     def status(self, snapshot: Snapshot, now: float) -> FleetStatus:
         """The status of the selected devices, with ages as of `now`."""

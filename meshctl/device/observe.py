@@ -9,7 +9,7 @@ import hashlib
 import secrets
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -42,6 +42,37 @@ T = TypeVar("T")
 OBSERVE_TIMEOUT_S = 90.0
 
 
+@dataclass(frozen=True, slots=True)
+class RawObservation:
+    """What observe.sh printed on a node, before it is parsed: sections between lines with `nonce`."""
+
+    nonce: str
+    output: bytes = field(repr=False)
+    asked_at_s: float
+    answered_at_s: float
+
+    def interpret(self) -> Observation:
+        sections = split_sections(self.output, self.nonce)
+        return interpret(sections, asked_at_s=self.asked_at_s, answered_at_s=self.answered_at_s)
+
+
+def observe_raw(
+    connection: Connection,
+    *,
+    extra_paths: Iterable[str] = (),
+    brief: bool = False,
+    timeout_s: float = OBSERVE_TIMEOUT_S,
+    clock: Callable[[], float] = time.time,
+) -> RawObservation:
+    """One round trip for everything about the node; `extra_paths` are further files to read. `brief` leaves out what no
+    proof of a change needs. Raises Timeout and ConnectionLost."""
+    nonce = f"meshctl-{secrets.token_hex(16)}"
+    sent = observation_script(nonce, extra_paths, brief=brief)
+    asked = clock()
+    done = connection.run(sent, timeout_s=timeout_s)
+    return RawObservation(nonce, done.stdout_bytes, asked, clock())
+
+
 def observe(
     connection: Connection,
     *,
@@ -50,16 +81,8 @@ def observe(
     timeout_s: float = OBSERVE_TIMEOUT_S,
     clock: Callable[[], float] = time.time,
 ) -> Observation:
-    """Observe everything about the node in one round trip; `extra_paths` are further files to read. `brief` leaves
-    out what no proof of a change needs.
-
-    Raises Timeout and ConnectionLost; a missing or unreadable answer is data.
-    """
-    nonce = f"meshctl-{secrets.token_hex(16)}"
-    sent = observation_script(nonce, extra_paths, brief=brief)
-    asked = clock()
-    done = connection.run(sent, timeout_s=timeout_s)
-    return interpret(split_sections(done.stdout_bytes, nonce), asked_at_s=asked, answered_at_s=clock())
+    """`observe_raw`, parsed; a missing or unreadable answer is data."""
+    return observe_raw(connection, extra_paths=extra_paths, brief=brief, timeout_s=timeout_s, clock=clock).interpret()
 
 
 def observation_script(nonce: str, extra_paths: Iterable[str] = (), *, brief: bool = False) -> str:

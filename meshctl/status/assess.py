@@ -12,6 +12,7 @@ from meshctl.device.observation import Observation
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Node, NodeState
 from meshctl.plan import NodePlan
+from meshctl.report.duration import duration
 from meshctl.robots.facts import RobotFacts
 from meshctl.status.dropped import dropped_beacons
 from meshctl.status.node_alarms import MESH_MODES, NodeAlarmInput, alarms, join_limited
@@ -119,7 +120,7 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
         tuple(statuses),
         tuple(robot_status(robot_answers, snapshot.fleet.robots[name]) for name in robots),
         strangers,
-        tuple(_fleet_alarms(snapshot)),
+        (*_fleet_alarms(snapshot), *_site_alarms(snapshot, now)),
         snapshot.took_s,
     )
 
@@ -147,6 +148,23 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
         yield Alarm(Level.WARNING, "not-compared", text, hint)
     if snapshot.robots_skipped:
         yield Alarm(Level.NOTE, "robots-unasked", snapshot.robots_skipped)
+
+
+def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
+    """One for each site that could not be asked: how old is what is shown of it."""
+    silent: dict[str, list[str]] = {}
+    for name, why in snapshot.no_answer.items():
+        if why.of_gateway:
+            silent.setdefault(snapshot.fleet.nodes[name].site, []).append(name)
+    for site, names in silent.items():
+        why = snapshot.no_answer[names[0]]
+        last_s = max((snapshot.known[name].seen_s for name in names if name in snapshot.known), default=None)
+        nodes = f"its {len(names)} nodes" if len(names) > 1 else f"its node {names[0]}"
+        if last_s is None:
+            shown = f"nothing is known of {nodes}"
+        else:
+            shown = f"what is known of {nodes} is {duration(max(0.0, now - last_s))} old"
+        yield Alarm(Level.WARNING, "site", f"no contact with site {site} ({why.reason}): {shown}", why.hint)
 
 
 def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting, ...], now: float) -> NodeStatus:

@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
-from meshctl.device.observe import observe
+from meshctl.device.observe import RawObservation, observe_raw
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
@@ -35,8 +35,11 @@ from meshctl.status.assess import Snapshot
 from meshctl.status.emergency_stop import StopPlan, StopResult, send
 from meshctl.status.last_known import merge_by_device
 from meshctl.status.pings import Pings, ping, pings_of
-from meshctl.status.unreachable import no_answer_of
+from meshctl.status.unreachable import NOT_ASKED, no_answer_of
 from meshctl.status.values import NoAnswer
+
+if TYPE_CHECKING:
+    from meshctl.status.site_observer import SiteObserver
 
 T = TypeVar("T")
 
@@ -60,7 +63,7 @@ class Collector:
     """Collects snapshots and keeps connections between them. Not thread-safe.
 
     `connector` is None when no robot can be queried, for the reason in `robots_skipped`; `owner` is this process's name
-    in the nodes' locks.
+    in the nodes' locks. The nodes of sites with a worker are observed by it, unless `sites` is None.
     """
 
     fleet: Fleet
@@ -70,11 +73,13 @@ class Collector:
     owner: str
     connector: RobotConnector | None = None
     robots_skipped: str = ""
+    sites: SiteObserver | None = None
     clock: Callable[[], float] = time.time
     _desired_states: dict[str, DesiredState | str] = field(default_factory=dict, repr=False)
     _expected_releases: dict[str, ExpectedRelease | str] = field(default_factory=dict, repr=False)
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
     _observed: dict[str, Observation] = field(default_factory=dict, repr=False)
+    _previous: dict[str, Observation] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def collect(self, nodes: Iterable[Node], robots: Iterable[str] = (), progress: Progress = _no_progress) -> Snapshot:
@@ -84,17 +89,30 @@ class Collector:
         asked = {node.name: node for node in nodes}
         targets = tuple(robots) if self.connector is not None else ()
         jobs: dict[tuple[str, str], Callable[[], object]] = {}
+        at_sites: dict[str, list[str]] = {}
         for node in asked.values():
-            jobs["node", node.name] = partial(self._observe, node)
+            site = self.sites.site_of(node) if self.sites is not None else ""
+            if site:
+                at_sites.setdefault(site, []).append(node.name)
+            else:
+                jobs["node", node.name] = partial(self._observe, node)
+        for site, names in at_sites.items():
+            jobs["site", site] = partial(self._ask_site, site, tuple(names))
         for robot in targets:
             jobs["robot", robot] = partial(self._collect_robot, robot)
         answers = run_parallel(jobs, MAX_PARALLEL, progress)
+        for site in at_sites:
+            of_site = answers.pop(("site", site))
+            assert isinstance(of_site, Mapping)
+            answers |= {("node", name): of_site[name] for name in at_sites[site]}
         observations = {key[1]: seen for key, seen in answers.items() if isinstance(seen, Observation)}
         facts = {key[1]: one for key, one in answers.items() if isinstance(one, RobotFacts)}
         no_answer: dict[str, dict[str, NoAnswer]] = {"node": {}, "robot": {}}
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
                 no_answer[kind][name] = no_answer_of(answer)
+            elif isinstance(answer, NoAnswer):
+                no_answer[kind][name] = answer
         # a report is made of all paths that a node knows: once
         reports = reports_of(observations)
         self.journal.remember_all(
@@ -108,7 +126,7 @@ class Collector:
             if isinstance(expected := self._expected_release(robot), str):
                 unrendered[f"{ROBOT_PREFIX}{robot}"] = expected
         base = self.fleet.base_node
-        previous, self._observed = self._observed, {**self._observed, **observations}
+        self._note(observations)
         return Snapshot(
             fleet=self.fleet,
             observations=observations,
@@ -124,9 +142,18 @@ class Collector:
             robots=facts,
             no_answer_robots=no_answer["robot"],
             robots_skipped=self.robots_skipped,
-            previous=previous,
+            previous=dict(self._previous),
             took_s=self.clock() - began,
         )
+
+    def _note(self, observations: Mapping[str, Observation]) -> None:
+        for name, seen in observations.items():
+            last = self._observed.get(name)
+            # what a site's worker said may stand for a while
+            if last is not seen:
+                self._observed[name] = seen
+                if last is not None:
+                    self._previous[name] = last
 
     def ping(self, robots: Iterable[str]) -> Pings:
         """Have each of these robots' daemons send an urgent message to each other and back."""
@@ -157,6 +184,8 @@ class Collector:
             jobs: dict[str, Callable[[], object]] = {name: stack.close for name, (stack, _) in self._computers.items()}
             self._computers.clear()
         run_parallel(jobs, MAX_PARALLEL)
+        if self.sites is not None:
+            self.sites.close()
 
     def __enter__(self) -> Collector:
         return self
@@ -164,11 +193,33 @@ class Collector:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _observe(self, node: Node) -> Observation:
+    def answers(self, nodes: Iterable[Node]) -> dict[str, RawObservation | NoAnswer]:
+        """What these radios say, for another meshctl to read (`site_observer`)."""
+        found = run_parallel({node.name: partial(self._observe_raw, node) for node in nodes}, MAX_PARALLEL)
+        answers: dict[str, RawObservation | NoAnswer] = {}
+        for name, answer in found.items():
+            if isinstance(answer, NodeError):
+                answers[name] = no_answer_of(answer)
+            elif isinstance(answer, RawObservation):
+                answers[name] = answer
+        return answers
+
+    def _observe_raw(self, node: Node) -> RawObservation:
         desired = self._desired_state(node)
         paths = () if isinstance(desired, str) else other_paths(desired)
         with self.access.borrow(node) as connection:
-            return observe(connection, extra_paths=paths, timeout_s=OBSERVE_S)
+            return observe_raw(connection, extra_paths=paths, timeout_s=OBSERVE_S)
+
+    def _observe(self, node: Node) -> Observation:
+        return self._observe_raw(node).interpret()
+
+    def _ask_site(self, site: str, names: tuple[str, ...]) -> Mapping[str, Observation | NoAnswer | NodeError]:
+        assert self.sites is not None
+        try:
+            found = self.sites.observe(site, names)
+        except NodeError as error:
+            return dict.fromkeys(names, error)
+        return {name: found.get(name, NOT_ASKED) for name in names}
 
     def _desired_state(self, node: Node) -> DesiredState | str:
         """The desired state of a node, or why it cannot be rendered: status also works without the secrets."""

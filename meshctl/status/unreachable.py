@@ -32,7 +32,10 @@ def no_answer_of(error: NodeError) -> NoAnswer:
             code = "failed"
     reason = re.sub(r"^\S+ \(\S+\): ", "", str(error))
     if error.gateway_of:
-        return NoAnswer(f"gateway of {error.gateway_of}: {reason}", code, error.hint, of_gateway=True)
+        # the errors of a worker name its site
+        if not reason.startswith(f"site {error.gateway_of}"):
+            reason = f"gateway of {error.gateway_of}: {reason}"
+        return NoAnswer(reason, code, error.hint, of_gateway=True)
     return NoAnswer(reason, code, error.hint)
 
 

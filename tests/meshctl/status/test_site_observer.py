@@ -1,0 +1,168 @@
+"""The answers of nodes as their site's worker passes them on, and when a worker is asked."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from meshctl.device.observe import RawObservation
+from meshctl.errors import NodeError, Unreachable
+from meshctl.inventory import load_fleet
+from meshctl.nodes.connections import ConnectionPool
+from meshctl.sites.protocol import WorkerError
+from meshctl.sites.uplink import Uplink
+from meshctl.status.site_observer import MAX_OUTPUT_BYTES, PERIOD_S, SiteObserver, answers_json, parse_answers
+from meshctl.status.values import NoAnswer
+
+_SAID = b"@@n boot_id 0\nb-1\n"
+_ANSWERS: dict[str, RawObservation | NoAnswer] = {
+    "n1": RawObservation("n", _SAID, 100.0, 101.5),
+    "n2": NoAnswer("silent", "unreachable", "look"),
+}
+
+
+def test_answers_keep_their_age_although_the_clocks_of_both_sides_differ() -> None:
+    found = parse_answers(json.dumps(answers_json(_ANSWERS, 110.0)), 5000.0)
+    assert found["n2"] == _ANSWERS["n2"]
+    assert found["n1"] == RawObservation("n", _SAID, 4990.0, 4991.5).interpret()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        '{"now_s": 1}',
+        '{"now_s": 1, "answers": {"n1": {}}}',
+        '{"now_s": 1, "answers": {"n1": {"nonce": "n", "output": "AAAA", "asked_at_s": 1, "answered_at_s": 1}}}',
+        '{"now_s": 1, "answers": {"n1": {"nonce": "n", "output": "-", "asked_at_s": 1, "answered_at_s": 1}}}',
+    ],
+)
+def test_what_is_not_answers_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        parse_answers(text, 0.0)
+
+
+def test_an_answer_that_inflates_without_end_is_refused() -> None:
+    output = base64.b64encode(zlib.compress(bytes(MAX_OUTPUT_BYTES + 1))).decode()
+    said = {"nonce": "n", "output": output, "asked_at_s": 1, "answered_at_s": 1}
+    with pytest.raises(ValueError, match="more than 16 MiB"):
+        parse_answers(json.dumps({"now_s": 1, "answers": {"n1": said}}), 0.0)
+
+
+class Workers:
+    """What the workers' uplinks do, and at what time."""
+
+    def __init__(self, directory: Path) -> None:
+        (directory / "fleet.yaml").write_text(_INVENTORY)
+        self.now_s = 0.0
+        self.opened = self.asked = self.closed = 0
+        self.error: Exception | None = None
+        self.text = json.dumps(answers_json(_ANSWERS, 110.0))
+        fleet = load_fleet(directory, environ={})
+        self.observer = SiteObserver(
+            fleet, cast("ConnectionPool", None), lambda site: b"", lambda: 110.0, lambda: self.now_s, self._open
+        )
+
+    def _open(self, *about: object) -> Uplink:
+        self.opened += 1
+        return cast("Uplink", SimpleNamespace(status=self._status, close=self._close))
+
+    def _close(self) -> None:
+        self.closed += 1
+
+    def _status(self, run: str, part: bytes, nodes: Sequence[str], options: Sequence[str]) -> str:
+        self.asked += 1
+        if self.error is not None:
+            raise self.error
+        return self.text
+
+    def observe(self) -> Any:
+        return self.observer.observe("north", ["n1", "n2"])
+
+
+_INVENTORY = """\
+meshctl: 1
+fleet: mines
+country: US
+operators: {ssh_keys: []}
+hardware:
+  box:
+    board: compex,wpj344-16m
+    profile: compex_wpj344-16m
+    target: ath79/generic
+    release: "24.10"
+    lan_ports: [eth0]
+    radios: {radio0: {path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}
+meshes:
+  north: {ssid: north, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}
+sites:
+  north:
+    ssh: {host: 192.0.2.1, user: mesh}
+    worker_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g worker
+  south: {ssh: {host: 192.0.2.2, user: mesh}}
+defaults: {hardware: box, state: deployed, radios: {radio0: {mesh: north}}}
+nodes:
+  n1: {role: base, site: north, address: 10.42.0.1}
+  n2: {site: north, address: 10.42.0.2}
+  s1: {site: south, address: 10.42.0.3}
+  own: {address: 10.42.0.4}
+"""
+
+
+@pytest.fixture
+def workers(tmp_path: Path) -> Workers:
+    return Workers(tmp_path)
+
+
+def test_only_a_site_whose_worker_is_installed_is_asked(workers: Workers) -> None:
+    nodes = workers.observer.fleet.nodes
+    assert {name: workers.observer.site_of(node) for name, node in nodes.items()} == {
+        "n1": "north",
+        "n2": "north",
+        "s1": "",
+        "own": "",
+    }
+
+
+def test_a_worker_is_asked_once_in_a_while_over_one_uplink(workers: Workers) -> None:
+    first = workers.observe()
+    workers.now_s = PERIOD_S - 1
+    assert workers.observe() == first
+    assert workers.asked == 1
+    workers.now_s = PERIOD_S
+    workers.observe()
+    workers.observer.observe("north", ["n1"])
+    assert (workers.asked, workers.opened) == (3, 1)
+    workers.observer.close()
+    assert workers.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"), [(Unreachable("cut", hint="mend it"), Unreachable), (WorkerError("busy"), NodeError)]
+)
+def test_a_worker_that_fails_is_asked_again_over_a_new_uplink(
+    workers: Workers, error: Exception, kind: type[NodeError]
+) -> None:
+    workers.observe()
+    workers.now_s, workers.error = PERIOD_S, error
+    with pytest.raises(kind) as raised:
+        workers.observe()
+    assert type(raised.value) is kind
+    assert raised.value.gateway_of == "north"
+    workers.error = None
+    workers.observe()
+    assert (workers.opened, workers.closed) == (2, 1)
+
+
+def test_an_unusable_answer_is_the_sites_failure(workers: Workers) -> None:
+    workers.text = "[]"
+    with pytest.raises(NodeError, match="site north: its worker's answer is unusable"):
+        workers.observe()
