@@ -39,6 +39,7 @@ from meshctl.sites.envelope import (
 )
 from meshctl.sites.nats_client import NatsLost, NatsServer, shared, stream_settings
 from meshctl.sites.protocol import SILENCE_S, raise_error
+from meshctl.sites.service import unit_name
 from meshctl.sites.subjects import SiteSubjects
 from meshctl.sites.uplink import Greeting, Parcel, Uplink, greeting_of
 
@@ -163,7 +164,8 @@ class NatsUplink(Uplink):
 
     def _offline(self, text: str) -> SiteOffline:
         name = self.site.name
-        hint = f"check the uplink of {name}, its leaf node and `systemctl --user status meshctl-worker` on its gateway"
+        unit = unit_name(self._fleet, name)
+        hint = f"check the uplink of {name}, its leaf node, and `systemctl --user status {unit}` on its gateway"
         return SiteOffline(f"site {name} {text}", hint=hint)
 
     def send_images(self, images: Mapping[str, Path]) -> None:

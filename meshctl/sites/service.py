@@ -19,7 +19,9 @@ cat > "$directory/$1"
 command -v systemctl >/dev/null || exit 3
 # without a login session the user's systemd is not in the environment
 export XDG_RUNTIME_DIR="${XDG_RUNTIME_DIR:-/run/user/$(id -u)}"
-loginctl enable-linger 2>/dev/null || echo no-linger
+# an administrator may have done what is not allowed to the user
+[ "$(loginctl show-user "$(id -un)" --property Linger --value 2>/dev/null)" = yes ] ||
+	loginctl enable-linger 2>/dev/null || echo "no-linger $(id -un)"
 systemctl --user daemon-reload
 systemctl --user enable --quiet "$1"
 systemctl --user restart "$1"
@@ -28,14 +30,25 @@ _UNIT = """\
 # Written by `meshctl sites install`.
 [Unit]
 Description=meshctl worker of site {name}
-Documentation=man:meshctl-worker(1)
 
 [Service]
 ExecStart={command}
 Restart=always
 RestartSec=5
-# a run continues while the worker is restarted or updated
+# a run continues while the worker is restarted or updated, or runs out of memory
 KillMode=process
+OOMPolicy=continue
+# what a login user's systemd can take away without root; files are protected by being another user's
+UMask=0077
+NoNewPrivileges=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
 
 [Install]
 WantedBy=default.target
@@ -65,6 +78,9 @@ def start_service(connection: Connection, name: str, text: str) -> str:
     script = f"printf %s {shlex.quote(text)} | sh -c {shlex.quote(_START)} sh {shlex.quote(name)}"
     done = connection.run(script, timeout_s=_TIMEOUT_S)
     if done.exit_status == 0:
-        return "run `loginctl enable-linger` there, as root" if "no-linger" in done.stdout else ""
+        _, is_missing, user = done.stdout.strip().rpartition("no-linger ")
+        if is_missing:
+            return f"it ends when {user} logs out, until root runs `loginctl enable-linger {user}` there"
+        return ""
     reason = (done.stderr.strip().splitlines() or ["there is no systemd"])[-1]
     return f"start {name} there ({reason}), or the command in it"

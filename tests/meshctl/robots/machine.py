@@ -12,9 +12,11 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from meshctl.device.connection import Credentials, Deadlines, Endpoint
+from meshctl.device.errors import ConnectionLost
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import HostKey, TrustStore, parse_key
 from tests.meshctl.device.servers import PATIENCE_S, eventually
@@ -128,7 +130,9 @@ class Machine:
 
     def reboot(self, pins: Path) -> None:
         """As `systemctl reboot` does it: services stop in order, and everything starts again."""
-        self.shell("systemctl reboot", pins)
+        with suppress(ConnectionLost):
+            # which may end before the command does
+            self.shell("systemctl reboot", pins)
         eventually(self._ended)
         assert self._process is not None
         # what the kernel reports of a namespace whose first process asked for a restart: reboot(2)

@@ -4,5 +4,10 @@ from __future__ import annotations
 
 from tests.meshctl.sites.nats_servers import expects_nats
 
-_NEED_SERVER = ["test_many_sites.py", "test_nats_authorization.py", "test_sites_over_nats.py"]
+_NEED_SERVER = [
+    "test_gateway_machine.py",
+    "test_many_sites.py",
+    "test_nats_authorization.py",
+    "test_sites_over_nats.py",
+]
 collect_ignore = [] if expects_nats() else _NEED_SERVER

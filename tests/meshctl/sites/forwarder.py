@@ -1,4 +1,4 @@
-"""An uplink that a test can cut: a TCP forwarder on loopback in front of a gateway's SSH server."""
+"""An uplink that a test can cut: a TCP forwarder in front of a gateway's SSH server."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ _READ_BYTES = 64 << 10
 
 
 class CuttableUplink:
-    """Forwards connections to `port` on loopback; `cut` closes all of them and accepts no more until `mend`."""
+    """Forwards connections to `port` of `host`; `cut` closes all of them and accepts no more until `mend`. It listens
+    on loopback, or with `listener`, which may be in another network."""
 
-    def __init__(self, port: int) -> None:
-        self._target = port
-        self._listener = socket.create_server(("127.0.0.1", 0))
+    def __init__(self, port: int, host: str = "127.0.0.1", listener: socket.socket | None = None) -> None:
+        self._target = (host, port)
+        self._listener = listener or socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
@@ -47,7 +48,12 @@ class CuttableUplink:
                     client.close()
                     continue
                 self.accepted += 1
-                server = socket.create_connection(("127.0.0.1", self._target))
+                try:
+                    server = socket.create_connection(self._target)
+                except OSError:
+                    # nothing listens there now
+                    client.close()
+                    continue
                 self._open |= {client, server}
             for source, sink in ((client, server), (server, client)):
                 threading.Thread(target=self._pass_on, args=(source, sink), daemon=True).start()

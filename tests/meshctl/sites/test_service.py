@@ -50,7 +50,8 @@ class Gateway:
     ("programs", "left"),
     [
         ({"systemctl": "exit 0", "loginctl": "exit 0"}, ""),
-        ({"systemctl": "exit 0", "loginctl": "exit 1"}, "run `loginctl enable-linger` there, as root"),
+        ({"systemctl": "exit 0", "loginctl": 'test "$1" = show-user && echo yes'}, ""),
+        ({"systemctl": "exit 0", "loginctl": "exit 1"}, "it ends when "),
         ({"systemctl": "echo no bus >&2; exit 1", "loginctl": "exit 0"}, "start x.service there (no bus)"),
         ({}, "start x.service there (there is no systemd)"),
     ],

@@ -12,9 +12,9 @@ from meshctl.sites.gateway import requirements
 from tests.meshctl.robots.wheels import repack
 
 
-def required_wheels(directory: Path) -> Path:
-    """Write one wheel for each project that meshctl needs, directly or not, into `directory`."""
-    waiting = [Requirement(line) for line in requirements()]
+def required_wheels(directory: Path, extra: str = "") -> Path:
+    """Write one wheel for each project that meshctl and one of its extras need, directly or not, into `directory`."""
+    waiting = [Requirement(line) for line in requirements(extra)]
     found: dict[str, None] = {}
     while waiting:
         requirement = waiting.pop()
