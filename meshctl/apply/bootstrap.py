@@ -144,6 +144,7 @@ def discover(
             raise
         with lock:
             found[node.name] = FoundDevice(target, node, seen, host_key_policy.key, old_pins)
+            connections.on_bench.add(node.name)
             connections.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
             if target.interface:
                 connections.interfaces[node.name] = target.interface

@@ -14,9 +14,9 @@ from types import MappingProxyType
 from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
-from meshctl.device.ssh import connect
+from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey, TrustStore
-from meshctl.errors import InputError, NodeError
+from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.fleet import Interrupt
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.nodes.collect import observe_cleared
@@ -44,9 +44,8 @@ def adopt(
 ) -> Replacement:
     """Connect to the new device and pin its key under the old node's name.
 
-    Raises NodeError when the old node still answers, or the new device does not.
+    Raises NodeError when the new device does not answer.
     """
-    _require_unreachable(connections, old)
     recorder = AcceptAnyKey()
     if target is not None:
         credentials = replace(connections.credentials(old), empty_password=True)
@@ -60,7 +59,7 @@ def adopt(
         key = recorder.key
     elif spare is not None:
         # checked against its own pin
-        connection = connections.open(spare)
+        connection = _open_spare(connections, spare, old)
         key = connection.host_key
     else:
         raise InputError("expected a spare of the inventory, or a device on the bench")
@@ -73,6 +72,8 @@ def adopt(
         raise
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
+    if target is not None or (spare is not None and spare.name in connections.on_bench):
+        connections.on_bench.add(old.name)
     connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:
         connections.interfaces[old.name] = connection.endpoint.interface
@@ -81,14 +82,40 @@ def adopt(
     return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key, pins)}, ()), spare)
 
 
-def _require_unreachable(connections: ConnectionPool, old: Node) -> None:
-    """The old device must be off: two devices with the same address conflict."""
+def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConnection:
+    """A connection to a spare: through the gateway of its site, or else on the bench."""
+    site = connections.fleet.gateway_site(spare)
+    if site is None:
+        return connections.open(spare)
+    try:
+        connection = connections.open(spare)
+    except Unreachable:
+        connections.on_bench.add(spare.name)
+        return connections.open(spare)
+    if spare.site != old.site:
+        connection.close()
+        raise NodeError(
+            f"{spare.name} is at site {spare.site}, and {old.name} at {old.site or 'none'}",
+            hint=f"take {spare.name} to where {old.name} was, or to a bench, and repeat",
+        )
+    return connection
+
+
+def require_off(connections: ConnectionPool, old: Node) -> None:
+    """The old device must be off: two devices with the same address conflict. Raises NodeError, also if the
+    gateway on the way to it cannot be asked."""
     try:
         connections.open(old).close()
-    except NodeError:
+    except NodeError as error:
+        if error.gateway_of:
+            raise
         return
-    raise NodeError(
-        f"{old.name} still answers at {connections.endpoint(old).address}: two nodes with one address conflict",
+    raise still_on(old, str(connections.endpoint(old).address))
+
+
+def still_on(old: Node, where: str) -> NodeError:
+    return NodeError(
+        f"{old.name} still answers at {where}: two nodes with one address conflict",
         hint="switch the old device off first",
     )
 

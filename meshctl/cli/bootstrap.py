@@ -7,6 +7,7 @@ import os
 import secrets
 import socket
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace as with_changes
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,7 +22,7 @@ from meshctl.apply.bootstrap import (
     plan_discovered,
     restore_pins,
 )
-from meshctl.apply.replace import adopt, identity_edits, with_identity
+from meshctl.apply.replace import adopt, identity_edits, require_off, still_on, with_identity
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -35,10 +36,12 @@ from meshctl.cli.context import (
     selected_nodes,
     session,
 )
+from meshctl.cli.fleet_view import site_observer
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
 from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
-from meshctl.errors import ExitCode, InputError, MeshctlError
+from meshctl.device.observation import Observation
+from meshctl.errors import ExitCode, InputError, MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.model import Fleet, Node, NodeState
@@ -98,7 +101,6 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        opened.access.use_gateways = False
         places = _expected_places(opened, nodes or [], limit or [], _named_places(at or [], interface or []))
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
@@ -210,6 +212,9 @@ def replace(
         str, typer.Option("--interface", metavar="IF", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
     inventory: InventoryPath = Path(),
+    old_is_off: Annotated[
+        bool, typer.Option("--old-is-off", help="Do not look whether the old device answers: its site is out of reach.")
+    ] = False,
     dry_run: DryRun = False,
     yes: Yes = False,
     no_firmware: NoFirmware = False,
@@ -224,9 +229,10 @@ def replace(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        opened.access.use_gateways = False
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
+        if not old_is_off:
+            _require_off(opened, inventory, old_node)
         spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
         place = with_changes(spots[0], node=old_node.name) if spots else None
         fleet = with_identity(opened.fleet, old_node, spare)
@@ -294,6 +300,23 @@ def _replaced(fleet: Fleet, word: str) -> Node:
         hint = f"to use its name again, run `meshctl inventory state {node.name} deployed`"
         raise InputError(f"{node.name} is retired: expected a node that is in use or lost", hint=hint)
     return node
+
+
+def _require_off(opened: Session, inventory: Path, old: Node) -> None:
+    """Raises NodeError if the old device answers, or if its site cannot be asked."""
+    try:
+        if opened.fleet.gateway_site(old) is None and (observer := site_observer(opened, inventory)) is not None:
+            with closing(observer):
+                if site := observer.site_of(old):
+                    if isinstance(observer.observe(site, [old.name]).get(old.name), Observation):
+                        raise still_on(old, f"site {site}")
+                    return
+        require_off(opened.access, old)
+    except NodeError as error:
+        if error.gateway_of:
+            hint = f"pass --old-is-off if you know that it is{f'; {error.hint}' if error.hint else ''}"
+            raise NodeError(f"whether {old.name} is off is not known: {error}", hint=hint) from error
+        raise
 
 
 def _spare(opened: Session, old: Node, new: str) -> Node | None:

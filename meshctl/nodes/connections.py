@@ -65,8 +65,8 @@ class ConnectionPool:
     # node -> the address at which it was last seen, where the inventory has another one by now
     former_addresses: Callable[[], Mapping[str, IpAddress]] = dict
     meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
-    # off on the bench, where a device is on a cable of the operator's
-    use_gateways: bool = True
+    # nodes whose device is on a cable of the operator's: not behind the gateway of their site
+    on_bench: set[str] = field(default_factory=set)
     slots: ChannelSlots = field(default_factory=ChannelSlots, repr=False)
     _kept: dict[str, SshConnection] = field(default_factory=dict, repr=False)
     _own_keys: dict[Credentials, tuple[OwnKey, ...]] = field(default_factory=dict, repr=False)
@@ -141,7 +141,7 @@ class ConnectionPool:
             where, *places_left = places
             try:
                 return connect_to(where)
-            except Unreachable:
+            except Unreachable as error:
                 places = tuple(places_left)
                 if not places:
                     is_pinned_only = policy is None and self.policy is None
@@ -149,12 +149,23 @@ class ConnectionPool:
                     if former is not None:
                         with suppress(NodeError):
                             return connect_to(self.endpoint(node, former))
+                    error.hint = self._site_hint(node) or error.hint
                     raise
+
+    def _site_hint(self, node: Node) -> str:
+        """What to do about a node that is not reached from here because its site has no login."""
+        site = self.fleet.worker_site(node)
+        if site is None or site.has_gateway or node.ssh.jump or node.ssh.host or node.name in self.on_bench:
+            return ""
+        return (
+            f"site {site.name} is reached over NATS only, where status, plan, provision, apply and rollback work: "
+            f"set sites.{site.name}.ssh.host for the rest, or use a computer in the network of the site"
+        )
 
     def _via(self, node: Node) -> SshConnection | None:
         if not node.ssh.jump:
             site = self.fleet.gateway_site(node)
-            return self.gateway(site) if site is not None and self.use_gateways else None
+            return self.gateway(site) if site is not None and node.name not in self.on_bench else None
         through = self.fleet.nodes.get(node.ssh.jump)
         if through is None:
             raise InputError(f"node {node.name}: ssh.jump names {node.ssh.jump!r}, which is not in the fleet")

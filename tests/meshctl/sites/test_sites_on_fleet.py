@@ -38,6 +38,26 @@ def rig(shared: SitesRig) -> SitesRig:
     return shared
 
 
+def test_status_sees_the_nodes_through_the_worker_and_how_old_they_are_without(
+    rig: SitesRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # without it no node can be reached from here, nor from the gateway by an address
+    monkeypatch.delitem(rig.environment, "MESHCTL_LAB")
+    seen = json.loads(rig.run("status", "--json", expected=0).out)
+    assert {node["name"]: node["health"] for node in seen["nodes"]} == dict.fromkeys(_EVERY, "ok")
+    assert rig.run("status", "--direct", "--timeout", "2", "--json").code == 3
+    rig.uplinks["north"].cut()
+    ended = rig.run("status", "--json")
+    assert ended.code == 3
+    found = json.loads(ended.out)
+    (alarm,) = (alarm for alarm in found["alarms"] if alarm["code"] == "site")
+    assert re.search(r"no contact with site north .*: what is known of its 3 nodes is \d+ s old", alarm["text"])
+    assert {node["name"]: node["health"] for node in found["nodes"]} == {
+        **dict.fromkeys(NORTH, "unreachable"),
+        **dict.fromkeys(SOUTH, "ok"),
+    }
+
+
 def test_all_sites_change_in_one_run_without_the_secrets_of_each_other(rig: SitesRig) -> None:
     power_dbm = rig.change_power()
     planned = rig.run("provision", "--check")
@@ -251,3 +271,26 @@ def test_a_saved_plan_is_applied_by_the_workers_as_it_was_shown_or_refused(rig: 
     assert set(late.results.values()) == {"refused"}, late
     rig.run(*_PROVISION, expected=0)
     assert _files_with_secrets(rig.site_directory("north")) == []
+
+
+def test_backup_restore_and_replace_reach_nodes_through_the_gateway(rig: SitesRig, tmp_path: Path) -> None:
+    """The last one here: afterwards the site has a node less."""
+    rig.change_power()
+    rig.run(*_PROVISION, expected=0)
+    rig.run("backup", "n1", "--out", str(tmp_path), expected=0)
+    rig.change_power()
+    rig.run(*_PROVISION, expected=0)
+    (saved,) = tmp_path.glob("n1-*.tgz")
+    rig.run("restore", "n1", str(saved), "--yes", expected=0)
+    assert rig.powers()["n1"] != rig.powers()["n-base"]
+    text = rig.inventory.read_text()
+    spare = "  n1: {groups: [north]}\n  n2: {groups: [north], state: spare, label: S2}\n"
+    rig.inventory.write_text(text.replace("  n[1-2]: {groups: [north]}\n", spare))
+    assert "n1 still answers" in rig.run("replace", "n1", "n2", "--yes").err
+    rig.uplinks["north"].cut()
+    assert "whether n1 is off is not known" in rig.run("replace", "n1", "n2", "--yes").err
+    rig.uplinks["north"].mend()
+    rig.run("lab", "break", "n1", "off", expected=0)
+    assert rig.run("replace", "n1", "n2", "--yes", "--json", expected=0).results == {"n1": "done"}
+    assert "n1: {groups: [north], label: S2}" in rig.inventory.read_text()
+    rig.run("provision", "--check", expected=0)

@@ -55,6 +55,36 @@ def test_sites_change_over_nats_and_its_servers_get_no_secret(rig: NatsRig) -> N
     assert re.search(r"north  3 ok; meshctl \S+, provision by \S+ .* ago: over", status)
 
 
+def test_status_and_monitor_see_the_nodes_through_their_workers(rig: NatsRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    # without it no node can be reached from here
+    monkeypatch.delitem(rig.environment, "MESHCTL_LAB")
+    status = json.loads(rig.run("status", "--json", expected=0).out)
+    assert status["totals"]["nodes"] == {"ok": 4, "degraded": 0, "unreachable": 0, "off": 0}
+    assert all(node["drift"] == [] for node in status["nodes"])
+    assert {node["name"]: node["hops"] for node in status["nodes"]}["n1"] == 1
+    assert rig.run("status", "n1", "--only", "--json").code == 0
+    rig.uplinks["south"].cut()
+    until(lambda: rig.run("sites", "status", "south").code, "the site to be offline", wait_s=60)
+    seen = json.loads(rig.run("monitor", "--once", "--json").out)
+    found = {alarm["code"]: alarm["text"] for alarm in seen["status"]["alarms"]}
+    assert re.search(r"no contact with site south .*: what is known of its node s-base is \d+ s old", found["site"])
+    nodes = {node["name"]: node for node in seen["status"]["nodes"]}
+    assert {name: node["health"] for name, node in nodes.items()} == {
+        **dict.fromkeys(NORTH, "ok"),
+        "s-base": "unreachable",
+    }
+    assert nodes["s-base"]["alarms"][0]["text"].startswith("site south ")
+    # what needs a login there says what to do instead
+    backup = rig.run("backup", "n1", "--out", str(rig.directory / "backups"))
+    assert backup.code == 3
+    assert "site north is reached over NATS only" in backup.out
+    spare = rig.run("replace", "s-base", "bench", "--at", "127.0.0.1:1", "--yes")
+    assert "whether s-base is off is not known" in spare.err
+    assert "pass --old-is-off" in spare.err
+    alive = rig.run("replace", "n1", "bench", "--at", "127.0.0.1:1", "--yes")
+    assert "n1 still answers at site north" in alive.err
+
+
 def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path) -> None:
     file, of_south = tmp_path / "plan.json", tmp_path / "south.json"
     power_dbm = rig.change_power()
