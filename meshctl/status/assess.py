@@ -48,6 +48,8 @@ class Snapshot:
     robots: Mapping[str, RobotFacts] = field(default_factory=dict)
     no_answer_robots: Mapping[str, NoAnswer] = field(default_factory=dict)
     robots_skipped: str = ""
+    unusable_workers: Mapping[str, NoAnswer] = field(default_factory=dict)
+    """Site -> why its nodes were not queried by its worker, but from here."""
     previous: Mapping[str, Observation] = field(default_factory=dict)
     """The observations of the snapshot before, for what happened since."""
     is_partial: bool = False
@@ -152,6 +154,9 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
 
 def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
     """One for each site that could not be asked: how old is what is shown of it."""
+    for site, why in snapshot.unusable_workers.items():
+        text = f"the nodes of site {site} were queried from here, not by its worker: {why.reason}"
+        yield Alarm(Level.NOTE, "site", text, why.hint)
     silent: dict[str, list[str]] = {}
     for name, why in snapshot.no_answer.items():
         if why.of_gateway:

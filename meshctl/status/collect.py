@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeVar
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.observe import RawObservation, observe_raw
-from meshctl.errors import MeshctlError, NodeError
+from meshctl.errors import MeshctlError, NodeError, Unreachable
 from meshctl.fleet.journal import ROBOT_PREFIX, Journal
 from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import facts_of, fleet_graph, known_macs, reports_of
@@ -80,6 +80,8 @@ class Collector:
     _computers: dict[str, tuple[ExitStack, Host]] = field(default_factory=dict, repr=False)
     _observed: dict[str, Observation] = field(default_factory=dict, repr=False)
     _previous: dict[str, Observation] = field(default_factory=dict, repr=False)
+    # site -> why its nodes are queried from here
+    _unusable_workers: dict[str, NoAnswer] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def collect(self, nodes: Iterable[Node], robots: Iterable[str] = (), progress: Progress = _no_progress) -> Snapshot:
@@ -142,6 +144,7 @@ class Collector:
             robots=facts,
             no_answer_robots=no_answer["robot"],
             robots_skipped=self.robots_skipped,
+            unusable_workers=dict(self._unusable_workers),
             previous=dict(self._previous),
             took_s=self.clock() - began,
         )
@@ -218,7 +221,19 @@ class Collector:
         try:
             found = self.sites.observe(site, names)
         except NodeError as error:
-            return dict.fromkeys(names, error)
+            if isinstance(error, Unreachable) or not self.fleet.sites[site].has_gateway:
+                return dict.fromkeys(names, error)
+            # such as a worker that is older than this meshctl
+            self._unusable_workers[site] = no_answer_of(error)
+            jobs: dict[str, Callable[[], object]] = {
+                name: partial(self._observe, self.fleet.nodes[name]) for name in names
+            }
+            return {
+                name: answer
+                for name, answer in run_parallel(jobs, MAX_PARALLEL).items()
+                if isinstance(answer, Observation | NodeError)
+            }
+        self._unusable_workers.pop(site, None)
         return {name: found.get(name, NOT_ASKED) for name in names}
 
     def _desired_state(self, node: Node) -> DesiredState | str:

@@ -41,6 +41,15 @@ def rig(shared: SitesRig) -> SitesRig:
 def test_status_sees_the_nodes_through_the_worker_and_how_old_they_are_without(
     rig: SitesRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # a worker of another version than this meshctl: the nodes are queried from here
+    protocol = rig.gateway / "root/.local/share/meshctl/current/lib/meshctl/sites/protocol.py"
+    text = protocol.read_text()
+    protocol.write_text(text.replace("PROTOCOL = 1\n", "PROTOCOL = 0\n"))
+    old = json.loads(rig.run("status", "--json", expected=0).out)
+    protocol.write_text(text)
+    notes = [alarm for alarm in old["alarms"] if alarm["code"] == "site"]
+    assert [alarm["hint"] for alarm in notes] == [f"run `meshctl sites install {site}`" for site in SECRETS]
+    assert all("were queried from here, not by its worker" in alarm["text"] for alarm in notes)
     # without it no node can be reached from here, nor from the gateway by an address
     monkeypatch.delitem(rig.environment, "MESHCTL_LAB")
     seen = json.loads(rig.run("status", "--json", expected=0).out)

@@ -6,6 +6,7 @@ import base64
 import json
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,12 +15,15 @@ import pytest
 
 from meshctl.device.observe import RawObservation
 from meshctl.errors import NodeError, Unreachable
+from meshctl.fleet.journal import LastKnown
 from meshctl.inventory import load_fleet
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Uplink
+from meshctl.status.assess import Snapshot, assess
 from meshctl.status.site_observer import MAX_OUTPUT_BYTES, PERIOD_S, SiteObserver, answers_json, parse_answers
-from meshctl.status.values import NoAnswer
+from meshctl.status.values import Level, NoAnswer
+from meshctl.topology import Graph
 
 _SAID = b"@@n boot_id 0\nb-1\n"
 _ANSWERS: dict[str, RawObservation | NoAnswer] = {
@@ -166,3 +170,20 @@ def test_an_unusable_answer_is_the_sites_failure(workers: Workers) -> None:
     workers.text = "[]"
     with pytest.raises(NodeError, match="site north: its worker's answer is unusable"):
         workers.observe()
+
+
+def test_the_alarm_of_a_silent_site_says_how_old_its_facts_are(workers: Workers) -> None:
+    fleet = workers.observer.fleet
+    why = NoAnswer("site north is not connected to the NATS hub", hint="check it", of_gateway=True)
+    known = {"n1": LastKnown("n1", 1000.0, {}), "n2": LastKnown("n2", 400.0, {})}
+    snapshot = Snapshot(
+        fleet, {}, dict.fromkeys(("n1", "n2"), why), {}, {}, Graph(), known, {}, unusable_workers={"south": why}
+    )
+    found = {alarm.level: alarm for alarm in assess(snapshot, fleet.nodes.values(), 1090.0).alarms}
+    assert found[Level.WARNING].text == (
+        "no contact with site north (site north is not connected to the NATS hub): what is known of its 2 nodes is "
+        "90 s old"
+    )
+    assert found[Level.NOTE].text.startswith("the nodes of site south were queried from here, not by its worker")
+    nothing = assess(replace(snapshot, known={}), fleet.nodes.values(), 1090.0).alarms
+    assert any("nothing is known of its 2 nodes" in alarm.text for alarm in nothing)
