@@ -12,16 +12,30 @@ from meshctl.sites.runs import SiteDirectory
 from tests.meshctl.device.servers import public
 from tests.meshctl.sites.nats_servers import NatsSites
 from tests.meshctl.sites.recorded_site import MODULE as RECORDED
+from tests.meshctl.sites.recorded_site import VIRTUAL_VARIABLE
 from tests.meshctl.sites.rig import INVENTORY, NORTH, SECRETS, SOUTH, FleetRig
+
+# Virtual nodes that are set up at the same time.
+_AT_ONCE = 8
+_SHARED_WINDOW_S = 600
 
 
 class NatsRig(FleetRig):
     """Use it in a `with` block: the nodes are bootstrapped and accept the workers, which run. `recorded` are further
-    sites, with so many nodes each that are recordings; `with_lab` False: only those."""
+    sites, with so many nodes each that are recordings, except the bases of the first `virtual_bases` of them;
+    `with_lab` False: only those."""
 
-    def __init__(self, directory: Path, recorded: Mapping[str, int] | None = None, *, with_lab: bool = True) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        recorded: Mapping[str, int] | None = None,
+        *,
+        with_lab: bool = True,
+        virtual_bases: int = 0,
+    ) -> None:
         super().__init__(directory)
         self.recorded = {site: _names(site, count) for site, count in (recorded or {}).items()}
+        self.virtual_bases = {site: names[:1] for site, names in list(self.recorded.items())[:virtual_bases]}
         self.real: dict[str, tuple[str, ...]] = {"north": NORTH, "south": SOUTH} if with_lab else {}
         if not with_lab:
             self.environment.pop("MESHCTL_LAB")
@@ -39,6 +53,11 @@ class NatsRig(FleetRig):
         """Site -> its nodes."""
         return {**self.real, **self.recorded}
 
+    @property
+    def virtual(self) -> tuple[str, ...]:
+        """The nodes that are virtual."""
+        return tuple(name for names in (*self.real.values(), *self.virtual_bases.values()) for name in names)
+
     def directory_of(self, site: str) -> SiteDirectory:
         return SiteDirectory.of(f"mines/{site}", self._gateway_environment)
 
@@ -47,8 +66,10 @@ class NatsRig(FleetRig):
 
     def _set_up(self) -> None:
         if self.real:
-            self.start_lab(self._text(self.real))
-            self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
+            self.start_lab(self._text({**self.real, **self.virtual_bases}))
+            for first in range(0, len(self.virtual), _AT_ONCE):
+                nodes = self.virtual[first : first + _AT_ONCE]
+                self.run("bootstrap", *nodes, "--yes", "--json", expected=0)
             self.run("lab", "unplug", expected=0)
         self.inventory.parent.mkdir(parents=True, exist_ok=True)
         if self.recorded:
@@ -82,15 +103,20 @@ class NatsRig(FleetRig):
                 address = f"address: {{from: 10.{100 + number}.0.1}}"
                 groups += f"  {site}: {{site: {site}, radios: {{radio0: {{mesh: {site}}}}}, {address}}}\n"
                 nodes += f"  {names[0]}: {{role: base, groups: [{site}]}}\n"
-                nodes += f"  {site}-n[01-{len(names) - 1:02}]: {{groups: [{site}]}}\n"
+                if len(names) > 1:
+                    nodes += f"  {site}-n[01-{len(names) - 1:02}]: {{groups: [{site}]}}\n"
+        if self.virtual_bases:
+            # all sites share this machine's processors, and none has them at the pace of its own gateway
+            head = head.replace("confirm_window_s: 60", f"confirm_window_s: {_SHARED_WINDOW_S}")
         return f"{head}{meshes}nats: {{url: {self.servers.hub.url}}}\nsites:\n{lines}defaults:{groups}nodes:\n{nodes}"
 
     def start_worker(self, site: str) -> None:
         program = RECORDED if site in self.recorded else "meshctl"
         command = [sys.executable, "-m", program, "worker", f"mines/{site}", "--nats", self.servers.leaves[site].url]
+        environment = self._gateway_environment | ({VIRTUAL_VARIABLE: "1"} if site in self.virtual_bases else {})
         with (self.directory / f"worker-{site}.log").open("ab") as log:
             self._workers[site] = subprocess.Popen(
-                command, env=self._gateway_environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True,
             )  # fmt: skip
 

@@ -1,10 +1,10 @@
-"""A site whose nodes are recordings: the commands `plan` and `apply` of its worker, which is meshctl's own.
+"""A site whose nodes are recordings, all or all but its base: `plan` and `apply` of its worker, which is meshctl's own.
 
 `python -m tests.meshctl.sites.recorded_site worker FLEET/SITE --nats URL` is `meshctl worker`, whose `plan` and `apply`
 are this program's: they read the nodes' names and the desired power from the site's part of the inventory, keep each
-node's power in a file, and print what one virtual node printed (`recordings/change.json`), in the same order and with
-the same waits, some at a time. Some nodes never answer. `record RUN_DIRECTORY` makes the recording from a run at a site
-of virtual nodes.
+node's power in a file, and print what a virtual node of one of several kinds printed (`recordings/`, made by
+`record_kinds`), in the same order and with the same waits, some at a time. Some nodes never answer. With
+VIRTUAL_VARIABLE set, the site's base is a virtual node, which meshctl's own `plan` and `apply` change at the same time.
 """
 
 from __future__ import annotations
@@ -13,24 +13,61 @@ import hashlib
 import json
 import os
 import re
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-RECORDING = Path(__file__).with_name("recordings") / "change.json"
+RECORDINGS = Path(__file__).with_name("recordings")
 MODULE = "tests.meshctl.sites.recorded_site"
 # How many nodes change at the same time, and how much faster than the recorded one.
 PARALLEL = 8
 SPEED_VARIABLE = "MESHCTL_RECORDED_SPEED"
-_NODE, _MESH = "NODE", "MESH"
+VIRTUAL_VARIABLE = "MESHCTL_RECORDED_VIRTUAL_BASE"
+NODE, MESH = "NODE", "MESH"
 NO_ANSWER = "no answer within 10 s (a recorded node that is switched off)"
+# of a hundred nodes: so many are switched off, and so many are of each kind that does not end `done`
+_OFF, _RARE = 5, 3
 
 
-def answers(node: str) -> bool:
-    """Whether a node is switched on: about one of twenty is not."""
-    return int(hashlib.sha256(node.encode()).hexdigest(), 16) % 20 != 0
+@cache
+def recordings() -> dict[str, dict[str, Any]]:
+    """Kind -> its plan and events."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(RECORDINGS.glob("*.json"))}
+
+
+def result_of(kind: str) -> str:
+    return str(recordings()[kind]["events"][-1]["outcome"]["result"])
+
+
+def kind_of(node: str) -> str:
+    """The kind of a node, by its name; empty for one that is switched off."""
+    if node.endswith("-base"):
+        return "base"
+    number = int(hashlib.sha256(node.encode()).hexdigest(), 16)
+    percent, rest = number % 100, number // 100
+    if percent < _OFF:
+        return ""
+    kinds = [kind for kind in recordings() if kind != "base"]
+    rare = [kind for kind in kinds if result_of(kind) != "done"]
+    if percent < _OFF + _RARE * len(rare):
+        return rare[(percent - _OFF) // _RARE]
+    usual = [kind for kind in kinds if kind not in rare]
+    return usual[rest % len(usual)]
+
+
+def expected_result(node: str) -> str:
+    """How the first change of a node ends."""
+    kind = kind_of(node)
+    return result_of(kind) if kind else "unreachable"
+
+
+def is_virtual(node: str) -> bool:
+    return VIRTUAL_VARIABLE in os.environ and node.endswith("-base")
 
 
 def power_file(state: Path, node: str) -> Path:
@@ -43,18 +80,22 @@ def changes_of(state: Path, node: str) -> list[str]:
     return path.read_text().split() if path.exists() else []
 
 
-def _recorded(node: str, mesh: str, value: Any) -> Any:
+def _recorded(node: str, value: Any) -> Any:
     text = json.dumps(value)
-    return json.loads(text.replace(_NODE, node).replace(_MESH, mesh))
+    return json.loads(text.replace(NODE, node).replace(MESH, node.partition("-")[0]))
 
 
 def _option(words: list[str], name: str) -> Path:
     return Path(words[words.index(name) + 1])
 
 
-def _desired_power(inventory: Path) -> str:
-    found = re.search(r"max_drive_dbm['\"]?: ['\"]?(\d+)", (inventory / "fleet.yaml").read_text())
-    assert found is not None, f"no max_drive_dbm in {inventory}"
+def _fleet_text(words: list[str]) -> str:
+    return (_option(words, "-i") / "fleet.yaml").read_text()
+
+
+def _desired_power(words: list[str]) -> str:
+    found = re.search(r"max_drive_dbm['\"]?: ['\"]?(\d+)", _fleet_text(words))
+    assert found is not None, "no max_drive_dbm in the site's part"
     return found[1]
 
 
@@ -62,27 +103,55 @@ def _state() -> Path:
     return Path(os.environ["XDG_STATE_HOME"])
 
 
+def _real(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "meshctl", *words]
+    return subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+
+
 def plan(words: list[str]) -> None:
     """`plan NODES... --out FILE ... -i INVENTORY`."""
-    nodes = words[: next(index for index, word in enumerate(words) if word.startswith("-"))]
-    inventory = _option(words, "-i")
-    desired = _desired_power(inventory)
-    recording = json.loads(RECORDING.read_text())
-    document, template = recording["plan"], recording["plan"]["nodes"][0]
-    made = [_planned(node, desired, template) for node in nodes]
+    count = next(index for index, word in enumerate(words) if word.startswith("-"))
+    nodes, options = words[:count], words[count:]
+    out, desired = _option(words, "--out"), _desired_power(words)
+    virtual = [node for node in nodes if is_virtual(node)]
+    if virtual:
+        done = _real("plan", *virtual, *options)
+        if not out.exists():
+            sys.exit(done.stderr or "no plan")
+        document = json.loads(out.read_text())
+    else:
+        fleet = re.search(r"^['\"]?fleet['\"]?: ['\"]?(\w+)", _fleet_text(words), re.M)
+        assert fleet is not None
+        document = _EMPTY_PLAN | {"created_s": time.time(), "fleet": fleet[1], "entry": nodes[0], "entries": [nodes[0]]}
+    made = [_planned(node, desired) for node in nodes if node not in virtual]
     changing = [each["node"] for each in made if each["verdict"] == "change"]
     stage = {"kind": "free", "nodes": changing, "reason": "interrupts nothing", "cuts_off": [], "mesh": ""}
-    document |= {"nodes": made, "stages": [stage] if changing else [], "created_s": time.time(), "ways": []}
-    fleet = re.search(r"^['\"]?fleet['\"]?: ['\"]?(\w+)", (inventory / "fleet.yaml").read_text(), re.M)
-    assert fleet is not None
-    document |= {"fleet": fleet[1], "entry": nodes[0], "entries": [nodes[0]]}
-    _option(words, "--out").write_text(json.dumps(document, indent=1) + "\n")
+    document["nodes"] = [*document["nodes"], *made]
+    document["stages"] = [*document["stages"], *([stage] if changing else [])]
+    out.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def _planned(node: str, desired: str, template: dict[str, Any]) -> dict[str, Any]:
-    made: dict[str, Any] = _recorded(node, node.partition("-")[0], template)
+_EMPTY_PLAN: dict[str, Any] = {
+    "format": "meshctl-plan",
+    "version": 3,
+    "inventory": "",
+    "salt": "617dfd87870c37716f3bc268a44da7fa",
+    "with_firmware": True,
+    "refusal": "",
+    "refusal_hint": "",
+    "notes": [],
+    "ways": [],
+    "pace": "",
+    "stages": [],
+    "nodes": [],
+}
+
+
+def _planned(node: str, desired: str) -> dict[str, Any]:
+    kind = kind_of(node)
+    made: dict[str, Any] = _recorded(node, recordings()[kind or "base"]["plan"])
     kept = changes_of(_state(), node)
-    if not answers(node):
+    if not kind:
         return made | {"verdict": "away", "reason": NO_ANSWER, "files": [], "effects": []}
     if kept and kept[-1] == desired:
         return made | {"verdict": "same", "files": [], "effects": []}
@@ -92,59 +161,98 @@ def _planned(node: str, desired: str, template: dict[str, Any]) -> dict[str, Any
 def apply(words: list[str]) -> None:
     """`apply PLAN [--dry-run] --json -i INVENTORY`."""
     document = json.loads(Path(words[0]).read_text())
+    recorded = [node for node in document["nodes"] if not is_virtual(node["node"])]
+    virtual = [node for node in document["nodes"] if is_virtual(node["node"])]
+    part = Path(words[0]).with_name("virtual-plan.json")
+    if virtual:
+        names = {node["node"] for node in virtual}
+        stages = [stage for stage in document["stages"] if names & set(stage["nodes"])]
+        part.write_text(json.dumps(document | {"nodes": virtual, "stages": stages}))
     if "--dry-run" in words:
+        if virtual:
+            done = _real("apply", str(part), *words[1:])
+            if not done.stdout.strip():
+                sys.exit(done.stderr or "no plan")
+            applies = json.loads(done.stdout)
+            stages = [stage for stage in document["stages"] if not names & set(stage["nodes"])]
+            document = applies | {
+                "nodes": [*applies["nodes"], *recorded],
+                "stages": [*applies["stages"], *stages],
+            }
         sys.stdout.write(json.dumps(document, indent=1) + "\n")
         return
-    desired = _desired_power(_option(words, "-i"))
+    outcomes: list[dict[str, Any]] = []
+    changing = threading.Thread(target=_change, args=([str(part), *words[1:]], outcomes))
+    if virtual:
+        changing.start()
+    outcomes_recorded = _play_all(recorded, _desired_power(words))
+    if virtual:
+        changing.join()
+    ended = {"event": "ended", "run": 1, "totals": "", "outcomes": [*outcomes, *outcomes_recorded]}
+    _write(ended)
+
+
+_writing = threading.Lock()
+
+
+def _write(event: dict[str, Any]) -> None:
+    with _writing:
+        sys.stdout.write(json.dumps(event) + "\n")
+        sys.stdout.flush()
+
+
+def _change(words: list[str], outcomes: list[dict[str, Any]]) -> None:
+    """meshctl's own `apply`; its events are written as they come, its outcomes kept for the last event."""
+    command = [sys.executable, "-m", "meshctl", "apply", *words]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            event = json.loads(line)
+            if event["event"] == "ended":
+                outcomes += event["outcomes"]
+            else:
+                _write(event)
+
+
+def _play_all(nodes: list[dict[str, Any]], desired: str) -> list[dict[str, Any]]:
     speed = float(os.environ.get(SPEED_VARIABLE, "1"))
-    changing = [node["node"] for node in document["nodes"] if node["verdict"] == "change"]
-    outcomes = {node["node"]: _outcome(node) for node in document["nodes"]}
+    changing = [node["node"] for node in nodes if node["verdict"] == "change"]
+    outcomes = []
+    for node in nodes:
+        outcomes.append(_outcome(node))
+        if node["verdict"] != "change":
+            _write({"event": "finished", "node": node["node"], "at_s": time.time(), "outcome": outcomes[-1]})
     for first in range(0, len(changing), PARALLEL):
         for event in _played(changing[first : first + PARALLEL], desired, speed):
-            sys.stdout.write(json.dumps(event) + "\n")
-            sys.stdout.flush()
-    ended = {"event": "ended", "run": 1, "totals": "", "outcomes": list(outcomes.values())}
-    sys.stdout.write(json.dumps(ended) + "\n")
+            _write(event)
+    return outcomes
 
 
 def _outcome(node: dict[str, Any]) -> dict[str, Any]:
-    results = {"change": "done", "same": "unchanged", "away": "unreachable"}
-    found = {"node": node["node"], "result": results[node["verdict"]], "reason": node["reason"], "hint": ""}
-    return {**found, "duration_s": 0.0, "facts": {}}
+    name = node["node"]
+    if node["verdict"] in ("same", "away"):
+        result = {"same": "unchanged", "away": "unreachable"}[node["verdict"]]
+        return {"node": name, "result": result, "reason": node["reason"], "hint": "", "duration_s": 0.0, "facts": {}}
+    found: dict[str, Any] = _recorded(name, recordings()[kind_of(name)]["events"][-1]["outcome"])
+    return found
 
 
 def _played(nodes: list[str], desired: str, speed: float) -> Iterator[dict[str, Any]]:
-    """The recorded events for these nodes at the same time."""
-    events = json.loads(RECORDING.read_text())["events"]
-    before_s = events[0]["at_s"]
-    for event in events:
-        time.sleep((event["at_s"] - before_s) / speed)
-        before_s = event["at_s"]
-        for node in nodes:
-            if event["event"] == "finished":
-                path = power_file(_state(), node)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with path.open("a") as file:
-                    file.write(f"{desired}\n")
-            yield _recorded(node, node.partition("-")[0], event) | {"at_s": time.time()}
-
-
-def record(run: Path) -> None:
-    """Make the recording from the first node of a real site's run."""
-    document = json.loads((run / "plan.json").read_text())
-    events = [json.loads(line) for line in (run / "events").read_text().splitlines()]
-    node, mesh = events[0]["node"], document["nodes"][0]["meshes"][0]
-    its = [event for event in events if event.get("node") == node]
-    document["nodes"] = [each for each in document["nodes"] if each["node"] == node]
-    document |= {"inventory": "", "stages": [], "ways": [], "notes": [], "entry": _NODE, "entries": [_NODE]}
-    text = json.dumps({"plan": document, "events": its}, indent=1)
-    RECORDING.parent.mkdir(exist_ok=True)
-    text = (
-        text.replace(f'"{node}"', f'"{_NODE}"')
-        .replace(f"node={node}", f"node={_NODE}")
-        .replace(f'"{mesh}"', f'"{_MESH}"')
-    )
-    RECORDING.write_text(text + "\n")
+    """The recorded events of these nodes, which begin at the same time."""
+    waiting = []
+    for node in nodes:
+        events = recordings()[kind_of(node)]["events"]
+        waiting += [(event["at_s"] - events[0]["at_s"], node, event) for event in events]
+    before_s = 0.0
+    for at_s, node, event in sorted(waiting, key=lambda each: each[0]):
+        time.sleep((at_s - before_s) / speed)
+        before_s = at_s
+        if event["event"] == "finished" and event["outcome"]["result"] == "done":
+            path = power_file(_state(), node)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a") as file:
+                file.write(f"{desired}\n")
+        yield _recorded(node, event) | {"at_s": time.time()}
 
 
 def worker(words: list[str]) -> None:
@@ -164,8 +272,6 @@ if __name__ == "__main__":
             plan(rest)
         case "apply":
             apply(rest)
-        case "record":
-            record(Path(rest[0]))
         case "worker":
             worker(rest)
         case _:

@@ -12,7 +12,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -183,9 +183,9 @@ class FleetRig:
         self.inventory.write_text(text.replace(found[0], f"max_drive_dbm: {power_dbm}"))
         return power_dbm
 
-    def powers(self) -> Mapping[str, str]:
+    def powers(self, nodes: Iterable[str] = (*NORTH, *SOUTH)) -> Mapping[str, str]:
         """The drive level that each node has, as read from it."""
-        said = self.run("run", *NORTH, *SOUTH, "--json", "--", "uci get wireless.radio0.txpower", expected=0)
+        said = self.run("run", *nodes, "--json", "--", "uci get wireless.radio0.txpower", expected=0)
         return {item["node"]: item["stdout"].strip() for item in said.events}
 
     def started_run(self, site: str) -> Path:
