@@ -84,8 +84,9 @@ def _knows_all(rig: NatsRig, run: int) -> bool:
 
 def _check(rig: NatsRig, outcomes: Mapping[str, str], power_dbm: str) -> None:
     for site, nodes in rig.nodes.items():
-        at_site = _ended(next(rig.site_directory(site).glob("runs/*/events")))
-        assert {name: outcomes[name] for name in nodes} == at_site, site
+        at_site = _outcomes_at(rig.site_directory(site))
+        found = {name: outcomes[name] for name in nodes}
+        assert found == at_site, f"{site}: {sorted(found.items() ^ at_site.items())}"
     for site, nodes in rig.recorded.items():
         state = rig.directory_of(site).state
         for name in nodes:
@@ -98,10 +99,13 @@ def _check(rig: NatsRig, outcomes: Mapping[str, str], power_dbm: str) -> None:
         assert set(rig.powers(rig.virtual).values()) == {power_dbm}
 
 
-def _ended(events: Path) -> dict[str, str]:
-    """The outcomes in the last event of a site's run."""
-    last = json.loads(events.read_text().splitlines()[-1])
-    return {outcome["node"]: outcome["result"] for outcome in last["outcomes"]}
+def _outcomes_at(site: Path) -> dict[str, str]:
+    """The last outcome of each node at a site; `resume` orders another run for those that have failed."""
+    found: dict[str, str] = {}
+    for order in sorted(site.glob("runs/*/order.json"), key=lambda path: path.stat().st_mtime):
+        last = json.loads(order.with_name("events").read_text().splitlines()[-1])
+        found |= {outcome["node"]: outcome["result"] for outcome in last["outcomes"]}
+    return found
 
 
 @contextmanager
