@@ -30,8 +30,8 @@ def test_four_sites_of_five_nodes_end_right(tmp_path: Path) -> None:
 @pytest.mark.proof
 @pytest.mark.timeout(3600)
 def test_forty_sites_of_fifty_nodes_end_right(tmp_path: Path) -> None:
-    """Two sites of virtual nodes, the others with a virtual base and 49 recorded nodes of several kinds."""
-    with NatsRig(tmp_path, dict.fromkeys(_names(38), 50), virtual_bases=38) as rig:
+    """Two sites of virtual nodes, eight with a virtual base; all other nodes are recordings of several kinds."""
+    with NatsRig(tmp_path, dict.fromkeys(_names(38), 50), virtual_bases=8) as rig:
         ended = run_show(rig, _SEED, wait_s=2400)
     assert ended.outcomes.total() == 38 * 50 + 4
     assert ended.cuts > 38
