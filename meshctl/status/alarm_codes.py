@@ -64,7 +64,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "computer-silent": "another computer on its switch does not answer",
         # the fleet
         "stranger": "a device that is not in the inventory is in the mesh",
-        "site": "a site's worker or gateway cannot be asked: how old is what is known of its nodes",
+        "site": "a site's worker or gateway does not answer: how old the last known state of its nodes is",
         "not-compared": "a device could not be compared with the inventory, usually because a secret is missing",
         "robots-unasked": "no robot was queried",
     }

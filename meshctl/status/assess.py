@@ -153,22 +153,22 @@ def _fleet_alarms(snapshot: Snapshot) -> Iterable[Alarm]:
 
 
 def _site_alarms(snapshot: Snapshot, now: float) -> Iterable[Alarm]:
-    """One for each site that could not be asked: how old is what is shown of it."""
-    for site, why in snapshot.unusable_workers.items():
+    """One for each site that did not answer: how old the state is that is shown of it."""
+    for site, why in sorted(snapshot.unusable_workers.items()):
         text = f"the nodes of site {site} were queried from here, not by its worker: {why.reason}"
         yield Alarm(Level.NOTE, "site", text, why.hint)
     silent: dict[str, list[str]] = {}
     for name, why in snapshot.no_answer.items():
         if why.of_gateway:
             silent.setdefault(snapshot.fleet.nodes[name].site, []).append(name)
-    for site, names in silent.items():
+    for site, names in sorted(silent.items()):
         why = snapshot.no_answer[names[0]]
         last_s = max((snapshot.known[name].seen_s for name in names if name in snapshot.known), default=None)
         nodes = f"its {len(names)} nodes" if len(names) > 1 else f"its node {names[0]}"
         if last_s is None:
             shown = f"nothing is known of {nodes}"
         else:
-            shown = f"what is known of {nodes} is {duration(max(0.0, now - last_s))} old"
+            shown = f"the last known state of {nodes} is {duration(max(0.0, now - last_s))} old"
         yield Alarm(Level.WARNING, "site", f"no contact with site {site} ({why.reason}): {shown}", why.hint)
 
 

@@ -60,7 +60,7 @@ def test_status_sees_the_nodes_through_the_worker_and_how_old_they_are_without(
     assert ended.code == 3
     found = json.loads(ended.out)
     (alarm,) = (alarm for alarm in found["alarms"] if alarm["code"] == "site")
-    assert re.search(r"no contact with site north .*: what is known of its 3 nodes is \d+ s old", alarm["text"])
+    assert re.search(r"no contact with site north .*: the last known state of its 3 nodes is \d+ s old", alarm["text"])
     assert {node["name"]: node["health"] for node in found["nodes"]} == {
         **dict.fromkeys(NORTH, "unreachable"),
         **dict.fromkeys(SOUTH, "ok"),

@@ -181,8 +181,8 @@ def test_the_alarm_of_a_silent_site_says_how_old_its_facts_are(workers: Workers)
     )
     found = {alarm.level: alarm for alarm in assess(snapshot, fleet.nodes.values(), 1090.0).alarms}
     assert found[Level.WARNING].text == (
-        "no contact with site north (site north is not connected to the NATS hub): what is known of its 2 nodes is "
-        "90 s old"
+        "no contact with site north (site north is not connected to the NATS hub): the last known state of its "
+        "2 nodes is 90 s old"
     )
     assert found[Level.NOTE].text.startswith("the nodes of site south were queried from here, not by its worker")
     nothing = assess(replace(snapshot, known={}), fleet.nodes.values(), 1090.0).alarms

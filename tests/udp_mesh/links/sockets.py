@@ -1,9 +1,12 @@
 """Real sockets on the loopback for tests."""
 
+import contextlib
+import random
 import select
 import socket
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 from udp_mesh.links.attachments import Address, Attachment
 from udp_mesh.links.udp import UdpLink
@@ -22,10 +25,18 @@ class Out:
 
 
 def free_port() -> int:
-    """A UDP port that is free at the moment."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port that is free now, for UDP and TCP, and below those that the kernel itself gives to connections later."""
+    first, _ = Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()
+    while True:
+        port = random.SystemRandom().randrange(10_000, max(20_000, int(first)))
+        with (
+            contextlib.suppress(OSError),
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+            socket.socket(socket.AF_INET, socket.SOCK_STREAM) as tcp,
+        ):
+            udp.bind(("127.0.0.1", port))
+            tcp.bind(("127.0.0.1", port))
+            return port
 
 
 def open_link(host: str, port: int, *, urgent_dscp: int = 0) -> UdpLink:
