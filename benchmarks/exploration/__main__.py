@@ -13,14 +13,13 @@ import argparse
 import itertools
 import json
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.link.laboratory import Laboratory, Link, laboratory
+from benchmarks.link.laboratory import Laboratory, Link
 from benchmarks.page import fill, this_machine
 from tests.udp_mesh.bridges.bridge_processes import NodeProcess
 from tests.udp_mesh.bridges.exploration import (
@@ -39,7 +38,7 @@ from tests.udp_mesh.bridges.exploration import (
 )
 from tests.udp_mesh.bridges.interpreters import ROS_PYTHON
 from tests.udp_mesh.bridges.ros1_processes import ROOT, Master
-from tests.udp_mesh.bridges.ros_team import team
+from tests.udp_mesh.bridges.ros_team import masters_on_one_link, team
 
 RESULTS = Path(__file__).parents[1] / "results" / "exploration.jsonl"
 RATE_BITS_PER_S, DELAY_MS = 5e6, 5.0
@@ -53,16 +52,8 @@ HOMEWARD = ("ferry out", "ferry home", "home")
 @contextmanager
 def legacy_team(names: Sequence[str], link: Link) -> Iterator[tuple[Laboratory, list[Master]]]:
     """Masters of these names on one link, each with the legacy transport."""
-    with (
-        tempfile.TemporaryDirectory(prefix="legacy-") as path,
-        laboratory(len(names), link=link) as lab,
-        ExitStack() as kept,
-    ):
-        masters = [Master(Path(path), name, lab.inside(place, [])) for place, name in enumerate(names)]
-        for master in masters:
-            kept.callback(master.stop)
-            master.start(wait=False)
-        for place, master in enumerate(masters):
+    with masters_on_one_link(names, link) as (lab, masters), ExitStack() as kept:
+        for place, master in enumerate(masters.values()):
             master.wait()
             others = [name for name in names if name != master.name]
             arguments = [master.name, lab.addresses[place], "10.99.0.255", json.dumps(PRIORITIES), *others]
@@ -72,7 +63,7 @@ def legacy_team(names: Sequence[str], link: Link) -> Iterator[tuple[Laboratory, 
                 master.folder / f"{master.name}-transport.log",
             )
             kept.callback(node.close)
-        yield lab, masters
+        yield lab, list(masters.values())
 
 
 @contextmanager

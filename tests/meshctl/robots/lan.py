@@ -10,7 +10,7 @@ import os
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from meshlab.namespaces import CLONE_NEWNET, setns, unshare
 from tests.meshctl.device.servers import PATIENCE_S
@@ -48,16 +48,9 @@ class Lan:
         self._run("ip", "addr", "add", f"{address}/24", "brd", "+", "dev", interface, at=there)
         self._run("ip", "link", "set", interface, "up", at=there)
 
-    @contextmanager
-    def inside(self) -> Iterator[None]:
+    def inside(self) -> AbstractContextManager[None]:
         """This thread, and the threads and processes it starts, are in the network."""
-        outside = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-        try:
-            setns(self._namespaces[0], CLONE_NEWNET)
-            yield
-        finally:
-            setns(outside, CLONE_NEWNET)
-            os.close(outside)
+        return in_network(self._own)
 
     def close(self) -> None:
         while self._namespaces:
@@ -69,6 +62,19 @@ class Lan:
 
     def _run(self, *words: str, at: str = "") -> None:
         subprocess.run(["nsenter", f"--net={at or self._own}", *words], check=True, timeout=PATIENCE_S)
+
+
+@contextmanager
+def in_network(path: str) -> Iterator[None]:
+    """This thread, and the threads and processes it starts, are in the network namespace that `path` enters."""
+    outside, inside = os.open("/proc/thread-self/ns/net", os.O_RDONLY), os.open(path, os.O_RDONLY)
+    try:
+        setns(inside, CLONE_NEWNET)
+        yield
+    finally:
+        setns(outside, CLONE_NEWNET)
+        os.close(outside)
+        os.close(inside)
 
 
 def _new_namespace() -> int:

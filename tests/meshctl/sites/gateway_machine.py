@@ -10,17 +10,15 @@ import os
 import re
 import socket
 import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from meshctl.model import NatsHub, SiteNats
 from meshctl.sites.service import start_service, unit
 from meshlab.addresses import loopback_of
 from meshlab.client import request
-from meshlab.namespaces import CLONE_NEWNET, setns
 from tests.meshctl.device.servers import public
-from tests.meshctl.robots.lan import Lan
+from tests.meshctl.inventories import compex_hardware
+from tests.meshctl.robots.lan import Lan, in_network
 from tests.meshctl.robots.machine import PYTHON, Machine
 from tests.meshctl.sites.forwarder import CuttableUplink
 from tests.meshctl.sites.nats_servers import NatsServerProcess
@@ -33,20 +31,16 @@ USER, UID = "mesh", 1000
 HOME = f"/home/{USER}"
 NODES = {"n-base": "10.42.0.1"}
 UNIT = "meshctl-worker-mines-north.service"
-INVENTORY = """\
+INVENTORY = (
+    """\
 meshctl: 1
 fleet: mines
 country: US
 operators: {{ssh_keys: ["{key}"]}}
 hardware:
-  box:
-    board: compex,wpj344-16m
-    profile: compex_wpj344-16m
-    target: ath79/generic
-    release: "24.10"
-    lan_ports: [eth0]
-    confirm_window_s: 60
-    radios: {{radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}}}
+"""
+    + compex_hardware("24.10", confirm_window_s=60)
+    + """\
 meshes:
   north: {{ssid: north, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}}
 nats: {{url: {hub}}}
@@ -56,6 +50,7 @@ defaults: {{hardware: box, state: deployed, site: north, radios: {{radio0: {{mes
 nodes:
   n-base: {{role: base, address: 10.42.0.1}}
 """
+)
 # libpam-systemd's line of common-session, as its package writes it
 _SESSIONS = "session\toptional\tpam_systemd.so\n"
 
@@ -101,7 +96,7 @@ class GatewayRig(FleetRig):
         self.run("bootstrap", *NODES, "--yes", "--json", expected=0)
         self.run("lab", "unplug", expected=0)
         port = int(request(self.lab, {"op": "status"})["port"])
-        with _in_network(self.machine.network):
+        with in_network(self.machine.network):
             for address in NODES.values():
                 subprocess.run(["ip", "addr", "add", f"{address}/32", "dev", "lo"], check=True)
             listeners = [socket.create_server((address, 22)) for address in NODES.values()]
@@ -136,19 +131,6 @@ class GatewayRig(FleetRig):
         self.hub.stop()
         for each in (self.uplink, *self._ports):
             each.close()
-
-
-@contextmanager
-def _in_network(path: str) -> Iterator[None]:
-    """This thread is in a network namespace."""
-    outside, inside = os.open("/proc/thread-self/ns/net", os.O_RDONLY), os.open(path, os.O_RDONLY)
-    try:
-        setns(inside, CLONE_NEWNET)
-        yield
-    finally:
-        setns(outside, CLONE_NEWNET)
-        os.close(outside)
-        os.close(inside)
 
 
 def leaf_configuration(url: str) -> str:

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from tests.meshctl.device.servers import keypair, openssh, public
+from tests.meshctl.inventories import compex_hardware
 from tests.meshctl.sites.forwarder import CuttableUplink
 from tests.meshctl.sites.wheels import required_wheels
 from tests.waiting import until
@@ -27,21 +28,17 @@ from tests.waiting import until
 LIMIT_S = 300.0
 NORTH, SOUTH = ("n-base", "n1", "n2"), ("s-base",)
 SECRETS = {"north": "a-secret-of-the-north", "south": "a-secret-of-the-south"}
-INVENTORY = """\
+INVENTORY = (
+    """\
 meshctl: 1
 fleet: mines
 country: US
 operators: {{ssh_keys: ["{key}"]}}
 apply: {{canary: true}}
 hardware:
-  box:
-    board: compex,wpj344-16m
-    profile: compex_wpj344-16m
-    target: ath79/generic
-    release: "24.10"
-    lan_ports: [eth0]
-    confirm_window_s: 60
-    radios: {{radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}}}
+"""
+    + compex_hardware("24.10", confirm_window_s=60)
+    + """\
 meshes:
   north:
     ssid: north
@@ -73,6 +70,7 @@ nodes:
   n[1-2]: {{groups: [north]}}
   s-base: {{role: base, groups: [south]}}
 """
+)
 
 
 @dataclass(frozen=True, slots=True)

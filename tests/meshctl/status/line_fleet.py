@@ -22,23 +22,21 @@ from meshctl.model import Secret, SecretRef
 from meshctl.render import render_node
 from meshlab.fleet import VirtualFleet
 from meshlab.spec import FleetSpec, LinkSpec, Medium, NodeSpec
+from tests.meshctl.inventories import compex_hardware
 from tests.meshctl.status.terminal import PATIENCE_S
 from tests.waiting import until
 
 NAMES = ("base", "b01", "b02")
-INVENTORY = """\
+INVENTORY = (
+    """\
 meshctl: 1
 fleet: looked-at
 country: US
 operators: {{ssh_keys: ["{key}"]}}
 hardware:
-  box:
-    board: compex,wpj344-16m
-    profile: compex_wpj344-16m
-    target: ath79/generic
-    release: "23.05"
-    lan_ports: [eth0]
-    radios: {{radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}}}
+"""
+    + compex_hardware("23.05")
+    + """\
 meshes:
   main: {{ssid: looked-at, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24{encryption}}}
 defaults: {{hardware: box, state: deployed, ssh: {{key_files: [key]}}}}
@@ -49,6 +47,7 @@ nodes:
 robots:
   rover: {{computer: {{address: 10.42.0.20/24}}}}
 """
+)
 
 
 @dataclass(frozen=True, slots=True)

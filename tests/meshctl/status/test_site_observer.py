@@ -24,6 +24,7 @@ from meshctl.status.assess import Snapshot, assess
 from meshctl.status.site_observer import MAX_OUTPUT_BYTES, PERIOD_S, SiteObserver, answers_json, parse_answers
 from meshctl.status.values import Level, NoAnswer
 from meshctl.topology import Graph
+from tests.meshctl.inventories import compex_hardware
 
 _SAID = b"@@n boot_id 0\nb-1\n"
 _ANSWERS: dict[str, RawObservation | NoAnswer] = {
@@ -92,19 +93,16 @@ class Workers:
         return self.observer.observe("north", ["n1", "n2"])
 
 
-_INVENTORY = """\
+_INVENTORY = (
+    """\
 meshctl: 1
 fleet: mines
 country: US
 operators: {ssh_keys: []}
 hardware:
-  box:
-    board: compex,wpj344-16m
-    profile: compex_wpj344-16m
-    target: ath79/generic
-    release: "24.10"
-    lan_ports: [eth0]
-    radios: {radio0: {path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}
+"""
+    + compex_hardware("24.10")
+    + """\
 meshes:
   north: {ssid: north, bssid: "02:ca:fe:00:00:01", band: 2g, channel: 6, network: 10.42.0.0/24}
 sites:
@@ -119,6 +117,7 @@ nodes:
   s1: {site: south, address: 10.42.0.3}
   own: {address: 10.42.0.4}
 """
+)
 
 
 @pytest.fixture

@@ -68,23 +68,28 @@ class Member:
 
 
 @contextmanager
-def team(*names: str, link: Link = LOSSY, topics: str = TOPICS) -> Iterator[tuple[Laboratory, list[Member]]]:
-    """Robots of these names on one link, all of them online for one another."""
+def masters_on_one_link(names: Sequence[str], link: Link) -> Iterator[tuple[Laboratory, dict[str, Master]]]:
+    """A computer with a roscore of its own for each name. The masters are started; they may not answer yet."""
     # A Unix socket's path has at most 107 bytes: pytest's folders are too long.
     with (
         tempfile.TemporaryDirectory(prefix="udp-mesh-") as path,
         laboratory(len(names), link=link) as lab,
         ExitStack() as kept,
     ):
-        folder = Path(path)
-        places = {name: lab.inside(place, []) for place, name in enumerate(names)}
-        masters = {name: Master(folder, name, places[name]) for name in names}
+        masters = {name: Master(Path(path), name, lab.inside(place, [])) for place, name in enumerate(names)}
         for master in masters.values():
             kept.callback(master.stop)
             master.start(wait=False)
+        yield lab, masters
+
+
+@contextmanager
+def team(*names: str, link: Link = LOSSY, topics: str = TOPICS) -> Iterator[tuple[Laboratory, list[Member]]]:
+    """Robots of these names on one link, all of them online for one another."""
+    with masters_on_one_link(names, link) as (lab, masters), ExitStack() as kept:
         members = []
         for name, master in masters.items():
-            daemon = RobotsDaemon(folder, name, places[name], topics)
+            daemon = RobotsDaemon(master.folder, name, master.inside, topics)
             kept.enter_context(daemon)
             master.wait()
             bridge = Ros1Bridge(master, daemon)
