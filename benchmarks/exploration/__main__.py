@@ -202,7 +202,7 @@ def main() -> None:
     shown = [one for one in results if (one["cut_s"], one["limit_s"]) == (arguments.cut, arguments.limit)]
     text = (
         f"Finds: artifacts of {ARTIFACT_BYTES / 1e3:.0f} kB and map differences of {MAP_BYTES / 1e3:.0f} kB. "
-        f"Medians of the runs, on a busy machine.\n\n{table(shown)}"
+        f"Medians of the runs.\n\n{table(shown)}"
     )
     print(text)
     if arguments.fill:

@@ -332,7 +332,7 @@ class RecordingReader:
             yield from thin_items(t, entry["thin"])
 
     def _radio(self, t: float, at: str, entry: dict[str, Any]) -> Iterator[RecordedEvent]:
-        """An event when a radio stops to give new values, and when all do again."""
+        """An event when a radio stops giving new values, and when all give them again."""
         problem = radio_problem(entry.get("radio"))
         if problem != self._radio_problem:
             self._radio_problem = problem

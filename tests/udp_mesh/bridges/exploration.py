@@ -2,7 +2,7 @@
 
 The base and the robots have names as BOBCAT gives them. In the cut all are alone but the base and the last robot. That
 one leaves the base with a task for the first, passes it on to the next one when they meet, and so on; what the first
-found comes home the same way. Used by the test and by the comparison in `benchmarks/exploration.py`.
+found comes home the same way. Used by the test and by the comparison in `benchmarks/exploration`.
 """
 
 from __future__ import annotations
