@@ -60,26 +60,38 @@ def test_messages_on_disk_are_delivered_after_a_killed_sender_restarts() -> None
     assert entries == {b"entry %d" % number for number in range(10)}
 
 
-def test_a_hung_disk_delays_only_the_publisher_that_waits_for_it() -> None:
+def test_a_hung_disk_delays_only_the_publishers_that_wait_for_it() -> None:
     topics = 'log = { priority = 8, outbox = "all", outbox_on_disk = true }'
     with (
         two_daemons(topics) as (alice, bob),
         standing_disk(alice.folder / "alice" / "outbox", 0) as go_on,
+        alice.client() as first,
         alice.client() as patient,
         alice.client() as sender,
         bob.client() as receiver,
     ):
         receiver.subscribe("log", "status")
-        with ThreadPoolExecutor(1) as waiting:
+        with ThreadPoolExecutor(2) as waiting:
+            # Carol never comes, so this message has to be written. A message that is delivered before its write
+            # begins need not be, and would not find the disk hung.
+            for_carol = waiting.submit(first.publish, "log", b"entry", to="carol")
+            poll(lambda: messages_held_for(sender, "carol") == 1, "the message to carol")
             answer = waiting.submit(patient.publish, "log", b"entry", to="bob", notify=True)
             assert collect(receiver, 1)[0].payload == b"entry"
             sender.publish("status", b"now", to="bob")
             assert collect(receiver, 1)[0].payload == b"now"
+            assert not for_carol.done()
             assert not answer.done()
             go_on()
+            for_carol.result(WAIT_S)
             # a client is one thread's at a time
             number = answer.result(WAIT_S)
             assert outcomes(patient, 1) == {number: "delivered"}
+
+
+def messages_held_for(client: MeshClient, peer: str) -> int:
+    peers = client.request("peers")["peers"]
+    return sum(found["outbox_messages"] for found in peers if found["name"] == peer)
 
 
 def priority_of(operator: MeshClient, name: str) -> int | None:
