@@ -51,7 +51,7 @@ from udp_mesh.daemon.positions import (
 )
 from udp_mesh.daemon.relay_settings import read_relay
 from udp_mesh.daemon.thin_settings import ThinPortConfig, read_thin
-from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, parse
+from udp_mesh.daemon.toml_source import ConfigurationError, Problem, Table, may_be_key, parse
 from udp_mesh.daemon.topic_settings import or_default, problem_from, read_topic
 from udp_mesh.links.attachments import EVERY_INTERFACE, LinkConfig
 from udp_mesh.wire.limits import MAX_MESSAGE_BYTES
@@ -139,6 +139,9 @@ def load(path: Path) -> Configuration:
 
 def _read_named_keys(top: Table, path: Path, key: str, name: str) -> tuple[Key, ...]:
     """The keys of the file that the configuration names; its problems are added to those of the configuration."""
+    if may_be_key(name) and not (path.parent / name).exists():
+        top.report(key, "the name of a file with the key", name, "udp-mesh keygen writes one")
+        return ()
     try:
         # Relative to the configuration file, so that a bundle can be moved as a whole.
         return read_keys(path.parent / name)
@@ -220,7 +223,7 @@ def read(top: Table, keys: tuple[Key, ...], relay_keys: tuple[Key, ...] = ()) ->
     position = _read_position(top.table("position")) if top.has("position") else None
     top.finish()
     if source.problems:
-        raise ConfigurationError(sorted(source.problems, key=lambda problem: problem.line))
+        raise ConfigurationError(source.all_problems())
     try:
         settings = Settings(
             name=name,

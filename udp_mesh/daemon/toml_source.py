@@ -7,6 +7,7 @@ and keys.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import re
 import tomllib
@@ -122,6 +123,10 @@ class Source:
     file: str
     lines: dict[KeyPath, int]
     problems: list[Problem] = field(default_factory=list)
+    places: dict[str, dict[str, None]] = field(default_factory=dict)
+    """The tables that have a key of this name, in the order of reading."""
+    unknown: dict[Problem, tuple[str, str]] = field(default_factory=dict)
+    """The table and the key of each problem with a key that the table does not have."""
 
     def line(self, path: KeyPath) -> int:
         """The line of this key, or of the nearest enclosing table."""
@@ -129,11 +134,25 @@ class Source:
             path = path[:-1]
         return self.lines.get(path, 1)
 
-    def report(self, path: KeyPath, expected: str, found: str, hint: str = "") -> None:
+    def report(self, path: KeyPath, expected: str, found: str, hint: str = "", not_in: str = "") -> None:
+        """`not_in` is the title of the table if it does not have this key."""
         key = ".".join(str(part) for part in path)
         problem = Problem(self.file, self.line(path), key, expected, found, hint)
         if problem not in self.problems:
             self.problems.append(problem)
+        if not_in:
+            self.unknown[problem] = (not_in, str(path[-1]))
+
+    def all_problems(self) -> list[Problem]:
+        """By line. Once all tables are read, a key that another table has is said to belong there: in TOML, a key is
+        part of the table whose header stands above it."""
+        found = []
+        for problem in self.problems:
+            table, key = self.unknown.get(problem, ("", ""))
+            places = [place for place in self.places.get(key, ()) if place != table]
+            hint = f"it belongs {' or '.join(places)}" if places else problem.hint
+            found.append(dataclasses.replace(problem, hint=hint))
+        return sorted(found, key=lambda problem: problem.line)
 
 
 def parse(text: str, file: str) -> Table:
@@ -182,6 +201,7 @@ class Table:
 
     def _take(self, key: str) -> object:
         self._known.add(key)
+        self.source.places.setdefault(key, {}).setdefault(self._title())
         return self._values.get(key)
 
     def report(self, key: str, expected: str, found: object, hint: str = "") -> None:
@@ -256,7 +276,7 @@ class Table:
         if value is None:
             value = {}
         elif not isinstance(value, dict):
-            self.report(key, "a table", value)
+            self.source.report((*self.path, key), "a table", show(value), not_in=self._title())
             value = {}
         return Table(value, self.source, (*self.path, key))
 
@@ -279,7 +299,20 @@ class Table:
         for key, value in self._values.items():
             if key not in self._known:
                 hint = did_you_mean(key, self._known)
-                self.source.report((*self.path, key), "a known key", f"{key} = {show(value)}", hint)
+                found = f"{key} = {show(value)}"
+                self.source.report((*self.path, key), "a known key", found, hint, not_in=self._title())
+
+    def _title(self) -> str:
+        """This table as a hint names it. Each topic has a table of its own, so no single one is named."""
+        match self.path:
+            case ():
+                return "above the first [table]"
+            case ("topics", _):
+                return "in the table of a topic"
+            case (*keys, int()):
+                return f"in [[{'.'.join(map(str, keys))}]]"
+            case keys:
+                return f"in [{'.'.join(map(str, keys))}]"
 
 
 def did_you_mean(found: object, known: Iterable[str]) -> str:
@@ -287,14 +320,29 @@ def did_you_mean(found: object, known: Iterable[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else ""
 
 
+# Hexadecimal digits or base64, about as many as a key has: it may have lost or gained some. Paths consist of base64's
+# characters, too, so only a whole text of that length counts.
+_HEX_KEY = re.compile(r"[0-9A-Fa-f]{32}")
+_BASE64_KEY = re.compile(r"[A-Za-z0-9+/_-]{40,48}={0,2}")
+
+
+def may_be_key(text: str) -> bool:
+    """Whether the text may contain a key, which must not reach a terminal or a log."""
+    return _HEX_KEY.search(text) is not None or _BASE64_KEY.fullmatch(text.split("#")[0].strip()) is not None
+
+
 def show(value: object) -> str:
-    """A value as written in the file, truncated to one line."""
+    """A value as written in the file, truncated to one line. What may be a key is not shown."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, dict):
         return "a table"
     if isinstance(value, list) and any(isinstance(item, dict) for item in value):
         return "a list of tables"
+    if isinstance(value, list):
+        return f"[{', '.join(map(show, value))}]" if len(str(value)) <= 60 else f"a list of {len(value)}"
+    if isinstance(value, str) and may_be_key(value):
+        return f"{len(value)} characters that may be a key (not shown)"
     if isinstance(value, str):
         return f'"{value}"' if len(value) <= 60 else f'"{value[:57]}..."'
     text = str(value)

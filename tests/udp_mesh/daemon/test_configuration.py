@@ -1,5 +1,6 @@
 """The configuration: its values, and that every mistake is reported with its line."""
 
+import base64
 import dataclasses
 from pathlib import Path
 
@@ -137,6 +138,20 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
         ),
         ("name = 5", "udp-mesh.toml:2: name: expected a string, found 5"),
         ("\nprot = 8700", "udp-mesh.toml:3: prot: expected a known key, found prot = 8700 (did you mean 'port'?)"),
+        (
+            '[topics]\nvideo = {}\nsocket = "/run/mesh.sock"',
+            'udp-mesh.toml:4: topics.socket: expected a table, found "/run/mesh.sock" (it belongs in [daemon])',
+        ),
+        (
+            '[daemon]\nrelay_key_file = "relay.key"',
+            'udp-mesh.toml:3: daemon.relay_key_file: expected a known key, found relay_key_file = "relay.key" '
+            "(it belongs above the first [table])",
+        ),
+        (
+            '[topics]\na = {}\n[[links]]\naddress = "127.0.0.1"\npriority = 3',
+            "udp-mesh.toml:6: links.0.priority: expected a known key, found priority = 3 "
+            "(it belongs in the table of a topic)",
+        ),
         ("port = 70000", "udp-mesh.toml:2: port: expected an integer from 1 to 65535, found 70000"),
         ("port = true", "udp-mesh.toml:2: port: expected an integer from 1 to 65535, found true"),
         ("window = 0", 'udp-mesh.toml:2: window: expected "adaptive" or an integer from 1 to 4096, found 0'),
@@ -280,6 +295,16 @@ def test_a_missing_key_error_suggests_the_unkeyed_option(tmp_path: Path) -> None
         "udp-mesh.toml:1: key_file: expected a file with the fleet's key, found none "
         "(set unkeyed = true to run without protection)"
     ]
+
+
+@pytest.mark.parametrize("key", [KEY.secret.hex(), KEY.secret.hex()[:-3], base64.b64encode(KEY.secret).decode()])
+@pytest.mark.parametrize(
+    "line", ["key = '{}'", "keys = ['{}', '{}']", "key_file = '{}'", "name = '{} # id'", "[topics]\nkey = '{}'"]
+)
+def test_a_key_in_a_wrong_place_is_not_shown(tmp_path: Path, line: str, key: str) -> None:
+    found = "\n".join(problems(tmp_path, line.format(key, key)))
+    assert "udp-mesh.toml" in found
+    assert not any(key[start : start + 8] in found for start in range(len(key) - 8))
 
 
 def test_a_missing_key_file_is_reported_at_the_line_that_references_it(tmp_path: Path) -> None:
