@@ -41,7 +41,7 @@ HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
 HEADROOM_BYTES = 4 << 20
 # Writing 16 MB of NOR takes up to 3 minutes and the first boot 2 more; then keys are made and the mesh is joined.
 RETURN_TIMEOUT_S = 900.0
-# If the node has not rebooted by then, sysupgrade has failed.
+# If sysupgrade has not been started by then, it never will be.
 START_TIMEOUT_S = 120.0
 
 
@@ -136,6 +136,7 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
             connection = ctx.run.connections.open(ctx.node)
             try:
                 seen = observe(connection, extra_paths=[MARKER_PATH])
+                upgrade = None if has_booted(ctx.before, seen, marker) else openwrt.upgrade_state(connection)
             finally:
                 connection.close()
         except NodeError as error:
@@ -143,16 +144,12 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
             listener.unreachable()
         else:
             ctx.run.record(ctx.name, seen)
-            if has_booted(ctx.before, seen, marker):
+            if upgrade is None:
                 listener.ended(seen, rebooted=True)
                 return verdict(ctx.name, ctx.node.hardware, seen, marker)
-            if backoff.elapsed_s > START_TIMEOUT_S:
-                return Outcome(
-                    ctx.name,
-                    Result.FAILED,
-                    "sysupgrade did not reboot it; it runs the previous firmware",
-                    hint="see its log",
-                )
+            if (why := why_not_flashed(*upgrade, after_s=backoff.elapsed_s)) is not None:
+                return Outcome(ctx.name, Result.FAILED, f"{why}; it runs the previous firmware")
+            last_error = "its sysupgrade has not ended"
         backoff.pause()
     return Outcome(
         ctx.name,
@@ -160,6 +157,16 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
         f"not back after it was flashed ({last_error})",
         hint=ctx.node.hardware.recovery or "run `meshctl resume` to check it again",
     )
+
+
+def why_not_flashed(upgrade: openwrt.Upgrade, said: str, *, after_s: float) -> str | None:
+    """Why a node that has not booted since sysupgrade began will not be flashed. None: it may yet be, however long that
+    takes on a slow processor."""
+    if upgrade is openwrt.Upgrade.ENDED:
+        return f"its sysupgrade has failed{f': {said}' if said else ''}"
+    if upgrade is openwrt.Upgrade.NOT_STARTED and after_s > START_TIMEOUT_S:
+        return "its sysupgrade has not been started"
+    return None
 
 
 def has_booted(before: Observation, seen: Observation, marker: str) -> bool:

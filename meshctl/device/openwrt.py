@@ -13,6 +13,7 @@ import tarfile
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 
 from meshctl.device.connection import Connection
 from meshctl.device.errors import CommandFailed
@@ -22,6 +23,7 @@ from meshctl.device.parse.system import parse_boot_id, parse_meminfo, parse_upti
 
 # `sysupgrade -T` unpacks and hashes the image.
 FIRMWARE_TEST_TIMEOUT_S = 120.0
+UPGRADE_STATE_TIMEOUT_S = 60.0
 _PATTERN = re.compile(r"/[A-Za-z0-9._/+@*?-]+")
 # sysupgrade's own lines have the date before them from 21.02 on (lib/upgrade/common.sh, v).
 _STAMP = re.compile(r"^.{,60} upgrade: ")
@@ -175,9 +177,42 @@ def start_sysupgrade(connection: Connection, image_path: str, config_path: str) 
     _detached(connection, "sysupgrade", act)
 
 
+class Upgrade(Enum):
+    """What has become of a `sysupgrade` that was started, on a node that still runs the previous firmware."""
+
+    NOT_STARTED = "not started"
+    RUNNING = "running"
+    ENDED = "ended"
+
+
+def upgrade_state(connection: Connection) -> tuple[Upgrade, str]:
+    """The state of the `sysupgrade` that `start_sysupgrade` started, and the last that it said.
+
+    It is not over when its script is: procd tests the image once more and answers no request meanwhile, and `ubus call`
+    waits 30 s for it (ubus, cli.c). Then procd becomes `upgraded`, which writes the flash (procd, sysupgrade.c). If procd
+    answers a later request, it has refused the upgrade.
+    """
+    script = (
+        f"pid=''; read -r pid 2>/dev/null <{_pid_file('sysupgrade')}\n"
+        'if [ -z "$pid" ]; then echo "not started"\n'
+        'elif grep -q sysupgrade "/proc/$pid/cmdline" 2>/dev/null; then echo running\n'
+        "elif ubus call system board >/dev/null 2>&1 && ! grep -q '^upgraded$' /proc/1/comm; then echo ended\n"
+        "else echo running; fi\n"
+        "tail -n 3 /tmp/sysupgrade.log 2>/dev/null"
+    )
+    done = connection.run(script, timeout_s=UPGRADE_STATE_TIMEOUT_S)
+    state, *said = done.stdout.splitlines() or [Upgrade.RUNNING.value]
+    lines = (_STAMP.sub("", line).strip() for line in said)
+    return Upgrade(state), "; ".join(line for line in lines if line)
+
+
+def _pid_file(name: str) -> str:
+    return f"/tmp/meshctl/{name}.pid"
+
+
 def _detached(connection: Connection, name: str, act: str) -> None:
     # with a fresh pid file, because -x alone would match any running shell and start nothing
-    pid_file = f"/tmp/meshctl/{name}.pid"
+    pid_file = _pid_file(name)
     daemon = quoted(f"sleep {DETACHED_DELAY_S}; {act}")
     start = f"start-stop-daemon -S -b -m -p {pid_file} -x /bin/sh -- -c {daemon}"
     started = f"mkdir -p /tmp/meshctl && rm -f {pid_file} && {start}"

@@ -7,10 +7,10 @@ import tarfile
 
 import pytest
 
-from meshctl.apply.sysupgrade import MARKER_PATH, archive, has_booted, verdict
+from meshctl.apply.sysupgrade import MARKER_PATH, archive, has_booted, verdict, why_not_flashed
 from meshctl.device import deadman
 from meshctl.device.observation import BoardInfo, FileInfo, Observation, ReleaseInfo
-from meshctl.device.openwrt import FetchedFile
+from meshctl.device.openwrt import FetchedFile, Upgrade
 from meshctl.fleet import Result
 from tests.meshctl.plan.support import fleet, wanted
 
@@ -91,3 +91,17 @@ def test_the_new_firmware_with_another_configuration_is_a_failure() -> None:
 def test_a_node_that_has_not_booted_yet_is_waited_for(before: str | None, now: str | None) -> None:
     """It may not report its boot id while sysupgrade ends its processes."""
     assert not has_booted(Observation(0.0, 0.0, boot_id=before), seen(OLD, now, "of an earlier flash"), "mark")
+
+
+@pytest.mark.parametrize("after_s", [0.0, 121.0, 800.0])
+def test_a_slow_node_that_still_upgrades_is_not_given_up(after_s: float) -> None:
+    """Minutes pass before it reboots if its processor is slow; another flash, or cutting its power, would ruin it."""
+    assert why_not_flashed(Upgrade.RUNNING, "", after_s=after_s) is None
+
+
+def test_an_upgrade_that_failed_is_told_with_what_it_said() -> None:
+    said = "Command failed: Unknown error"
+    assert why_not_flashed(Upgrade.ENDED, said, after_s=3.0) == f"its sysupgrade has failed: {said}"
+    # start-stop-daemon answers before it has written the process id
+    assert why_not_flashed(Upgrade.NOT_STARTED, "", after_s=3.0) is None
+    assert why_not_flashed(Upgrade.NOT_STARTED, "", after_s=121.0) == "its sysupgrade has not been started"

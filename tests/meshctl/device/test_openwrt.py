@@ -193,6 +193,30 @@ def test_starting_sysupgrade_answers_before_the_connection_ends(connection: Conn
     eventually(lambda: calls(node) == ["sysupgrade -n -f /tmp/config.tgz /tmp/image.bin"])
 
 
+# as the real one's end: it asks procd, which may answer too late for it
+UPGRADING = """#!/bin/sh
+echo "Sun Nov 22 03:21:04 UTC 2026 upgrade: Commencing upgrade. Closing all shell sessions."
+until [ -e /harness/answered ]; do sleep 1; done
+echo "Command failed: $(cat /harness/answered)" >&2
+exit 1
+"""
+
+
+def test_an_upgrade_is_over_only_when_procd_answers_again(connection: SshConnection, node: Sandbox) -> None:
+    node.put("/sbin/sysupgrade", UPGRADING, 0o755)
+    node.put("/bin/ubus", "#!/bin/sh\ncase $* in 'call system board') [ -e /harness/procd ] ;; esac\n", 0o755)
+    assert openwrt.upgrade_state(connection) == (openwrt.Upgrade.NOT_STARTED, "")
+    openwrt.start_sysupgrade(connection, "/tmp/image.bin", "/tmp/config.tgz")
+    said = "Commencing upgrade. Closing all shell sessions."
+    eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.RUNNING, said))
+    node.put("/harness/answered", "Request timed out")
+    said += "; Command failed: Request timed out"
+    # its script has ended, and procd goes on with the upgrade
+    eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.RUNNING, said))
+    node.put("/harness/procd", "answers")
+    eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.ENDED, said))
+
+
 def test_a_first_boot_lasts_until_sysupgrades_archive_is_deleted(connection: SshConnection, node: Sandbox) -> None:
     assert not openwrt.is_first_boot(connection)
     node.put("/sysupgrade.tgz", "the configuration that the flash kept")
