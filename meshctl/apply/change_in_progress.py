@@ -8,8 +8,9 @@ that (`connect`, `observe_and_decide`), and `confirm` or `abort` ends the change
 from __future__ import annotations
 
 import threading
+import time
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from meshctl.apply.change_listener import ChangeListener
 from meshctl.apply.change_set import change_of, new_change_id, new_nonce, services_of
@@ -17,7 +18,7 @@ from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import RELOADING, unmet
 from meshctl.apply.next_action import Action, applied_age_s, next_action
 from meshctl.device import deadman
-from meshctl.device.connection import Endpoint
+from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, Payload
 from meshctl.device.errors import AuthenticationRefused, CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus, Observation
@@ -47,6 +48,9 @@ APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 AWAIT_RELOAD_S = 30
 # Erasing 16 MB of NOR takes up to three minutes, more with other work beside it; then its init scripts run.
 FIRST_BOOT_TIMEOUT_S = 600.0
+# A login at an address other than the new one may hang: another device may have that address, or the server may be
+# going down. While the confirm window runs, each phase of such a login takes at most this share of it.
+ELSEWHERE_SHARE = 1 / 16
 ABSENT = ChangeStatus("absent", installed=False)
 
 
@@ -76,6 +80,8 @@ class ChangeInProgress:
     extra_s: float = 0.0
     # the radios that the change restarts
     radios: Radios = NO_RADIOS
+    # when it was started, by the monotonic clock
+    started_s: float | None = None
     # the one of `candidates` where the node answered
     found_at: Endpoint | None = None
     # whether its services have reloaded: only a connection opened after that proves the node reachable
@@ -105,6 +111,11 @@ class ChangeInProgress:
         """Whether it may affect who can log in: all but settings of radios, which only decide over which links."""
         harmless = (WIRELESS, MARKER_PATH)
         return self.extra_s > 0 or any(change.path not in harmless for change in self.ctx.plan.files)
+
+    @property
+    def is_window_over(self) -> bool:
+        """Whether the node has confirmed it or rolled it back by now."""
+        return self.started_s is None or time.monotonic() - self.started_s > self.extra_s + self.window_s
 
     @property
     def first_look_s(self) -> float:
@@ -193,6 +204,7 @@ def send(change: ChangeInProgress, connection: SshConnection, slot: Slot) -> Non
     with ctx.step("apply"):
         install_switch(ctx, connection)
         change.listener.started()
+        change.started_s = time.monotonic()
         await_reload_s = AWAIT_RELOAD_S if connection.endpoint.host == change.new.host else 0
         with change.listener.waiting(connection):
             status = deadman.change(
@@ -217,6 +229,7 @@ def start(change: ChangeInProgress, connection: SshConnection, *, at_uptime_s: f
     NodeRefused, Unreachable.
     """
     change.listener.started()
+    change.started_s = time.monotonic()
     change.is_reloaded = False
     patience = threading.Timer(min(APPLY_ANSWER_TIMEOUT_S, change.window_s / 4), connection.close)
     patience.daemon = True
@@ -234,7 +247,7 @@ def connect(change: ChangeInProgress) -> SshConnection | None:
     ctx = change.ctx
     for endpoint in dict.fromkeys((change.new, *change.candidates, change.old)):
         try:
-            connection = ctx.run.connections.open(ctx.node, endpoint=endpoint)
+            connection = ctx.run.connections.open(ctx.node, endpoint=endpoint, deadlines=_deadlines(change, endpoint))
         except NodeError as error:
             change.last_error = change.connect_error = str(error)
             if isinstance(error, AuthenticationRefused):
@@ -244,6 +257,19 @@ def connect(change: ChangeInProgress) -> SshConnection | None:
             change.found_at = endpoint
         return connection
     return None
+
+
+def _deadlines(change: ChangeInProgress, endpoint: Endpoint) -> Deadlines:
+    usual = change.ctx.run.connections.deadlines
+    if endpoint == change.new or change.is_window_over:
+        return usual
+    limit_s = change.window_s * ELSEWHERE_SHARE
+    return replace(
+        usual,
+        connect_s=min(usual.connect_s, limit_s),
+        handshake_s=min(usual.handshake_s, limit_s),
+        auth_s=min(usual.auth_s, limit_s),
+    )
 
 
 def observe_and_decide(

@@ -188,9 +188,9 @@ class Upgrade(Enum):
 def upgrade_state(connection: Connection) -> tuple[Upgrade, str]:
     """The state of the `sysupgrade` that `start_sysupgrade` started, and the last that it said.
 
-    It is not over when its script is: procd tests the image once more and answers no request meanwhile, and `ubus call`
-    waits 30 s for it (ubus, cli.c). Then procd becomes `upgraded`, which writes the flash (procd, sysupgrade.c). If procd
-    answers a later request, it has refused the upgrade.
+    It is not over when its script is: procd tests the image once more and answers no request meanwhile, while
+    `ubus call` waits 30 s for it (ubus, cli.c). Then procd becomes `upgraded`, which writes the flash (procd,
+    sysupgrade.c). If procd answers a later request, it has refused the upgrade.
     """
     script = (
         f"pid=''; read -r pid 2>/dev/null <{_pid_file('sysupgrade')}\n"

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from meshctl.apply import change_in_progress
-from meshctl.apply.change_in_progress import ChangeInProgress, observe_and_decide
+from meshctl.apply.change_in_progress import ChangeInProgress, connect, observe_and_decide
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.next_action import Action
-from meshctl.device.connection import Endpoint
+from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change
 from meshctl.device.observation import ChangeStatus, NetInterface, Observation
 from meshctl.device.ssh import SshConnection
+from meshctl.errors import Unreachable
 from meshctl.model import Secret
 from meshctl.uci import parse
 
@@ -65,3 +67,34 @@ def test_an_applied_change_is_checked_even_if_its_age_is_unknown(monkeypatch: py
     unknown = ChangeStatus("applied", "c1", reload_status=0)
     assert looked_at(change, monkeypatch, unknown, "192.168.1.1/24") is Action.WAIT
     assert change.unmet == ("its LAN has 192.168.1.1/24, not 10.42.0.101",)
+
+
+def logins_of(change: ChangeInProgress) -> dict[str, Deadlines]:
+    """The time limits with which a change logs in at each address, where no node answers."""
+    limits = {}
+
+    def open_at(_: object, *, endpoint: Endpoint, deadlines: Deadlines) -> SshConnection:
+        limits[endpoint.host] = deadlines
+        raise Unreachable("no route to host")
+
+    cast("SimpleNamespace", change.ctx.run).connections = SimpleNamespace(open=open_at, deadlines=Deadlines())
+    assert connect(change) is None
+    return limits
+
+
+def test_a_login_that_hangs_at_the_old_address_leaves_most_of_the_confirm_window() -> None:
+    """Another device has it by now, or the node's server is going down there."""
+    change = a_change()
+    change.old = Endpoint("192.168.1.1")
+    change.started_s = time.monotonic()
+    limits = logins_of(change)
+    assert limits["10.42.0.101"] == Deadlines()
+    old = limits["192.168.1.1"]
+    assert old.connect_s + old.handshake_s + old.auth_s < change.window_s / 4
+
+
+def test_a_slow_node_that_has_rolled_back_gets_all_the_time_at_its_old_address() -> None:
+    change = a_change()
+    change.old = Endpoint("192.168.1.1")
+    change.started_s = time.monotonic() - change.window_s - 1
+    assert logins_of(change)["192.168.1.1"] == Deadlines()
