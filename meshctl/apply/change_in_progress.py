@@ -31,7 +31,7 @@ from meshctl.model import Secret
 from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
-from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
 from meshctl.render.rendered import MARKER_PATH
 
@@ -138,7 +138,9 @@ def new_change(ctx: NodeContext, old: Endpoint, *, window_s: int | None = None) 
 
 
 def _radios_of(ctx: NodeContext) -> Radios:
-    """The radios that restart with the plan's files."""
+    """The radios that may restart with the plan's changes. Where one is left over, all may be taken down and up."""
+    if ctx.plan.left_over:
+        return EVERY_RADIO
     if not any(change.path == WIRELESS for change in ctx.plan.files):
         return NO_RADIOS
     before = packages_seen([WIRELESS], ctx.before)["wireless"]

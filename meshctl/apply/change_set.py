@@ -12,7 +12,7 @@ from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.effects import loaded_package
-from meshctl.plan.seen import file_info, text_of
+from meshctl.plan.seen import WIRELESS, file_info, text_of
 
 # The id is part of a file name on the node; the nonce must be unguessable for a confirm window of minutes.
 ID_BYTES, NONCE_BYTES = 5, 16
@@ -35,7 +35,8 @@ def change_of(
     return Change(
         change_id=change_id,
         files=files,
-        reload=reload_script(touched, services),
+        # a reload of this package takes down what is left over
+        reload=reload_script(touched | {WIRELESS} if plan.left_over else touched, services),
         expected={f"/{path}": _sha256_seen(path, before) for path in sorted(touched) if _is_exact(path, before)},
     )
 

@@ -205,7 +205,7 @@ def _change_node(ctx: NodeContext, images: Mapping[str, Path]) -> Outcome:
     outcome = Outcome(ctx.name, Result.DONE)
     if ctx.plan.packages is not None:
         outcome = install(ctx, _connection(ctx), ctx.plan.packages)
-    if not ctx.plan.files or not outcome.result.is_good:
+    if not ctx.plan.reloads or not outcome.result.is_good:
         return outcome
     try:
         return configure(ctx, _connection(ctx))
@@ -240,7 +240,7 @@ def _simultaneous_stage(
         reason = f"{what} was canceled: packages could not be installed on {', '.join(failed)}"
         ended = {name: failed.get(name) or Outcome(name, Result.PENDING, reason) for name in stage.nodes}
     else:
-        with_files = [name for name in stage.nodes if contexts[name].plan.files]
+        with_files = [name for name in stage.nodes if contexts[name].plan.reloads]
         ended = {name: Outcome(name, Result.DONE) for name in stage.nodes}
         if with_files:
             ended |= commit_mesh(

@@ -15,6 +15,7 @@ from ipaddress import ip_address
 from meshctl.device.observation import Observation
 from meshctl.plan import DesiredState
 from meshctl.plan.cell import enabled_interfaces
+from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.plan.seen import WIRELESS, address_options, packages_seen
 from meshctl.topology import NEIGHBOUR_FRESH_MS
@@ -52,7 +53,10 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
     trees = {file.package.name: file.package for file in desired.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
     wireless = trees.get("wireless")
-    off = frozenset() if wireless is None else _named(packages_seen([WIRELESS], before)["wireless"]) - _named(wireless)
+    off = frozenset(left_over(before))
+    if wireless is not None:
+        named_before = interface_names(packages_seen([WIRELESS], before)["wireless"]) - {""}
+        off = (off | named_before) - interface_names(wireless)
     return Expectation(
         wireless,
         trees.get("network"),
@@ -61,11 +65,6 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
         frozenset(mac.lower() for mac in base_macs) & originators,
         off,
     )
-
-
-def _named(wireless: Package | None) -> frozenset[str]:
-    """The names of the enabled radio interfaces."""
-    return frozenset(iface.get("ifname") for iface, _ in enabled_interfaces(wireless)) - {""}
 
 
 def heard_neighbors(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:

@@ -17,6 +17,7 @@ from meshctl.plan.abilities import lacking_abilities
 from meshctl.plan.cell import cells, partitions
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
+from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.packages import NO_NEEDS, Needs, package_step
@@ -99,6 +100,11 @@ def node_plan(
     if locked_out is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=locked_out.reason, hint=locked_out.hint)
     node_effects = effects((change.path for change in files), before, after, node.release)
+    wanted_on = interface_names(after.get("wireless"))
+    still_on = () if firmware is not None else tuple(name for name in left_over(seen) if name not in wanted_on)
+    if still_on:
+        why = f"{', '.join(still_on)}: turned off by its configuration, but on the air: taken down"
+        node_effects = (*node_effects, Effect("wifi", Cut.MESH, why))
     if firmware is not None:
         node_effects = (
             Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"),
@@ -106,10 +112,11 @@ def node_plan(
         )
     return replace(
         basis,
-        verdict=Verdict.CHANGE if files or firmware or packages else Verdict.SAME,
+        verdict=Verdict.CHANGE if files or still_on or firmware or packages else Verdict.SAME,
         firmware=firmware,
         packages=packages,
         files=files,
+        left_over=still_on,
         effects=node_effects,
         notes=(
             *seen.notes,

@@ -151,6 +151,8 @@ def _node(data: Mapping[str, Any]) -> NodePlan:
         firmware=None if firmware is None else FirmwareStep(**{key: str(text) for key, text in firmware.items()}),
         packages=None if packages is None else PackageStep(**{key: _texts(names) for key, names in packages.items()}),
         files=tuple(FileChange(**{key: str(text) for key, text in change.items()}) for change in data["files"]),
+        # plans of earlier versions have none
+        left_over=_texts(data.get("left_over", [])),
         effects=tuple(Effect(str(item["service"]), Cut(item["cut"]), str(item["why"])) for item in data["effects"]),
         splits=_texts(data["splits"]),
         parted_from=_texts(data["parted_from"]),

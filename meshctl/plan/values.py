@@ -83,7 +83,8 @@ class PackageStep:
 
 @dataclass(frozen=True, slots=True)
 class NodePlan:
-    """The steps of one node, in this order: firmware, packages, files.
+    """The steps of one node, in this order: firmware, packages, files. `left_over` are radio interfaces that its
+    configuration has turned off, but that transmit: the reload takes them down.
 
     `observed` and `wanted` are fingerprints of its observed and desired state. `splits` lists how its current cell
     differs from the planned one (`channel 6 -> 11`), `parted_from` which of its `meshes` that concerns. `departs`: of
@@ -98,6 +99,7 @@ class NodePlan:
     firmware: FirmwareStep | None = None
     packages: PackageStep | None = None
     files: tuple[FileChange, ...] = ()
+    left_over: tuple[str, ...] = ()
     effects: tuple[Effect, ...] = ()
     splits: tuple[str, ...] = ()
     parted_from: tuple[str, ...] = ()
@@ -108,6 +110,11 @@ class NodePlan:
     observed: str = ""
     wanted: str = ""
     notes: tuple[str, ...] = ()
+
+    @property
+    def reloads(self) -> bool:
+        """Whether files or services change: all but firmware and packages."""
+        return bool(self.files or self.left_over)
 
     @property
     def cut(self) -> Cut:

@@ -103,7 +103,7 @@ def _stage_s(stage: Stage, plans: Sequence[NodePlan], pace: Pace) -> float:
 def _node_s(plan: NodePlan, pace: Pace) -> float:
     if plan.firmware is not None:
         return FIRMWARE_S
-    return (PACKAGES_S if plan.packages is not None else 0.0) + (pace.change_s if plan.files else 0.0)
+    return (PACKAGES_S if plan.packages is not None else 0.0) + (pace.change_s if plan.reloads else 0.0)
 
 
 def _outage_counts(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) -> Counter[str]:

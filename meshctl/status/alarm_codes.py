@@ -26,6 +26,7 @@ CODES: Mapping[str, str] = MappingProxyType(
         "packages": "packages are missing",
         "radio": "a mesh radio is down",
         "join": "a radio has not joined a cell",
+        "left-over": "a radio interface that its configuration has turned off is on the air",
         "channel": "a radio is on another channel than its mesh",
         "alone": "deployed, but hears no other node",
         "no-path": "no path through the mesh to the base",

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
+from meshctl.plan.left_over import left_over
 from meshctl.report.duration import duration
 from meshctl.status.values import Alarm, Level, Neighbor, RadioStatus
 from meshctl.topology import Path
@@ -96,6 +97,13 @@ def _drift(seen: NodeAlarmInput) -> Iterator[Alarm]:
         names = ", ".join(change.path.removeprefix("etc/config/") for change in plan.files)
         hint = f"meshctl plan {name} shows the differences; meshctl provision {name} fixes them"
         yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}", hint)
+
+
+def _left_over(seen: NodeAlarmInput) -> Iterator[Alarm]:
+    """A mesh that it has left may still be joined through it, and others may be disturbed on its channel."""
+    for name in left_over(seen.observation):
+        text = f"{name} is on the air, although its configuration has turned it off"
+        yield Alarm(Level.WARNING, "left-over", text, f"meshctl provision {seen.node.name} takes it down")
 
 
 def _radios(seen: NodeAlarmInput) -> Iterator[Alarm]:
@@ -233,6 +241,7 @@ _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (
     _identity,
     _drift,
     _radios,
+    _left_over,
     _mesh,
     _air,
     _dropped,

@@ -207,7 +207,7 @@ _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
         "configuration", "matches the inventory", "drift", "foreign", "refused", "not-compared", is_fleetwide=True
     ),
     _alarm_check("changes", "no change in progress", "change"),
-    _alarm_check("radios", "every radio is in its cell", "radio", "join", "channel", "alone", "bridge"),
+    _alarm_check("radios", "every radio is in its cell", "radio", "join", "left-over", "channel", "alone", "bridge"),
     _quality,
     _alarm_check("resources", "enough memory and flash", "memory", "flash"),
     _strangers,

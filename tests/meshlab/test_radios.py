@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import pytest
 
 from meshctl.apply.change_set import reload_script
+from meshctl.device.observation import Observation
 from meshctl.device.observe import interpret, observation_script
 from meshctl.device.parse.sections import split_sections
+from meshctl.plan.left_over import left_over
 from meshlab.fleet import VirtualFleet, VirtualNode
 from tests.meshlab.conftest import MESH, factory_reset
 from tests.waiting import until
@@ -117,6 +119,19 @@ def test_the_reload_script_recreates_a_lost_interface(latest: VirtualNode) -> No
 def test_the_reload_script_removes_the_interface_of_a_radio_that_is_off(latest: VirtualNode, off: str) -> None:
     latest.exec(f"uci -q batch <<END\n{off}\ncommit wireless\nEND\n{reload_script({WIRELESS}, ())}").check("reload")
     until(lambda: latest.exec("[ -e /sys/class/net/mesh0 ]").exit_status != 0, "mesh0 to go")
+
+
+def test_an_interface_that_was_left_on_the_air_is_found_and_a_later_reload_removes_it(latest: VirtualNode) -> None:
+    assert left_over(observed(latest)) == ()
+    configure(latest, OFF)
+    assert left_over(observed(latest)) == ("mesh0",)
+    latest.exec(reload_script({WIRELESS}, ())).check("reload")
+    until(lambda: left_over(observed(latest)) == (), "mesh0 to go")
+
+
+def observed(node: VirtualNode) -> Observation:
+    output = node.exec(observation_script("NONCE")).stdout_bytes
+    return interpret(split_sections(output, "NONCE"), asked_at_s=0.0, answered_at_s=0.0)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from tests.meshctl.device.changes import (
     NONCE,
     NONCE_HASH,
     OWNER,
+    RELOAD,
     change,
     is_after,
     is_before,
@@ -87,6 +88,25 @@ def test_an_unconfirmed_change_is_rolled_back_and_the_services_are_reloaded(node
     assert "192.168.1.1" in (node.text("/harness/running") or "")
     assert last(node) == ("c1", "restored", "timeout")
     assert refusal(node.deadman("confirm", "c1", NONCE)) == "restored"
+
+
+@pytest.mark.parametrize("is_confirmed", [True, False])
+def test_a_change_of_no_file_reloads_services(node: Sandbox, is_confirmed: bool) -> None:
+    """It takes down a radio interface that is left over."""
+    for path, (text, mode) in BEFORE.items():
+        node.put(path, text, mode)
+    node.put(BUNDLE, bundle(Change("c1", {}, RELOAD)))
+    node.deadman("lock", OWNER, "1000")
+    assert node.deadman("stage", OWNER, "c1", BUNDLE) == "ok state=staged id=c1"
+    assert node.deadman("arm", OWNER, "c1", NONCE_HASH, "3" if not is_confirmed else "1000") == "ok state=armed id=c1"
+    assert node.deadman("apply", OWNER, "c1", "now").startswith("ok state=waiting")
+    eventually(lambda: node.path("/harness/running").exists())
+    if is_confirmed:
+        eventually(lambda: state(node) == "applied")
+        assert node.deadman("confirm", "c1", NONCE) == "ok state=idle id=c1 outcome=confirmed"
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert is_before(node.path("/etc"))
+    assert last(node)[1] == ("confirmed" if is_confirmed else "restored")
 
 
 def test_an_unconfirmed_change_is_rolled_back_at_boot(node: Sandbox) -> None:

@@ -28,6 +28,7 @@ from meshctl.plan import FileChange, NodePlan, Verdict
 from meshctl.status import Health
 from meshctl.status.json_output import as_json
 from meshctl.status.last_known import facts_to_record, merge_by_device, typed
+from meshctl.status.preflight import preflight
 from meshctl.status.rows import row
 from meshctl.status.text import text
 from meshctl.status.unreachable import no_answer_of
@@ -158,6 +159,31 @@ def test_a_node_problem_degrades_the_node(fleet: Fleet, change: dict[str, Any], 
     assert code in alarms(status, "rover")
     assert health(status)["rover"] is Health.DEGRADED
     assert status.exit_code is not ExitCode.OK
+
+
+def test_a_radio_that_is_off_but_on_the_air_is_told_with_what_to_do_and_no_go(fleet: Fleet) -> None:
+    """25.12 leaves it in its cell, and versions before this one did not take it down."""
+    wireless = """
+config wifi-device 'radio0'
+config wifi-device 'radio1'
+	option disabled '1'
+config wifi-iface 'mesh0'
+	option device 'radio0'
+	option ifname 'mesh0'
+"""
+    links = (
+        WirelessLink("mesh0", "IBSS", MACS["rover"], "trio", channel=6, joined=True),
+        WirelessLink("mesh1", "IBSS", "02:00:00:00:01:04", "trio", channel=6, joined=True),
+    )
+    status = status_of(
+        fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, uci={"wireless": wireless}, links=links)}
+    )
+    alarm = alarms(status, "rover")["left-over"]
+    assert alarm.text == "mesh1 is on the air, although its configuration has turned it off"
+    assert alarm.hint == "meshctl provision rover takes it down"
+    assert health(status)["rover"] is Health.DEGRADED
+    (radios,) = (check for check in preflight(fleet, status) if check.name == "radios")
+    assert (radios.is_go, radios.reason) == (False, f"rover: {alarm.text}")
 
 
 @pytest.mark.parametrize(
