@@ -1,7 +1,8 @@
 """Flush stale station entries: neighbors remove them over SSH while a node's radios restart.
 
     armed: nodes reached through the node, and the node itself, start to watch their entries
-    unreachable: the other holders are queried, with growing pauses
+    unreachable: the other holders are queried, with growing pauses; after `BOOT_S` those of its other radios as well,
+        which restart if it has lost its power
     ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
@@ -63,6 +64,8 @@ _DEADLINES = Deadlines(
 SLOW_CONNECT_S = 5.0
 # A connection that waits for an answer is asked for a sign of life every 5 s; twice that is a node that is unreachable.
 SILENT_S, SILENCE_PAUSE_S = 10.0, 1.0
+# A node that is unreachable for longer than that may have lost its power, and then restarts all of its radios.
+BOOT_S = 20.0
 # The fact in an outcome: the neighbors that may still hold a stale station entry.
 UNFLUSHED = "not_asked"
 # The consequence, for the operator (docs/provisioning.md).
@@ -85,6 +88,8 @@ class StationFlush:
     radios: Radios
     unfinished: list[StationFlush] = field(repr=False)
     _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
+    # of all radios of the node
+    _every_holder: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
@@ -101,7 +106,9 @@ class StationFlush:
     _since_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self._holders = by_holder(entries_of(self.ctx.name, self.ctx.run.observations, self.radios))
+        observations = self.ctx.run.observations
+        self._holders = by_holder(entries_of(self.ctx.name, observations, self.radios))
+        self._every_holder = by_holder(entries_of(self.ctx.name, observations))
 
     @property
     def node(self) -> str:
@@ -181,13 +188,13 @@ class StationFlush:
                     self.unreachable()
 
         thread = threading.Thread(target=watch, daemon=True)
-        if self._holders:
+        if self._every_holder:
             thread.start()
         try:
             yield
         finally:
             ended.set()
-            if self._holders:
+            if self._every_holder:
                 thread.join()
 
     def unreachable(self, among: Container[str] | None = None) -> None:
@@ -195,10 +202,12 @@ class StationFlush:
         now_s = time.monotonic()
         if self._started_s is None or now_s < next_query_s(self._queried_s):
             return
-        names = [name for name in self._holders if name not in self._watching and (among is None or name in among)]
+        answered_s = max(self._started_s, self._observed_s or 0.0)
+        holders = self._holders if now_s < answered_s + BOOT_S else self._every_holder
+        names = [name for name in holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._queried_s.append(now_s)
-            self._flush({name: self._holders[name] for name in names}, self._started_s)
+            self._flush({name: holders[name] for name in names}, self._started_s)
 
     def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
         """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has

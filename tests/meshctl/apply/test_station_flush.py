@@ -104,6 +104,29 @@ def test_repeated_queries_are_journaled_and_reported_once(
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
 
 
+@pytest.mark.parametrize("radios", [NO_RADIOS, Radios(frozenset({"mesh1"}))])
+def test_a_node_that_stays_unreachable_may_have_lost_its_power_whatever_its_change_restarts(
+    monkeypatch: pytest.MonkeyPatch, radios: Radios
+) -> None:
+    """Seen on real OpenWrt: a second radio was to join, the power was cut, and the first radio's neighbor did not hear
+    the node's unicast for minutes, so that it stayed unreachable although it was back in its mesh."""
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
+    flush = near.flushes.listener(near.job, radios)
+    flush.started()
+    now_s[0] += 15
+    flush.observed()
+    now_s[0] += 15
+    flush.unreachable()
+    assert near.asked == []
+    now_s[0] += 10
+    flush.unreachable()
+    ((name, script),) = near.asked
+    assert (name, script.splitlines()[-1]) == ("b01", f"flush_stale mesh0 {MAC} 40")
+    assert near.notes == ["b02: b01 removed a stale entry of its radio"]
+
+
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
