@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
+from meshctl.apply.half_deaf import RELEARN_S, reconnect
 from meshctl.device.observation import Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
@@ -65,10 +66,14 @@ def prepare(
     choices: PlanOptions | None = None,
     interrupt: Interrupt | None = None,
     observer: Observer = silent,
+    reconnects: bool = False,
+    tried: frozenset[str] = frozenset(),
 ) -> Prepared:
     """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
 
-    Where the plan cuts a running mesh, the whole mesh is observed: distances and cut vertices need all of it.
+    `reconnects`: neighbors that hear an unreachable node remove their stale entries of it, and it is tried again,
+    except the nodes in `tried`. Where the plan cuts a running mesh, the whole mesh is observed: distances and cut
+    vertices need all of it.
     """
     fleet = renderer.fleet
     chosen = tuple(nodes)
@@ -98,6 +103,28 @@ def prepare(
         _remember(journal, fleet, others)
         seen = replace(seen, observations={**seen.observations, **others.observations})
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
+    if reconnects and seen.unreachable and not (interrupt is not None and interrupt.stopping):
+        owners = known_macs(fleet, journal.last_known(fleet.name))
+        untried = {name: why for name, why in seen.unreachable.items() if name not in tried}
+        removed = reconnect(connections, fleet, replace(seen, unreachable=untried), owners)
+        if removed:
+            (interrupt or Interrupt()).wait(RELEARN_S)
+            again = prepare(
+                renderer,
+                connections,
+                chosen,
+                journal,
+                salt=salt,
+                owner=owner,
+                choices=choices,
+                interrupt=interrupt,
+                observer=observer,
+                reconnects=True,
+                # the nodes behind these may be reachable now, and in the same state
+                tried=tried | removed.keys(),
+            )
+            notes = (f"{name}: {', '.join(by)} removed a stale entry of its radio" for name, by in removed.items())
+            return replace(again, plan=replace(again.plan, notes=(*notes, *again.plan.notes)))
     pace = Pace.of(journal.change_durations_s(fleet.name))
     return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace)
 

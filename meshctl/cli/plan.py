@@ -181,7 +181,7 @@ def provision(
             raise change_everywhere(
                 opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run, check=check
             )
-        prepared = prepare_plan(opened, own, choices)
+        prepared = prepare_plan(opened, own, choices, reconnects=not check and not dry_run)
         if check:
             raise typer.Exit(report_check(prepared.plan, opened.fleet, as_json=as_json, brief=brief))
         confirm_and_execute(
@@ -249,7 +249,7 @@ def resume(
         if sites:
             options = RunOptions("resume", choices, as_json, rate)
             raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
-        prepared = prepare_plan(opened, names, choices)
+        prepared = prepare_plan(opened, names, choices, reconnects=not dry_run)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
         for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():

@@ -51,6 +51,7 @@ def prepare_plan(
     salt: bytes | None = None,
     *,
     limits: list[str] | None = None,
+    reconnects: bool = False,
 ) -> Prepared:
     with opened.interrupt.on_signals(echo_error):
         prepared = prepare(
@@ -62,6 +63,7 @@ def prepare_plan(
             owner=opened.owner,
             choices=choices,
             interrupt=opened.interrupt,
+            reconnects=reconnects,
         )
     if opened.interrupt.stopping:
         raise KeyboardInterrupt

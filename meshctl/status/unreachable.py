@@ -70,7 +70,7 @@ def no_answer_alarm(
         return Alarm(Level.WARNING, "mute", f"{why.reason}, but {seen}", hint) if seen else None
     last_answer = f"last answered {duration(now - last.seen_s)} ago" if last else "never answered"
     if seen:
-        hint = "it is on and in range: wait a minute, then power-cycle it"
+        hint = "it is on and in range: wait a minute, then run meshctl provision; if that fails, keep it off for 2 min"
         return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; {seen}", hint)
     hint = first_contact_hint if last is None else last_place_hint(last)
     return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; no node hears it", hint)

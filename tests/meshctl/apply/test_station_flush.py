@@ -14,6 +14,7 @@ from typing import cast
 import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
+from meshctl.apply.half_deaf import HEARD_MS, entries_of_unreachable
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
@@ -21,6 +22,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Release
+from meshctl.nodes.collect import FleetObservation
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, SLACK_S, Radios
 from meshlab.fleet import VirtualNode
 from tests import waiting
@@ -241,6 +243,22 @@ def test_entries_from_before_a_boot_are_flushed_later(
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
 
 
+def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_entries() -> None:
+    heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
+    silent, reachable = replace(heard, inactive_ms=30_000), replace(heard, mac=MACS["b03"])
+    around = {
+        "b01": replace(node("b01"), stations=(heard, reachable)),
+        "b03": replace(node("b03"), stations=(silent,)),
+        "b04": replace(node("b04"), stations=(reachable,)),
+    }
+    owners = {mac: name for name, mac in MACS.items()}
+    asked = entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), owners)
+    assert {holder: [(one.ifname, one.mac) for one in entries] for holder, entries in asked.items()} == {
+        "b01": [("mesh0", MAC)]
+    }
+    assert entries_of_unreachable(FleetObservation(around, {}), owners) == {}
+
+
 def test_current_and_recently_heard_neighbors_are_observed() -> None:
     seen = {"b02": node("b02", "b01")}
     known = {
@@ -275,6 +293,12 @@ def known_for_s(rig: Rig) -> list[int]:
     """For how many seconds base has known each radio that it hears."""
     dump = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
     return [int(age) for age in re.findall(r"connected time:\s*(\d+)", dump)]
+
+
+def is_heard(rig: Rig) -> bool:
+    """Whether base hears the only other radio now."""
+    dump = rig.fleet.node("base").exec("iw dev mesh0 station dump").check("base: stations").stdout
+    return any(int(age_ms) < HEARD_MS for age_ms in re.findall(r"inactive time:\s*(\d+)", dump))
 
 
 def is_set_up(node: VirtualNode, *, distance: int) -> bool:
@@ -360,6 +384,24 @@ class TestOnAVirtualFleet:
             ended = rig.meshctl("provision", rig.current, "--yes", "--json")
             assert ended.results["n001"] == "unchanged", ended.out + ended.err
             assert notes(ended) == expected
+
+    def test_a_node_that_is_unreachable_since_its_power_was_cut_is_reached_and_changed(self, rig: Rig) -> None:
+        node = rig.fleet.node("n001")
+        boot = node.boot_id
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
+        rig.fleet.inject_fault("n001", "power-cut")
+        waiting.until(lambda: node.boot_id != boot, "the node to boot")
+        node.wait_up(wait_s=120.0)
+        waiting.until(lambda: is_heard(rig), "base to hear its radio again")
+        # over the mesh alone
+        node.plug(False)
+        try:
+            assert rig.meshctl("provision", rig.current, "n001", "--check", "--json").verdicts["n001"] == "away"
+            _, new = rig.flip()
+            ended = rig.meshctl("provision", new, "n001", "--yes", "--json")
+            assert ended.results == {"n001": "done"}, ended.out + ended.err
+        finally:
+            node.plug(True)
 
     def test_an_unobserved_radio_restart_is_flushed_later(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]

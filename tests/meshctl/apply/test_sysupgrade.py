@@ -99,7 +99,7 @@ def test_a_slow_node_that_still_upgrades_is_not_given_up(after_s: float) -> None
     assert why_not_flashed(Upgrade.RUNNING, "", after_s=after_s) is None
 
 
-def test_an_upgrade_that_failed_is_told_with_what_it_said() -> None:
+def test_an_upgrade_that_failed_is_reported_with_what_it_said() -> None:
     said = "Command failed: Unknown error"
     assert why_not_flashed(Upgrade.ENDED, said, after_s=3.0) == f"its sysupgrade has failed: {said}"
     # start-stop-daemon answers before it has written the process id

@@ -211,7 +211,7 @@ def test_an_upgrade_is_over_only_when_procd_answers_again(connection: SshConnect
     eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.RUNNING, said))
     node.put("/harness/answered", "Request timed out")
     said += "; Command failed: Request timed out"
-    # its script has ended, and procd goes on with the upgrade
+    # its script has ended, and procd continues with the upgrade
     eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.RUNNING, said))
     node.put("/harness/procd", "answers")
     eventually(lambda: openwrt.upgrade_state(connection) == (openwrt.Upgrade.ENDED, said))

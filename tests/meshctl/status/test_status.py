@@ -161,7 +161,7 @@ def test_a_node_problem_degrades_the_node(fleet: Fleet, change: dict[str, Any], 
     assert status.exit_code is not ExitCode.OK
 
 
-def test_a_radio_that_is_off_but_on_the_air_is_told_with_what_to_do_and_no_go(fleet: Fleet) -> None:
+def test_a_radio_that_is_off_but_on_the_air_is_an_alarm_and_a_no_go(fleet: Fleet) -> None:
     """25.12 leaves it in its cell, and versions before this one did not take it down."""
     wireless = """
 config wifi-device 'radio0'
