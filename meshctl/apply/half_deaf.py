@@ -7,11 +7,12 @@ has the neighbors that hear such a node remove their entries if they are stale, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 from meshctl.apply.stale_stations import GONE, MAX_QUERIED, StationEntry, flush_script
 from meshctl.errors import NodeError
+from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import FleetObservation
 from meshctl.nodes.connections import ConnectionPool
@@ -65,3 +66,13 @@ def entries_of_unreachable(seen: FleetObservation, owners: Mapping[str, str]) ->
             if is_heard and owners.get(station.mac.lower()) in seen.unreachable and len(found) < MAX_QUERIED:
                 found.setdefault(holder, []).append(StationEntry(holder, station.ifname, station.mac))
     return found
+
+
+def last_relays(names: Iterable[str], known: Mapping[str, LastKnown]) -> Iterator[str]:
+    """The relays of the paths over which these nodes last reached their base."""
+    for name in names:
+        passed = {name}
+        while name in known and (via := known[name].facts.get("via", "")) and via not in passed:
+            passed.add(via)
+            yield via
+            name = via

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from meshctl.apply.half_deaf import RELEARN_S, reconnect
+from meshctl.apply.half_deaf import RELEARN_S, last_relays, reconnect
 from meshctl.device.observation import Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
@@ -89,6 +89,7 @@ def prepare(
     _remember(journal, fleet, seen)
     decided = choices or PlanOptions()
     single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=decided)
+    away = dict(seen.unreachable)
     rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
@@ -102,10 +103,11 @@ def prepare(
         )
         _remember(journal, fleet, others)
         seen = replace(seen, observations={**seen.observations, **others.observations})
+        away |= others.unreachable
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
-    if reconnects and seen.unreachable and not (interrupt is not None and interrupt.stopping):
+    if reconnects and away and not (interrupt is not None and interrupt.stopping):
         owners = known_macs(fleet, journal.last_known(fleet.name))
-        untried = {name: why for name, why in seen.unreachable.items() if name not in tried}
+        untried = {name: why for name, why in away.items() if name not in tried}
         removed = reconnect(connections, fleet, replace(seen, unreachable=untried), owners)
         if removed:
             (interrupt or Interrupt()).wait(RELEARN_S)
@@ -148,7 +150,8 @@ def _other_members(fleet: Fleet, plans: Iterable[NodePlan]) -> tuple[Node, ...]:
 
 
 def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[str, LastKnown]) -> tuple[Node, ...]:
-    """Nodes that may hear the unreachable ones: their last known neighbors, and their bases."""
+    """Nodes that may hear the unreachable ones, or a relay between: their last known neighbors and paths, and their
+    bases."""
     chosen = {plan.node: plan for plan in plans}
     macs = known_macs(fleet, known)
     away = [name for name, plan in chosen.items() if plan.verdict is Verdict.AWAY]
@@ -159,7 +162,11 @@ def _former_neighbors(fleet: Fleet, plans: Iterable[NodePlan], known: Mapping[st
         for mac in known[name].facts.get("neighbours", "").split()
         if mac in macs
     ]
-    names = [name for name in dict.fromkeys((*near, *fleet.bases_of(away))) if name not in chosen]
+    names = [
+        name
+        for name in dict.fromkeys((*near, *last_relays(away, known), *fleet.bases_of(away)))
+        if name not in chosen and name in fleet.nodes
+    ]
     return tuple(fleet.nodes[name] for name in names[:MAX_QUERIED])
 
 

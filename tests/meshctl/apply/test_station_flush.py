@@ -14,7 +14,7 @@ from typing import cast
 import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.half_deaf import HEARD_MS, entries_of_unreachable
+from meshctl.apply.half_deaf import HEARD_MS, entries_of_unreachable, last_relays
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
@@ -257,6 +257,17 @@ def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_en
         "b01": [("mesh0", MAC)]
     }
     assert entries_of_unreachable(FleetObservation(around, {}), owners) == {}
+
+
+def test_the_relays_to_an_unreachable_node_are_those_of_its_last_path() -> None:
+    """It may be a relay that is not heard. A path that leads in a circle was recorded at two times."""
+    known = {
+        name: LastKnown(name, 0.0, {"via": via} if via else {})
+        for name, via in {"b03": "b02", "b02": "b01", "b01": "base", "base": "", "b04": "b05", "b05": "b04"}.items()
+    }
+    assert list(last_relays(["b03"], known)) == ["b02", "b01", "base"]
+    assert list(last_relays(["b04"], known)) == ["b05"]
+    assert list(last_relays(["unknown"], known)) == []
 
 
 def test_current_and_recently_heard_neighbors_are_observed() -> None:
