@@ -41,7 +41,7 @@ HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
 HEADROOM_BYTES = 4 << 20
 # Writing 16 MB of NOR takes up to 3 minutes and the first boot 2 more; then keys are made and the mesh is joined.
 RETURN_TIMEOUT_S = 900.0
-# If sysupgrade has not been started by then, it never will be.
+# If sysupgrade does not run by then, it was not started, or the node has booted without it.
 START_TIMEOUT_S = 120.0
 
 
@@ -165,7 +165,7 @@ def why_not_flashed(upgrade: openwrt.Upgrade, said: str, *, after_s: float) -> s
     if upgrade is openwrt.Upgrade.ENDED:
         return f"its sysupgrade has failed{f': {said}' if said else ''}"
     if upgrade is openwrt.Upgrade.NOT_STARTED and after_s > START_TIMEOUT_S:
-        return "its sysupgrade has not been started"
+        return "no sysupgrade runs on it"
     return None
 
 
