@@ -114,11 +114,17 @@ def sites_of(
 
 
 def prepare_everywhere(
-    opened: Session, inventory: Path, own: list[str], sites: Mapping[str, Sequence[str]], choices: PlanOptions
+    opened: Session,
+    inventory: Path,
+    own: list[str],
+    sites: Mapping[str, Sequence[str]],
+    choices: PlanOptions,
+    *,
+    reconnects: bool = False,
 ) -> WholePlan:
     """Plan the operator's own nodes here and the others at their sites. Raises InputError for a mesh at two sites."""
     _check_meshes(opened, sites)
-    direct = prepare_plan(opened, own, choices) if own else None
+    direct = prepare_plan(opened, own, choices, reconnects=reconnects) if own else None
     bundle_of = _bundles(opened, inventory, choices)
     return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, _options(choices))))
 
@@ -292,7 +298,8 @@ def change_everywhere(
     check: bool = False,
 ) -> typer.Exit:
     """Plan, show, ask and execute, where some nodes are provisioned by the workers of their sites."""
-    with closing(prepare_everywhere(opened, inventory, own, sites, options.choices)) as made:
+    reconnects = not check and not dry_run
+    with closing(prepare_everywhere(opened, inventory, own, sites, options.choices, reconnects=reconnects)) as made:
         if check:
             return typer.Exit(check_everywhere(opened, made, as_json=options.as_json, brief=brief))
         if dry_run:
