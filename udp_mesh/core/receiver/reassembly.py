@@ -24,6 +24,9 @@ RELIABLE_TIMEOUT_S = 300.0
 """A reliable message may wait this long behind more urgent ones. Then its memory is released, and if another fragment
 arrives, the sender is asked to restart the message."""
 
+MAX_EXPIRED_REMEMBERED = 1024
+"""Expired messages of which further fragments are not acknowledged. Their sender gives each up within a second."""
+
 
 class CompleteMessage(NamedTuple):
     """A complete message."""
@@ -72,7 +75,7 @@ RESERVE_STEP_BYTES = 1 << 16
 class Reassembly:
     """`bytes` is the size of all unfinished messages, at most `Limits.partial_bytes_per_peer`."""
 
-    __slots__ = ("_account", "_limits", "_partials", "_reserved", "bytes", "finished", "forgotten")
+    __slots__ = ("_account", "_expired", "_limits", "_partials", "_reserved", "bytes", "finished", "forgotten")
 
     def __init__(self, limits: Limits, account: Account | None = None) -> None:
         """`account` is this peer's share of the budget of all peers (None: unlimited)."""
@@ -84,6 +87,8 @@ class Reassembly:
         self.bytes = 0
         self.finished = RangeSet()
         self.forgotten = RangeSet()
+        self._expired: dict[int, None] = {}
+        """Those of `finished` that were dropped because their lifetime was over."""
 
     def __len__(self) -> int:
         return len(self._partials)
@@ -98,12 +103,12 @@ class Reassembly:
         if head is not None and head.life_ms is not None:
             expires_at = now + head.life_ms / 1000 - late_s
             if expires_at <= now and message_id not in self.finished:
-                self.end(message_id)
-                return FragmentStatus.EXPIRED
+                return self._expire(message_id)
         partial = self._partials.get(message_id)
         if partial is None:
             if message_id in self.finished:
-                return FragmentStatus.DUPLICATE
+                # To acknowledge a copy of an expired message would report it as delivered.
+                return FragmentStatus.EXPIRED if message_id in self._expired else FragmentStatus.DUPLICATE
             if message_id in self.forgotten:
                 return FragmentStatus.FORGOTTEN
             if head is not None:
@@ -150,8 +155,7 @@ class Reassembly:
             self.forget(message_id)
             return FragmentStatus.CORRUPT
         if partial.expires_at <= now:
-            self.end(message_id)
-            return FragmentStatus.EXPIRED
+            return self._expire(message_id)
         body = b"".join([payloads[place] for place in range(known.fragments)])
         self.forget(message_id)
         self._finish(message_id)
@@ -208,6 +212,13 @@ class Reassembly:
         self.forget(message_id)
         self._finish(message_id)
 
+    def _expire(self, message_id: int) -> FragmentStatus:
+        self.end(message_id)
+        self._expired[message_id] = None
+        if len(self._expired) > MAX_EXPIRED_REMEMBERED:
+            del self._expired[next(iter(self._expired))]
+        return FragmentStatus.EXPIRED
+
     def purge(self, now: float) -> None:
         """Drop messages that receive no more fragments."""
         for message_id, partial in list(self._partials.items()):
@@ -216,7 +227,7 @@ class Reassembly:
                 partial.touched_at = now
             idle_s = now - partial.touched_at
             if partial.expires_at <= now:
-                self.end(message_id)
+                self._expire(message_id)
             elif idle_s > RELIABLE_TIMEOUT_S:
                 self.forget(message_id)
                 self._remember(self.forgotten, message_id)
