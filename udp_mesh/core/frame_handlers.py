@@ -71,10 +71,9 @@ def process_frames(
             case Cancel(message_ids, broadcast_ids):
                 _on_cancel(state, session, message_ids, broadcast_ids=broadcast_ids)
             case Refused():
-                if not frame.broadcast_id:
-                    _on_refused(state, session, frame)
-                    report_ended(state, peer, now)
-                    state.ready[peer] = None
+                _on_refused(state, session, frame)
+                report_ended(state, peer, now)
+                state.ready[peer] = None
             case Delivered(message_ids, broadcast_ids):
                 if not broadcast_ids:
                     sender.on_delivered(message_ids)
@@ -142,6 +141,12 @@ def _on_refused(state: State, session: Session, refused: Refused) -> None:
     peer = session.peer
     assert peer is not None
     sender = peer.open_sender()
+    if refused.broadcast_id:
+        # Its number means this broadcast whatever its fragments are, so it cannot be started again under another one.
+        repair = sender.by_broadcast_number(refused.message_id)
+        if repair is not None and refused.reason is not RefuseReason.NO_MEMORY:
+            sender.finish(repair, ExpiryReason.REFUSED)
+        return
     message = sender.by_wire_id(refused.message_id)
     if message is None:
         if refused.reason is RefuseReason.FORGOTTEN:
@@ -169,7 +174,7 @@ def _on_nack(state: State, session: Session, number: int, now: float) -> None:
         state.schedule_control(session)
         return
     sender = peer.open_sender()
-    if any(message.accepted.broadcast_number == number for message in sender.pending):
+    if sender.by_broadcast_number(number) is not None:
         return
     state.event_queue.counters.repairs_sent += 1
     copy = AcceptedMessage(

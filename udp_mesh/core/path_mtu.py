@@ -1,6 +1,6 @@
 """The size of fragments on a peer's path: a change of the link's MTU, black holes, probes (DPLPMTUD, RFC 8899)."""
 
-from udp_mesh.core.events import PathNarrowed
+from udp_mesh.core.events import ExpiryReason, PathNarrowed
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packetizer import build_mtu_probe
@@ -28,7 +28,8 @@ def refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
 
     A message sent completely may have arrived completely, and under a new number it would arrive twice. It is restarted
     only with `include_sent`, when none of its large fragments get through anyway. Otherwise the kernel fragments what
-    is too large for the link.
+    is too large for the link. The repair of a broadcast is given up: it has no other number, under which its receiver
+    would not mistake the smaller fragments for some of the larger ones.
     """
     for message in list(sender.pending):
         if not include_sent and message.started and message.next_position >= message.fragments:
@@ -37,6 +38,9 @@ def refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:
             not there and _fragment_bytes(message, position) > path.fragment_bytes
             for position, there in enumerate(message.arrived)
         ):
+            if message.accepted.broadcast_number is not None:
+                sender.finish(message, ExpiryReason.REFUSED)
+                continue
             sender.cancel(message)
             sender.resend_from_start(message)
 

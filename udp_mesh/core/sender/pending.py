@@ -185,6 +185,10 @@ class PendingMessages:
         own = (message for message in self.pending if message.accepted.broadcast_number is None)
         return next((message for message in own if message.wire_id == wire_id), None)
 
+    def by_broadcast_number(self, number: int) -> OutgoingMessage | None:
+        """The pending repair of this broadcast. A linear search as well."""
+        return next((message for message in self.pending if message.accepted.broadcast_number == number), None)
+
     def on_delivered(self, wire_ids: Iterable[int]) -> None:
         """The peer reports these messages as complete, whatever it acknowledged. A linear search, for other
         implementations."""
