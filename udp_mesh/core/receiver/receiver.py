@@ -87,6 +87,7 @@ class Receiver:
 
     __slots__ = (
         "_account",
+        "_asked_again",
         "_gap_ack_at",
         "_limits",
         "_rates",
@@ -131,6 +132,8 @@ class Receiver:
         """Delivered messages whose senders wait for a confirmation."""
         self.confirmed: list[int] = []
         """Confirmations to send."""
+        self._asked_again: dict[int, None] = {}
+        """Messages that could not be kept: should the refusal be lost, each of their fragments is refused again."""
         self._refused: dict[tuple[bool, int], RefuseReason] = {}
         self._gap_ack_at: int | None = None
 
@@ -160,7 +163,7 @@ class Receiver:
             payload = frames[FRAGMENT_WIDE_BYTES:]
         else:
             return False
-        if not position or self._refused:
+        if not position or (self._refused and (False, message_id) in self._refused):
             return False
         if not self.unicasts.add_plain(message_id, position, payload):
             return False
@@ -209,7 +212,12 @@ class Receiver:
                 self.duplicates += 1
                 if any(inflating.key == key for inflating in self.inflating if _is_version(inflating)):
                     return False
-                if _asks_to_confirm(fragment) and self._is_confirmed(fragment.message_id):
+                if not _asks_to_confirm(fragment):
+                    return True
+                if fragment.message_id in self._asked_again:
+                    self._refuse(key, RefuseReason.FORGOTTEN)
+                    return False
+                if self._is_confirmed(fragment.message_id):
                     # The confirmation was lost.
                     self.confirmed.append(fragment.message_id)
                 return True
@@ -243,6 +251,9 @@ class Receiver:
         if message_id not in self.unconfirmed:
             return False
         self.unconfirmed.remove(message_id)
+        self._asked_again[message_id] = None
+        if len(self._asked_again) > MAX_UNCONFIRMED:
+            del self._asked_again[next(iter(self._asked_again))]
         self._refuse((False, message_id), RefuseReason.FORGOTTEN)
         return True
 
