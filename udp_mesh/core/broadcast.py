@@ -45,6 +45,8 @@ class BroadcastQueue:
         "_repairable_bytes",
         "_unrepaired",
         "free_at",
+        "held",
+        "held_until",
         "waiting",
     )
 
@@ -57,6 +59,9 @@ class BroadcastQueue:
         self._unrepaired = 0
         self.waiting = 0
         self.free_at = 0.0
+        self.held = 0
+        """Mask of the levels that are held back for other nodes' urgent messages until `held_until`."""
+        self.held_until = 0.0
 
     @property
     def next_number(self) -> int:
@@ -136,7 +141,9 @@ class BroadcastQueue:
     def next_at(self) -> float:
         """When something can be sent that could not be sent yet."""
         at = self._copies[0][0] if self._copies else float("inf")
-        return min(at, self.free_at) if self.waiting else at
+        if self.waiting & ~self.held:
+            return min(at, self.free_at)
+        return min(at, max(self.free_at, self.held_until)) if self.waiting else at
 
     def repair(self, number: int) -> AcceptedMessage | None:
         """The broadcast with this number, if still kept."""

@@ -86,7 +86,8 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
     """Send a session's acknowledgement and control frames in as few datagrams as possible."""
     path = session.path
     peer = session.peer
-    if not path.link or peer is None:
+    if not path.link or peer is None or peer.session is not session:
+        # The packet numbers of an earlier boot are not those that the sender keeps account of.
         return
     frames: list[Frame] = []
     if session.receiver.acks.pending or session.receiver.acks.send_now:
@@ -155,6 +156,7 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             sender.app_limited = True
             state.arm(peer)
     held = mask & ~allowed
+    broadcasts.held, broadcasts.held_until = held, state.priority_backoff.held_until(now) or now
     mask &= allowed
     while mask and room > 0:
         bit = mask & -mask

@@ -152,3 +152,39 @@ def test_unconfirmed_messages_at_the_receiver_are_bounded(monkeypatch: pytest.Mo
         for receipt in receipts(made):
             made.nodes["b"].confirm(receipt)
         made.run(5.0)
+
+
+def test_a_lost_request_to_send_again_is_repeated_and_not_taken_for_a_confirmation() -> None:
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(0.5)
+    made.pipes["b", "a"].loss = 1.0
+    made.nodes["b"].request_again(receipts(made)[0])
+    made.run(0.1)
+    made.pipes["b", "a"].loss = 0.0
+    made.run(10.0)
+    assert made.events_of("a", MessageDelivered) == []
+    assert len(receipts(made)) == 2
+    made.nodes["b"].confirm(receipts(made)[1])
+    made.run(1.0)
+    assert len(made.events_of("a", MessageDelivered)) == 1
+
+
+def test_a_late_confirmation_to_an_earlier_run_of_the_sender_disturbs_nothing() -> None:
+    """A packet number of the earlier run, kept account of as one of the current run, would shift the meaning of all
+    acknowledgements that follow."""
+    made = world()
+    made.send("a", "kept", b"x", destination="b")
+    made.run(1.0)
+    (receipt,) = receipts(made)
+    made.add(settings("a", KEPT))
+    made.run(5.0)
+    made.pipes["b", "a"].delay_s = 0.2
+    made.send("b", "any", bytes(50_000), destination="a")
+    made.run(0.05)
+    made.nodes["b"].confirm(receipt)
+    made.run(0.001)
+    peer = made.nodes["b"]._state.peer_table.peers["a"]
+    assert peer.session is not None
+    assert peer.open_sender().in_flight.outstanding
+    assert peer.open_sender().in_flight.next_number == peer.session.path.channel.next_number

@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.udp_mesh.core.pair import World, settings
+from tests.udp_mesh.core.pair import World, pair, settings
 from udp_mesh.core.events import MessageDelivered
 from udp_mesh.core.priority_backoff import ALL_LEVELS, BUDGET_S, PriorityBackoff
 from udp_mesh.core.settings import Rates, Topic
@@ -51,3 +51,18 @@ def test_bulk_backs_off_while_another_node_has_urgent_messages_waiting() -> None
     # The reported hold-back of the level is no more than the node's total.
     assert 0 < queues[9].held_s <= held_s + 1e-9
     assert world.run(20.0, until=lambda: bool(world.events_of("a", MessageDelivered)))
+
+
+def test_a_broadcast_that_is_held_back_wakes_its_node_when_it_may_be_sent_and_not_before() -> None:
+    both = pair(Topic("news", priority=9))
+    both.a._state.priority_backoff.on_waiting((Waiting(2, 50),), both.now)
+    both.a.send("news", b"x", now=both.now)
+    both.leave(both.a)
+    assert both.a._state.broadcasts.waiting
+    at = both.a.next_timer()
+    assert at is not None
+    assert at > both.now
+    both.now += Rates().yield_hold_s
+    assert at <= both.now
+    both.leave(both.a)
+    assert not both.a._state.broadcasts.waiting

@@ -208,8 +208,9 @@ def _send_run(sender: Sender, path: Path, run: Run, count: int, snapshot: SendSn
             first |= FRAGMENT_ACK_NOW
         frames.append(pack(first, wire_id, place) + body[offset : offset + size])
         offset += size
+    number = path.channel.next_number
     out.extend(Datagram.run(path.link, path.address, path.seal_run(frames)))
-    sender.in_flight.add_run(snapshot, message, range(position, position + count))
+    sender.in_flight.add_run(number, snapshot, message, range(position, position + count))
     sender.since_ack_requested = since
     sent_bytes = count * (size + FRAGMENT_BYTES + path.overhead_bytes)
     sender.sent_packets += count

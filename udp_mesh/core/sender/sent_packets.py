@@ -92,17 +92,20 @@ class SentPackets:
 
     def add(self, number: int, packet: Packet | None) -> None:
         """Record a sent packet; None for one that requests no acknowledgement. Called for every number of the channel,
-        in order."""
+        in order, from when it has a sender: earlier ones requested no acknowledgement."""
         packets = self._packets
+        if not packets:
+            self.base = number if packet is not None else number + 1
         if packet is not None:
             self.outstanding += 1
         elif not packets:
-            self.base = number + 1
             return
         packets.append(packet)
 
-    def add_run(self, snapshot: SendSnapshot, message: OutgoingMessage, positions: range) -> None:
-        """Record one packet per fragment under the next numbers, without a Python call for each."""
+    def add_run(self, number: int, snapshot: SendSnapshot, message: OutgoingMessage, positions: range) -> None:
+        """Record one packet per fragment, from `number` on, without a Python call for each."""
+        if not self._packets:
+            self.base = number
         self.outstanding += len(positions)
         self._packets.extend(
             map(partial(tuple.__new__, Packet), zip(repeat(snapshot), repeat(message), positions, repeat(())))
