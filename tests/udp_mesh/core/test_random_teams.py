@@ -1,0 +1,29 @@
+"""Whatever happens to links, nodes, disks and programs, the promises of `promises` hold."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.udp_mesh.core.promises import play
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 6, 7, 8, 10])
+def test_every_promise_is_kept_whatever_happens(seed: int) -> None:
+    play(seed, 8.0)
+
+
+@pytest.mark.proof
+@pytest.mark.timeout(4 * 3600)
+def test_every_promise_is_kept_in_three_thousand_teams() -> None:
+    for seed in range(3000):
+        try:
+            play(seed, 20.0)
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {error}") from error
+
+
+@pytest.mark.proof
+@pytest.mark.timeout(4 * 3600)
+@pytest.mark.parametrize("seed", range(100, 120))
+def test_every_promise_is_kept_for_ten_minutes(seed: int) -> None:
+    play(seed, 600.0)
