@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from udp_mesh.core.interfaces import Datagram, RandomSource
 from udp_mesh.core.ranges import RangeSet
 from udp_mesh.core.receiver.datagram_age import clock_ms
+from udp_mesh.core.receiver.reassembly import NUMBERED_APART_FROM
 from udp_mesh.core.sender.message import AcceptedMessage
 from udp_mesh.core.settings import Address
 from udp_mesh.crypto import SHORT_OVERHEAD_BYTES, SendChannel
@@ -19,7 +20,7 @@ from udp_mesh.wire.codec import encode
 from udp_mesh.wire.frames import Fragment, Frame, MessageFlag, MessageHead, Nack, Sent, TopicAnnounce
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
-FIRST_UNREPAIRED_NUMBER = 1 << 31
+FIRST_UNREPAIRED_NUMBER = NUMBERED_APART_FROM
 """First number of broadcasts without repair, so that losing one leaves no gap among those with repair."""
 
 NACK_DELAY_S = 0.02

@@ -121,8 +121,12 @@ class RangeSet:
         """(first, last) of each range, ascending."""
         return list(zip(self._firsts, self._lasts, strict=True))
 
-    def fill_lowest_gap(self) -> None:
-        """Join the two lowest ranges: their gap then counts as contained."""
-        if len(self._firsts) > 1:
-            del self._firsts[1]
-            del self._lasts[0]
+    def fill_lowest_gap(self, apart_from: int | None = None) -> int | None:
+        """Join the two lowest ranges: their gap then counts as contained. Numbers from `apart_from` on are not joined
+        with lower ones. Returns the last number of the gap."""
+        firsts, lasts = self._firsts, self._lasts
+        place = int(apart_from is not None and len(firsts) > 1 and lasts[0] < apart_from <= firsts[1])
+        if place + 1 >= len(firsts):
+            return None
+        del lasts[place]
+        return firsts.pop(place + 1) - 1

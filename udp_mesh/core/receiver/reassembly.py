@@ -24,6 +24,9 @@ RELIABLE_TIMEOUT_S = 300.0
 """A reliable message may wait this long behind more urgent ones. Then its memory is released, and if another fragment
 arrives, the sender is asked to restart the message."""
 
+NUMBERED_APART_FROM = 1 << 31
+"""From here on broadcasts without repair are numbered, so that their losses leave no gaps among the others."""
+
 MAX_EXPIRED_REMEMBERED = 1024
 """Expired messages of which further fragments are not acknowledged. Their sender gives each up within a second."""
 
@@ -75,7 +78,17 @@ RESERVE_STEP_BYTES = 1 << 16
 class Reassembly:
     """`bytes` is the size of all unfinished messages, at most `Limits.partial_bytes_per_peer`."""
 
-    __slots__ = ("_account", "_expired", "_limits", "_partials", "_reserved", "bytes", "finished", "forgotten")
+    __slots__ = (
+        "_account",
+        "_expired",
+        "_limits",
+        "_partials",
+        "_reserved",
+        "_unknown_to",
+        "bytes",
+        "finished",
+        "forgotten",
+    )
 
     def __init__(self, limits: Limits, account: Account | None = None) -> None:
         """`account` is this peer's share of the budget of all peers (None: unlimited)."""
@@ -86,6 +99,10 @@ class Reassembly:
         self._partials: dict[int, _Partial] = {}
         self.bytes = 0
         self.finished = RangeSet()
+        self._unknown_to = [-1, -1]
+        """Up to this number `finished` has numbers of which that is no longer known, below `NUMBERED_APART_FROM` and
+        from there on: rather a message that old is sent again, and in the worst case twice, than taken for finished
+        without having arrived."""
         self.forgotten = RangeSet()
         self._expired: dict[int, None] = {}
         """Those of `finished` that were dropped because their lifetime was over."""
@@ -106,11 +123,13 @@ class Reassembly:
                 return self._expire(message_id)
         partial = self._partials.get(message_id)
         if partial is None:
-            if message_id in self.finished:
-                # To acknowledge a copy of an expired message would report it as delivered.
-                return FragmentStatus.EXPIRED if message_id in self._expired else FragmentStatus.DUPLICATE
-            if message_id in self.forgotten:
+            if message_id in self._expired:
+                # To acknowledge a copy of it would report it as delivered.
+                return FragmentStatus.EXPIRED
+            if message_id <= self._unknown_to[message_id >= NUMBERED_APART_FROM] or message_id in self.forgotten:
                 return FragmentStatus.FORGOTTEN
+            if message_id in self.finished:
+                return FragmentStatus.DUPLICATE
             if head is not None:
                 if head.size_bytes > self._limits.message_bytes:
                     return FragmentStatus.TOO_LARGE
@@ -254,13 +273,18 @@ class Reassembly:
         return gaps
 
     def _finish(self, message_id: int) -> None:
-        self._remember(self.finished, message_id)
+        closed_to = self._remember(self.finished, message_id)
+        if closed_to is not None:
+            self._unknown_to[closed_to >= NUMBERED_APART_FROM] = closed_to
 
-    def _remember(self, numbers: RangeSet, message_id: int) -> None:
+    def _remember(self, numbers: RangeSet, message_id: int) -> int | None:
+        """Add a number. Returns the end of the gap that was closed for it, if that was necessary."""
         before = len(numbers)
+        closed_to = None
         numbers.add(message_id)
         if len(numbers) > self._limits.finished_ranges_per_peer or self._account.too_many_ranges(len(numbers)):
             # Close the oldest gap: what could still fill it is older than thousands of finished messages.
-            numbers.fill_lowest_gap()
+            closed_to = numbers.fill_lowest_gap(NUMBERED_APART_FROM)
         if len(numbers) != before:
             self._account.count_ranges(len(numbers) - before)
+        return closed_to

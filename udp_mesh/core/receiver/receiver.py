@@ -228,6 +228,9 @@ class Receiver:
                 self.expired += 1
                 return False
             case FragmentStatus.FORGOTTEN:
+                if not by_broadcast and fragment.message_id in self.unconfirmed:
+                    # It arrived long ago and waits for its program.
+                    return True
                 self._refuse(key, RefuseReason.FORGOTTEN)
                 return False
             case FragmentStatus.TOO_LARGE:
