@@ -14,7 +14,7 @@ from functools import partial
 from udp_mesh.core.conditions import Conditions
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import Event, MessageId, Rejected
-from udp_mesh.core.interfaces import Datagram, Store
+from udp_mesh.core.interfaces import Background, Datagram, Store, in_foreground
 from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import Address, LinkInfo, LinkKind, Settings
@@ -95,6 +95,7 @@ class Topology:
         *,
         store: Store | None = None,
         log_store: LogStore | None = None,
+        background: Background = in_foreground,
     ) -> Endpoint:
         """Start (or restart) a node with a link, named like the network, on each of these networks."""
         name = settings.name
@@ -105,6 +106,7 @@ class Topology:
             now=self.clock(name),
             store=store,
             log_store=log_store,
+            background=background,
         )
         self.nodes[name] = node
         self.events.setdefault(name, [])
@@ -129,6 +131,12 @@ class Topology:
     def suspend(self, name: str) -> Endpoint:
         """The node's process stops; what is sent to it meanwhile is lost."""
         return self.nodes.pop(name)
+
+    def wake(self, name: str) -> None:
+        """The node does what is due."""
+        if name in self.nodes:
+            self.nodes[name].handle_timer(self.clock(name))
+            self.pump(name)
 
     def resume(self, node: Endpoint) -> None:
         """A suspended process continues."""

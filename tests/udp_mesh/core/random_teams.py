@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import random
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from tests.udp_mesh.core.relaying.topologies import KEY
 from tests.udp_mesh.core.test_broadcast import Disk
@@ -28,8 +30,10 @@ from udp_mesh.core.interfaces import Datagram, StoredMessage
 from udp_mesh.core.logs.store import MemoryLogStore
 from udp_mesh.core.settings import LinkInfo, LinkKind, Log, Outbox, Rates, RelaySettings, Settings, Topic
 from udp_mesh.core.subscriptions.messages import Bounds, Subscription
+from udp_mesh.crypto import Key
 from udp_mesh.sim.topology import Topology
 
+NEXT_KEY = Key(bytes(range(1, 33)))
 RATES = Rates(offline_s=3.0, peer_lost_s=8.0, heartbeat_sparse_s=1.0)
 TOPICS = (
     Topic("stop", priority=0),
@@ -49,7 +53,7 @@ OUTBOXES = {topic.name for topic in TOPICS if topic.outbox is not Outbox.NONE}
 LOG = Topic("artifact", priority=4, log=Log(readers=("a", "b")))
 CHANGES = (
     *("down", "loss", "one-way", "jitter", "path-mtu", "link-mtu", "rate"),
-    *("kill", "leave", "suspend", "disk", "read", "wants", "apply"),
+    *("kill", "leave", "suspend", "disk", "read", "wants", "apply", "keys", "unplug"),
 )
 SMALL, LARGE = (20, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 
@@ -173,7 +177,13 @@ class RandomTeam(Topology):
         disk = self.disks[name]
         kept = disk.load()
         self._starting = []
-        node = self.add(self.config[name], self.homes[name], store=disk, log_store=self.log_stores[name])
+        node = self.add(
+            self.config[name],
+            self.homes[name],
+            store=disk,
+            log_store=self.log_stores[name],
+            background=self._in_background,
+        )
         events, self._starting = self._starting, None
         first = self._restored_from(node, kept)
         for number, stored in enumerate(kept):
@@ -258,6 +268,8 @@ class RandomTeam(Topology):
 
     def read(self, name: str) -> None:
         """The programs of a node take what came, or cannot keep it."""
+        if name in self.suspended:
+            return
         unread, self.unread[name] = self.unread[name], []
         for node, receipt, key in unread:
             if self.nodes.get(name) is not node:
@@ -355,6 +367,12 @@ class RandomTeam(Topology):
                 self.pump(name)
             case "apply" if name in self.nodes:
                 self._apply(name)
+            case "keys" if name in self.nodes:
+                self._rekey(name, dice.choice(((KEY,), (KEY, NEXT_KEY), (NEXT_KEY, KEY), (NEXT_KEY,))))
+            case "unplug" if name in self.nodes and name in network.members:
+                self.nodes[name].link_down(network.name, self.clock(name))
+                self.pump(name)
+                self.event_queue.after(dice.choice((0.1, 10.0)), lambda: self._plug_in(name, network.name))
             case _:
                 pass
 
@@ -375,6 +393,25 @@ class RandomTeam(Topology):
         self.nodes[name].apply(self.config[name], self.clock(name))
         self.pump(name)
 
+    def _rekey(self, name: str, keys: tuple[Key, ...]) -> None:
+        """A node gets its new key, or loses the old one, before or after others."""
+        self.config[name] = replace(self.config[name], keys=keys)
+        self.nodes[name].apply(self.config[name], self.clock(name))
+        self.pump(name)
+
+    def _plug_in(self, name: str, network: str) -> None:
+        if name in self.nodes:
+            self.connect(name, network)
+            self.pump(name)
+
+    def _in_background(self, work: Callable[[], None]) -> Callable[[], bool]:
+        """Work beside a node, which takes a while; then the node is woken, as a driver does."""
+        work()
+        done_at = self.now + self.dice.choice((0.0, 0.02, 0.5))
+        for name in self.homes:
+            self.event_queue.at(done_at + 1e-6, partial(self.wake, name))
+        return lambda: self.now >= done_at
+
     def _start_again(self, name: str) -> None:
         if name not in self.nodes and name not in self.suspended:
             self.start(name)
@@ -382,6 +419,8 @@ class RandomTeam(Topology):
     def _continue(self, name: str) -> None:
         if name in self.suspended:
             self.resume(self.suspended.pop(name))
+            if name in self.reading:
+                self.read(name)
 
     def repair(self) -> None:
         """All networks, nodes, disks and programs work."""
@@ -393,6 +432,7 @@ class RandomTeam(Topology):
             self.disks[name].recover()
             self._continue(name)
             self._start_again(name)
+            self._rekey(name, (KEY, NEXT_KEY))
             for link in home:
                 self.connect(name, link)
             self.reading.add(name)
