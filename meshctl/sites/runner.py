@@ -19,7 +19,7 @@ from meshctl.errors import InputError
 from meshctl.fleet.process import process_of, this_process
 from meshctl.sites.order import SignedOrder, checked_order, operator_keys
 from meshctl.sites.part import FILES_VARIABLE
-from meshctl.sites.runs import RunDirectory, SiteDirectory, closing, read_json, write_json
+from meshctl.sites.runs import RunDirectory, SiteDirectory, closing, read_json, replace_text, write_json
 
 _LAST_ERRORS_BYTES = 4096
 
@@ -73,7 +73,7 @@ def start(directory: SiteDirectory, signed: SignedOrder, environ: Mapping[str, s
                 env={**environ, "MESHCTL_SITE_LOCK": str(lock)},
             )
         # before the answer: who asks for the run's state next must not find it without a process
-        run.process.write_text(f"{process_of(runner.pid)}\n")
+        replace_text(run.process, f"{process_of(runner.pid)}\n")
     return runner
 
 
@@ -96,7 +96,8 @@ def execute(directory: SiteDirectory, run: RunDirectory, environ: Mapping[str, s
             # an ignored signal would stay ignored there
             preexec_fn=_default_signals,
         )
-        run.process.write_text(f"{this_process()}\n{process_of(child.pid)}\n")
+        # a file of its own: the one above may be written later
+        replace_text(run.processes, f"{this_process()}\n{process_of(child.pid)}\n")
         status = child.wait()
     error, hint = _last_error(run.errors)
     write_json(run.over, {"exit": status, "error": error, "hint": hint, "ended_s": time.time()})
@@ -133,7 +134,7 @@ def _last_error(path: Path) -> tuple[str, str]:
 
 def stop(run: RunDirectory) -> bool:
     """Ask the run to finish the nodes in progress and to start no more; whether it is in progress."""
-    lines = run.process.read_text(encoding="utf-8").splitlines() if run.process.exists() else []
+    lines = run.processes.read_text(encoding="utf-8").splitlines() if run.processes.exists() else []
     if not run.is_alive() or len(lines) < 2:
         return False
     try:

@@ -104,7 +104,7 @@ class SiteDirectory:
     def install(self, operators: Iterable[str]) -> str:
         """Let these public keys sign orders; returns the worker's public key, which is made if there is none."""
         self.root.mkdir(parents=True, exist_ok=True, mode=0o700)
-        (self.root / "operators").write_text("".join(f"{line}\n" for line in operators), encoding="utf-8")
+        replace_text(self.root / "operators", "".join(f"{line}\n" for line in operators))
         public = self.key.with_name(f"{self.key.name}.pub")
         if not self.key.exists():
             private, shared = new_key_pair(f"meshctl-worker@{self.site}")
@@ -148,9 +148,7 @@ class SiteDirectory:
 
     def _note_forgotten(self, run: str) -> None:
         lines = [*_text(self._forgotten).splitlines(), run][-_MAX_FORGOTTEN:]
-        new = self._forgotten.with_name(".forgotten.new")
-        new.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-        new.replace(self._forgotten)
+        replace_text(self._forgotten, "".join(f"{line}\n" for line in lines))
 
     def has_forgotten(self, run: str) -> bool:
         """Whether a run was started here of which nothing is kept."""
@@ -226,7 +224,13 @@ class RunDirectory:
 
     @property
     def process(self) -> Path:
+        """The runner, as the worker that started it names it."""
         return self.path / "process"
+
+    @property
+    def processes(self) -> Path:
+        """The runner and the command that changes nodes, as the runner names them."""
+        return self.path / "processes"
 
     @property
     def over(self) -> Path:
@@ -291,7 +295,7 @@ class RunDirectory:
 
     def is_alive(self) -> bool:
         """Whether one of the run's processes lives: the one that waits for its end, or the one that changes nodes."""
-        return any(process_lives(line) for line in _text(self.process).splitlines())
+        return any(process_lives(line) for path in (self.process, self.processes) for line in _text(path).splitlines())
 
     def taken_replaced(self) -> dict[str, Any]:
         """Node -> what the plan would replace on it, for the operator alone: it has the node's keys."""
@@ -368,10 +372,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, value: Mapping[str, object]) -> None:
-    """Replace a file in one rename, so that a reader finds the whole of it."""
+    replace_text(path, json.dumps(dict(value)))
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Replace a file in one rename, so that a reader finds the whole of it, or of the earlier one."""
     new = path.with_name(f".{path.name}.new")
     with new.open("w", encoding="utf-8") as file:
-        json.dump(dict(value), file)
+        file.write(text)
         file.flush()
         os.fsync(file.fileno())
     new.replace(path)

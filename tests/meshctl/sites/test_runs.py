@@ -12,7 +12,7 @@ import pytest
 from meshctl.archive import TarMember, tar_of
 from meshctl.errors import InputError
 from meshctl.fleet.process import process_of, this_process
-from meshctl.sites.runs import MAX_RUNS, PREPARED_S, SiteBusy, SiteDirectory, closing, write_json
+from meshctl.sites.runs import MAX_RUNS, PREPARED_S, SiteBusy, SiteDirectory, closing, replace_text, write_json
 
 _RUN = "0123456789abcdef"
 
@@ -110,6 +110,19 @@ def test_a_run_is_interrupted_once_its_processes_are_gone(site: SiteDirectory) -
     assert not run.inventory.exists()
     write_json(run.over, {"exit": 0})
     assert run.state().state == "over"
+
+
+def test_a_run_is_never_without_a_process_while_its_files_are_written(site: SiteDirectory) -> None:
+    run = site.run(_RUN)
+    run.path.mkdir(parents=True)
+    replace_text(run.process, f"{this_process()}\n")
+    with run.process.open() as reader:
+        replace_text(run.process, this_process().rpartition(":")[0] + ":0\n")
+        assert reader.read() == f"{this_process()}\n", "a reader found a part"
+    assert not run.is_alive()
+    # the runner names itself, too, whichever of both is written first
+    replace_text(run.processes, f"{this_process()}\n")
+    assert run.is_alive()
 
 
 def test_a_process_that_had_ended_before_it_was_named_is_not_alive(site: SiteDirectory) -> None:
