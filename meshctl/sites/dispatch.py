@@ -98,6 +98,8 @@ def prepare_sites(
             bundle = bundle_of(plan.site.name)
             saved = (agreed or {}).get(plan.site.name, "")
             plan.bundle = bundle
+            # a saved plan can wait at the hub; what of it applies is then found out at the site
+            can_wait = bool(saved) and plan.site.nats is not None and not bundle.images
             for attempt in range(PLAN_ATTEMPTS):
                 try:
                     plan.uplink = open_uplink(fleet, plan.site, access)
@@ -107,15 +109,16 @@ def prepare_sites(
                     )
                     break
                 except Unreachable:
-                    if plan.uplink is None and saved and plan.site.nats is not None and not bundle.images:
-                        plan.uplink, text = open_uplink(fleet, plan.site, access, must_answer=False), saved
-                        plan.is_queued = True
-                        break
                     # an uplink that comes and goes is tried again; one that is not there is reported at once
-                    if plan.uplink is None or attempt + 1 == PLAN_ATTEMPTS:
+                    is_last = plan.uplink is None or attempt + 1 == PLAN_ATTEMPTS
+                    if is_last and not can_wait:
                         raise
                     plan.close()
                     plan.run = new_run_id()
+                    if is_last:
+                        plan.uplink, text = open_uplink(fleet, plan.site, access, must_answer=False), saved
+                        plan.is_queued = True
+                        break
                     time.sleep(min(_FIRST_WAIT_S * 2**attempt, _LONGEST_WAIT_S))
             plan.text = saved or text
             plan.saved = load(text, f"the plan of site {plan.site.name}")
