@@ -32,19 +32,26 @@ FACTORY_ADDRESS = "192.168.1.1"
 @dataclass(frozen=True, slots=True)
 class BenchTarget:
     """Where one device answers. `node` is the name the operator gave, empty to identify it by MAC; `interface` the
-    local interface it is plugged into, empty where only one device has the address."""
+    local interface it is plugged into, empty where only one device has the address; `site` the one on whose gateway's
+    bench it is, empty for the operator's own."""
 
     host: str = FACTORY_ADDRESS
     port: int = 22
     node: str = ""
     interface: str = ""
+    site: str = ""
 
     @property
     def endpoint(self) -> Endpoint:
         return Endpoint(self.host, self.port, interface=self.interface)
 
+    @property
+    def label(self) -> str:
+        """Its address, and the site there: `192.168.1.1 at site north`."""
+        return f"{self.endpoint.label} at site {self.site}" if self.site else self.endpoint.label
+
     def __str__(self) -> str:
-        where = self.endpoint.label
+        where = self.label
         return f"{self.node} at {where}" if self.node else where
 
 
@@ -130,12 +137,13 @@ def discover(
     def identify_one(name: str) -> Outcome:
         target = by_name[name]
         host_key_policy = AcceptAnyKey()
-        connection = _connect(connections, renderer.fleet, target, host_key_policy)
+        connection = connect_to_bench(connections, target, host_key_policy)
         try:
             with lock:
                 identified = tuple(found)
             seen = observe_cleared(connection, _paths(renderer, target), signal)
             node = identify(renderer.fleet, seen, target.node, identified)
+            require_site(node, target)
             assert host_key_policy.key is not None
             old_pins = trust.pinned(node.name)
             _pin(trust, node.name, host_key_policy.key, replace_keys=replace_keys)
@@ -144,7 +152,8 @@ def discover(
             raise
         with lock:
             found[node.name] = FoundDevice(target, node, seen, host_key_policy.key, old_pins)
-            connections.on_bench.add(node.name)
+            if not target.site:
+                connections.on_bench.add(node.name)
             connections.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
             if target.interface:
                 connections.interfaces[node.name] = target.interface
@@ -155,20 +164,27 @@ def discover(
     return Discovered(found, tuple(outcome for outcome in ended.values() if not outcome.result.is_good))
 
 
-def _connect(
-    connections: ConnectionPool, fleet: Fleet, target: BenchTarget, host_key_policy: AcceptAnyKey
-) -> SshConnection:
+def connect_to_bench(connections: ConnectionPool, target: BenchTarget, host_key_policy: AcceptAnyKey) -> SshConnection:
     """Log in without a password, or with the fleet's keys where an earlier run was cut short."""
-    some = next(fleet.managed())
-    credentials = replace(connections.credentials(some), empty_password=True)
-    release = fleet.nodes[target.node].release if target.node else None
+    fleet = connections.fleet
+    node = fleet.nodes[target.node] if target.node else next(fleet.managed())
     return connect(
         target.endpoint,
-        credentials=credentials,
+        credentials=replace(connections.credentials(node), empty_password=True),
         trust=host_key_policy,
         deadlines=connections.deadlines,
-        release=release,
+        via=connections.gateway(fleet.sites[target.site]) if target.site else None,
+        release=node.release if target.node else None,
     )
+
+
+def require_site(node: Node, target: BenchTarget) -> None:
+    """The new address is reached the same way. Raises NodeError for a node of elsewhere."""
+    if target.site and node.site != target.site:
+        raise NodeError(
+            f"{node.name} is at site {target.site}, and in the inventory at {node.site or 'none'}",
+            hint=f"correct its `site` in the inventory, or bring it to {node.site or 'this computer'}",
+        )
 
 
 def _paths(renderer: Renderer, target: BenchTarget) -> tuple[str, ...]:

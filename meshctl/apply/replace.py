@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, connect_to_bench, require_site
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
-from meshctl.device.ssh import SshConnection, connect
+from meshctl.device.ssh import SshConnection
 from meshctl.device.trust import AcceptAnyKey, TrustStore
 from meshctl.errors import InputError, NodeError, Unreachable
 from meshctl.fleet import Interrupt
@@ -48,14 +48,8 @@ def adopt(
     """
     recorder = AcceptAnyKey()
     if target is not None:
-        credentials = replace(connections.credentials(old), empty_password=True)
-        connection = connect(
-            target.endpoint,
-            credentials=credentials,
-            trust=recorder,
-            deadlines=connections.deadlines,
-            release=old.release,
-        )
+        require_site(old, target)
+        connection = connect_to_bench(connections, target, recorder)
         key = recorder.key
     elif spare is not None:
         # checked against its own pin
@@ -72,7 +66,7 @@ def adopt(
         raise
     pins = trust.pinned(old.name)
     trust.replace(old.name, key)
-    if target is not None or (spare is not None and spare.name in connections.on_bench):
+    if (target is not None and not target.site) or (spare is not None and spare.name in connections.on_bench):
         connections.on_bench.add(old.name)
     connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import socket
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace as with_changes
@@ -23,6 +22,7 @@ from meshctl.apply.bootstrap import (
     restore_pins,
 )
 from meshctl.apply.replace import adopt, identity_edits, require_off, still_on, with_identity
+from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, with_site
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -55,24 +55,6 @@ Changes = tuple[FileEdit, ...]
 BENCH = "bench"
 NO_ANSWER_HINT = f"check that it has booted and that this machine has an address in the network of {FACTORY_ADDRESS}"
 
-At = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--at",
-        metavar="HOST",
-        help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order.",
-    ),
-]
-
-Interfaces = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--interface",
-        metavar="IF",
-        help="Interface with one factory-default device, e.g. eth1; one per NODE, in the same order.",
-    ),
-]
-
 
 def bootstrap(
     nodes: Annotated[
@@ -84,6 +66,7 @@ def bootstrap(
     limit: Limit = None,
     at: At = None,
     interface: Interfaces = None,
+    at_site: AtSite = "",
     inventory: InventoryPath = Path(),
     replace_key: Annotated[bool, typer.Option("--replace-key", "--replace", help="Accept a changed host key.")] = False,
     dry_run: DryRun = False,
@@ -98,10 +81,13 @@ def bootstrap(
     """Set up factory-default devices (192.168.1.1, root without password): identify, install keys, provision.
 
     Example: meshctl bootstrap b03 b04 --interface eth1 --interface eth2
+
+    Example: meshctl bootstrap b03 --at-site north
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _expected_places(opened, nodes or [], limit or [], _named_places(at or [], interface or []))
+        places = _expected_places(opened, nodes or [], limit or [], named_places(at or [], interface or [], at_site))
+        places = [with_site(opened.fleet, place, at_site) for place in places]
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
                 opened.renderer,
@@ -116,7 +102,7 @@ def bootstrap(
             _print_failure(outcome)
         if not as_json:
             for name, item in arrivals.found.items():
-                echo(f"{name}: found at {item.target.endpoint.label}, host key {item.key.fingerprint}")
+                echo(f"{name}: found at {item.target.label}, host key {item.key.fingerprint}")
         if not arrivals.found:
             raise typer.Exit(exit_for(arrivals.outcomes, opened.interrupt))
         prepared = plan_discovered(
@@ -152,22 +138,10 @@ def bootstrap(
 def _print_failure(outcome: Outcome) -> None:
     echo(f"{outcome_text(outcome)}", err=True)
     is_unreachable = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
-    hint = outcome.hint or (NO_ANSWER_HINT if is_unreachable else "")
+    is_here = not outcome.node.partition(" at site ")[1]
+    hint = outcome.hint or (NO_ANSWER_HINT if is_unreachable and is_here else "")
     if hint:
         echo(f"  hint: {hint}", err=True)
-
-
-def _named_places(at: list[str], interfaces: list[str]) -> list[BenchTarget]:
-    """The bench places given by --at or --interface."""
-    if at and interfaces:
-        raise InputError("expected --at or --interface, found both")
-    if doubles := sorted({name for name in interfaces if interfaces.count(name) > 1}):
-        raise InputError(f"--interface {doubles[0]} is given twice: expected one device per interface")
-    known = {name for _, name in socket.if_nameindex()}
-    for name in interfaces:
-        if name not in known:
-            raise InputError(f"--interface {name}: no such interface, found {', '.join(sorted(known))}")
-    return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
 
 
 def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
@@ -192,16 +166,6 @@ def _expected_places(opened: Session, words: list[str], limits: list[str], at: l
     return [with_changes(place, node=name) for place, name in zip(at, names, strict=True)]
 
 
-def _parse_place(text: str) -> BenchTarget:
-    """Parse `HOST`, `HOST:PORT` or `[IPv6]:PORT`; a bare IPv6 address has no port."""
-    host, colon, port = text.rpartition(":")
-    if not colon or (text.count(":") > 1 and not text.startswith("[")):
-        return BenchTarget(text)
-    if not port.isdecimal() or not 0 < int(port) < 65536:
-        raise InputError(f"--at {text}: expected HOST or HOST:PORT")
-    return BenchTarget(host.strip("[]"), int(port))
-
-
 def replace(
     old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.")],
     new: Annotated[str, typer.Argument(help="Spare node, or `bench` for a device that is not in the inventory.")],
@@ -211,6 +175,7 @@ def replace(
     interface: Annotated[
         str, typer.Option("--interface", metavar="IF", help="Interface with the factory-default device, e.g. eth1.")
     ] = "",
+    at_site: AtSite = "",
     inventory: InventoryPath = Path(),
     old_is_off: Annotated[
         bool, typer.Option("--old-is-off", help="Do not look whether the old device answers: its site is out of reach.")
@@ -233,8 +198,9 @@ def replace(
         spare = _spare(opened, old_node, new)
         if not old_is_off:
             _require_off(opened, inventory, old_node)
-        spots = _named_places([at] if at else [], [interface] if interface else []) or [BenchTarget()][: spare is None]
-        place = with_changes(spots[0], node=old_node.name) if spots else None
+        given = named_places([at] if at else [], [interface] if interface else [], at_site)
+        spots = given or [BenchTarget()][: spare is None or at_site != ""]
+        place = with_site(opened.fleet, with_changes(spots[0], node=old_node.name), at_site) if spots else None
         fleet = with_identity(opened.fleet, old_node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[old_node.name]
@@ -287,7 +253,7 @@ def replace(
 
 def _replacement_text(node: Node, spare: Node | None, new: str, found: FoundDevice | None) -> str:
     """`spare2, found at 192.168.1.1, becomes husky1-b03 (10.42.0.13): its name, address and role; ...`."""
-    there = f", found at {found.target.endpoint.label}," if found is not None else ""
+    there = f", found at {found.target.label}," if found is not None else ""
     who = spare.name if spare is not None else f"the device on the {new}"
     left = f"; {spare.name} is retired" if spare is not None else ""
     return f"{who}{there} becomes {node.name} ({node.address.ip}): its name, address and role{left}"

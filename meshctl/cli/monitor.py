@@ -22,7 +22,7 @@ from starlette.applications import Starlette
 
 from meshctl import __version__
 from meshctl.cli.context import AsJson, InventoryPath, KeyFiles, Lab
-from meshctl.cli.fleet_view import CONNECT_S, FleetView, NoRobots, Timeout, collect, open_fleet_view
+from meshctl.cli.fleet_view import CONNECT_S, Direct, FleetView, NoRobots, Timeout, collect, open_fleet_view
 from meshctl.cli.monitor_history import HistoryFile, history_path
 from meshctl.cli.monitor_web import WebOptions
 from meshctl.cli.output import echo, echo_json
@@ -119,6 +119,7 @@ def monitor(
     ] = None,
     inventory: InventoryPath = Path(),
     no_robots: NoRobots = False,
+    direct: Direct = False,
     timeout: Timeout = CONNECT_S,
     ask_sudo: AskSudo = False,
     as_json: AsJson = False,
@@ -155,7 +156,9 @@ def monitor(
     hook_settings = HookSettings(webhook, _words(hook), hook_level)
     with ExitStack() as stack:
         view = stack.enter_context(
-            open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, ask_sudo=ask_sudo, no_robots=no_robots)
+            open_fleet_view(
+                inventory, key=key, lab=lab, timeout=timeout, ask_sudo=ask_sudo, no_robots=no_robots, direct=direct
+            )
         )
         history = stack.enter_context(_open_history(view, store, keep_days, max_mb))
         history.claim()
@@ -254,7 +257,7 @@ def sampler_of(view: FleetView, history: FrameStore, interval_s: float) -> Frame
         view.nodes,
         view.robots,
         interval_s=interval_s,
-        traffic=view.opened.access.meter.totals,
+        traffic=view.collector.traffic,
         topic_classes={topic.name: topic.topic_class.value for topic in view.fleet.topics},
     )
 

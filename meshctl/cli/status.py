@@ -121,7 +121,8 @@ class _StatusQuery:
         """What the nodes say, for the operator that asked a site's worker."""
         from meshctl.status.site_observer import answers_json
 
-        return answers_json(self._fleet_view.collector.answers(self._nodes), time.time())
+        collector = self._fleet_view.collector
+        return answers_json(collector.answers(self._nodes), time.time(), collector.traffic())
 
     def status(self, snapshot: Snapshot, now: float) -> FleetStatus:
         """The status of the selected devices, with ages as of `now`."""

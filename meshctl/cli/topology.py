@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Limit, Nodes, selected_nodes
-from meshctl.cli.fleet_view import CONNECT_S, Timeout, collect, open_fleet_view
+from meshctl.cli.fleet_view import CONNECT_S, Direct, Timeout, collect, open_fleet_view
 from meshctl.cli.output import echo
 from meshctl.errors import ExitCode, InputError
 from meshctl.inventory.suggest import did_you_mean
@@ -37,6 +37,7 @@ def topology(
     mesh: Annotated[str, typer.Option("--mesh", help="Mesh to show if the fleet has several.")] = "",
     form: Annotated[TopologyFormat, typer.Option("--format", "-f", help="Output format.")] = TopologyFormat.TREE,
     inventory: InventoryPath = Path(),
+    direct: Direct = False,
     timeout: Timeout = CONNECT_S,
     as_json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,
     key: KeyFiles = None,
@@ -50,7 +51,7 @@ def topology(
 
     Example: meshctl topology --format dot | dot -Tsvg > mesh.svg
     """
-    with open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, no_robots=True) as fleet_view:
+    with open_fleet_view(inventory, key=key, lab=lab, timeout=timeout, no_robots=True, direct=direct) as fleet_view:
         fleet = fleet_view.fleet
         if mesh and mesh not in fleet.meshes:
             hint = did_you_mean(mesh, fleet.meshes) or f"its meshes are {', '.join(fleet.meshes)}"

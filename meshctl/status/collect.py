@@ -10,6 +10,7 @@ import queue
 import secrets
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,7 @@ from meshctl.model import Fleet, Node
 from meshctl.nodes.collect import facts_of, fleet_graph, known_macs, reports_of
 from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.desired import Renderer
+from meshctl.nodes.site_gateways import PIN_PREFIX
 from meshctl.plan import DesiredState, NodePlan, node_plan
 from meshctl.plan.masking import Fingerprints
 from meshctl.robots.connection import RobotConnector
@@ -148,6 +150,14 @@ class Collector:
             previous=dict(self._previous),
             took_s=self.clock() - began,
         )
+
+    def traffic(self) -> dict[str, int]:
+        """Bytes to and from each device so far, also those that workers exchanged with nodes; no gateway is one, since
+        uplinks are not on the air of the mesh."""
+        total = Counter(self.access.meter.totals())
+        if self.sites is not None:
+            total.update(self.sites.traffic())
+        return {device: count for device, count in total.items() if not device.startswith(PIN_PREFIX)}
 
     def _note(self, observations: Mapping[str, Observation]) -> None:
         for name, seen in observations.items():

@@ -17,6 +17,7 @@ from typing import Any
 
 from meshctl.device.observation import Observation
 from meshctl.device.observe import RawObservation
+from meshctl.device.traffic import TrafficMeter
 from meshctl.errors import MeshctlError, NodeError, Unreachable
 from meshctl.model import Fleet, Node, Site
 from meshctl.nodes.connections import ConnectionPool
@@ -33,9 +34,12 @@ PERIOD_S = 30.0
 MAX_OUTPUT_BYTES = 16 << 20
 
 
-def answers_json(answers: Mapping[str, RawObservation | NoAnswer], now_s: float) -> dict[str, object]:
-    """Answers as JSON; `now_s` by the clock that the answers' times are of."""
-    return {"now_s": now_s, "answers": {name: _as_object(answer) for name, answer in answers.items()}}
+def answers_json(
+    answers: Mapping[str, RawObservation | NoAnswer], now_s: float, sent: Mapping[str, int]
+) -> dict[str, object]:
+    """Answers as JSON; `now_s` by the clock that the answers' times are of, `sent` the bytes to and from each node."""
+    said = {name: _as_object(answer) for name, answer in answers.items()}
+    return {"now_s": now_s, "answers": said, "sent_bytes": dict(sent)}
 
 
 def _as_object(answer: RawObservation | NoAnswer) -> dict[str, object]:
@@ -49,12 +53,21 @@ def _as_object(answer: RawObservation | NoAnswer) -> dict[str, object]:
     }
 
 
-def parse_answers(text: str, now_s: float) -> dict[str, Observation | NoAnswer]:
+@dataclass(frozen=True, slots=True)
+class SiteAnswers:
+    """What a worker was told: each node's answer, and how many bytes went to and came from each device there."""
+
+    answers: dict[str, Observation | NoAnswer]
+    sent_bytes: dict[str, int]
+
+
+def parse_answers(text: str, now_s: float) -> SiteAnswers:
     """The answers in what a worker printed, with times by our own clock, which shows `now_s`. Raises ValueError."""
     try:
         document = json.loads(text)
         ahead_s = float(document["now_s"]) - now_s
-        return {str(name): _parsed(said, ahead_s) for name, said in document["answers"].items()}
+        answers = {str(name): _parsed(said, ahead_s) for name, said in document["answers"].items()}
+        return SiteAnswers(answers, {str(name): int(count) for name, count in document["sent_bytes"].items()})
     except (AttributeError, KeyError, TypeError, zlib.error) as error:
         raise ValueError(f"not the answers of nodes: {type(error).__name__}: {error}") from error
 
@@ -92,6 +105,7 @@ class SiteObserver:
     _answers: dict[str, _Answers] = field(default_factory=dict, repr=False)
     _parts: dict[str, bytes] = field(default_factory=dict, repr=False)
     _uplinks: dict[str, Uplink] = field(default_factory=dict, repr=False)
+    _meter: TrafficMeter = field(default_factory=TrafficMeter, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def site_of(self, node: Node) -> str:
@@ -109,13 +123,19 @@ class SiteObserver:
         try:
             text = self._uplink(site).status(new_run_id(), self._part(site), asked, OPTIONS)
             found = parse_answers(text, self.clock())
-            self._answers[name] = _Answers(asked, now_s, found)
-            return found
+            for device, count in found.sent_bytes.items():
+                self._meter.add(device, count)
+            self._answers[name] = _Answers(asked, now_s, found.answers)
+            return found.answers
         except ValueError as error:
             raise _of_site(WorkerError(f"site {name}: its worker's answer is unusable: {error}"), name) from error
         except MeshctlError as error:
             self._drop(name)
             raise _of_site(error, name) from error
+
+    def traffic(self) -> dict[str, int]:
+        """Bytes that the workers exchanged with each device for us."""
+        return self._meter.totals()
 
     def _part(self, site: Site) -> bytes:
         with self._lock:

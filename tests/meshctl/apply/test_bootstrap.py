@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 import pytest
 
-from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, identify, restore_pins
+from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, identify, require_site, restore_pins
 from meshctl.apply.replace import identity_edits
 from meshctl.device.observation import BoardInfo, Observation
 from meshctl.device.trust import HostKey, TrustStore
@@ -53,6 +53,16 @@ def test_a_device_with_the_wrong_mac_is_rejected_even_if_named_by_the_operator()
 def test_the_same_node_at_two_addresses_is_rejected() -> None:
     with pytest.raises(NodeError, match="already found at another address"):
         identify(labelled(), device(MAC), "", identified=["b01"])
+
+
+def test_a_device_on_the_bench_of_a_site_must_be_of_that_site() -> None:
+    b01 = replace(fleet().nodes["b01"], site="north")
+    require_site(b01, BenchTarget(site="north"))
+    require_site(b01, BenchTarget())
+    for node, where in ((b01, "north"), (fleet().nodes["b01"], "none")):
+        with pytest.raises(NodeError, match=f"b01 is at site south, and in the inventory at {where}"):
+            require_site(node, BenchTarget(site="south"))
+    assert str(BenchTarget(node="b01", site="north")) == "b01 at 192.168.1.1 at site north"
 
 
 def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:

@@ -12,7 +12,9 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+import urllib.request
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +29,8 @@ from tests.waiting import until
 # Far above what any command needs on a busy machine; a hang ends here.
 LIMIT_S = 300.0
 NORTH, SOUTH = ("n-base", "n1", "n2"), ("s-base",)
+# it is set up on the bench of its site's gateway
+AT_SITE = "n2"
 SECRETS = {"north": "a-secret-of-the-north", "south": "a-secret-of-the-south"}
 INVENTORY = (
     """\
@@ -172,6 +176,18 @@ class FleetRig:
         self._count += 1
         return Started(self, words, self._count)
 
+    @contextmanager
+    def monitoring(self) -> Iterator[Callable[[str], Any]]:
+        """`meshctl monitor` runs and has a frame; what its page reads at a place below `/api/`."""
+        started = self.start("monitor", "--port", "0", "--interval", "1", "--json")
+        try:
+            started.wait_for('"event": "verdict"')
+            url = json.loads(started.out.read_text().splitlines()[0])["url"]
+            yield lambda place: _get(f"{url}api/{place}")
+        finally:
+            started.signal(signal.SIGTERM)
+            started.end()
+
     def change_power(self) -> int:
         """Let the next provision change every node; returns the new drive level."""
         text = self.inventory.read_text()
@@ -207,7 +223,8 @@ class FleetRig:
 
 
 class SitesRig(FleetRig):
-    """The nodes are bootstrapped, the workers installed over SSH and accepted by the nodes."""
+    """The nodes are bootstrapped, one of them on the gateway's bench; the workers are installed over SSH, and the nodes
+    accept them."""
 
     def __init__(self, directory: Path) -> None:
         super().__init__(directory)
@@ -225,9 +242,17 @@ class SitesRig(FleetRig):
         ports = {site: uplink.port for site, uplink in self.uplinks.items()}
         key = public(self.key).read_text().strip()
         self.start_lab(INVENTORY.format(key=key, private=self.key, secrets=secrets, **ports))
-        self.run("bootstrap", *NORTH, *SOUTH, "--yes", "--json", expected=0)
-        self.run("lab", "unplug", expected=0)
+        here = [node for node in (*NORTH, *SOUTH) if node != AT_SITE]
+        self.run("bootstrap", *here, "--yes", "--json", expected=0)
+        self.run("lab", "unplug", "n1", expected=0)
         self.run("sites", "trust", "--yes", expected=0)
+        self.uplinks["north"].cut()
+        lost = self.run("bootstrap", AT_SITE, "--at-site", "north", "--yes")
+        assert (lost.code, "hint: check the uplink of north" in lost.err) == (3, True), lost
+        self.uplinks["north"].mend()
+        done = self.run("bootstrap", AT_SITE, "--at-site", "north", "--yes", expected=0)
+        assert re.search(f"{AT_SITE}: found at .* at site north", done.out)
+        self.run("lab", "unplug", expected=0)
         self.run("sites", "install", "--wheels", str(required_wheels(self.directory / "wheels")), expected=0)
         self.run("provision", "--direct", "--yes", "--json", expected=0)
 
@@ -244,6 +269,11 @@ class SitesRig(FleetRig):
         for uplink in self.uplinks.values():
             uplink.close()
         self.sshd.stop()
+
+
+def _get(url: str) -> Any:
+    with urllib.request.urlopen(url, timeout=LIMIT_S) as answer:
+        return json.load(answer)
 
 
 def _is_worker(status: Path) -> bool:

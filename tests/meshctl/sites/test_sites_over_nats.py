@@ -11,6 +11,7 @@ import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,6 +43,14 @@ def _reasons(ended: Ended) -> set[str]:
     return {event["outcome"]["reason"] for event in ended.events if event["event"] == "finished"}
 
 
+def _health(status: dict[str, Any]) -> dict[str, str]:
+    return {node["name"]: node["health"] for node in status["nodes"]}
+
+
+def _site_alarms(frame: dict[str, Any]) -> list[dict[str, Any]]:
+    return [alarm for alarm in frame["status"]["alarms"] if alarm["code"] == "site"]
+
+
 def test_sites_change_over_nats_and_its_servers_get_no_secret(rig: NatsRig) -> None:
     power_dbm = rig.change_power()
     done = rig.run(*_PROVISION, expected=0)
@@ -63,27 +72,36 @@ def test_status_and_monitor_see_the_nodes_through_their_workers(rig: NatsRig, mo
     assert all(node["drift"] == [] for node in status["nodes"])
     assert {node["name"]: node["hops"] for node in status["nodes"]}["n1"] == 1
     assert rig.run("status", "n1", "--only", "--json").code == 0
-    rig.uplinks["south"].cut()
-    until(lambda: rig.run("sites", "status", "south").code, "the site to be offline", wait_s=60)
-    seen = json.loads(rig.run("monitor", "--once", "--json").out)
-    found = {alarm["code"]: alarm["text"] for alarm in seen["status"]["alarms"]}
-    no_contact = r"no contact with site south .*: the last known state of its node s-base is \d+ s old"
-    assert re.search(no_contact, found["site"])
-    nodes = {node["name"]: node for node in seen["status"]["nodes"]}
-    assert {name: node["health"] for name, node in nodes.items()} == {
-        **dict.fromkeys(NORTH, "ok"),
-        "s-base": "unreachable",
-    }
-    assert nodes["s-base"]["alarms"][0]["text"].startswith("site south ")
-    # what needs a login there says what to do instead
-    backup = rig.run("backup", "n1", "--out", str(rig.directory / "backups"))
-    assert backup.code == 3
-    assert "site north is reached over NATS only" in backup.out
-    spare = rig.run("replace", "s-base", "bench", "--at", "127.0.0.1:1", "--yes")
-    assert "whether s-base is off is not known" in spare.err
-    assert "pass --old-is-off" in spare.err
-    alive = rig.run("replace", "n1", "bench", "--at", "127.0.0.1:1", "--yes")
-    assert "n1 still answers at site north" in alive.err
+    drawn = json.loads(rig.run("topology", "--json", expected=0).out)
+    assert {node["name"]: node["hops"] for node in drawn["nodes"]} == dict(zip(_EVERY, (0, 1, 1, 0), strict=True))
+    of_north = json.loads(rig.run("topology", "site:north", "--mesh", "north", "--json", expected=0).out)
+    assert {node["name"] for node in of_north["nodes"]} == set(NORTH)
+    assert rig.run("topology", "--direct", "--timeout", "1", "--json").code == 3
+    ready = json.loads(rig.run("preflight", "--json", expected=0).out)
+    assert (ready["go"], ready["verdict"]) == (True, "GO")
+    with rig.monitoring() as page:
+        assert _health(page("frame")["status"]) == dict.fromkeys(_EVERY, "ok")
+        assert any(frame["airtime"]["bytes_per_s"] > 0 for frame in page("frames"))
+        rig.uplinks["south"].cut()
+        until(lambda: _site_alarms(page("frame")), "the alarm of the site", wait_s=120)
+        status = page("frame")["status"]
+        (alarm,) = _site_alarms(page("frame"))
+        no_contact = r"no contact with site south .*: the last known state of its node s-base is \d+ s old"
+        assert re.search(no_contact, alarm["text"])
+        assert _health(status) == {**dict.fromkeys(NORTH, "ok"), "s-base": "unreachable"}
+        nodes = {node["name"]: node for node in status["nodes"]}
+        assert nodes["s-base"]["alarms"][0]["text"].startswith("site south ")
+        # what needs a login there says what to do instead
+        backup = rig.run("backup", "n1", "--out", str(rig.directory / "backups"))
+        assert backup.code == 3
+        assert "site north is reached over NATS only" in backup.out
+        spare = rig.run("replace", "s-base", "bench", "--at", "127.0.0.1:1", "--yes")
+        assert "whether s-base is off is not known" in spare.err
+        assert "pass --old-is-off" in spare.err
+        alive = rig.run("replace", "n1", "bench", "--at", "127.0.0.1:1", "--yes")
+        assert "n1 still answers at site north" in alive.err
+        rig.uplinks["south"].mend()
+        until(lambda: not _site_alarms(page("frame")), "the site to answer again", wait_s=120)
 
 
 def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path) -> None:

@@ -14,13 +14,16 @@ from typing import Any, cast
 import pytest
 
 from meshctl.device.observe import RawObservation
+from meshctl.device.traffic import TrafficMeter
 from meshctl.errors import NodeError, Unreachable
-from meshctl.fleet.journal import LastKnown
+from meshctl.fleet.journal import Journal, LastKnown
 from meshctl.inventory import load_fleet
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.nodes.desired import Renderer
 from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Uplink
 from meshctl.status.assess import Snapshot, assess
+from meshctl.status.collect import Collector
 from meshctl.status.site_observer import MAX_OUTPUT_BYTES, PERIOD_S, SiteObserver, answers_json, parse_answers
 from meshctl.status.values import Level, NoAnswer
 from meshctl.topology import Graph
@@ -31,10 +34,15 @@ _ANSWERS: dict[str, RawObservation | NoAnswer] = {
     "n1": RawObservation("n", _SAID, 100.0, 101.5),
     "n2": NoAnswer("silent", "unreachable", "look"),
 }
+_ONE_ANSWER = (
+    '{"now_s": 1, "sent_bytes": {}, '
+    '"answers": {"n1": {"nonce": "n", "output": "%s", "asked_at_s": 1, "answered_at_s": 1}}}'
+)
+_SENT_BYTES = {"n1": 40_000, "n2": 60}
 
 
 def test_answers_keep_their_age_although_the_clocks_of_both_sides_differ() -> None:
-    found = parse_answers(json.dumps(answers_json(_ANSWERS, 110.0)), 5000.0)
+    found = parse_answers(json.dumps(answers_json(_ANSWERS, 110.0, {})), 5000.0).answers
     assert found["n2"] == _ANSWERS["n2"]
     assert found["n1"] == RawObservation("n", _SAID, 4990.0, 4991.5).interpret()
 
@@ -45,9 +53,11 @@ def test_answers_keep_their_age_although_the_clocks_of_both_sides_differ() -> No
         "",
         "[]",
         '{"now_s": 1}',
-        '{"now_s": 1, "answers": {"n1": {}}}',
-        '{"now_s": 1, "answers": {"n1": {"nonce": "n", "output": "AAAA", "asked_at_s": 1, "answered_at_s": 1}}}',
-        '{"now_s": 1, "answers": {"n1": {"nonce": "n", "output": "-", "asked_at_s": 1, "answered_at_s": 1}}}',
+        '{"now_s": 1, "answers": {}, "sent_bytes": {"n1": []}}',
+        '{"now_s": 1, "answers": {}}',
+        '{"now_s": 1, "sent_bytes": {}, "answers": {"n1": {}}}',
+        _ONE_ANSWER % "AAAA",
+        _ONE_ANSWER % "-",
     ],
 )
 def test_what_is_not_answers_is_refused(text: str) -> None:
@@ -59,7 +69,7 @@ def test_an_answer_that_inflates_without_end_is_refused() -> None:
     output = base64.b64encode(zlib.compress(bytes(MAX_OUTPUT_BYTES + 1))).decode()
     said = {"nonce": "n", "output": output, "asked_at_s": 1, "answered_at_s": 1}
     with pytest.raises(ValueError, match="more than 16 MiB"):
-        parse_answers(json.dumps({"now_s": 1, "answers": {"n1": said}}), 0.0)
+        parse_answers(json.dumps({"now_s": 1, "answers": {"n1": said}, "sent_bytes": {}}), 0.0)
 
 
 class Workers:
@@ -70,7 +80,7 @@ class Workers:
         self.now_s = 0.0
         self.opened = self.asked = self.closed = 0
         self.error: Exception | None = None
-        self.text = json.dumps(answers_json(_ANSWERS, 110.0))
+        self.text = json.dumps(answers_json(_ANSWERS, 110.0, _SENT_BYTES))
         fleet = load_fleet(directory, environ={})
         self.observer = SiteObserver(
             fleet, cast("ConnectionPool", None), lambda site: b"", lambda: 110.0, lambda: self.now_s, self._open
@@ -146,6 +156,20 @@ def test_a_worker_is_asked_once_in_a_while_over_one_uplink(workers: Workers) -> 
     assert (workers.asked, workers.opened) == (3, 1)
     workers.observer.close()
     assert workers.closed == 1
+
+
+def test_bytes_on_the_air_of_a_site_are_counted_and_those_of_its_uplink_are_not(workers: Workers) -> None:
+    meter = TrafficMeter()
+    collector = Collector(
+        workers.observer.fleet, cast("Renderer", None), cast("ConnectionPool", SimpleNamespace(meter=meter)),
+        cast("Journal", None), "laptop", sites=workers.observer,
+    )  # fmt: skip
+    meter.add("own", 500)
+    meter.add("site.north", 9_000)
+    for _ in range(2):
+        workers.observe()
+        workers.now_s += PERIOD_S
+    assert collector.traffic() == {"own": 500, "n1": 80_000, "n2": 120}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,76 @@
+"""Where devices are on a bench: the options `--at`, `--interface` and `--at-site`."""
+
+from __future__ import annotations
+
+import socket
+from dataclasses import replace
+from typing import Annotated
+
+import typer
+
+from meshctl.apply.bootstrap import BenchTarget
+from meshctl.errors import InputError
+from meshctl.inventory.suggest import did_you_mean
+from meshctl.model import Fleet
+
+At = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--at",
+        metavar="HOST",
+        help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order.",
+    ),
+]
+
+Interfaces = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--interface",
+        metavar="IF",
+        help="Interface with one factory-default device, e.g. eth1; one per NODE, in the same order.",
+    ),
+]
+
+AtSite = Annotated[
+    str,
+    typer.Option(
+        "--at-site", metavar="SITE", help="The devices are on the bench of this site's gateway, not on your own."
+    ),
+]
+
+
+def with_site(fleet: Fleet, place: BenchTarget, site: str) -> BenchTarget:
+    """This place on the bench of a site's gateway, if there is a site. Raises InputError."""
+    if not site:
+        return place
+    if site not in fleet.sites:
+        hint = did_you_mean(site, fleet.sites) or f"its sites are {', '.join(fleet.sites) or 'none'}"
+        raise InputError(f"--at-site {site}: {fleet.name} has no such site", hint=hint)
+    if not fleet.sites[site].has_gateway:
+        raise InputError(f"--at-site {site}: the site has no login", hint=f"set sites.{site}.ssh.host")
+    return replace(place, site=site)
+
+
+def named_places(at: list[str], interfaces: list[str], site: str) -> list[BenchTarget]:
+    """The bench places given by --at or --interface."""
+    if interfaces and site:
+        raise InputError("--interface is one of this computer, and --at-site says that the device is elsewhere")
+    if at and interfaces:
+        raise InputError("expected --at or --interface, found both")
+    if doubles := sorted({name for name in interfaces if interfaces.count(name) > 1}):
+        raise InputError(f"--interface {doubles[0]} is given twice: expected one device per interface")
+    known = {name for _, name in socket.if_nameindex()}
+    for name in interfaces:
+        if name not in known:
+            raise InputError(f"--interface {name}: no such interface, found {', '.join(sorted(known))}")
+    return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
+
+
+def _parse_place(text: str) -> BenchTarget:
+    """Parse `HOST`, `HOST:PORT` or `[IPv6]:PORT`; a bare IPv6 address has no port."""
+    host, colon, port = text.rpartition(":")
+    if not colon or (text.count(":") > 1 and not text.startswith("[")):
+        return BenchTarget(text)
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise InputError(f"--at {text}: expected HOST or HOST:PORT")
+    return BenchTarget(host.strip("[]"), int(port))
