@@ -127,7 +127,7 @@ def _reserved(path: tuple[str, ...], address: IpInterface) -> Iterator[Finding]:
     ends = (0, host_mask) if address.version == 4 else (0,)
     if host_bits >= 2 and int(address.ip) & host_mask in ends:
         network = address.network
-        expected = f"an address between {network.network_address} and {network.broadcast_address}"
+        expected = f"one of {network.network_address + 1} to {network.broadcast_address - 1}"
         yield Finding(path, "not a host address", expected, str(address.ip))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
@@ -112,14 +112,27 @@ def order_turned(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for topic in fleet.topics
         if topic.topic_class in _ORDER[1:] and not (topic.topic_class in _BULK and topic.priority <= commands)
     ]
-    latest: Topic | None = None
-    for topic in sorted(ranked, key=lambda topic: (_ORDER.index(topic.topic_class), topic.priority)):
-        if latest is not None and topic.topic_class is not latest.topic_class and topic.priority < latest.priority:
-            message = f"{topic.topic_class.value} precedes {latest.name} ({latest.topic_class.value})"
-            expected = f"more than {latest.priority}"
-            yield Finding(_path(topic, "priority"), message, expected, str(topic.priority))
-        if latest is None or topic.priority > latest.priority:
-            latest = topic
+    ranked.sort(key=lambda topic: (_ORDER.index(topic.topic_class), topic.priority))
+    # one topic at the wrong level turns its order with all others: the one with most of them is reported
+    while ranked:
+        topic = max(reversed(ranked), key=lambda each: len(_turned(each, ranked)))
+        others = _turned(topic, ranked)
+        if not others:
+            return
+        ranked.remove(topic)
+        is_early = topic.priority < others[0].priority
+        other = (max if is_early else min)(others, key=lambda each: each.priority)
+        word, expected = ("precedes", "more than") if is_early else ("follows", "less than")
+        message = f"{topic.topic_class.value} {word} {other.name} ({other.topic_class.value})"
+        yield Finding(_path(topic, "priority"), message, f"{expected} {other.priority}", str(topic.priority))
+
+
+def _turned(topic: Topic, others: Iterable[Topic]) -> list[Topic]:
+    """Those before or after which `topic` comes, although its class should not."""
+    rank = _ORDER.index(topic.topic_class)
+    return [
+        other for other in others if (rank - _ORDER.index(other.topic_class)) * (topic.priority - other.priority) < 0
+    ]
 
 
 @fleet_rule(

@@ -466,3 +466,17 @@ def test_a_public_key_in_place_of_a_private_one_is_found_by_its_content(name: st
     public = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f ada\n"
     example = Example(f"nodes: {{base: {{ssh: {{key_files: [{name}]}}}}}}", files={name: public})
     assert _codes(example, tmp_path) == ["MC433"]
+
+
+def test_the_one_topic_at_a_wrong_level_is_reported_and_not_those_around_it(tmp_path: Path) -> None:
+    others = "telemetry: {priority: 4}, maps: {class: map, priority: 6}, cameras: {class: video, priority: 8}"
+    found = _found(f"topics: {{artifacts: {{priority: 12}}, {others}}}", tmp_path)
+    (finding,) = [item for item in found if item.code == "MC704"]
+    assert (finding.path, finding.message, finding.expected) == (
+        "topics.artifacts.priority", "artifact follows telemetry (telemetry)", "less than 4"
+    )  # fmt: skip
+
+
+def test_the_range_of_host_addresses_has_none_that_is_refused(tmp_path: Path) -> None:
+    (finding,) = [item for item in _found("nodes: {b01: {address: 10.42.0.255}}", tmp_path) if item.code == "MC203"]
+    assert finding.expected == "one of 10.42.0.1 to 10.42.0.254"
