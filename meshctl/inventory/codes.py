@@ -25,6 +25,7 @@ GROUP_CYCLE = "INV033"
 UNKNOWN_HARDWARE = "INV034"
 UNKNOWN_RADIO = "INV035"
 BAD_ADDRESS = "INV036"
+UNKNOWN_MESH = "INV037"
 CSV_TABLE = "INV040"
 TOO_MANY_ERRORS = "INV099"
 
@@ -54,6 +55,7 @@ MEANINGS = {
     UNKNOWN_HARDWARE: "A node's hardware is not defined.",
     UNKNOWN_RADIO: "A node sets a radio that its hardware does not have.",
     BAD_ADDRESS: "A node's address cannot be determined.",
+    UNKNOWN_MESH: "A radio joins a mesh that is not defined; lint reports it as MC101.",
     CSV_TABLE: "A CSV table for `meshctl inventory import` has a wrong heading, value or node.",
     TOO_MANY_ERRORS: "Too many errors: the rest is not reported.",
 }

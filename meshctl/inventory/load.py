@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from meshctl.diagnostics import Diagnostic, InvalidInput, sorted_diagnostics
+from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity, sorted_diagnostics
 from meshctl.inventory.build import build
+from meshctl.inventory.codes import UNKNOWN_MESH
 from meshctl.inventory.include import read_files
 from meshctl.inventory.layers import resolve_layers
 from meshctl.inventory.source import Reader, read_bytes
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.validate import validate
 from meshctl.model import Fleet
 
@@ -49,8 +51,25 @@ def load(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON, read: Reader =
 
 
 def load_fleet(path: Path, *, environ: Mapping[str, str] = _NO_ENVIRON) -> Fleet:
-    """Load the fleet. Raises InvalidInput with all diagnostics if there are any."""
+    """Load the fleet. Raises InvalidInput with all diagnostics if there are any, and for radios of unknown meshes: lint
+    reports those beside all else (MC101), and no other command can go on."""
     loaded = load(path, environ=environ)
     if loaded.fleet is None:
         raise InvalidInput(loaded.diagnostics)
+    if unknown := _unknown_meshes(loaded.fleet):
+        raise InvalidInput(sorted_diagnostics(unknown))
     return loaded.fleet
+
+
+def _unknown_meshes(fleet: Fleet) -> list[Diagnostic]:
+    """One diagnostic for each place that names a mesh which is not there."""
+    found: dict[Position, Diagnostic] = {}
+    for node in fleet.nodes.values():
+        for radio in node.radios:
+            if radio.mesh is not None and radio.mesh not in fleet.meshes:
+                path = ("nodes", node.name, "radios", radio.name, "mesh")
+                where, message = fleet.where(*path).position, f"unknown mesh {radio.mesh!r}"
+                hint = did_you_mean(radio.mesh, fleet.meshes) or f"its meshes are {', '.join(fleet.meshes) or 'none'}"
+                known = Diagnostic(UNKNOWN_MESH, Severity.ERROR, where, message, ".".join(path), hint=hint)
+                found.setdefault(where, known)
+    return list(found.values())

@@ -237,3 +237,18 @@ def test_loading_twice_gives_the_same_fleet(tmp_path: Path) -> None:
     first, second = fleet_of(tmp_path, text), fleet_of(tmp_path, text)
     assert first.nodes == second.nodes
     assert dict(first.provenance) == dict(second.provenance)
+
+
+def test_a_radio_of_an_unknown_mesh_is_refused_where_it_is_named_and_left_to_lint(tmp_path: Path) -> None:
+    loaded = load_text(
+        tmp_path,
+        HEAD + "groups:\n  g: {hardware: rocket, radios: {radio0: {mesh: mian}}}\n"
+        "nodes: {'b[1-3]': {groups: [g], address: {from: 10.42.0.1}}}\n",
+    )
+    assert loaded.fleet is not None, "lint has a fleet to check"
+    with pytest.raises(InvalidInput) as caught:
+        load_fleet(tmp_path)
+    (found,) = caught.value.diagnostics
+    line = (tmp_path / "fleet.yaml").read_text().splitlines()[found.position.line - 1]
+    assert (found.code, found.message, found.hint) == ("INV037", "unknown mesh 'mian'", "did you mean 'main'?")
+    assert "mesh: mian" in line
