@@ -55,7 +55,7 @@ def _as_object(answer: RawObservation | NoAnswer) -> dict[str, object]:
 
 @dataclass(frozen=True, slots=True)
 class SiteAnswers:
-    """What a worker was told: each node's answer, and how many bytes went to and came from each device there."""
+    """What a worker passes on: each node's answer, and how many bytes went to and came from each device there."""
 
     answers: dict[str, Observation | NoAnswer]
     sent_bytes: dict[str, int]
