@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.sites.runs import SiteDirectory, closing
 from tests.meshctl.sites.rig import NORTH, SECRETS, SOUTH, SitesRig
 from tests.waiting import until
 
@@ -111,15 +112,18 @@ def _text(path: Path) -> str | None:
 
 def test_a_site_continues_while_its_uplink_is_cut_and_takes_no_second_run(rig: SitesRig) -> None:
     rig.change_power()
-    first = rig.start(*_PROVISION)
-    first.wait_for(_AT_WORK)
-    second = rig.run("provision", *NORTH, "--yes", "--json")
+    holder = {"run": "0123456789abcdef", "operator": "ann@laptop", "command": "provision"}
+    with closing(SiteDirectory(rig.site_directory("north")).lock(holder)):
+        second = rig.run("provision", *NORTH, "--yes", "--json")
     reasons = [event["outcome"]["reason"] for event in second.events if event["event"] == "finished"]
     assert second.code == 1
     assert len(reasons) == len(NORTH)
-    assert all("is in progress at this site" in reason for reason in reasons), second
-    run = rig.started_run("north")
+    busy = "run 0123456789abcdef of ann@laptop (provision) is in progress at this site"
+    assert all(busy in reason for reason in reasons), second
+    first = rig.start(*_PROVISION)
+    first.wait_for(_AT_WORK)
     rig.uplinks["north"].cut()
+    run = rig.started_run("north")
     first.wait_for("connecting again, the site continues on its own")
     until(lambda: (run / "over.json").exists(), "the end of the run at the site", wait_s=120)
     rig.uplinks["north"].mend()
