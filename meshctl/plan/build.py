@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from meshctl.model import Fleet
 from meshctl.plan.cell import LEAVES_MESH
+from meshctl.plan.independent import independent_meshes
 from meshctl.plan.order import MeshContext, stages_of, stages_together
 from meshctl.plan.switch import MeshSwitches, switches
 from meshctl.plan.values import Cut, NodePlan, Plan, Stage, StageKind, Verdict
@@ -37,9 +38,8 @@ def fleet_plan(
     """
     entries = (entry,) if entry else tuple(fleet.bases_of(plans))
     found = switches(fleet, plans, unchanged=unchanged, acknowledged=leave_behind, never_meshed=never_meshed)
-    surroundings = MeshContext(
-        graph, entries, fleet.apply, MappingProxyType({node.name: node.robot for node in fleet.nodes.values()})
-    )
+    robots = {node.name: node.robot for node in fleet.nodes.values()}
+    surroundings = MeshContext(graph, entries, fleet.apply, robots, independent_meshes(fleet, graph, entries))
     todo = [plan for plan in plans.values() if plan.verdict is Verdict.CHANGE]
     in_order = stages_of(todo, surroundings, found.nodes)
     at_once = stages_together(todo, surroundings, found.nodes)
@@ -61,11 +61,13 @@ def fleet_plan(
         and plans[name].splits
         and not any(name in nodes for nodes in found.nodes.values())
     ]
+    cuts = graph.cut_off_by_any(entries)
     notes += [
-        f"stage {number}: {stage.nodes[0]} is a cut vertex: {', '.join(stage.cuts_off)} "
-        f"{_cut_off_for(plans[stage.nodes[0]])}"
+        f"stage {number}: {name} is a cut vertex: {', '.join(cuts[name])} {_cut_off_for(plans[name])}"
         for number, stage in enumerate(stages, 1)
         if stage.cuts_off and stage.kind is not StageKind.LAST
+        for name in stage.nodes
+        if name in cuts
     ]
     return Plan(
         fleet.name,

@@ -8,13 +8,18 @@ stage instead.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from meshctl.model import ApplyPolicy
+from meshctl.plan.independent import by_group
 from meshctl.plan.values import Cut, NodePlan, Stage, StageKind
 from meshctl.topology import Graph, Path
+
+# A stage of more independent meshes does not repeat the reason of each.
+_MAX_REASONS = 3
+_LAST_OF_SEVERAL = "last, because their meshes are reached through them, each its own"
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +30,8 @@ class MeshContext:
     entries: tuple[str, ...]
     policy: ApplyPolicy
     robot_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # node -> the meshes that depend on each other (`plan.independent`)
+    groups_of: Mapping[str, frozenset[str]] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def stages_of(
@@ -99,7 +106,8 @@ def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
 
 
 def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ...]:
-    """From the far end inward, at most `max_down` at once, each cut vertex alone, the entries last."""
+    """From the far end inward, in each independent mesh at most `max_down` at once and each cut vertex alone, the
+    entries last."""
     paths = context.graph.paths_to_any(context.entries)
     cuts = context.graph.cut_off_by_any(context.entries)
     waiting = [plan.node for plan in plans if plan.node not in context.entries]
@@ -111,28 +119,67 @@ def _rolling(plans: Sequence[NodePlan], context: MeshContext) -> tuple[Stage, ..
         waiting.remove(canary)
         reason = f"canary: first alone; {_distance(canary, paths)}"
         stages.append(Stage(StageKind.CANARY, (canary,), reason, cuts.get(canary, ())))
-    while waiting:
-        batch = _batch(waiting, context, cuts)
-        waiting = [name for name in waiting if name not in batch]
-        lost = cuts.get(batch[0], ())
-        if lost and batch[0] in stays_up:
-            reason = f"alone, because it is a cut vertex: {', '.join(lost)} cannot be reached if a weak link breaks"
-        elif lost:
-            reason = f"alone, because it is a cut vertex: while it is down {', '.join(lost)} cannot be reached"
-        elif len(batch) == 1:
-            reason = _distance(batch[0], paths)
-        else:
-            reason = (
-                f"together, because they cut off no other node: {'; '.join(_distance(name, paths) for name in batch)}"
-            )
-        stages.append(Stage(StageKind.ROLLING, batch, reason, lost))
+    parts = by_group(waiting, context.groups_of)
+    while parts := [part for part in parts if part]:
+        batches: list[tuple[str, ...]] = []
+        for part in parts:
+            batch = _batch(part, context, cuts)
+            if not _robots(batch, context) & _robots((name for taken in batches for name in taken), context):
+                batches.append(batch)
+                part[:] = [name for name in part if name not in batch]
+        stages.append(_step(batches, cuts, paths, stays_up))
     changing = {plan.node for plan in plans}
-    for entry in context.entries:
-        if entry in changing:
-            rest = sorted(context.graph.reachable(entry) - {entry})
-            reason = "last, because the mesh is reached through it"
-            stages.append(Stage(StageKind.LAST, (entry,), reason, tuple(rest)))
+    stages += _entry_stages([entry for entry in context.entries if entry in changing], context)
     return tuple(stages)
+
+
+def _step(
+    batches: Sequence[tuple[str, ...]],
+    cuts: Mapping[str, tuple[str, ...]],
+    paths: Mapping[str, Path],
+    stays_up: Container[str],
+) -> Stage:
+    """One stage of these batches, each of another independent mesh."""
+    reasons = [_batch_reason(batch, cuts.get(batch[0], ()), paths, batch[0] in stays_up) for batch in batches]
+    reason = reasons[0]
+    if len(reasons) > _MAX_REASONS:
+        reason = f"{len(batches)} independent meshes at the same time, in each from its far end"
+    elif len(reasons) > 1:
+        reason = f"independent meshes at the same time: {'; '.join(reasons)}"
+    nodes = tuple(name for batch in batches for name in batch)
+    return Stage(StageKind.ROLLING, nodes, reason, tuple(lost for batch in batches for lost in cuts.get(batch[0], ())))
+
+
+def _batch_reason(batch: Sequence[str], lost: Sequence[str], paths: Mapping[str, Path], stays_up: bool) -> str:
+    if lost and stays_up:
+        return f"alone, because it is a cut vertex: {', '.join(lost)} cannot be reached if a weak link breaks"
+    if lost:
+        return f"alone, because it is a cut vertex: while it is down {', '.join(lost)} cannot be reached"
+    if len(batch) == 1:
+        return _distance(batch[0], paths)
+    return f"together, because they cut off no other node: {'; '.join(_distance(name, paths) for name in batch)}"
+
+
+def _entry_stages(entries: Sequence[str], context: MeshContext) -> Iterator[Stage]:
+    """The entries, those of independent meshes at the same time."""
+    left = list(entries)
+    while left:
+        now: list[str] = []
+        taken: set[str] = set()
+        for entry in left:
+            own = context.groups_of.get(entry) or frozenset({""})
+            if not own & taken and not _robots((entry,), context) & _robots(now, context):
+                now.append(entry)
+                taken |= own
+        left = [entry for entry in left if entry not in now]
+        rest = {name for entry in now for name in context.graph.reachable(entry)} - set(now)
+        reason = "last, because the mesh is reached through it" if len(now) == 1 else _LAST_OF_SEVERAL
+        yield Stage(StageKind.LAST, tuple(now), reason, tuple(sorted(rest)))
+
+
+def _robots(names: Iterable[str], context: MeshContext) -> set[str]:
+    """The robots that these radios are of: with both radios of one down, the robot itself would be cut off."""
+    return {context.robot_of.get(name, "") for name in names} - {""}
 
 
 def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
@@ -142,9 +189,7 @@ def _batch(waiting: Sequence[str], context: MeshContext, cuts: Mapping[str, tupl
     for name in waiting[1:]:
         if len(batch) >= max(1, context.policy.max_down):
             break
-        robots = {context.robot_of.get(other) for other in batch} - {None, ""}
-        # with both radios of a robot down, the robot itself would be cut off
-        if name in cuts or context.robot_of.get(name) in robots:
+        if name in cuts or _robots((name,), context) & _robots(batch, context):
             continue
         if not context.graph.cut_off_by_all(context.entries, [*batch, name]):
             batch.append(name)
