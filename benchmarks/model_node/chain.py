@@ -23,14 +23,14 @@ def mac_prefix(number: int) -> str:
     return f"02:4d:{number >> 8:02x}:{number & 255:02x}"
 
 
-def chain_sections(recorded: Sections, number: int, count: int) -> dict[str, tuple[str, str]]:
-    """The sections of the node with this number (from 1) in a chain of `count`, with MACs of its own."""
+def chain_sections(recorded: Sections, number: int, first: int, last: int) -> dict[str, tuple[str, str]]:
+    """The sections of the node with this number in the chain from `first` to `last`, with MACs of its own."""
     own = mac_prefix(number)
     sections = {
         name: (body.replace(RECORDED_MAC, own).replace(f"fe{RECORDED_MAC[2:]}", f"fe{own[2:]}"), status)
         for name, (body, status) in recorded.items()
     }
-    heard = [other for other in (number - 1, number + 1) if 1 <= other <= count]
+    heard = [other for other in (number - 1, number + 1) if first <= other <= last]
     last_seen = {"hard_ifindex": 21, "hard_ifname": "mesh0", "last_seen_msecs": 120}
     neighbors = [{**last_seen, "neigh_address": _radio_mac(other)} for other in heard]
     originators = [
@@ -41,7 +41,7 @@ def chain_sections(recorded: Sections, number: int, count: int) -> dict[str, tup
             "tq": _TQ - _TQ_PER_HOP * abs(other - number),
             "best": True,
         }
-        for other in range(1, count + 1)
+        for other in range(first, last + 1)
         if other != number
     ]
     return {

@@ -150,6 +150,10 @@ class ModelFleet:
                 text += f"  {name}: {{{role}address: {address}, ssh: {{host: 127.0.0.1, port: {port}}}}}\n"
             self.inventory(variant).write_text(text, encoding="utf-8")
 
+    def chain_of(self, number: int) -> list[int] | None:
+        """The number of a node (from 1), and those of its chain's ends."""
+        return [number, 1, len(self.ports)] if self.is_chain else None
+
     def _write_nodes(self) -> None:
         place = self.directory / "nodes"
         (place / "root" / ".ssh").mkdir(parents=True, mode=0o700)
@@ -172,9 +176,9 @@ class ModelFleet:
             public = next(line for line in said.splitlines() if line.startswith("ssh-ed25519 "))
             pins.append(f"{name} {' '.join(public.split()[:2])}\n")
             files = {path: content.decode() for path, content in self.rendered("a", name).items()}
-            chain = [index, len(self.ports)] if self.is_chain else None
             nodes[name] = {
-                "address": _address(index), "port": port, "files": files, "version": version, "chain": chain
+                "address": _address(index), "port": port, "files": files, "version": version,
+                "chain": self.chain_of(index),
             }  # fmt: skip
         (self.directory / "known_hosts").write_text("".join(pins))
         (place / "nodes.json").write_text(json.dumps(nodes))
