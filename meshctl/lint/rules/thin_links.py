@@ -1,4 +1,4 @@
-"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC777)."""
+"""Thin links: numbers, ports, the limits of their bands, and what topics offer on them (MC771 to MC778)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ def number_used_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
     passing="""
     udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
-    robots: {husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
     """,
 )
 def unknown_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
@@ -206,3 +208,32 @@ def frame_beyond_xbee(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             path = ("udp_mesh", "thin_links", name, "frame_bytes")
             expected = f"the radio's NP, at most {MAX_2400_MHZ_FRAME_BYTES} B at 2.4 GHz"
             yield Finding(path, "an XBee refuses larger payloads", expected, f"{link.frame_bytes} B")
+
+
+@fleet_rule(
+    "MC778",
+    Severity.WARNING,
+    "Only one robot is on a thin link",
+    why="""What it sends there is heard by no one, so without wifi neither its position nor an emergency stop arrives.
+    Usually the base station's radio is missing in the inventory.""",
+    fix="Add the port of another robot's radio (`thin.ports`), such as the base station's, or remove this one.",
+    failing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    robots: {husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}}
+    """,
+    passing="""
+    udp_mesh: {thin_links: {lora: {bits_per_s: 5470, band: eu869}}}
+    robots:
+      base-station: {thin: {number: 1, ports: {lora: /dev/ttyUSB0}}}
+      husky1: {thin: {number: 2, ports: {lora: /dev/ttyUSB0}}}
+    """,
+)
+def robot_alone_on_thin_link(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    robots: dict[str, list[str]] = {}
+    for robot in fleet.robots.values():
+        for link in robot.thin.ports if robot.thin is not None else ():
+            robots.setdefault(link, []).append(robot.name)
+    for link, names in robots.items():
+        if len(names) == 1 and link in fleet.udp_mesh.thin_links:
+            path = ("robots", names[0], "thin", "ports", link)
+            yield Finding(path, "no other robot is on this link", "at least two robots", f"{names[0]} alone")
