@@ -1,0 +1,36 @@
+"""Devices on the bench of a site's gateway: which sites have one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.apply.bootstrap import BenchTarget
+from meshctl.cli.bench_places import named_places, with_site
+from meshctl.errors import InputError
+from tests.meshctl.inventory.inventories import fleet_of
+
+_SITES = """
+    nats: {url: "nats://127.0.0.1:4222"}
+    sites: {north: {ssh: {host: north.example.org}}, south: {nats: {}}}
+    nodes: {n1: {hardware: rocket, address: 10.42.0.1, site: north}}
+    """
+
+
+def test_a_place_is_on_the_bench_of_a_gateway_that_can_be_logged_in_to(tmp_path: Path) -> None:
+    fleet = fleet_of(tmp_path, _SITES)
+    assert with_site(fleet, BenchTarget(node="n1"), "north") == BenchTarget(node="n1", site="north")
+    assert with_site(fleet, BenchTarget(node="n1"), "") == BenchTarget(node="n1")
+    with pytest.raises(InputError, match="no such site") as caught:
+        with_site(fleet, BenchTarget(), "nort")
+    assert caught.value.hint == "did you mean 'north'?"
+    with pytest.raises(InputError, match="has no login") as caught:
+        with_site(fleet, BenchTarget(), "south")
+    assert caught.value.hint == "set sites.south.ssh.host"
+
+
+def test_an_interface_of_this_computer_leads_to_no_other_bench() -> None:
+    assert named_places(["192.168.1.1:2222"], [], "north") == [BenchTarget("192.168.1.1", 2222)]
+    with pytest.raises(InputError, match="--interface is one of this computer"):
+        named_places([], ["lo"], "north")
