@@ -105,6 +105,7 @@ def test_prometheus_scrapes_radios_and_daemons_and_knows_every_metric_of_dashboa
         running(tmp_path, {"meshctl": target, "udp_mesh": f"127.0.0.1:{port}"}, rules=alert_rules()) as server,
     ):
         with alice.client() as client:
+            client.request("set-radio", b'{"source": "alice-radio", "problem": null, "paths": [], "neighbors": []}')
             for _ in range(20):
                 client.request("publish", payload=b"stop", topic="status", to="bob")
         until(lambda: set(server.query("up").values()) == {1.0} and len(server.query("up")) == 2, "both to be scraped")
@@ -161,6 +162,10 @@ tests:
       - {series: 'udp_mesh_delivery_latency_seconds_bucket{instance="a", priority="0", le="1.0"}', values: "0+1x17"}
       - {series: 'udp_mesh_delivery_latency_seconds_bucket{instance="a", priority="0", le="2.0"}', values: "0+10x17"}
       - {series: 'udp_mesh_delivery_latency_seconds_bucket{instance="a", priority="0", le="+Inf"}', values: "0+10x17"}
+      - {series: 'udp_mesh_radio_report_age_seconds{instance="spot"}', values: "1 1 16+15x15"}
+      - {series: 'udp_mesh_radio_report_age_seconds{instance="husky"}', values: "9x17"}
+      - {series: 'udp_mesh_radio_problem{instance="spot"}', values: "0x17"}
+      - {series: 'udp_mesh_radio_problem{instance="husky"}', values: "1x17"}
     alert_rule_test:
 EXPECTED
 """
@@ -181,6 +186,8 @@ def test_every_rule_fires_for_what_it_names_and_for_nothing_else(tmp_path: Path)
         "MeshUrgentQueue": '{robot: spot, priority: "1"}',
         "UdpMeshPeerOffline": "{instance: spot, peer: husky}",
         "UdpMeshUrgentSlow": "{instance: a}",
+        "UdpMeshCollectorSilent": "{instance: spot}",
+        "UdpMeshRadioProblem": "{instance: husky}",
     }
     assert set(severity) == set(labels)
     # promtool compares annotations, too; their text is the rules' own

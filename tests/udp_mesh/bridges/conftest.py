@@ -13,6 +13,7 @@ from tests.udp_mesh.bridges.ros2_processes import expects_ros2
 
 collect_ignore = [] if expects_ros() else ["test_exploration.py", "test_ros1_quick.py", "test_ros1_services.py"]
 collect_ignore += [] if expects_ros2() else ["test_ros2.py"]
+collect_ignore += [] if expects_ros() and expects_ros2() else ["test_mixed_team.py"]
 
 LAST_WORDS = 3000
 

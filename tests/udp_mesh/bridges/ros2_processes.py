@@ -7,6 +7,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.link.laboratory import Laboratory
 from tests.udp_mesh.bridges.bridge_processes import BridgeProcess, NodeProcess
 from tests.udp_mesh.bridges.ros1_processes import ROOT
 from tests.udp_mesh.daemon.processes import RunningDaemon
@@ -49,6 +50,12 @@ def environment(domain: int, built: Path | None = None) -> dict[str, str]:
         "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
+
+
+def hear_only_loopback(lab: Laboratory, place: int) -> None:
+    """Fast DDS finds the nodes of one machine by multicast."""
+    lab.run(place, ["ip", "link", "set", "lo", "up", "multicast", "on"])
+    lab.run(place, ["ip", "route", "replace", "239.0.0.0/8", "dev", "lo"])
 
 
 class Ros2Node(NodeProcess):

@@ -8,7 +8,8 @@ calls it: {"added": SERVICE, "sum" or "error"}; {"exists": SERVICE} -> {"exists"
 {"publish": NAME, "type": TYPE, "data": VALUE, "latch": BOOL, "repeat": how often}; {"stream": NAME, "type": TYPE,
 "rate_hz": HZ, "bytes": SIZE}; {"stop_streams": true}; {"call": SERVICE}.
 
-What arrives is {"name", "type", "md5sum", "definition", "latching"} and one of "data" (typed), "number" (of an image),
+What arrives is {"name", "type", "md5sum", "definition", "latching"} and one of "data" (typed; with a header, as Python
+shows the message), "number" (of an image),
 "text" (of a legacy message) or "hex" (of "*"). TYPE may be one that is installed
 nowhere: then "md5sum" and "definition" stand in the command, and the data is hex.
 """
@@ -54,6 +55,8 @@ def arrived(message: Any, about: tuple[str, float]) -> None:
         fields.pop("definition")
     elif header["type"] in ("udp_mesh/NetworkStats", "udp_mesh/HostEntry"):
         fields["text"] = str(message)
+    elif hasattr(message, "header"):
+        fields["data"] = str(message)
     else:
         fields.update(data=message.data, at=time.monotonic())
     say(**fields)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.bridges.ros2.quality import Quality, common, parse_quality, quality_text, ros2_name
+from udp_mesh.bridges.ros2.quality import Quality, common, in_order_of_arrival, parse_quality, quality_text, ros2_name
 
 QUALITIES = st.builds(
     Quality,
@@ -44,3 +44,12 @@ def test_a_subscription_requests_only_qos_that_every_publisher_offers(qualities:
 
 def test_names_are_converted_to_valid_ros_2_names() -> None:
     assert ros2_name("/ugv__1/mesh_comm/a___b/x_y") == "/ugv_1/mesh_comm/a_b/x_y"
+
+
+def test_the_publisher_that_came_last_is_last_whatever_order_the_graph_has() -> None:
+    killed, other, new = (b"\5", "std_msgs/msg/String"), (b"\7", "std_msgs/msg/String"), (b"\1", "std_msgs/msg/Int32")
+    first = in_order_of_arrival({}, dict([killed, other]))
+    second = in_order_of_arrival(first, dict([new, killed, other]))
+    assert list(second.items()) == [killed, other, new]
+    assert list(in_order_of_arrival(second, dict([new, other])).items()) == [other, new]
+    assert in_order_of_arrival(second, dict([other])) == dict([other])

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.link.laboratory import Laboratory, Link, laboratory
-from tests.udp_mesh.bridges.ros2_processes import Ros2Bridge, Ros2Node
+from tests.udp_mesh.bridges.ros2_processes import Ros2Bridge, Ros2Node, hear_only_loopback
 from tests.udp_mesh.bridges.ros_team import RobotsDaemon
 from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, poll, wait_online
 from udp_mesh.bridges.message_codec import decode, encode
@@ -51,6 +51,7 @@ map = { priority = 5 }
 history = { priority = 5 }
 camera = { priority = 5 }
 slow = { priority = 5 }
+echo = { priority = 5 }
 """
 SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
@@ -91,14 +92,15 @@ def whole() -> Iterator[Team]:
     ):
         sides = []
         for place, (name, domain) in enumerate(DOMAINS.items()):
-            # Fast DDS finds the nodes of one machine by multicast
-            lab.run(place, ["ip", "link", "set", "lo", "up", "multicast", "on"])
-            lab.run(place, ["ip", "route", "replace", "239.0.0.0/8", "dev", "lo"])
+            hear_only_loopback(lab, place)
             inside = lab.inside(place, [])
             daemon = RobotsDaemon(Path(path), name, inside, TOPICS, RATES)
             kept.enter_context(daemon)
-            remapped = ["--ros-args", "-r", f"/{name}/mesh_comm/camera:=/sensors/front/camera"]
-            bridge = Ros2Bridge(daemon, domain, inside, CONFIGURATION, *remapped)
+            arguments = ["--ros-args", "-r", f"/{name}/mesh_comm/camera:=/sensors/front/camera"]
+            if name == "alice":
+                # as launch files give it to all nodes; nobody publishes /clock
+                arguments += ["-p", "use_sim_time:=true"]
+            bridge = Ros2Bridge(daemon, domain, inside, CONFIGURATION, *arguments)
             kept.callback(bridge.stop)
             bridge.start()
             node = Ros2Node(daemon.folder, f"{name}_node", domain, inside)
@@ -120,6 +122,43 @@ def test_messages_cross_in_both_directions(team: tuple[Side, Side]) -> None:
     alice.node.subscribe(TO_ALICE)
     alice.node.publish_until_received(TO_BOB, "from alice", bob.node)
     bob.node.publish_until_received(TO_ALICE, "from bob", alice.node)
+
+
+def test_the_first_message_of_a_topic_reaches_an_existing_subscriber(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    names = [f"/alice/mesh_comm/bob/once{number}" for number in range(5)]
+    for name in names:
+        bob.node.subscribe(name)
+    # answered after the subscriptions, which the bridge finds in its graph meanwhile
+    bob.node.is_available("/nothing")
+    kind = kind_text(MessageKind(TypeKey("std_msgs/msg/String", "reliable:volatile:10:")))
+    with alice.daemon.client() as client:
+        for number in range(5):
+            topic = f"once{number}"
+            client.request("set-topic", topic=topic, values={"priority": 0})
+            client.publish(topic, b"\0\1\0\0\5\0\0\0stop\0", to="bob", type=kind)
+    for name in names:
+        assert bob.node.expect("name", name)["data"] == "stop"
+
+
+def test_robots_in_one_ros_graph_send_nothing_in_circles(whole: Team) -> None:
+    alice, bob = whole.alice, whole.bob
+    name = "/alice/mesh_comm/bob/echo"
+    # of alice, but in bob's graph: as if both robots had the same domain on a network that joins them
+    other = Ros2Bridge(alice.daemon, DOMAINS["bob"], whole.lab.inside(1, []), CONFIGURATION)
+    other.start()
+    try:
+        advice = "ROS_DOMAIN_ID"
+        poll(lambda: advice in bob.bridge.log.read_text() and advice in other.log.read_text(), "the advice")
+        with bob.daemon.client() as client:
+            client.subscribe("echo")
+            bob.node.publish(name, "one")
+            assert client.next_frame(3.0) is None
+    finally:
+        other.stop()
+    bob.node.subscribe(name)
+    poll(lambda: "bridges-apart" in bob.bridge.log.read_text(), "the other bridge has gone")
+    alice.node.publish_until_received(name, "apart", bob.node)
 
 
 def test_a_late_subscriber_receives_the_last_transient_local_message(team: tuple[Side, Side]) -> None:

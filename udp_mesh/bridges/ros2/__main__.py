@@ -34,7 +34,7 @@ from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
-from udp_mesh.bridges.ros2.quality import MAX_DEPTH, Quality, common, parse_quality, quality_text, ros2_name
+from udp_mesh.bridges.ros2.quality import Quality, common, in_order_of_arrival, quality_text, ros2_name
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.transforms import DEFINITION, TF, TF_STATIC, TOPIC_SETTINGS, TransformGatherer
 from udp_mesh.bridges.types import TypeKey
@@ -44,15 +44,16 @@ try:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.node import Node
-    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     from udp_mesh.bridges.ros2.interfaces import interface_class
+    from udp_mesh.bridges.ros2.publishers import Publishers, profile, quality_of, steady_timer
     from udp_mesh.bridges.ros2.services import Ros2Calls
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.ros2: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
 
 log = logging.getLogger(__name__)
 
+NODE = "mesh_bridge"
 REFRESH_S = 1.0
 TF_TICK_S = 0.02
 STATIC_TF = Quality(durability="transient_local", depth=1)
@@ -60,31 +61,6 @@ MOVING_TF = Quality(depth=100)
 """As tf2_ros subscribes to them."""
 MAX_ARRIVED = 1000
 """Messages from the mesh waiting for the executor; the oldest are dropped."""
-
-
-def profile(quality: Quality) -> Any:
-    """A quality as rclpy's QoSProfile."""
-    reliable, latched = quality.reliability == "reliable", quality.latched
-    return QoSProfile(
-        depth=quality.depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def quality_of(info: Any, depth: int | None = None) -> Quality:
-    """The quality offered by an endpoint. `depth` is the configured one, for middlewares that do not report it, such as
-    Fast DDS."""
-    reliable = info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
-    latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-    # Since Iron; "INVALID" if the middleware does not report it.
-    type_hash = str(getattr(info, "topic_type_hash", ""))
-    return Quality(
-        "reliable" if reliable else "best_effort",
-        "transient_local" if latched else "volatile",
-        min(depth or info.qos_profile.depth or (1 if latched else 10), MAX_DEPTH),
-        type_hash if type_hash.startswith("RIHS") else "",
-    )
 
 
 class Ros2Bridge:
@@ -107,18 +83,20 @@ class Ros2Bridge:
         self._gatherer = None if options.tf is None else TransformGatherer(2, options.tf.rate_hz)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
-        self._publishers: dict[str, tuple[TypeKey, Any]] = {}
+        self._publishers = Publishers(node, self._class, self._warn_once)
+        self._came_last: dict[str, dict[bytes, str]] = {}
+        self._others: set[str] = set()
         self._warned: set[str] = set()
         self._has_conditions_package = importlib.util.find_spec(PACKAGE) is not None
         self._wake = node.create_guard_condition(self.publish_arrived)
-        node.create_timer(REFRESH_S, self.refresh)
+        steady_timer(node, REFRESH_S, self.refresh)
         positions = PositionInput(daemon, 2, odometry, tf_frames)
         for name, type_name in positions.topics.items():
             self._watch(name, type_name, positions.arrived)
         if self._gatherer is not None:
             for topic in (TF, TF_STATIC):
                 self._watch("/" + topic, DEFINITION.name, self._gather)
-            node.create_timer(TF_TICK_S, self._send_transforms)
+            steady_timer(node, TF_TICK_S, self._send_transforms)
 
     def _gather(self, name: str, data: bytes) -> None:
         if self._gatherer is not None:
@@ -189,17 +167,43 @@ class Ros2Bridge:
             log.debug("daemon-unreachable %s", error)
             return
         found = routes(self._own, [topic for topic in topics if not topic.startswith("bridge/")], peers)
-        table = {ros2_name(name): route for name, route in found.items()}
+        table = {} if self._sees_other_bridges() else {ros2_name(name): route for name, route in found.items()}
         for name in [name for name in self._subscriptions if name not in table]:
             self._node.destroy_subscription(self._subscriptions.pop(name)[1])
+        self._came_last = {name: known for name, known in self._came_last.items() if name in table}
         for name, route in table.items():
             self._refresh_subscription(name, route)
+
+    def _sees_other_bridges(self) -> bool:
+        """Whether other robots' bridges are in this robot's graph. Each publishes what it receives under the name that
+        its source reads, so messages would go in circles."""
+        nodes = self._node.get_node_names_and_namespaces()
+        others = {space for name, space in nodes if name == NODE and space != self._node.get_namespace()}
+        if others and others != self._others:
+            log.error(
+                "bridges-in-one-graph others=%s: ROS 2 itself connects these robots, so nothing is sent over the mesh; "
+                "give each robot a ROS_DOMAIN_ID of its own or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
+                ",".join(sorted(others)),
+            )
+        elif self._others and not others:
+            log.info("bridges-apart: messages are sent over the mesh again")
+        self._others = others
+        return bool(others)
+
+    def _type_published(self, name: str, infos: Sequence[Any]) -> str:
+        listed = {bytes(info.endpoint_gid): str(info.topic_type) for info in infos}
+        self._came_last[name] = types = in_order_of_arrival(self._came_last.get(name, {}), listed)
+        found = list(types.values())
+        if len(set(found)) > 1:
+            text = "{}: publishers of {}: only the type that came last is sent"
+            self._warn_once(name + " types", text.format(name, " and ".join(sorted(set(found)))))
+        return found[-1]
 
     def _refresh_subscription(self, name: str, route: Route) -> None:
         infos = self._node.get_publishers_info_by_topic(name)
         if not infos:
             return
-        type_name = str(infos[0].topic_type)
+        type_name = self._type_published(name, infos)
         options = self._options.topics.get(route.topic, TopicOptions())
         quality = common(quality_of(info, options.depth) for info in infos if info.topic_type == type_name)
         key = TypeKey(type_name, quality_text(quality))
@@ -225,34 +229,7 @@ class Ros2Bridge:
     def publish_arrived(self) -> None:
         """Publishes the messages that arrived from the mesh since the last call."""
         while self._arrived:
-            self._publish(self._arrived.popleft())
-
-    def _publish(self, message: ToRos) -> None:
-        quality, name = parse_quality(message.key.checksum), ros2_name(message.name)
-        message_class = self._class(message.key.name)
-        if quality is None or message_class is None:
-            return
-        known = self._publishers.get(name)
-        if known is None or known[0] != message.key:
-            if known is not None:
-                self._node.destroy_publisher(known[1])
-            known = (message.key, self._node.create_publisher(message_class, name, profile(quality)))
-            self._publishers[name] = known
-        if self._has_matching_hash(name, quality.type_hash):
-            # rclpy takes bytes as a serialized message.
-            known[1].publish(message.payload)
-
-    def _has_matching_hash(self, name: str, type_hash: str) -> bool:
-        """Whether our publisher's type hash equals the source's, if both are known: CDR of another type is garbage."""
-        hashes = {
-            quality_of(info).type_hash
-            for info in self._node.get_publishers_info_by_topic(name)
-            if info.node_name == self._node.get_name()
-        } - {""}
-        if not type_hash or not hashes or type_hash in hashes:
-            return True
-        self._warn_once(name, "{}: the source has another definition of the type: not published".format(name))
-        return False
+            self._publishers.publish(self._arrived.popleft())
 
     def _class(self, name: str) -> Any:
         try:
@@ -296,26 +273,35 @@ def main(argv: Sequence[str] | None = None) -> int:
         own = _wait_for_node_name(daemon)
         if own is None:
             return 0
-        node = Node("mesh_bridge", namespace=ros2_name("/" + ros_word(own)))
-        bridge = Ros2Bridge(node, daemon, own, options.odometry, options.tf_frames, configuration)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
-        thread.start()
-        while rclpy.ok() and thread.is_alive():
-            executor.spin_once(timeout_sec=REFRESH_S)
-        failed = rclpy.ok()
-        stop.set()
-        thread.join(5.0)
-        executor.shutdown()
-        node.destroy_node()
+        node = Node(NODE, namespace=ros2_name("/" + ros_word(own)))
+        try:
+            bridge = Ros2Bridge(node, daemon, own, options.odometry, options.tf_frames, configuration)
+            return _serve(node, bridge, daemon, stop)
+        finally:
+            # else the graph lists its services and publishers for the 20 s of DDS's lease
+            node.destroy_node()
     except (KeyboardInterrupt, ExternalShutdownException):
         return 0
     finally:
         stop.set()
         rclpy.try_shutdown()
-    # The daemon client's thread failed and logged its exception; the supervisor restarts this process.
-    return 1 if failed else 0
+
+
+def _serve(node: Any, bridge: Ros2Bridge, daemon: DaemonClient, stop: threading.Event) -> int:
+    """Runs until ROS, a signal or an unexpected exception in the daemon client's thread stops it."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    thread = threading.Thread(target=daemon.run, args=(stop, bridge.on_daemon_up, bridge.on_frame), daemon=True)
+    thread.start()
+    try:
+        while rclpy.ok() and thread.is_alive():
+            executor.spin_once(timeout_sec=REFRESH_S)
+        # The exception was logged; the supervisor restarts this process.
+        return 1 if rclpy.ok() else 0
+    finally:
+        stop.set()
+        thread.join(5.0)
+        executor.shutdown()
 
 
 def _wait_for_node_name(daemon: DaemonClient) -> str | None:

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import re
-from typing import Iterable, NamedTuple
+from typing import Dict, Iterable, Mapping, NamedTuple
 
 RELIABILITIES = ("reliable", "best_effort")
 DURABILITIES = ("volatile", "transient_local")
@@ -59,6 +59,13 @@ def common(qualities: Iterable[Quality]) -> Quality:
         durability=min((quality.durability for quality in found), key=DURABILITIES.index),
         depth=max(quality.depth for quality in found),
     )
+
+
+def in_order_of_arrival(known: Mapping[bytes, str], listed: Mapping[bytes, str]) -> Dict[bytes, str]:
+    """The types of the publishers (by their ids) that the graph lists, in no order of its own: first those that are
+    known. A publisher that was killed is still listed for some seconds beside the one that replaces it."""
+    kept = {publisher: listed[publisher] for publisher in known if publisher in listed}
+    return {**kept, **listed}
 
 
 def ros2_name(name: str) -> str:

@@ -23,6 +23,7 @@ from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.names import inbound_name
 from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class
+from udp_mesh.bridges.ros2.publishers import steady_timer
 from udp_mesh.bridges.ros2.quality import ros2_name
 
 log = logging.getLogger(__name__)
@@ -103,7 +104,7 @@ class Ros2Calls(MeshCalls):
         self._asked: List[Tuple[float, Any, Any]] = []
         self._ticks = 0
         self._wake = node.create_guard_condition(self._work)
-        node.create_timer(TICK_S, self._tick)
+        steady_timer(node, TICK_S, self._tick)
 
     def _take(self, work: Callable[[], List[CallEffect]]) -> None:
         self._inbox.append(work)
