@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -26,6 +27,22 @@ TOKEN = f"@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/10/MP/%/%/talker/%chatte
 KEPT_TYPE = "tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 KEPT = f"0/tf_static/{KEPT_TYPE}"
 KEPT_TOKEN = f"@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/11/MP/%/%/frames/%tf_static/{KEPT_TYPE}/:1:,2:,:,:,,"
+ROS2_CLIENT = """
+import sys, time
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber, get_topic_info
+about = dict(msg_type="std_msgs/msg/String", msg_definition="string data\\n", domain_id=0, router_port=int(sys.argv[2]))
+if sys.argv[1] == "talk":
+    publisher = ROS2Publisher("/chatter", **about)
+    while True:
+        publisher.publish(data="from an rmw_zenoh client")
+        time.sleep(0.1)
+subscriber = ROS2Subscriber("/chatter", callback=lambda message: print("heard", message.data, flush=True), **about)
+while True:
+    topic = get_topic_info("/chatter", router_port=about["router_port"])
+    print("publishers", topic and topic.publisher_count, flush=True)
+    time.sleep(0.2)
+"""
+"""Zenoh with the keys, attachments and tokens of rmw_zenoh, by others (zenoh-ros2-sdk). One session per process."""
 CDR_HELLO = bytes.fromhex("00010000") + struct.pack("<I", 6) + b"hello\0"
 
 
@@ -222,6 +239,30 @@ def late_subscriber(side: Side, seen: list[bytes]) -> Any:
     return zenoh.ext.declare_advanced_subscriber(
         side.session, KEPT, lambda sample: seen.append(bytes(sample.payload)), history=history
     )
+
+
+def test_an_independent_rmw_zenoh_client_hears_another_robots_and_sees_its_publisher(team: tuple[Side, Side]) -> None:
+    alice, bob = team
+    log = bob.daemon.folder / "client.log"
+    programs = []
+    # as peers, they would have to reach the bridges without the router
+    environment = {**os.environ, "ZENOH_CONFIG_OVERRIDE": 'mode="client"'}
+    try:
+        with log.open("wb") as out:
+            for role, side in (("listen", bob), ("talk", alice)):
+                command = [sys.executable, "-c", ROS2_CLIENT, role, str(side.port)]
+                programs.append(subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT))
+
+        def heard() -> bool:
+            lines = log.read_text().splitlines()
+            return "heard from an rmw_zenoh client" in lines and "publishers 1" in lines
+
+        poll(heard, "the message and the publisher")
+    finally:
+        for program in programs:
+            program.terminate()
+            program.wait(WAIT_S)
+    assert "publishers 2" not in log.read_text()
 
 
 def test_late_subscribers_and_robots_receive_cached_transient_local_samples(team: tuple[Side, Side]) -> None:
