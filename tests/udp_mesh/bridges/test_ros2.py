@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -15,9 +16,10 @@ from pathlib import Path
 import pytest
 
 from benchmarks.link.laboratory import Laboratory, Link, laboratory
-from tests.udp_mesh.bridges.ros2_processes import Ros2Bridge, Ros2Node, hear_only_loopback
+from tests.udp_mesh.bridges.ros2_processes import PYTHON, Ros2Bridge, Ros2Node, hear_only_loopback
 from tests.udp_mesh.bridges.ros_team import RobotsDaemon
 from tests.udp_mesh.daemon.processes import RATES, RunningDaemon, poll, wait_online
+from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.bridges.message_codec import decode, encode
 from udp_mesh.bridges.transforms import DEFINITION
 from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
@@ -25,6 +27,7 @@ from udp_mesh.bridges.types import MessageKind, TypeKey, kind_text
 pytestmark = pytest.mark.xdist_group("ros2")
 
 LINK = Link(rate=20e6, delay_ms=5.0, loss=0.05)
+CYCLONE = Path(__file__).with_name("cyclone_program.py")
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 DOMAINS = {"alice": 71, "bob": 72}
 TO_BOB = "/alice/mesh_comm/bob/status"
@@ -170,6 +173,22 @@ def test_a_late_subscriber_receives_the_last_transient_local_message(team: tuple
         poll(lambda: next(iter(client.messages(0.1)), None), "the map at bob's daemon")
     bob.node.subscribe(TO_BOB_MAP, latched=True)
     assert bob.node.expect("data", "the map")["name"] == TO_BOB_MAP
+
+
+def test_programs_of_another_dds_vendor_send_and_receive(whole: Team) -> None:
+    log = whole.bob.daemon.folder / "cyclone.log"
+    programs = []
+    try:
+        with log.open("wb") as out:
+            for place, role in enumerate(("publish", "subscribe")):
+                command = [*whole.lab.inside(place, []), str(PYTHON), str(CYCLONE), role, TO_BOB]
+                command.append(str(list(DOMAINS.values())[place]))
+                programs.append(subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT))
+        poll(lambda: "heard of another vendor" in log.read_text(), "a message from one to the other")
+    finally:
+        for program in programs:
+            program.terminate()
+            program.wait(WAIT_S)
 
 
 def test_a_killed_bridge_resumes_after_a_restart(team: tuple[Side, Side]) -> None:
