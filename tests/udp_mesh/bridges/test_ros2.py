@@ -101,7 +101,7 @@ def whole() -> Iterator[Team]:
             kept.enter_context(daemon)
             arguments = ["--ros-args", "-r", f"/{name}/mesh_comm/camera:=/sensors/front/camera"]
             if name == "alice":
-                # as launch files give it to all nodes; nobody publishes /clock
+                # as launch files give it to all nodes; there is no /clock
                 arguments += ["-p", "use_sim_time:=true"]
             bridge = Ros2Bridge(daemon, domain, inside, CONFIGURATION, *arguments)
             kept.callback(bridge.stop)

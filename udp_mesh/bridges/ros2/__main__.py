@@ -46,7 +46,7 @@ try:
     from rclpy.node import Node
 
     from udp_mesh.bridges.ros2.interfaces import interface_class
-    from udp_mesh.bridges.ros2.publishers import Publishers, profile, quality_of, steady_timer
+    from udp_mesh.bridges.ros2.publishers import Ros2Publishers, profile, quality_of, steady_timer
     from udp_mesh.bridges.ros2.services import Ros2Calls
 except ModuleNotFoundError as error:
     raise SystemExit("udp_mesh.bridges.ros2: {} (source /opt/ros/RELEASE/setup.bash first)".format(error)) from error
@@ -83,7 +83,7 @@ class Ros2Bridge:
         self._gatherer = None if options.tf is None else TransformGatherer(2, options.tf.rate_hz)
         self._arrived: Deque[ToRos] = deque(maxlen=MAX_ARRIVED)
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
-        self._publishers = Publishers(node, self._class, self._warn_once)
+        self._publishers = Ros2Publishers(node, self._class, self._warn_once)
         self._came_last: dict[str, dict[bytes, str]] = {}
         self._others: set[str] = set()
         self._warned: set[str] = set()

@@ -20,7 +20,7 @@ Warn = Callable[[str, str], None]
 
 
 def steady_timer(node: Any, period_s: float, callback: Callable[[], None]) -> Any:
-    """A timer of real time. rclpy's own follows `use_sim_time`, and stands still while nobody publishes /clock."""
+    """A timer of real time. rclpy's own follows `use_sim_time`, and stands still without /clock."""
     return node.create_timer(period_s, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
@@ -82,7 +82,7 @@ class _Publisher:
         self._node.destroy_publisher(self._publisher)
 
 
-class Publishers:
+class Ros2Publishers:
     """What the mesh brings, published in ROS. `message_class` returns None for a type that is not installed."""
 
     def __init__(self, node: Any, message_class: Callable[[str], Any], warn: Warn) -> None:
