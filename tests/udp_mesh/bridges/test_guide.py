@@ -25,9 +25,11 @@ def example() -> str:
     return found[1]
 
 
-def start(daemon: RunningDaemon, script: Path, source: int, serve: int) -> subprocess.Popen[bytes]:
+def start(daemon: RunningDaemon, script: Path, source: int, serve: int, *more: str) -> subprocess.Popen[bytes]:
     options = ["--socket", str(daemon.socket), "--topic", "status", "--source", f"127.0.0.1:{source}"]
-    return subprocess.Popen([sys.executable, str(script), *options, "--serve", str(serve)], stdout=subprocess.DEVNULL)
+    return subprocess.Popen(
+        [sys.executable, str(script), *options, "--serve", str(serve), *more], stdout=subprocess.DEVNULL
+    )
 
 
 def connect(port: int) -> socket.socket:
@@ -41,7 +43,7 @@ def connect(port: int) -> socket.socket:
 
 
 def test_the_example_bridge_is_short_and_relays_lines(tmp_path: Path) -> None:
-    assert example().count("\n") < 100
+    assert example().count("\n") < 120
     script = tmp_path / "text_bridge.py"
     script.write_text(example())
     with two_daemons() as (alice, bob), socket.create_server(("127.0.0.1", 0)) as source:
@@ -65,11 +67,37 @@ def test_the_example_bridge_is_short_and_relays_lines(tmp_path: Path) -> None:
                 process.wait(WAIT_S)
 
 
-def speak_until_heard(speaker: socket.socket, reader: socket.socket, lines: BinaryIO) -> None:
+def test_the_example_bridge_reads_a_yarp_port(tmp_path: Path) -> None:
+    """The port is written from YARP's documentation, `YARP without YARP`."""
+    script = tmp_path / "text_bridge.py"
+    script.write_text(example())
+    with two_daemons() as (alice, bob), socket.create_server(("127.0.0.1", 0)) as port:
+        port.settimeout(WAIT_S)
+        address, read = int(port.getsockname()[1]), free_tcp_port()
+        processes = [
+            start(alice, script, address, free_tcp_port(), "--yarp"),
+            start(bob, script, free_tcp_port(), read),
+        ]
+        try:
+            with port.accept()[0] as asker, asker.makefile("rb") as asked, connect(read) as reader:
+                assert asked.readline() == b"CONNECT /mesh\n"
+                asker.sendall(b"Welcome /mesh\n")
+                assert asked.readline() == b"r\n"
+                with reader.makefile("rb") as lines:
+                    speak_until_heard(asker, reader, lines, b"do 2654 1215723086.182938\nhello\n")
+        finally:
+            for process in processes:
+                process.terminate()
+                process.wait(WAIT_S)
+
+
+def speak_until_heard(
+    speaker: socket.socket, reader: socket.socket, lines: BinaryIO, message: bytes = b"hello\r\n"
+) -> None:
     """Repeats it until a reader receives it, since discovery takes a while."""
 
     def heard() -> bytes | None:
-        speaker.sendall(b"hello\r\n")
+        speaker.sendall(message)
         return lines.readline() if select.select([reader], [], [], 0.1)[0] else None
 
     assert poll(heard, "a line") == b"alice hello\n"
