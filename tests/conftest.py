@@ -4,6 +4,7 @@
 deadline depends on the clock. `deep` draws new cases and many more of them: `HYPOTHESIS_PROFILE=deep make test`.
 """
 
+import gc
 import os
 from importlib.metadata import version
 
@@ -26,6 +27,9 @@ settings.register_profile(
 settings.register_profile("deep", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
 
+
+# Eight thousand collected tests and their modules stay: the default thresholds search them again and again for cycles.
+gc.set_threshold(50_000, 20, 50)
 
 LONGEST_GROUPS = ("lab-real", "fleet", "tutorials", "lab")
 """The groups of tests that share a fleet or a machine and wait for minutes: each begins at once, on its own worker."""
@@ -102,6 +106,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def _turn(item: pytest.Item) -> int:
     mark = item.get_closest_marker("xdist_group")
     return LONGEST_GROUPS.index(mark.args[0]) if mark and mark.args[0] in LONGEST_GROUPS else len(LONGEST_GROUPS)
+
+
+def pytest_collection_finish() -> None:
+    """What was collected stays to the end, so that nothing has to look for garbage in it."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

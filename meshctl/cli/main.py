@@ -6,6 +6,7 @@ one by its summary only, and hands over to typer.
 
 from __future__ import annotations
 
+import atexit
 import errno
 import functools
 import gc
@@ -50,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # looking for some; a caller's process keeps its own thresholds
     if arguments is None:
         gc.set_threshold(*GC_THRESHOLD)
+        # the interpreter searches all objects once more when it ends: a tenth of a short command
+        atexit.register(gc.freeze)
         # paramiko imports it for `Match exec` of an ssh_config, which meshctl does not read, and does without it; that
         # was a quarter of paramiko's start
         sys.modules.setdefault("invoke", None)  # type: ignore[arg-type]

@@ -24,8 +24,7 @@ from meshctl.plan.saved import SavedPlan, load
 from meshctl.sites.bundle import SiteBundle
 from meshctl.sites.connect import open_uplink
 from meshctl.sites.events import events_of, final_outcomes
-from meshctl.sites.nats_uplink import SiteOffline
-from meshctl.sites.uplink import Parcel, Uplink
+from meshctl.sites.uplink import Parcel, SiteOffline, Uplink
 
 # Uplinks wait far more than they work.
 MAX_SITES_AT_ONCE = 64

@@ -41,17 +41,13 @@ from meshctl.sites.nats_client import NatsLost, NatsServer, shared, stream_setti
 from meshctl.sites.protocol import SILENCE_S, raise_error
 from meshctl.sites.service import unit_name
 from meshctl.sites.subjects import SiteSubjects
-from meshctl.sites.uplink import Greeting, Parcel, Uplink, greeting_of
+from meshctl.sites.uplink import Greeting, Parcel, SiteOffline, Uplink, greeting_of
 
 # How long the hub keeps orders and events, whatever their own limits are.
 KEPT_DAYS = 90
 MAX_ORDERS_BYTES = MAX_EVENTS_BYTES = 256 << 20
 _SLICE_BYTES = 256 << 10
 _POLL_S = 0.5
-
-
-class SiteOffline(NatsLost):
-    """The worker of a site cannot be asked now."""
 
 
 def hub_server(fleet: Fleet, hub: NatsHub) -> NatsServer:

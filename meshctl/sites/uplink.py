@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from meshctl import __version__
-from meshctl.errors import InputError
+from meshctl.errors import InputError, Unreachable
 from meshctl.model import Site
 from meshctl.sites.order import SignedOrder
 from meshctl.sites.protocol import PROTOCOL
@@ -51,6 +51,10 @@ class Parcel:
     part: bytes = field(default=b"", repr=False)
     plan: str = field(default="", repr=False)
     images: Mapping[str, str] = field(default_factory=dict)
+
+
+class SiteOffline(Unreachable):
+    """The worker of a site cannot be asked now."""
 
 
 class Uplink(ABC):
