@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.meshctl.fleet.postgresql_server import Server, running
-from tests.meshctl.proof.rig import COMMAND_LIMIT_S, Ended, Rig
+from tests.meshctl.proof.rig import COMMAND_LIMIT_S, Ended, Rig, run
 from tests.meshctl.proof.wires import WIRES, ip, plug_in, route
 
 
@@ -27,15 +27,19 @@ class Operator:
     rig: Rig
     url: str
 
+    @property
+    def environ(self) -> dict[str, str]:
+        return {
+            **self.rig.environ,
+            "XDG_STATE_HOME": str(self.rig.directory / self.name),
+            "MESHCTL_STORE": self.url,
+            "LOGNAME": self.name,
+        }
+
     def start(self, *words: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
             [sys.executable, "-m", "meshctl", *words],
-            env={
-                **self.rig.environ,
-                "XDG_STATE_HOME": str(self.rig.directory / self.name),
-                "MESHCTL_STORE": self.url,
-                "LOGNAME": self.name,
-            },
+            env=self.environ,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -43,9 +47,7 @@ class Operator:
         )
 
     def meshctl(self, *words: str) -> Ended:
-        with self.start(*words) as process:
-            out, err = process.communicate(timeout=COMMAND_LIMIT_S)
-            return Ended(process.returncode, out, err)
+        return run(words, self.environ)
 
     def runs(self) -> list[dict[str, object]]:
         found: list[dict[str, object]] = json.loads(self.meshctl("history", "--json").out)

@@ -15,6 +15,7 @@ import tarfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import TracebackType
 from typing import Any, Self
 
@@ -27,9 +28,9 @@ from meshctl.render import DeviceFacts, render_node
 from meshctl.uci import parse
 from meshlab.fleet import VirtualFleet
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
+from tests.meshctl import forked_commands
 
-# Far above what any command needs on a busy machine; a hang ends here.
-COMMAND_LIMIT_S = 600.0
+COMMAND_LIMIT_S = forked_commands.LIMIT_S
 INVENTORY = """\
 meshctl: 1
 fleet: proof
@@ -87,6 +88,19 @@ class Ended:
     def verdicts(self) -> dict[str, str]:
         """Node -> verdict, of `provision --check --json`."""
         return {name: item["verdict"] for name, item in json.loads(self.out)["nodes"].items()}
+
+
+def run(words: Sequence[str], environ: Mapping[str, str]) -> Ended:
+    """Run a command of meshctl to its end."""
+    with TemporaryFile() as out, TemporaryFile() as err:
+        process = forked_commands.start(words, environ, out, err)
+        try:
+            code = process.wait(COMMAND_LIMIT_S)
+        finally:
+            process.kill()
+        out.seek(0)
+        err.seek(0)
+        return Ended(code, out.read().decode(), err.read().decode())
 
 
 @dataclass(slots=True)
@@ -191,13 +205,8 @@ class Rig:
 
     def start(self, verb: str, variant: str, *words: str, command: Sequence[str] = ()) -> subprocess.Popen[str]:
         """Begin a verb of meshctl on inventory `variant` (empty: the verb takes none); `command` is for the nodes."""
-        arguments = [sys.executable, "-m", "meshctl", verb, *words]
-        if variant:
-            arguments += ["-i", str(self.inventory(variant)), "--key", str(self._key)]
-        if command:
-            arguments += ["--", *command]
         return subprocess.Popen(
-            arguments,
+            [sys.executable, "-m", "meshctl", *self._words(verb, variant, words, command)],
             env=self.environ,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -207,9 +216,15 @@ class Rig:
 
     def meshctl(self, verb: str, variant: str, *words: str, command: Sequence[str] = ()) -> Ended:
         """Run it to its end."""
-        with self.start(verb, variant, *words, command=command) as process:
-            out, err = process.communicate(timeout=COMMAND_LIMIT_S)
-            return Ended(process.returncode, out, err)
+        return run(self._words(verb, variant, words, command), self.environ)
+
+    def _words(self, verb: str, variant: str, words: Sequence[str], command: Sequence[str]) -> list[str]:
+        return [
+            verb,
+            *words,
+            *(("-i", str(self.inventory(variant)), "--key", str(self._key)) if variant else ()),
+            *(("--", *command) if command else ()),
+        ]
 
     def take_in(self, variant: str) -> Ended:
         """Bootstrap every node with inventory `variant`."""

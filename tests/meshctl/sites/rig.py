@@ -10,8 +10,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import urllib.request
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,6 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from tests.meshctl import forked_commands
 from tests.meshctl.device.servers import keypair, openssh, public
 from tests.meshctl.inventories import compex_hardware
 from tests.meshctl.sites.forwarder import CuttableUplink
@@ -101,10 +100,7 @@ class Started:
         self.out = rig.directory / f"command-{number}.out"
         self._err = rig.directory / f"command-{number}.err"
         with self.out.open("wb") as out, self._err.open("wb") as err:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "meshctl", *words], env=rig.environment, stdin=subprocess.DEVNULL,
-                stdout=out, stderr=err, start_new_session=True,
-            )  # fmt: skip
+            self.process = forked_commands.start(words, rig.environment, out, err)
 
     def wait_for(self, pattern: str) -> None:
         """Wait until its output has this."""
