@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 
 from meshctl.plan.values import Cut, NodePlan, Stage, StageKind, Way
 
@@ -38,6 +37,9 @@ class Pace:
     @classmethod
     def of(cls, durations_s: Sequence[float]) -> Pace:
         """The pace of these changes."""
+        # here, because it imports fractions and decimal, and most starts measure nothing
+        from statistics import median
+
         return cls(median(durations_s), len(durations_s)) if durations_s else cls()
 
     @property
