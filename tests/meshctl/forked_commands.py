@@ -141,7 +141,7 @@ def serve(requests: socket.socket) -> None:
         for stream in streams:
             os.close(stream)
         running[pid] = socket.socket(fileno=answers)
-        # whoever asked may be gone
+        # the process that asked may be gone
         with contextlib.suppress(OSError):
             running[pid].send(f"{pid}\n".encode())
 
