@@ -16,7 +16,7 @@ from meshctl.plan.saved import SavedPlan, dump
 from meshctl.sites import dispatch
 from meshctl.sites.bundle import SiteBundle
 from meshctl.sites.dispatch import PLAN_ATTEMPTS, SitePlan, prepare_sites
-from meshctl.sites.nats_uplink import SiteOffline
+from meshctl.sites.uplink import SiteOffline
 from tests.meshctl.inventory.inventories import fleet_of
 
 _NODES = """
