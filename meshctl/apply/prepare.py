@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from meshctl.apply.half_deaf import RELEARN_S, last_relays, reconnect
+from meshctl.apply.reconnect import RELEARN_S, last_relays, reconnect
 from meshctl.device.observation import Observation
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError

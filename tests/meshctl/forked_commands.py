@@ -138,6 +138,7 @@ def serve(requests: socket.socket) -> None:
             _become(environ, directory, *streams)
             sys.argv = ["meshctl", *words]
             main()
+            sys.exit()
         for stream in streams:
             os.close(stream)
         running[pid] = socket.socket(fileno=answers)

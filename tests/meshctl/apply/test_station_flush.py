@@ -14,8 +14,8 @@ from typing import cast
 import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.half_deaf import HEARD_MS, entries_of_unreachable, last_relays
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
+from meshctl.apply.reconnect import HEARD_MS, entries_of_unreachable, last_relays
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
 from meshctl.device.ssh import SshConnection

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -28,7 +29,6 @@ from meshlab.qemu import control
 from meshlab.spec import FleetSpec
 from tests import waiting
 from tests.conftest import TRIED_AGAIN
-from tests.meshctl import forked_commands
 from tests.meshlab.fleet_report import report
 
 INVENTORY = Path(__file__).with_name("inventory")
@@ -87,14 +87,18 @@ class Lab:
             "COLUMNS": "200",
         }
         lines: list[str] = []
-        reading, writing = os.pipe()
-        with tempfile.TemporaryFile() as complaints, open(reading, encoding="utf-8") as output:
-            with open(writing, "wb") as stream:
-                process = forked_commands.start(words, environment, stream, complaints)
+        with (
+            tempfile.TemporaryFile("w+") as complaints,
+            subprocess.Popen(
+                (sys.executable, "-m", "meshctl", *words),
+                env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints, text=True,
+            ) as process,
+        ):  # fmt: skip
             patience = threading.Timer(COMMAND_S, process.kill)
             patience.start()
             try:
-                for line in output:
+                assert process.stdout is not None
+                for line in process.stdout:
                     lines.append(line)
                     if on_line is not None and on_line[0] in line:
                         on_line[1]()
@@ -104,7 +108,7 @@ class Lab:
                 patience.cancel()
                 process.kill()
             complaints.seek(0)
-            done = Done(status, "".join(lines), complaints.read().decode())
+            done = Done(status, "".join(lines), complaints.read())
         assert expect is None or status == expect, f"meshctl {' '.join(words)}: {done.text}{done.errors}"
         return done
 
