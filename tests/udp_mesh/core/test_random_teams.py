@@ -25,5 +25,5 @@ def test_every_promise_is_kept_in_three_thousand_teams() -> None:
 @pytest.mark.proof
 @pytest.mark.timeout(4 * 3600)
 @pytest.mark.parametrize("seed", range(100, 120))
-def test_every_promise_is_kept_for_ten_minutes(seed: int) -> None:
-    play(seed, 600.0)
+def test_every_promise_is_kept_for_two_minutes(seed: int) -> None:
+    play(seed, 120.0)
