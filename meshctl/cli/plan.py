@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
@@ -38,7 +38,7 @@ from meshctl.cli.site_runs import (
     report_everywhere,
     sites_of,
 )
-from meshctl.errors import InputError
+from meshctl.errors import ExitCode, InputError
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.plan import Plan, Verdict
 from meshctl.plan.saved import dump, load
@@ -225,14 +225,20 @@ def resume(
         if record.command == "restore":
             hint = f"run `meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` to apply the inventory"
             raise InputError(f"run {record.id} restored a backup, which cannot be resumed", hint=hint)
-        has_met = meet(opened, record, as_json=as_json)
-        if has_met:
+        unknown = meet(opened, record, as_json=as_json)
+        if unknown is not None:
             left = opened.journal.unfinished(record.id)
-        if record.command == "rollback" and (left or not has_met):
+        if record.command == "rollback" and (left or unknown is None):
             hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
             raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
-        names = _still_managed(opened, left)
+        names = _still_managed(opened, [name for name in left if name not in (unknown or ())])
+        if unknown:
+            # another order could change them beside the run that may still be in progress
+            echo(f"left out, until their sites report how run {record.id} ended: {', '.join(unknown)}", err=True)
+            echo(f"hint: run `meshctl resume {record.id}` later, or `meshctl provision` for a new run", err=True)
         if not names:
+            if unknown:
+                raise typer.Exit(ExitCode.UNREACHABLE)
             echo(f"run {record.id} is finished: nothing to resume", err=as_json)
             return
         if not as_json:
@@ -248,16 +254,25 @@ def resume(
         own, sites = sites_of(opened, names, None, direct=direct)
         if sites:
             options = RunOptions("resume", choices, as_json, rate)
-            raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
+            ended = change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
+            raise _ended_without(unknown, ended)
         prepared = prepare_plan(opened, names, choices, reconnects=not dry_run)
         for line in bench_advice(record, prepared.plan):
             echo(line, err=True)
         for name, text in resolutions(record.id, opened.journal.outcomes(record.id), prepared).items():
             line = json.dumps({"event": "note", "node": name, "at_s": round(time.time(), 3), "text": text})
             echo(line if as_json else f"{name}: {text}")
-        confirm_and_execute(
-            opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
-        )
+        try:
+            confirm_and_execute(
+                opened, prepared, "resume", choices, yes=yes, as_json=as_json, brief=brief, rate=rate, dry_run=dry_run
+            )
+        except typer.Exit as exited:
+            raise _ended_without(unknown, exited) from None
+
+
+def _ended_without(unknown: Collection[str] | None, ended: typer.Exit) -> typer.Exit:
+    """No success while nodes were left out."""
+    return typer.Exit(ExitCode.UNREACHABLE) if unknown and ended.exit_code == ExitCode.OK else ended
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:

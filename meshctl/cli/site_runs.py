@@ -341,9 +341,9 @@ def _outcome_without_run(opened: Session, site: SitePlan, name: str) -> Outcome:
     return Outcome(name, Result.REFUSED, plan.refusal, plan.refusal_hint)
 
 
-def meet(opened: Session, record: RunRecord, *, as_json: bool) -> bool:
-    """Follow the sites' parts of an earlier run to their end, and complete its entry in the journal; whether it has
-    such parts."""
+def meet(opened: Session, record: RunRecord, *, as_json: bool) -> tuple[str, ...] | None:
+    """Follow the sites' parts of an earlier run to their end, and complete its entry in the journal. Returns the nodes
+    of the parts whose end is still not known; None if the run has no such parts."""
     recorded = json.loads(record.plan) if record.plan else {}
     started: Mapping[str, str] = recorded.get("sites", {})
     left = opened.journal.unfinished(record.id)
@@ -353,7 +353,7 @@ def meet(opened: Session, record: RunRecord, *, as_json: bool) -> bool:
         if site in opened.fleet.sites and (nodes := _nodes_at(opened, left, site))
     ]
     if not runs:
-        return False
+        return None
     entry = Run(opened.journal, record.id)
     names = [name for run in runs for name in run.nodes]
     if not as_json:
@@ -367,7 +367,7 @@ def meet(opened: Session, record: RunRecord, *, as_json: bool) -> bool:
     if opened.interrupt.stopping:
         echo_error("interrupted before it was known")
         raise typer.Exit(ExitCode.INTERRUPTED)
-    return True
+    return tuple(name for run in runs if run.is_unknown for name in run.nodes)
 
 
 def _nodes_at(opened: Session, names: Iterable[str], site: str) -> tuple[str, ...]:

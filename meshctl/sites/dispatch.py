@@ -153,6 +153,8 @@ class SiteRun:
     offset: int = 0
     is_started: bool = False
     is_over: bool = False
+    # it was left, or its site is offline: it may yet change nodes, or has done so unseen
+    is_unknown: bool = False
     in_work: set[str] = field(default_factory=set)
 
 
@@ -210,6 +212,7 @@ class SiteExecution:
                 text += ", or its order still waits for it"
             if not run.is_started:
                 text = "it has not started, or the uplink was lost just then"
+            run.is_unknown = True
             self._finish_all(run, Result.PENDING, text, "run `meshctl resume` to see how it ended")
 
     def _leaves(self, run: SiteRun) -> bool:
@@ -228,7 +231,7 @@ class SiteExecution:
                 if run.parcel is None:
                     text = f"site {run.site.name} is offline and has not reported how run {run.run} ended"
                     self._finish_all(run, Result.PENDING, text, "run `meshctl resume` later")
-                    run.is_over = True
+                    run.is_over = run.is_unknown = True
                     return
                 state = ""
             if state == "waiting" and (run.parcel is None or run.waits_until):
@@ -260,7 +263,7 @@ class SiteExecution:
         until = f" until {run.waits_until}" if run.waits_until else ""
         text = f"site {run.site.name} is offline: the order waits for it{until}"
         self._finish_all(run, Result.PENDING, text, "run `meshctl resume` later to see how it ended")
-        run.is_over = True
+        run.is_over = run.is_unknown = True
 
     def _finish_unknown(self, run: SiteRun, uplink: Uplink) -> None:
         """The outcomes of a run that its site does not know (anymore)."""

@@ -39,6 +39,11 @@ def rig(shared: NatsRig) -> NatsRig:
     return shared
 
 
+def _latest_run(rig: NatsRig) -> int:
+    number: int = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+    return number
+
+
 def _reasons(ended: Ended) -> set[str]:
     return {event["outcome"]["reason"] for event in ended.events if event["event"] == "finished"}
 
@@ -118,17 +123,20 @@ def test_an_order_waits_for_a_site_that_is_offline(rig: NatsRig, tmp_path: Path)
     ordered = rig.run("apply", str(file), "--json")
     assert ordered.results == {**dict.fromkeys(NORTH, "done"), **dict.fromkeys(SOUTH, "pending")}
     assert any("site south is offline: the order waits for it until 20" in reason for reason in _reasons(ordered))
-    run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+    run = _latest_run(rig)
     (waiting_run,) = json.loads(rig.run("sites", "status", "south", "--json").out)[0]["waiting"]
     canceled = rig.run("sites", "cancel", "south", waiting_run, expected=0)
     assert "nothing was changed" in canceled.out
     assert rig.run("sites", "cancel", "south", waiting_run).code == 1
     after = rig.run("resume", str(run), "--yes", "--json")
     assert any("is offline and has not reported" in reason for reason in _reasons(after)), after
+    assert (after.code, _latest_run(rig)) == (3, run)
     rig.run("apply", str(of_south), "--json")
-    run = json.loads(rig.run("history", "--json", expected=0).out)[0]["run"]
+    run = _latest_run(rig)
     waiting = rig.run("resume", str(run), "--yes", "--json")
     assert any("the order waits for it" in reason for reason in _reasons(waiting))
+    # no second order beside the one that waits
+    assert (waiting.code, _latest_run(rig)) == (3, run)
     rig.uplinks["south"].mend()
     until(lambda: list(rig.site_directory("south").glob("runs/*/over.json")), "the end of its run", wait_s=120)
     until(lambda: rig.run("resume", str(run), "--yes").code == 0, "the operator to know", wait_s=60)
