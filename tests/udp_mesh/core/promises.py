@@ -193,7 +193,7 @@ def play(seed: int, seconds: float) -> RandomTeam:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tests.udp_mesh.core.random_teams", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.udp_mesh.core.promises", description=__doc__)
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--seconds", type=float, default=20.0)
