@@ -12,6 +12,11 @@ def test_every_promise_is_kept_whatever_happens(seed: int) -> None:
     play(seed, 8.0)
 
 
+def test_a_boot_that_is_first_heard_over_an_unplugged_link_gets_what_waits() -> None:
+    """Its datagram was on its way when the link went, so it had no path until it was heard over the other one."""
+    play(255, 20.0)
+
+
 @pytest.mark.proof
 @pytest.mark.timeout(4 * 3600)
 def test_every_promise_is_kept_in_three_thousand_teams() -> None:
