@@ -156,7 +156,8 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
             sender.app_limited = True
             state.arm(peer)
     held = mask & ~allowed
-    broadcasts.held, broadcasts.held_until = held, state.priority_backoff.held_until(now) or now
+    held_until = state.priority_backoff.held_until(now) if held else None
+    broadcasts.held, broadcasts.held_until = held, held_until or now
     mask &= allowed
     while mask and room > 0:
         bit = mask & -mask
@@ -194,11 +195,9 @@ def _send_levels(state: State, now: float, out: list[Datagram], room: int) -> No
         if room > 0:
             state.ready.pop(peer, None)
             sender.app_limited = not sender.scheduler.waiting & ~sender.packing.waiting
-        if held & sender.scheduler.waiting:
-            until = state.priority_backoff.held_until(now)
-            if until is not None:
-                peer.record_held(held & sender.scheduler.waiting, now, until)
-                sender.wake_at = min(sender.wake_at, until)
+        if held_until is not None and held & sender.scheduler.waiting:
+            peer.record_held(held & sender.scheduler.waiting, now, held_until)
+            sender.wake_at = min(sender.wake_at, held_until)
         state.arm(peer)
 
 
