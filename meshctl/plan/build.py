@@ -44,7 +44,8 @@ def fleet_plan(
     in_order = stages_of(todo, surroundings, found.nodes)
     at_once = stages_together(todo, surroundings, found.nodes)
     stages = at_once if together else in_order
-    refusal, hint = _refusal(found, plans, graph, entries, frozenset(accept_cuts))
+    cuts = graph.cut_off_by_any(entries)
+    refusal, hint = _refusal(found, plans, cuts, frozenset(accept_cuts))
     if together and not refusal:
         refusal, hint = _refused_together(at_once, plans)
     windows = [fleet.nodes[plan.node].confirm_window_s for plan in todo]
@@ -61,7 +62,6 @@ def fleet_plan(
         and plans[name].splits
         and not any(name in nodes for nodes in found.nodes.values())
     ]
-    cuts = graph.cut_off_by_any(entries)
     notes += [
         f"stage {number}: {name} is a cut vertex: {', '.join(cuts[name])} {_cut_off_for(plans[name])}"
         for number, stage in enumerate(stages, 1)
@@ -108,7 +108,10 @@ def _refused_together(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) ->
 
 
 def _refusal(
-    found: MeshSwitches, plans: Mapping[str, NodePlan], graph: Graph, entries: tuple[str, ...], accepted: frozenset[str]
+    found: MeshSwitches,
+    plans: Mapping[str, NodePlan],
+    cuts: Mapping[str, tuple[str, ...]],
+    accepted: frozenset[str],
 ) -> tuple[str, str]:
     for mesh, why in found.blocked.items():
         flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
@@ -124,7 +127,6 @@ def _refusal(
             "part of this plan",
             f"switch them on and select them too, or acknowledge with --leave-behind {','.join(names)}",
         )
-    cuts = graph.cut_off_by_any(entries)
     for name, plan in plans.items():
         if plan.firmware is not None and plan.is_meshed and cuts.get(name) and not accepted & {name, "all"}:
             return (
