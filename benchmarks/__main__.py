@@ -15,7 +15,7 @@ from typing import Any
 
 from benchmarks.cells import QUICK, SETS, Cell, cells, measure
 from benchmarks.link.laboratory import laboratory
-from benchmarks.page import fill
+from benchmarks.page import append_result, fill
 from benchmarks.peers import PEERS, peer_called
 from benchmarks.tables import report
 
@@ -66,8 +66,7 @@ def main() -> None:
                 print(f"[{number}/{len(todo)}] {cell.set}: {cell.name}: {cell.peer}", file=sys.stderr, flush=True)
                 result = measure(lab, cell)
                 results.append(result)
-                with arguments.results.open("a") as file:
-                    file.write(json.dumps(result) + "\n")
+                append_result(arguments.results, result)
     print(report(results))
     if arguments.fill:
         fill("tables", report(results))

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import functools
 import gc
-import json
 import random
 import time
 from collections import deque
@@ -24,6 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from benchmarks.page import append_result, read_results
 from udp_mesh.core import receive
 from udp_mesh.core.endpoint import Endpoint
 from udp_mesh.core.events import PeerOffline, PeerOnline
@@ -252,13 +252,11 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     arguments.results.parent.mkdir(parents=True, exist_ok=True)
-    kept = arguments.results.read_text().splitlines() if arguments.results.exists() else []
-    results = {one["nodes"]: one for one in map(json.loads, kept)}
+    results = {one["nodes"]: one for one in read_results(arguments.results)}
     for word in arguments.nodes.split(","):
         if int(word) not in results:
             results[int(word)] = one = measure(int(word))
-            with arguments.results.open("a") as file:
-                file.write(json.dumps(one) + "\n")
+            append_result(arguments.results, one)
     print(table([one for _, one in sorted(results.items())]))
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.link.laboratory import INTERFACE, LaboratoryError
-from benchmarks.page import fill, this_machine
+from benchmarks.page import append_result, fill, this_machine
 from benchmarks.peers import ROS2_PYTHON
 
 RESULTS = Path(__file__).with_name("results") / "discovery_traffic.jsonl"
@@ -233,8 +233,7 @@ def main() -> None:
                 continue
             print(f"{size} members: {KINDS[kind]}", file=sys.stderr, flush=True)
             results.append(measure(kind, size, arguments.spread))
-            with arguments.results.open("a") as file:
-                file.write(json.dumps(results[-1]) + "\n")
+            append_result(arguments.results, results[-1])
     print(table(results))
     if arguments.fill:
         fill("discovery-traffic", table(results))

@@ -9,7 +9,6 @@ reachable while others change.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.model_node.fleet import INVENTORY, VARIANTS, ModelFleet
-from benchmarks.page import fill, this_machine
+from benchmarks.page import append_result, fill, read_results, this_machine
 from benchmarks.provisioning import limit_s, ran, sizes_of
 
 RESULTS = Path(__file__).with_name("results") / "meshes.jsonl"
@@ -87,12 +86,9 @@ def main() -> int:
     if not arguments.tables:
         for count in sizes_of(arguments.meshes):
             result = measure(count)
-            arguments.results.parent.mkdir(parents=True, exist_ok=True)
-            with arguments.results.open("a") as file:
-                file.write(json.dumps(result) + "\n")
+            append_result(arguments.results, result)
             print(table([result]), flush=True)
-    lines = arguments.results.read_text().splitlines() if arguments.results.exists() else []
-    latest = {result["meshes"]: result for result in map(json.loads, lines)}
+    latest = {result["meshes"]: result for result in read_results(arguments.results)}
     text = table([latest[key] for key in sorted(latest)])
     print(text)
     if arguments.fill:

@@ -15,7 +15,6 @@ of the first two is exact.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import socket
@@ -32,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.model_node.counting import counted
+from benchmarks.page import append_result
 from meshlab.fleet import VirtualNode
 from tests.meshctl.proof.rig import Rig
 
@@ -188,8 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if os.geteuid() != 0:
         parser.error("needs root: only root hears of all processes")
     result = measure()
-    with chosen.results.open("a") as file:
-        file.write(json.dumps(result) + "\n")
+    append_result(chosen.results, result)
     print(table(result))
     return 0
 

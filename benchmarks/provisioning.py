@@ -38,6 +38,7 @@ from typing import Any
 
 from benchmarks.model_node.counting import counted
 from benchmarks.model_node.fleet import ModelFleet
+from benchmarks.page import append_result, read_results
 from meshctl.errors import MeshctlError
 from meshctl.render import DeviceFacts
 from meshlab.fleet import VirtualFleet
@@ -252,9 +253,7 @@ def main() -> int:
             failed += 1
             print(f"{count} nodes: {error}", file=sys.stderr, flush=True)
             continue
-        arguments.results.parent.mkdir(parents=True, exist_ok=True)
-        with arguments.results.open("a") as file:
-            file.write(json.dumps(result) + "\n")
+        append_result(arguments.results, result)
         print(table([result]), flush=True)
     print(table(recorded(arguments.results)))
     return 1 if failed else 0
@@ -266,8 +265,7 @@ def sizes_of(text: str) -> list[int]:
 
 def recorded(path: Path) -> list[dict[str, Any]]:
     """The latest result of each fleet, size and concurrency."""
-    lines = path.read_text().splitlines() if path.exists() else []
-    found = map(json.loads, lines)
+    found = read_results(path)
     return list({(r["fleet"], r["nodes"], r["forks"], r["parallel"]): r for r in found if "fleet" in r}.values())
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.model_node.fleet import INVENTORY, VARIANTS, ModelFleet
-from benchmarks.page import fill, this_machine
+from benchmarks.page import append_result, fill, read_results, this_machine
 from tests.meshctl.device.servers import openssh, public
 from tests.meshctl.sites.forwarder import CuttableUplink
 from tests.meshctl.sites.wheels import required_wheels
@@ -220,12 +220,9 @@ def main() -> int:
         for size in filter(None, arguments.sizes.split(",")):
             sites, nodes = map(int, size.split("x"))
             result = measure(sites, nodes)
-            arguments.results.parent.mkdir(parents=True, exist_ok=True)
-            with arguments.results.open("a") as file:
-                file.write(json.dumps(result) + "\n")
+            append_result(arguments.results, result)
             print(table([result]), flush=True)
-    lines = arguments.results.read_text().splitlines() if arguments.results.exists() else []
-    latest = {(result["sites"], result["nodes"]): result for result in map(json.loads, lines)}
+    latest = {(result["sites"], result["nodes"]): result for result in read_results(arguments.results)}
     text = table([latest[key] for key in sorted(latest)])
     print(text)
     if arguments.fill:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.model_node.fleet import ModelFleet
-from benchmarks.page import fill
+from benchmarks.page import append_result, fill, read_results
 from benchmarks.provisioning import limit_s, ran, sizes_of
 from tests.meshctl.proof.rig import Rig
 
@@ -102,12 +102,9 @@ def main() -> int:
         sizes += [(measure, count) for count in sizes_of(arguments.nodes)]
         for run, count in sizes:
             result = run(count)
-            arguments.results.parent.mkdir(parents=True, exist_ok=True)
-            with arguments.results.open("a") as file:
-                file.write(json.dumps(result) + "\n")
+            append_result(arguments.results, result)
             print(table([result]), flush=True)
-    lines = arguments.results.read_text().splitlines() if arguments.results.exists() else []
-    latest = {(result["fleet"], result["nodes"]): result for result in map(json.loads, lines)}
+    latest = {(result["fleet"], result["nodes"]): result for result in read_results(arguments.results)}
     text = table([latest[key] for key in sorted(latest)])
     print(text)
     if arguments.fill:
