@@ -29,6 +29,7 @@ from meshctl.uci import parse
 from meshlab.fleet import VirtualFleet
 from meshlab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.meshctl import forked_commands
+from tests.meshctl.inventories import compex_hardware
 
 COMMAND_LIMIT_S = forked_commands.LIMIT_S
 INVENTORY = """\
@@ -40,16 +41,7 @@ operators:
 system: {{log_size_kib: {log_size}}}
 apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, quorum: 0.6{policy}}}
 hardware:
-  box:
-    board: compex,wpj344-16m
-    profile: compex_wpj344-16m
-    target: ath79/generic
-    release: "{release}"
-    lan_ports: [eth0]
-    confirm_window_s: {window_s}
-    radios:
-      radio0: {{path: platform/ahb/18100000.wmac, band: 2g, rated_power_dbm: 30, max_drive_dbm: 27}}
-{firmware}
+{hardware}{firmware}
 meshes:
   main:
     ssid: proof
@@ -142,14 +134,13 @@ class Rig:
             text = INVENTORY.format(
                 key=public.decode() + " proof",
                 count=self.count,
-                window_s=self.window_s,
+                hardware=compex_hardware(self.release.value, confirm_window_s=self.window_s),
                 policy="" if self.parallel is None else f", parallel: {self.parallel}",
                 firmware=self.firmware.get(variant, ""),
                 log_size=64 + number,
                 channel=SPLIT_CHANNELS[number] if variant == "split" else 6,
                 distance=1000 + number,
                 penalty=30 + number,
-                release=self.release.value,
             )
             self.inventory(variant).write_text(text, encoding="utf-8")
         names = ["base", *self.names]
