@@ -28,17 +28,25 @@ class LegacyPositions:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._turn = asyncio.Lock()
         self.saved = load_positions(path)
 
+    @property
+    def is_saving(self) -> bool:
+        """Whether a save is in progress. On a disk that hangs, it remains so."""
+        return self._turn.locked()
+
     async def save(self, positions: Mapping[str, ReceivePosition]) -> None:
-        """Saves what was received from legacy peers, if it changed."""
-        if positions == self.saved:
-            return
-        self.saved = dict(positions)
-        try:
-            await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
-        except OSError as error:
-            log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)
+        """Saves what was received from legacy peers, if it changed; first waits for a save in progress, which would
+        otherwise write its older positions over these."""
+        async with self._turn:
+            if positions == self.saved:
+                return
+            self.saved = dict(positions)
+            try:
+                await asyncio.get_running_loop().run_in_executor(None, save_positions, self._path, positions)
+            except OSError as error:
+                log.warning("legacy-positions-not-saved path=%s error=%s", self._path, error)
 
 
 def load_positions(path: Path) -> dict[str, ReceivePosition]:

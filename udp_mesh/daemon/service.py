@@ -212,10 +212,7 @@ class Service:
 
     def topic(self, name: str) -> Topic | None:
         """The settings of a topic (None: it is refused)."""
-        for topic in self.settings.topics:
-            if topic.name == name:
-                return topic
-        return self.settings.undeclared
+        return next((topic for topic in self.settings.topics if topic.name == name), self.settings.undeclared)
 
     # Runtime changes
 
@@ -364,7 +361,8 @@ class Service:
         if self.store.needs_flush:
             # Messages stored because a peer went offline; no publisher waits for them.
             self._spawn(self._flusher.flush())
-        self._spawn(self._legacy.save(self.driver.node.legacy_positions()))
+        if not self._legacy.is_saving:
+            self._spawn(self._legacy.save(self.driver.node.legacy_positions()))
         self.inbox.take_read()
         self.subscriptions.pass_on_held()
         clients = list(self.subscriptions.subscribed_literally(CONDITIONS_TOPIC))

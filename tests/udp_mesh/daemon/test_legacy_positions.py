@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 import socket
 import tempfile
+import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -14,7 +17,8 @@ from tests.udp_mesh.core.test_legacy import fragments
 from tests.udp_mesh.daemon.processes import RunningDaemon, configuration, poll, wait_online
 from tests.udp_mesh.links.sockets import free_port
 from udp_mesh.core.legacy.acks import ReceivePosition
-from udp_mesh.daemon.legacy_positions import load_positions, save_positions
+from udp_mesh.daemon import legacy_positions
+from udp_mesh.daemon.legacy_positions import LegacyPositions, load_positions, save_positions
 from udp_mesh.wire.legacy import Host, LegacyAck, decode_legacy, encode_legacy
 
 SOME = {"old": ReceivePosition(17, ((16, 2, 2), (17, 1, 9))), "older": ReceivePosition(1, ())}
@@ -39,6 +43,32 @@ def test_a_damaged_file_is_reported_and_ignored(text: str, tmp_path: Path, caplo
     path.write_text(text)
     assert load_positions(path) == {}
     assert "legacy-positions-unreadable" in caplog.text
+
+
+def test_saves_on_a_slow_disk_run_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, writing = tmp_path / "positions.json", threading.Lock()
+    disk_asked, disk_answers = threading.Event(), threading.Event()
+
+    def save_slowly(path: Path, positions: Mapping[str, ReceivePosition]) -> None:
+        assert writing.acquire(blocking=False)
+        disk_asked.set()
+        assert disk_answers.wait(60)
+        save_positions(path, positions)
+        writing.release()
+
+    async def save_twice() -> None:
+        positions = LegacyPositions(path)
+        first = asyncio.create_task(positions.save(SOME))
+        await asyncio.to_thread(disk_asked.wait, 60)
+        last = asyncio.create_task(positions.save({"old": SOME["old"]}))
+        await asyncio.sleep(0)
+        disk_answers.set()
+        await asyncio.gather(first, last)
+        assert not positions.is_saving
+
+    monkeypatch.setattr(legacy_positions, "save_positions", save_slowly)
+    asyncio.run(save_twice())
+    assert load_positions(path) == {"old": SOME["old"]}
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
