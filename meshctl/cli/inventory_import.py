@@ -42,8 +42,9 @@ def import_table(
 ) -> None:
     """Set labels, serial numbers, MAC addresses and other values of nodes from a CSV table.
 
-    Columns: node, label, serial, mac, role, state, hardware, release, address, robot. A row names its node in `node`,
-    or else by its label. Empty cells change nothing; the inventory's comments and layout stay.
+    Columns: node, label, serial, mac, role, state, hardware, release, address, robot, site, groups (names separated by
+    blanks). A row names its node in `node`, or else by its label. Empty cells change nothing; the inventory's comments
+    and layout stay.
 
     Example: meshctl inventory import csv boxes.csv --column "mac=MAC address" --ignore Owner --dry-run
     """

@@ -1,7 +1,8 @@
 """Nodes as a CSV table, for spreadsheets, stocktaking and label printers. Pure.
 
 Out: `write` makes one row per node. In: `read` checks the table and every value, `edits` compares it with the inventory
-and returns what to set on each node; an empty cell leaves the inventory's value.
+and returns what to set on each node; an empty cell leaves the inventory's value. A cell of `groups` has names separated
+by blanks.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from meshctl.inventory.fields import Name
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import Plain
 from meshctl.inventory.validate import expected_value
+from meshctl.inventory.yaml_text import Value
 from meshctl.model import Fleet, Node
 
 NODE = "node"
@@ -34,8 +36,11 @@ _GETTERS: Mapping[str, Callable[[Node], str]] = {
     "release": lambda node: node.release.value,
     "address": lambda node: str(node.address.ip),
     "robot": lambda node: node.robot,
+    "site": lambda node: node.site,
+    "groups": lambda node: " ".join(node.groups),
 }
 COLUMNS = (NODE, *_GETTERS)
+_LISTS = ("groups",)
 # no two devices have the same one
 _UNIQUE = (NODE, "label", "serial", "mac")
 _DELIMITERS = ",;\t"
@@ -56,7 +61,7 @@ class NodeEdit:
     node: str
     line: int
     is_new: bool
-    values: Mapping[str, str]
+    values: Mapping[str, Value]
 
 
 def write(nodes: Iterable[Node]) -> str:
@@ -125,11 +130,11 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
         if node is not None:
             changed = {key: value for key, value in values.items() if value != _GETTERS[key](node)}
             if changed:
-                found.append(NodeEdit(node.name, row.line, False, changed))
+                found.append(NodeEdit(node.name, row.line, False, _parsed(changed)))
         elif not (name or label):
             errors.append(_wrong(place, NODE, "a name or a label", "neither"))
         elif name and add:
-            found.append(NodeEdit(name, row.line, True, values))
+            found.append(NodeEdit(name, row.line, True, _parsed(values)))
         else:
             key, word, known = (NODE, name, list(fleet.nodes)) if name else ("label", label, list(by_label))
             hint = did_you_mean(word, known) or (
@@ -187,7 +192,14 @@ def _columns(
 
 
 def _normalized(column: str, cell: str) -> str:
+    if column in _LISTS:
+        return " ".join(cell.split())
     return cell.lower().replace("-", ":") if column == "mac" else cell
+
+
+def _parsed(values: Mapping[str, str]) -> dict[str, Value]:
+    """The values as the inventory has them."""
+    return {column: value.split() if column in _LISTS else value for column, value in values.items()}
 
 
 def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnostic]:
@@ -197,7 +209,8 @@ def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnosti
             if column == NODE:
                 TypeAdapter(Name).validate_python(Plain(value))
             else:
-                NodeDocument.model_validate({column: Plain(value)})
+                parts: object = [Plain(part) for part in value.split()] if column in _LISTS else Plain(value)
+                NodeDocument.model_validate({column: parts})
         except ValidationError as reason:
             (error, *_) = reason.errors(include_url=False, include_input=False)
             yield _wrong(place, column, expected_value(error), f"'{printable(value)}'")

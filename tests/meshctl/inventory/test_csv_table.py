@@ -78,6 +78,25 @@ def test_nodes_are_added_only_on_request(inventory: Path) -> None:
     assert str(load_fleet(inventory).nodes["extra1"].address.ip) == "10.42.0.250"
 
 
+def test_a_cell_lists_the_groups_of_a_node(inventory: Path) -> None:
+    table = "node;hardware;address;groups\nextra1;;10.42.0.250; legged   beacons\nbase;;;beacons\n"
+    done = run(inventory, table, "--add")
+    assert done.exit_code == 0, done.output
+    fleet = load_fleet(inventory)
+    assert fleet.nodes["extra1"].groups == ("legged", "beacons")
+    assert fleet.nodes["base"].groups == ("beacons",)
+    assert not edits(read(write(fleet.nodes.values()), "boxes.csv"), fleet, "boxes.csv")
+
+
+def test_an_unknown_group_in_a_table_is_not_written(inventory: Path) -> None:
+    before = (inventory / "fleet.yaml").read_bytes()
+    done = run(inventory, "node,groups\nbase,beacon\n")
+    assert done.exit_code == 2
+    assert "nothing was written" in done.stderr
+    assert "unknown group 'beacon'" in done.stderr
+    assert (inventory / "fleet.yaml").read_bytes() == before
+
+
 def test_an_invalid_new_node_is_not_written(inventory: Path) -> None:
     before = (inventory / "fleet.yaml").read_bytes()
     done = run(inventory, "node,label\nextra1,X1\n", "--add")
