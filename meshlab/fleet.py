@@ -192,7 +192,7 @@ class VirtualFleet:
         log_path = self.directory / "log"
         with log_path.open("ab") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", self.SUPERVISOR, str(self.directory)],
+                [sys.executable, "-P", "-m", self.SUPERVISOR, str(self.directory)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

@@ -47,6 +47,14 @@ def test_a_file_is_short_enough_to_read(folder: str) -> None:
     assert {name: length for name, length in lengths.items() if length > LONG.get(name, limit)} == {}
 
 
+def test_no_program_imports_from_the_current_directory() -> None:
+    """`python -m` does, and the current directory may be an inventory of a stranger: `-P` leaves it out."""
+    sources = {
+        file: file.read_text(encoding="utf-8") for package in PACKAGES for file in (ROOT / package).rglob("*.py")
+    }
+    assert [str(file.relative_to(ROOT)) for file, text in sources.items() if 'sys.executable, "-m"' in text] == []
+
+
 def test_no_import_cycles() -> None:
     """Imports for types alone count, too."""
     graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=False)

@@ -301,7 +301,7 @@ class _Watch:
         with TemporaryDirectory(prefix="meshctl-monitor.") as directory:
             actions = None
             if web.allow_actions:
-                command = [sys.executable, "-m", "meshctl"]
+                command = [sys.executable, "-P", "-m", "meshctl"]
                 names = frozenset(node.name for node in fleet.managed())
                 actions = Actions(command, options, lambda: names, Path(directory), time.time)
             thread = threading.Thread(target=sampler.run, name="sampler", daemon=True)

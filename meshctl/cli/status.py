@@ -201,22 +201,22 @@ def preflight(
     whole = assess(collect(fleet_view), fleet_view.nodes, time.time(), fleet_view.robots)
     fleet_view.opened.journal.remember_all(fleet.name, facts_to_record(whole), time.time())
     found = chosen.devices_of(whole)
-    unselected = [device.name for device in whole if device not in tuple(found)]
-    answering = [
-        robot.name
-        for robot in found.robots
-        if is_active(robot.state) and robot.facts is not None and robot.facts.answers
-    ]
+    unselected = [device.title for device in whole if device not in tuple(found)]
+    active = [robot for robot in found.robots if is_active(robot.state)]
+    answering = [robot.name for robot in active if robot.facts is not None and robot.facts.answers]
+    silent = [robot.name for robot in active if robot.name not in answering]
     pings = fleet_view.collector.ping(answering)
-    stop = None if send_estop is None else _send_stop(fleet_view, answering, send_estop, yes=yes)
+    stop = None if send_estop is None else _send_stop(fleet_view, answering, silent, send_estop, yes=yes)
     checks = checks_of(fleet, found, pings, unselected, stop)
     show_preflight(checks, as_json=as_json)
     raise typer.Exit(ExitCode.OK if all(check.is_go for check in checks) else ExitCode.FINDINGS)
 
 
-def _send_stop(fleet_view: FleetView, robots: Sequence[str], file: Path, *, yes: bool) -> StopResult:
-    """Send the emergency stop in `file` to these robots, after confirmation."""
-    plan = stop_plan(fleet_view.fleet, robots)
+def _send_stop(
+    fleet_view: FleetView, answering: Sequence[str], silent: Sequence[str], file: Path, *, yes: bool
+) -> StopResult:
+    """Send the emergency stop in `file` to the robots whose daemons answer, after confirmation."""
+    plan = stop_plan(fleet_view.fleet, answering, silent)
     if plan is None:
         raise InputError("--send-estop: the inventory has no topic of class emergency_stop, or no robot that sends it")
     try:

@@ -75,7 +75,7 @@ class SandboxRenderer:
     def _running(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "meshctl.render.sandbox_worker", *self._limits],
+                [sys.executable, "-P", "-m", "meshctl.render.sandbox_worker", *self._limits],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -121,7 +122,18 @@ def _diagnostic(file: TemplateFile, error: Exception) -> Diagnostic:
             lines = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename.endswith(SUFFIX)]
             if lines:
                 place = Position(lines[-1].filename, lines[-1].lineno or 0)
-    if isinstance(error, MemoryError):
-        return Diagnostic(TEMPLATE, Severity.ERROR, place, "the template exceeds its memory limit")
-    kind = "" if isinstance(error, TemplateError | ValueError | TypeError) else f"{type(error).__name__}: "
-    return Diagnostic(TEMPLATE, Severity.ERROR, place, f"{kind}{error}")
+    return Diagnostic(TEMPLATE, Severity.ERROR, place, _message(error))
+
+
+def _message(error: Exception) -> str:
+    match error:
+        case MemoryError():
+            limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+            return f"the template exceeds {limit >> 20} MiB of memory"
+        case RecursionError():
+            return "the template includes itself, or is nested too deeply"
+        case UnicodeDecodeError():
+            return f"expected UTF-8 text, found byte 0x{error.object[error.start]:02x} at offset {error.start}"
+        case TemplateError() | ValueError() | TypeError():
+            return str(error)
+    return f"{type(error).__name__}: {error}"

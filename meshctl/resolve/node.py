@@ -10,6 +10,7 @@ router instead: the bridge has the wired ports only, and the routing interface h
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
@@ -46,11 +47,7 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
     keys = _keys(meshes, node, secrets, checks)
     masters = _masters(meshes)
     intervals = {mesh.name: _intervals(mesh, checks) for mesh in meshes if mesh.backend is Backend.BATMAN}
-    if len({(mesh.backend, mesh.operator_parts) for mesh in meshes}) > 1:
-        path = ("nodes", node.name, "radios")
-        checks.add(
-            COMBINATION, path, "meshes of one back end", ", ".join(f"{m.name}: {m.backend.value}" for m in meshes)
-        )
+    _check_backends(node, meshes, checks)
     if node.lan_address is not None and (primary is None or primary.backend is not Backend.BATMAN):
         found = "no mesh" if primary is None else primary.backend.value
         message = "a router between the mesh and a LAN needs batman-adv"
@@ -92,6 +89,20 @@ def resolve(fleet: Fleet, node: Node, secrets: Callable[[SecretRef], Secret]) ->
     if checks.found:
         raise InvalidInput(checks.found)
     return intent
+
+
+def _check_backends(node: Node, meshes: tuple[Mesh, ...], checks: ValueChecks) -> None:
+    """A node runs one back end, with one set of operator parts."""
+    path = ("nodes", node.name, "radios")
+    if len({mesh.backend for mesh in meshes}) > 1:
+        found = ", ".join(f"{mesh.name}: {mesh.backend.value}" for mesh in meshes)
+        checks.add(COMBINATION, path, "meshes of one back end", found)
+        return
+    for name in (each.name for each in fields(OperatorParts)):
+        values = {mesh.name: getattr(mesh.operator_parts, name) for mesh in meshes}
+        if len(set(values.values())) > 1:
+            found = ", ".join(f"{mesh}: {value or 'none'}" for mesh, value in values.items())
+            checks.add(COMBINATION, path, f"one `operator_parts.{name}` in all its meshes", found)
 
 
 def _login_keys(fleet: Fleet, node: Node) -> tuple[str, ...]:

@@ -150,6 +150,11 @@ class RobotFacts:
         return tuple(peer.name for peer in self.peers if peer.online)
 
     @property
+    def is_installed(self) -> bool:
+        """Whether udp_mesh is."""
+        return bool(self.release or self.service.enabled)
+
+    @property
     def reached_through(self) -> tuple[str, ...]:
         """Whom it reaches through whom, one text per online peer behind relays: `uav1 through husky1`."""
         relayed = (peer for peer in self.peers if peer.online and peer.via)
@@ -167,19 +172,16 @@ class RobotFacts:
         """What is wrong, in one line; empty if nothing is."""
         if self.error:
             return self.error
-        if not self.service.enabled and not self.release:
+        if not self.is_installed:
             return "not installed: run `meshctl robots deploy`"
         problems = []
         if not self.is_proven:
             problems.append("a switch was interrupted: deploy again")
         if self.service.is_up and not self.answers:
             problems.append("the daemon does not answer")
-        if self.bridge is not None and not self.bridge.is_up:
-            problems.append(f"the ROS bridge is {self.bridge.active or 'absent'}")
-        if self.hosts is not None and not self.hosts.is_up:
-            problems.append(f"the service for /etc/hosts is {self.hosts.active or 'absent'}")
-        if self.collector is not None and not self.collector.is_up:
-            problems.append(f"the collector is {self.collector.active or 'absent'}")
+        others = {"ROS bridge": self.bridge, "service for /etc/hosts": self.hosts, "collector": self.collector}
+        down = {name: one for name, one in others.items() if one is not None and not one.is_up}
+        problems += [f"the {name} is {service.active or 'absent'}" for name, service in down.items()]
         problems += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
         away = [peer.name for peer in self.peers if not peer.online]
         problems += [f"offline peers: {', '.join(away)}"] if away else []

@@ -129,7 +129,7 @@ def _urlsafe(content: bytes) -> str:
 def download_wheels(target: Target, directory: Path) -> None:
     """Download the requirements for a target into `directory` with pip. Raises InputError."""
     directory.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    command = [sys.executable, "-P", "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary", ":all:", "--dest", str(directory), *pip_options(target), *requirements(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, check=False)

@@ -205,7 +205,7 @@ def download_wheels(target: Target, directory: Path, named: Path | None, extra: 
     if named is None and (kept := tuple(directory.glob("*.whl"))):
         return kept
     source = [] if named is None else ["--no-index", "--find-links", str(named)]
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
+    command = [sys.executable, "-P", "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
     command += ["--only-binary", ":all:", "--dest", str(directory), *source, *pip_options(target), *requirements(extra)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_PIP_TIMEOUT_S, check=False)

@@ -26,7 +26,7 @@ _LAST_ERRORS_BYTES = 4096
 
 def meshctl_command(*words: str) -> list[str]:
     """This very meshctl as a command."""
-    return [sys.executable, "-m", "meshctl", *words]
+    return [sys.executable, "-P", "-m", "meshctl", *words]
 
 
 def environment(directory: SiteDirectory, run: RunDirectory, environ: Mapping[str, str]) -> dict[str, str]:

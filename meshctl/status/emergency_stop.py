@@ -14,17 +14,19 @@ from meshctl.robots.host import Host
 from meshctl.status.pings import replies
 
 DELIVERED = "delivered"
+NOT_SENT = "not sent: its daemon does not answer"
 # the script waits 10 s for each outcome, all at once
 SEND_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
 class StopPlan:
-    """Which topic, from which robot, to which ones."""
+    """Which topic, from which robot, to which ones; `silent` are destinations whose daemons do not answer."""
 
     topic: Topic
     source: str
     destinations: tuple[str, ...]
+    silent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +37,14 @@ class StopResult:
     problem: str = ""
 
 
-def stop_plan(fleet: Fleet, active: Iterable[str]) -> StopPlan | None:
-    """The first emergency stop of the inventory, from its first source, to its destinations among the `active` robots.
+def stop_plan(fleet: Fleet, answering: Iterable[str], silent: Iterable[str] = ()) -> StopPlan | None:
+    """The first emergency stop of the inventory, from its first source, to its destinations among the active robots.
 
-    Where every robot may send it, the base does. None if the inventory has no such topic, or no robot that sends it.
+    Of these, the daemons of `answering` answer, and those of `silent` do not: it is not sent to them, so that no robot
+    stops when its daemon starts later. Where every robot may send it, the base does. None if the inventory has no such
+    topic, or no robot that sends it.
     """
-    names = tuple(active)
+    names = tuple(answering)
     topic = next((each for each in fleet.topics if each.topic_class is TopicClass.EMERGENCY_STOP), None)
     base = (robot.name for robot in fleet.robots.values() if robot.is_base)
     if topic is None:
@@ -48,14 +52,20 @@ def stop_plan(fleet: Fleet, active: Iterable[str]) -> StopPlan | None:
     source = next((name for name in topic.sources or (*base, *names) if name in fleet.robots), None)
     if source is None:
         return None
-    reached = [name for name in names if "all" in topic.destinations or name in topic.destinations]
-    return StopPlan(topic, source, tuple(name for name in reached if name != source))
+    wanted = topic.destinations
+
+    def destinations(robots: Iterable[str]) -> tuple[str, ...]:
+        return tuple(name for name in robots if name != source and ("all" in wanted or name in wanted))
+
+    return StopPlan(topic, source, destinations(names), destinations(silent))
 
 
 def send(host: Host, plan: StopPlan, message: bytes) -> StopResult:
     """Send the message from `host`, the source. Raises what `Host.run` raises."""
     words = (plan.topic.name, plan.topic.type_name, *plan.destinations)
-    return parse_outcomes(host.run("estop", *words, stdin=message, timeout_s=SEND_TIMEOUT_S), plan.destinations)
+    text = host.run("estop", *words, stdin=message, timeout_s=SEND_TIMEOUT_S) if plan.destinations else ""
+    found = parse_outcomes(text, plan.destinations)
+    return StopResult({**found.outcomes, **dict.fromkeys(plan.silent, NOT_SENT)})
 
 
 def parse_outcomes(text: str, destinations: Iterable[str]) -> StopResult:

@@ -105,6 +105,20 @@ def _answered(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
     return sum(not one.no_answer_reason for one in expected), len(expected)
 
 
+def _answered_radios(status: FleetStatus) -> tuple[int, int]:
+    return _answered(status.nodes)
+
+
+def _answered_computers(status: FleetStatus) -> tuple[int, int]:
+    return _answered(status.robots)
+
+
+def _installed(status: FleetStatus) -> tuple[int, int]:
+    """(answered and have udp_mesh, expected) of active robots."""
+    robots = _active_robots(status)
+    return sum(robot.facts is not None and robot.facts.is_installed for robot in robots), len(robots)
+
+
 def _answered_daemons(status: FleetStatus) -> tuple[int, int]:
     """(answered, expected) of the daemons of active robots."""
     robots = _active_robots(status)
@@ -116,13 +130,17 @@ def _plural(count: int, what: str) -> str:
 
 
 def _alarm_check(
-    name: str, good: str, *codes: str, robots: bool = False, daemons: bool = False, is_fleetwide: bool = False
+    name: str,
+    good: str,
+    *codes: str,
+    answered: Callable[[FleetStatus], tuple[int, int]] = _answered_radios,
+    is_fleetwide: bool = False,
 ) -> Callable[[Fleet, FleetStatus], Check]:
-    """A check that no device has one of these alarms; `daemons`: only daemons can report them."""
+    """A check that no device has one of these alarms; `answered` counts those that can report them."""
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
-        devices: Sequence[NodeStatus | RobotStatus] = status.robots if robots or daemons else status.nodes
-        asked = _answered_daemons(status) if daemons else _answered(devices)
+        devices: Sequence[NodeStatus | RobotStatus] = status.nodes if answered is _answered_radios else status.robots
+        asked = answered(status)
         bad = [_alarm_text(one.name, one.alarms, codes) for one in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
         return _check(name, [*everywhere, *(text for text in bad if text)], good, asked)
@@ -250,6 +268,8 @@ def _peers(fleet: Fleet, status: FleetStatus) -> Check:
             bad.append(f"{robot.name} does not hear {join_limited(missing)}")
     if not answering:
         bad.append("no daemon answers")
+    if not bad and len(names) < 2:
+        return Check("peers", True, "fewer than two robots take part", is_checked=False)
     return _check("peers", bad, f"every robot hears all {_plural(len(names) - 1, 'other')}")
 
 
@@ -290,19 +310,19 @@ def _emergency_stop(stop: StopResult) -> Check:
 
 _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
     _daemons,
-    _alarm_check("one release", "same version and configuration", "drift", "version", robots=True),
-    _alarm_check("keys", "every robot can decrypt every other", "key", "unkeyed", daemons=True),
-    _alarm_check("ROS bridges", "up on every robot that has one", "ros-bridge", robots=True),
+    _alarm_check("one release", "same version and configuration", "drift", "version", answered=_installed),
+    _alarm_check("keys", "every robot can decrypt every other", "key", "unkeyed", answered=_answered_daemons),
+    _alarm_check("ROS bridges", "up on every robot that has one", "ros-bridge", answered=_installed),
     _peers,
     _urgent_topics,
-    _alarm_check("queues", "no urgent messages queued", "urgent-queue", "restarts", daemons=True),
+    _alarm_check("queues", "no urgent messages queued", "urgent-queue", "restarts", answered=_answered_daemons),
     _alarm_check(
         "topics",
         "every topic flows",
         "topic-undeclared",
         "topic-silent",
         "topic-not-arriving",
-        daemons=True,
+        answered=_answered_daemons,
     ),
     _alarm_check(
         "computers",
@@ -311,6 +331,6 @@ _ROBOT_CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (
         "disk",
         "memory",
         "clock",
-        robots=True,
+        answered=_answered_computers,
     ),
 )

@@ -64,7 +64,7 @@ def robot_alarms(seen: RobotAlarmInput) -> tuple[Alarm, ...]:
 
 def _daemon(seen: RobotAlarmInput) -> Iterator[Alarm]:
     facts, name = seen.facts, seen.robot.name
-    if not facts.release and not facts.service.enabled:
+    if not facts.is_installed:
         yield Alarm(Level.ERROR, "not-installed", "udp_mesh is not installed", f"meshctl robots deploy {name}")
         return
     if not facts.service.is_up:

@@ -92,8 +92,7 @@ def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
         text = f"{join_limited(status.strangers)} {'are' if count > 1 else 'is'} in the mesh but not in the inventory"
         found.append(("", Alarm(Level.WARNING, "stranger", text, "if it is yours, add its `mac:` to the inventory")))
     for one in status:
-        name = one.name if isinstance(one, NodeStatus) else f"{one.name} {COMPUTER}"
-        found += [(name, alarm) for alarm in one.alarms]
+        found += [(one.title, alarm) for alarm in one.alarms]
     return sorted(found, key=lambda pair: -pair[1].level)
 
 

@@ -8,6 +8,7 @@ from enum import Enum, IntEnum
 
 from meshctl.device.observation import LanFilterCounts, MeshTableSizes
 from meshctl.errors import ExitCode
+from meshctl.inventory.selection import COMPUTER
 from meshctl.model import Node, NodeState, Robot
 from meshctl.robots.facts import RobotFacts
 from meshctl.topology import Sighting
@@ -161,6 +162,10 @@ class NodeStatus:
         return self.node.name
 
     @property
+    def title(self) -> str:
+        return self.name
+
+    @property
     def state(self) -> NodeState | None:
         return self.node.state
 
@@ -214,6 +219,11 @@ class RobotStatus:
     @property
     def name(self) -> str:
         return self.robot.name
+
+    @property
+    def title(self) -> str:
+        """`rover1 computer`: a radio may have the robot's name."""
+        return f"{self.name} {COMPUTER}"
 
 
 @dataclass(frozen=True, slots=True)

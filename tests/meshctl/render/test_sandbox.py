@@ -21,7 +21,7 @@ from tests.meshctl.render import fleets
 
 NAME = "husky1-front"
 # which of both comes first depends on the machine
-MEMORY = "exceeds its memory limit|MiB of memory|exceeds 1 s of CPU time"
+MEMORY = "exceeds 512 MiB of memory|exceeds 1 s of CPU time"
 GOOD = "config system\n\toption hostname {{ intent.hostname | uci }}\n"
 
 
@@ -59,6 +59,7 @@ def quick(folder: Path) -> Templates:
             "{% for i in range(99999) %}{{ ('A' * 99) | uci }}{% endfor %}",
             "the template's output of .* characters exceeds",
         ),
+        ("{% include 'common/etc/config/system.j2' %}", "the template includes itself, or is nested too deeply"),
     ],
 )
 def test_a_template_that_exceeds_its_limits_is_rejected(tmp_path: Path, text: str, words: str) -> None:
@@ -74,6 +75,22 @@ def test_a_template_that_exceeds_its_limits_is_rejected(tmp_path: Path, text: st
     others = quick(tmp_path / "other")
     others._bounded = templates._bounded
     assert render(tmp_path / "other", others).package("system")
+
+
+def test_a_template_that_is_not_text_is_reported_with_the_byte(tmp_path: Path) -> None:
+    write(tmp_path, "").write_bytes(b"config \xe8")
+    with pytest.raises(InvalidInput) as caught:
+        render(tmp_path)
+    assert "expected UTF-8 text, found byte 0xe8 at offset 7" in str(caught.value)
+
+
+def test_no_python_file_of_the_inventory_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`python -m` imports from the current directory first, and lint runs in the directory of a pull request."""
+    write(tmp_path, GOOD)
+    for name in ("json", "jinja2", "meshctl"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit(7)")
+    monkeypatch.chdir(tmp_path)
+    assert "option hostname" in render(tmp_path).masked_text
 
 
 def test_shipped_templates_start_no_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

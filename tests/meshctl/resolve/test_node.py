@@ -17,6 +17,7 @@ from meshctl.model import (
     Encryption,
     Fleet,
     MeshMode,
+    OperatorParts,
     Operators,
     Radio,
     Release,
@@ -71,6 +72,19 @@ def test_the_mesh_that_contains_the_node_address_is_bridged() -> None:
     found = intent(fleets.fleet(node, meshes=(fleets.mesh(), wide)))
     assert found.lan.ports == ("eth0.1", "bat1")
     assert found.lan.mtu == 1400
+
+
+def test_meshes_with_different_operator_parts_are_refused_with_the_part_that_differs() -> None:
+    def parts(interface: str) -> OperatorParts:
+        return OperatorParts(service="meshmerize", interface=interface)
+
+    main = fleets.mesh(backend=Backend.MESHMERIZE, operator_parts=parts("mesh0"))
+    wide = fleets.mesh(name="wide", backend=Backend.MESHMERIZE, operator_parts=parts("mesh1"))
+    with pytest.raises(InvalidInput, match=r"one `operator_parts\.interface` .*, found main: mesh0, wide: mesh1"):
+        intent(fleets.fleet(fleets.node(radios=BOTH), meshes=(main, wide)))
+    batman = fleets.mesh(name="wide", band=Band.G5, channel=36)
+    with pytest.raises(InvalidInput, match="meshes of one back end, found main: meshmerize, wide: batman-adv"):
+        intent(fleets.fleet(fleets.node(radios=BOTH), meshes=(main, batman)))
 
 
 def test_a_node_without_a_mesh_keeps_its_lan_ports() -> None:

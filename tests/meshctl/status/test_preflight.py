@@ -11,7 +11,7 @@ from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet, Robot, Role
 from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status import Check, preflight
-from meshctl.status.emergency_stop import StopResult, parse_outcomes, stop_plan
+from meshctl.status.emergency_stop import StopResult, parse_outcomes, send, stop_plan
 from meshctl.status.filters import select_devices
 from meshctl.status.json_output import preflight_json
 from meshctl.status.pings import Pings, parse_pings, pings_of
@@ -169,14 +169,14 @@ def selected(fleet: Fleet, *words: str) -> tuple[Check, ...]:
     """The checks of what `words` select, while rover is unreachable and b02 was never seen."""
     whole = status_of(fleet, {name: HEALTHY[name] for name in ("base", "b01")}, TEAM, known={})
     chosen = select_devices(fleet, words, lambda path: path).devices_of(whole)
-    left_out = [one.name for one in whole if one not in tuple(chosen)]
+    left_out = [one.title for one in whole if one not in tuple(chosen)]
     return preflight(fleet, chosen, DELIVERED, left_out)
 
 
 def test_a_go_for_a_selection_lists_what_was_not_checked(fleet: Fleet) -> None:
     found = {check.name: check for check in selected(fleet, "base", "b01")}
     assert stopped(found) == []
-    assert "not selected: station, b02, rover" in found["others"].reason
+    assert "not selected: station computer, b02, rover, rover computer" in found["others"].reason
     assert "no robot is selected" in found["robots"].reason
     assert preflight_text(found.values()).splitlines()[-1] == "GO (not checked: robots, others)"
 
@@ -187,8 +187,9 @@ def test_a_selected_device_that_is_not_ready_is_a_no_go(fleet: Fleet) -> None:
 
 def test_one_selected_robot_has_no_peer_for_test_messages(fleet: Fleet) -> None:
     found = {check.name: check for check in selected(fleet, "base", "robot:station")}
-    assert found["delivery"].is_go
-    assert not found["delivery"].is_checked
+    for name in ("peers", "delivery"):
+        assert found[name].is_go
+        assert not found[name].is_checked
 
 
 def test_an_emergency_stop_goes_from_its_source_to_the_active_robots(fleet: Fleet) -> None:
@@ -213,6 +214,24 @@ def test_an_emergency_stop_is_a_go_only_if_every_robot_acknowledges_it(fleet: Fl
     assert not found[()]["emergency stop"].is_go
     # none was requested
     assert "emergency stop" not in checks(fleet)
+
+
+def test_a_robot_whose_daemon_is_down_has_not_acknowledged_the_emergency_stop(fleet: Fleet) -> None:
+    plan = stop_plan(fleet, ["station"], ["rover"])
+    assert plan is not None
+    assert (plan.destinations, plan.silent) == ((), ("rover",))
+    # nothing is run on the source: it has nobody to send it to
+    result = preflight(fleet, status_of(fleet, known=KNOWN), DELIVERED, (), send(None, plan, b"stop"))  # type: ignore[arg-type]
+    assert [(check.name, check.reason) for check in result if not check.is_go] == [
+        ("emergency stop", "rover: not sent: its daemon does not answer")
+    ]
+
+
+def test_what_only_an_installed_daemon_shows_is_not_a_go_without_one(fleet: Fleet) -> None:
+    bare = {name: replace(facts, release="", status={}, service=ServiceFacts()) for name, facts in TEAM.items()}
+    found = checks(fleet, bare)
+    for name in ("daemons", "one release", "keys", "ROS bridges", "peers", "topics"):
+        assert not found[name].is_go, name
 
 
 def test_an_emergency_stop_that_could_not_be_sent_is_a_no_go(fleet: Fleet) -> None:
