@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any, ClassVar, get_args, get_origin
 
+from typer import BadParameter
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
 _METAVARS = {Path: "PATH", int: "N", float: "NUMBER"}
@@ -18,6 +20,32 @@ class Command(TyperCommand):
         super().__init__(*args, **options)
         for parameter in self.params:
             _name_value(parameter)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except BadParameter as error:
+            error.message = _reworded(error)
+            raise
+
+
+# of pydantic, which newer typers check values with
+_WORDINGS = {
+    "Value error, ": "",
+    "Input should be a valid integer.*": "expected a whole number",
+    "Input should be a valid number.*": "expected a number",
+    "Input should be ((greater|less) than)": r"expected a value \1",
+}
+
+
+def _reworded(error: BadParameter) -> str:
+    """The message in our words, with the value if the message lacks it."""
+    text = error.message
+    for pattern, ours in _WORDINGS.items():
+        text = re.sub(f"^{pattern}", ours, text)
+    details: list[Any] = getattr(error.__cause__, "errors", list)()
+    value = str(details[0]["input"]) if details else ""
+    return text if not value or repr(value) in text else f"{text}, found {value!r}"
 
 
 def _name_value(parameter: Any) -> None:

@@ -71,6 +71,14 @@ class _RunFilter:
     def matches(self, record: RunRecord) -> bool:
         return self.fleet in (None, record.fleet) and self.is_virtual in (None, bool(record.lab))
 
+    @property
+    def text(self) -> str:
+        """` of b03 of fleet cave in a lab`; empty if it matches all."""
+        node = "" if self.node is None else f" of {self.node}"
+        fleet = "" if self.fleet is None else f" of fleet {self.fleet}"
+        where = {None: "", True: " in a lab", False: " on real nodes"}[self.is_virtual]
+        return f"{node}{fleet}{where}"
+
 
 def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json: bool) -> None:
     node = run_filter.node
@@ -90,7 +98,9 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
             echo(("\n" if number else "") + f"{run_filter.node} of {_fleet_text(*key)}")
         _list_group(journal, group, run_filter.node)
     if not records:
-        echo("no runs yet" if run_filter.node is None else f"no runs of {run_filter.node} yet")
+        echo(f"no runs{run_filter.text} yet")
+        if fleets := dict.fromkeys(run.fleet for run in journal.runs(limit=None)):
+            echo(f"the journal has runs of {', '.join(fleets)}")
 
 
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
@@ -144,7 +154,7 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
     for outcome in outcomes:
         echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for change in changes.get(outcome.node, ()):
-            echo(f"  {change.kind:<{width}} /{change.path}: {summary(change)}".rstrip(": "))
+            echo(f"  {change.kind} /{change.path}: {summary(change)}".rstrip(": "))
             if with_diffs:
                 for line in diff_lines(change):
                     echo(f"    {line}")

@@ -65,7 +65,7 @@ def lint(
         Path | None, typer.Option(help="Regulatory database; default: the system's, else the bundled one.")
     ] = None,
     explain: Annotated[str | None, typer.Option(help="Explain a rule.", metavar="CODE")] = None,
-    list_rules: Annotated[bool, typer.Option("--list", help="List all rules.")] = False,
+    list_rules: Annotated[bool, typer.Option("--list", help="List all rules, or those of --select.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Same as --format json.")] = False,
 ) -> None:
     """Check inventories for errors and risks, from the radio up to the application.
@@ -78,7 +78,7 @@ def lint(
         echo(_rule_page(explain), nl=False)
         return
     if list_rules:
-        for rule in RULES:
+        for rule in selected_rules(select or (), ignore or ()):
             echo(f"{rule.code}  {rule.severity.value:<7}  {rule.title}")
         return
     if write_baseline and baseline is None:
@@ -181,8 +181,10 @@ def _rule_page(code: str) -> str:
         return f"# {wanted}\n\n{MEANINGS[wanted]}\n"
     rule = BY_CODE.get(wanted)
     if rule is None:
+        beginning = wanted and any(known.startswith(wanted) for known in BY_CODE)
+        rules = f"`meshctl lint --list{f' --select {wanted}' if beginning else ''}`"
         raise InputError(
             f"unknown rule code {code}: expected a code such as MC342",
-            hint="run `meshctl lint --list` to list all rules",
+            hint=f"run {rules} to list {'these' if beginning else 'all'} rules",
         )
     return page(rule)

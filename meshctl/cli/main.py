@@ -12,6 +12,7 @@ import functools
 import gc
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Callable, MutableMapping, Sequence
 from itertools import groupby
@@ -25,7 +26,7 @@ from meshctl.cli.command_group import Command, CommandGroup
 from meshctl.cli.commands import COMMANDS, Entry
 from meshctl.cli.extensions import load
 from meshctl.cli.output import discard_output, echo, ignore_broken_pipe, prepare_streams
-from meshctl.errors import ExitCode, MeshctlError
+from meshctl.errors import ExitCode, InputError, MeshctlError
 
 if TYPE_CHECKING:
     from meshctl.cli.user_config import Defaults
@@ -128,6 +129,13 @@ def build(requested: str) -> typer.Typer:
 
 class _RootGroup(TyperGroup):
     """Lists the commands under the headings of their table, in its order."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        named = next((place for place, word in enumerate(args) if word in COMMANDS), 0)
+        if named and args[0].startswith("-") and args[0] not in (*ctx.help_option_names, "--version"):
+            moved = ["meshctl", args[named], *args[:named], *args[named + 1 :]]
+            raise InputError("options follow the command", hint=shlex.join(moved))
+        return super().parse_args(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         # one column of names for all sections

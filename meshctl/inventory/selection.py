@@ -238,9 +238,10 @@ def _pattern_hint(text: str, candidates: _Named[K]) -> str:
 def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]:
     attributes = dict.fromkeys(key for _, each in candidates.values() for key in each)
     if term.attribute not in attributes:
+        near = f"tags are groups: group:{term.pattern}" if term.attribute in ("tag", "tags") else ""
         raise InputError(
             f"{term.text!r}: unknown attribute {term.attribute!r}",
-            hint=did_you_mean(term.attribute, attributes) or f"expected one of: {', '.join(attributes)}",
+            hint=near or did_you_mean(term.attribute, attributes) or f"expected one of: {', '.join(attributes)}",
         )
     found = _having(term.attribute, term.pattern, candidates)
     if not found:

@@ -68,7 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments = [*arguments[1:], "--help"]
         if arguments and arguments[0] in FORWARDED:
             return _forward(FORWARDED[arguments[0]], arguments[1:])
-        parsed = build_parser().parse_args(arguments)
+        parser = build_parser()
+        parser.refuse_options_first(arguments)
+        parsed = parser.parse_args(arguments)
         command = parsed.command
         return command(parsed)
     except MeshError as error:
@@ -96,16 +98,18 @@ def _forward(package: str, arguments: list[str]) -> int:
     return code
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> CommandParser:
     """The parser of all commands."""
-    parser: argparse.ArgumentParser = CommandParser(
+    root = CommandParser(
         prog="udp-mesh",
         description="Send prioritized messages between robots over lossy, intermittent links.",
         epilog=EPILOG,
         formatter_class=HelpFormatter,
     )
+    parser: argparse.ArgumentParser = root
     parser.add_argument("--version", action="version", version=f"udp-mesh {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    root.words = commands.choices
     _add_serve(commands)
     _add_inspect(commands)
     _add_change(commands)
@@ -115,7 +119,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("sim", "run a scenario in the simulator"),
     ):
         commands.add_parser(name, help=text, add_help=False)
-    return parser
+    return root
 
 
 def _parser(

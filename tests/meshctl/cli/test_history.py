@@ -71,7 +71,9 @@ def test_runs_are_filtered_by_fleet_and_by_real_or_virtual(
 def test_a_pattern_selects_the_runs_of_its_nodes(capfd: pytest.CaptureFixture[str]) -> None:
     assert said(capfd, "--node", "b0*").count("b01: done") == 4
     assert said(capfd, "1", "--node", "b?1").count("b01: done") == 1
-    assert said(capfd, "--node", "rover*") == "no runs of rover* yet\n"
+    others = "the journal has runs of mine, ruins\n"
+    assert said(capfd, "--node", "rover*") == f"no runs of rover* yet\n{others}"
+    assert said(capfd, "--fleet", "mien", "--real") == f"no runs of fleet mien on real nodes yet\n{others}"
     with pytest.raises(SystemExit) as ended:
         main(["history", "--node", "role:beacon"])
     assert ended.value.code == 2

@@ -59,6 +59,25 @@ def test_an_unknown_command_is_a_usage_error_with_a_suggestion() -> None:
     assert "lint" in done.stderr
 
 
+def test_options_before_the_command_are_told_where_they_belong() -> None:
+    done = run("-v", "run", "b01")
+    assert (done.returncode, done.stderr) == (2, "error: options follow the command\nhint: meshctl run -v b01\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("history", "x"), "Invalid value for 'run': expected a whole number, found 'x'"),
+        (("history", "--limit", "0"), "expected a value greater than or equal to 1, found '0'"),
+        (("status", "--watch", "often"), "expected a number, found 'often'"),
+        (("inventory", "state", "b01", "gone"), "Invalid value for 'new': 'gone' is not one of 'carried', 'deployed'"),
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_value_is_explained_in_plain_words(words: tuple[str, ...], message: str) -> None:
+    assert message in " ".join(run(*words).stderr.split())
+
+
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_each_command_has_help_with_an_example(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Groups show their commands; a command's own help holds one line that starts with the program's name."""

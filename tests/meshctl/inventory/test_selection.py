@@ -58,6 +58,7 @@ def test_terms_select_nodes(words: tuple[str, ...], names: list[str]) -> None:
         (("b1",), "no managed node of lab matches 'b1'", "did you mean 'b01'?"),
         (("wset",), "no managed node of lab matches 'wset'", "did you mean 'west'?"),
         (("rol:beacon",), "'rol:beacon': unknown attribute 'rol'", "did you mean 'role'?"),
+        (("tag:west",), "'tag:west': unknown attribute 'tag'", "tags are groups: group:west"),
         (("role:becon",), "no managed node of lab has role 'becon'", "did you mean 'beacon'?"),
         (("mesh:zz",), "no managed node of lab has mesh 'zz'", "found: main, side"),
         (("b01", "!b0*"), "b01,!b0*: selects no managed node of lab", ""),

@@ -182,6 +182,17 @@ def test_list_names_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     assert "MC342  error    The conducted power exceeds the FCC limit\n" in capsys.readouterr().out
 
 
+def test_the_rules_of_a_prefix_are_listed_and_named_where_one_was_to_be_explained(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _lint("--list", "--select", "MC34") == 0
+    codes = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert "MC342" in codes
+    assert all(code.startswith("MC34") for code in codes)
+    assert _lint("--explain", "mc34") == 2
+    assert "run `meshctl lint --list --select MC34` to list these rules" in capsys.readouterr().err
+
+
 def test_a_machine_without_a_regulatory_database_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -350,6 +350,13 @@ def test_an_unknown_word_gets_the_nearest_known_one(
     assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
 
 
+def test_options_before_the_command_are_told_where_they_belong(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--socket", "/run/x y", "status", "--json"])
+    assert ended.value.code == Exit.USAGE
+    assert "options follow the command: udp-mesh status --socket '/run/x y' --json" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [[], ["status"], ["sim"]])
 def test_help_and_a_command_is_that_command_s_help(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["help", *words], [*words, "--help"]):
