@@ -140,7 +140,10 @@ def chosen_beacons(fleet: Fleet, words: Iterable[str], limits: Iterable[str] = (
     for word in wanted:
         node = fleet.nodes.get(word)
         if node is not None and node.role is not Role.BEACON:
-            raise InputError(f"{node.name} is not a beacon: its role is {node.role.value}")
+            raise InputError(
+                f"{node.name} is not a beacon: its role is {node.role.value}",
+                hint=f"for any node: meshctl inventory state {node.name} deployed",
+            )
         labeled = [node.name for node in fleet.managed() if node.label and node.label.lower() == word.lower()]
         if len(labeled) > 1:
             raise InputError(f"label '{word}' is ambiguous: {', '.join(labeled)}")

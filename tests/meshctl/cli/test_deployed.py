@@ -84,6 +84,7 @@ def test_a_dry_run_shows_the_edit_and_writes_nothing(inventory: Path) -> None:
     [
         (("husky1-b9",), "no beacon matches 'husky1-b9'"),
         (("base",), "base is not a beacon: its role is base"),
+        (("base",), "hint: for any node: meshctl inventory state base deployed"),
         (("x*",), "no beacon matches 'x*'"),
     ],
 )

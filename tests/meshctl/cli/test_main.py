@@ -59,7 +59,7 @@ def test_an_unknown_command_is_a_usage_error_with_a_suggestion() -> None:
     assert "lint" in done.stderr
 
 
-def test_options_before_the_command_are_told_where_they_belong() -> None:
+def test_options_before_the_command_are_answered_with_the_right_order() -> None:
     done = run("-v", "run", "b01")
     assert (done.returncode, done.stderr) == (2, "error: options follow the command\nhint: meshctl run -v b01\n")
 

@@ -350,7 +350,7 @@ def test_an_unknown_word_gets_the_nearest_known_one(
     assert capsys.readouterr().err.endswith(f"; did you mean {meant}?\n")
 
 
-def test_options_before_the_command_are_told_where_they_belong(capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_before_the_command_are_answered_with_the_right_order(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--socket", "/run/x y", "status", "--json"])
     assert ended.value.code == Exit.USAGE
