@@ -25,6 +25,7 @@ from meshctl.cli.plan_execution import (
     report_plan,
     saved_plan,
 )
+from meshctl.cli.run_record import run_of
 from meshctl.cli.saved_site_plans import SavedSitePlans, check_fleet, dump_site_plans, load_site_plans
 from meshctl.cli.site_files import hand_over, with_sent_states
 from meshctl.cli.site_runs import (
@@ -295,11 +296,7 @@ def _to_resume(journal: Journal, fleet: str, run_id: int | None) -> tuple[RunRec
         if latest is None:
             raise InputError(f"fleet {fleet} has no run to resume", hint="start one with `meshctl provision`")
         return latest, ()
-    record = journal.run(number)
-    if record is None or (record.fleet, record.lab) != (fleet, journal.lab):
-        raise InputError(f"run {number} of fleet {fleet} does not exist", hint="run `meshctl history` to list all runs")
-    if not record.is_over:
-        raise InputError(f"run {record.id} is still in progress ({record.owner})", hint="wait for it, or interrupt it")
+    record = run_of(journal, fleet, number)
     return record, left.get(number, ()) if run_id is None else journal.unfinished(number)
 
 

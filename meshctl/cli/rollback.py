@@ -25,6 +25,7 @@ from meshctl.cli.context import (
 from meshctl.cli.output import echo
 from meshctl.cli.plan import AcceptCut, Brief, Direct, LeaveBehind, Rate, Together, Yes
 from meshctl.cli.plan_execution import PlanRefused, choices_of, confirm_and_execute, prepare_plan
+from meshctl.cli.run_record import run_of
 from meshctl.cli.site_files import with_states
 from meshctl.cli.site_runs import RunOptions, change_everywhere, meet, sites_of
 from meshctl.errors import ExitCode, InputError
@@ -102,13 +103,7 @@ def rollback(
 
 def _record(opened: Session, run_id: int) -> RunRecord:
     """The run. Raises InputError for none of this fleet, PlanRefused for one that no plan takes back."""
-    record = opened.journal.run(run_id)
-    if record is None or (record.fleet, record.lab) != (opened.fleet.name, opened.journal.lab):
-        raise InputError(
-            f"run {run_id} of fleet {opened.fleet.name} does not exist", hint="run `meshctl history` to list all runs"
-        )
-    if not record.is_over:
-        raise InputError(f"run {run_id} is still in progress ({record.owner})", hint="wait for it, or interrupt it")
+    record = run_of(opened.journal, opened.fleet.name, run_id)
     if record.command.startswith("robots "):
         raise PlanRefused(
             f"run {run_id} was `{record.command}`", hint="run `meshctl robots rollback` for the previous release"

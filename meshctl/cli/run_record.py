@@ -1,0 +1,28 @@
+"""The run that an operator named by its number in `meshctl history`, checked before it is resumed or rolled back."""
+
+from __future__ import annotations
+
+from meshctl.errors import InputError
+from meshctl.fleet.journal import Journal, RunRecord
+
+
+def run_of(journal: Journal, fleet: str, number: int) -> RunRecord:
+    """A run of this fleet that has ended. Raises InputError if there is none, or if it is still in progress.
+
+    A lab's fleet has the same name as the real one, but its runs are not the real fleet's.
+    """
+    record = journal.run(number)
+    if record is None:
+        raise InputError(f"run {number} does not exist", hint="run `meshctl history` to list all runs")
+    if record.fleet != fleet:
+        raise InputError(f"run {number} is one of fleet {record.fleet}: expected one of fleet {fleet}")
+    if record.lab and record.lab != journal.lab:
+        raise InputError(f"run {number} is one of the lab in {record.lab}", hint=f"add `--lab {record.lab}`")
+    if journal.lab and not record.lab:
+        raise InputError(
+            f"run {number} is one of the real fleet, and $MESHCTL_LAB or --lab names the lab in {journal.lab}",
+            hint="unset MESHCTL_LAB, and omit --lab",
+        )
+    if not record.is_over:
+        raise InputError(f"run {number} is still in progress ({record.owner})", hint="wait for it, or interrupt it")
+    return record

@@ -1,0 +1,45 @@
+"""A run number that names nothing to resume or to roll back is answered with what it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.cli.run_record import run_of
+from meshctl.errors import InputError
+from meshctl.fleet.journal import Journal
+
+
+@pytest.mark.parametrize(
+    ("of", "asked_by", "error", "hint"),
+    [
+        (("f", ""), ("f", "/lab"), "one of the real fleet, and $MESHCTL_LAB or --lab names the lab in /lab", "unset"),
+        (("f", "/lab"), ("f", ""), "one of the lab in /lab", "add `--lab /lab`"),
+        (("f", "/lab"), ("f", "/other"), "one of the lab in /lab", "add `--lab /lab`"),
+        (("g", ""), ("f", ""), "one of fleet g: expected one of fleet f", ""),
+    ],
+)
+def test_a_run_of_another_fleet_is_refused_by_its_fleet(
+    of: tuple[str, str], asked_by: tuple[str, str], error: str, hint: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "journal.sqlite"
+    with Journal(path, lab=of[1]) as journal:
+        run = journal.begin("provision", fleet=of[0], inventory="inv", nodes=("a",))
+        run.end("done")
+    with Journal(path, lab=asked_by[1]) as journal:
+        with pytest.raises(InputError) as raised:
+            run_of(journal, asked_by[0], run.id)
+        assert error in str(raised.value)
+        assert hint in raised.value.hint
+        with pytest.raises(InputError, match=f"run {run.id + 1} does not exist"):
+            run_of(journal, asked_by[0], run.id + 1)
+    with Journal(path, lab=of[1]) as journal:
+        assert run_of(journal, of[0], run.id).id == run.id
+
+
+def test_a_run_in_progress_is_not_resumed(tmp_path: Path) -> None:
+    with Journal(tmp_path / "journal.sqlite") as journal:
+        run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
+        with pytest.raises(InputError, match="is still in progress"):
+            run_of(journal, "f", run.id)
