@@ -35,7 +35,7 @@ class TransformGatherer:
         self._static: Dict[str, Any] = {}
         self._static_changed = False
         self._others: Dict[str, Any] = {}
-        self._foreign: Dict[str, None] = {}
+        self._foreign: Dict[str, str] = {}
         self._sent_at: Optional[float] = None
         self._lock = threading.Lock()
 
@@ -66,20 +66,27 @@ class TransformGatherer:
                 self._changed = {}
         return found
 
-    def merge(self, data: bytes, *, static: bool) -> bytes:
-        """A message of another robot -> the one to publish here: of static ones, all that came, because a late
+    def merge(self, data: bytes, source: str, *, static: bool) -> bytes:
+        """A message of robot `source` -> the one to publish here: of static ones, all that came, because a late
         subscriber gets a publisher's last message alone."""
         with self._lock:
             transforms = self._decoded(data)
             for transform in transforms:
                 child = transform["child_frame_id"]
                 if child in self._foreign or len(self._foreign) < MAX_FRAMES:
-                    self._foreign[child] = None
+                    self._foreign[child] = source
                     for own in (self._moving, self._changed, self._static):
                         own.pop(child, None)
                     if static:
                         self._others[child] = transform
             return self._encoded(list(self._others.values()) if static else transforms)
+
+    def forget(self, source: str) -> None:
+        """The frames that this robot sent count as local from now on, since its nodes are in the same ROS graph."""
+        with self._lock:
+            for child in [child for child, robot in self._foreign.items() if robot == source]:
+                del self._foreign[child]
+                self._others.pop(child, None)
 
     def _decoded(self, data: bytes) -> List[Any]:
         try:

@@ -58,13 +58,28 @@ def test_static_transforms_are_sent_all_together_whenever_one_changes() -> None:
 
 def test_merged_static_transforms_of_several_robots_are_published_together() -> None:
     gatherer = TransformGatherer(ROS_2, rate_hz=5)
-    gatherer.merge(message("husky1/lidar", 1), static=True)
-    assert children(gatherer.merge(message("husky2/lidar", 2), static=True)) == {"husky1/lidar": 1, "husky2/lidar": 2}
+    gatherer.merge(message("husky1/lidar", 1), "husky1", static=True)
+    published = gatherer.merge(message("husky2/lidar", 2), "husky2", static=True)
+    assert children(published) == {"husky1/lidar": 1, "husky2/lidar": 2}
 
 
 def test_a_merged_frame_that_ros_hands_back_is_not_sent_to_the_mesh() -> None:
     gatherer = TransformGatherer(ROS_2, rate_hz=5)
     for static in (False, True):
-        gatherer.merge(message("husky1/base"), static=static)
+        gatherer.merge(message("husky1/base"), "husky1", static=static)
         gatherer.add(message("husky1/base"), static=static)
     assert gatherer.due(0.0) == {}
+
+
+def test_frames_of_a_robot_that_joined_the_graph_are_local() -> None:
+    gatherer = TransformGatherer(ROS_2, rate_hz=5)
+    for robot in ("husky1", "husky2"):
+        gatherer.merge(message(f"{robot}/lidar"), robot, static=True)
+    gatherer.forget("husky1")
+    for robot in ("husky1", "husky2"):
+        gatherer.add(message(f"{robot}/lidar"), static=True)
+    assert set(children(gatherer.due(0.0)[TF_STATIC])) == {"husky1/lidar"}
+    assert set(children(gatherer.merge(message("husky3/lidar"), "husky3", static=True))) == {
+        "husky2/lidar",
+        "husky3/lidar",
+    }

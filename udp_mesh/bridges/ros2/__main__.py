@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from typing import Any, Callable, Deque, Mapping, Sequence
+from typing import Any, Callable, Deque, Iterable, Mapping, Sequence
 
 from udp_mesh.bridges.conditions_message import PACKAGE, to_ros
 from udp_mesh.bridges.configuration import (
@@ -35,6 +35,7 @@ from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, common, in_order_of_arrival, quality_text, ros2_name
+from udp_mesh.bridges.ros2.shared_graph import other_bridges, shared_graph
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.transforms import DEFINITION, TF, TF_STATIC, TOPIC_SETTINGS, TransformGatherer
 from udp_mesh.bridges.types import TypeKey
@@ -85,7 +86,7 @@ class Ros2Bridge:
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers = Ros2Publishers(node, self._class, self._warn_once)
         self._came_last: dict[str, dict[bytes, str]] = {}
-        self._others: set[str] = set()
+        self._graph = shared_graph(own, (), ())
         self._warned: set[str] = set()
         self._has_conditions_package = importlib.util.find_spec(PACKAGE) is not None
         self._wake = node.create_guard_condition(self.publish_arrived)
@@ -103,7 +104,9 @@ class Ros2Bridge:
             self._gatherer.add(data, static=name.endswith("_static"))
 
     def _send_transforms(self) -> None:
-        for topic, data in (self._gatherer.due(time.monotonic()) if self._gatherer is not None else {}).items():
+        if self._gatherer is None or not self._graph.sends_transforms:
+            return
+        for topic, data in self._gatherer.due(time.monotonic()).items():
             quality = STATIC_TF if topic == TF_STATIC else MOVING_TF
             key = TypeKey(ros2_type(DEFINITION.name), quality_text(quality))
             self._runtime.from_ros(Route(topic, None), "/" + topic, key, "", quality.latched, data)
@@ -125,9 +128,10 @@ class Ros2Bridge:
     def _to_ros(self, message: ToRos) -> None:
         self._arrived.append(message)
         if self._gatherer is not None and self._options.tf is not None and self._options.tf.merge:
-            topic = message.name.rpartition("/")[2]
-            if topic in (TF, TF_STATIC) and message.key.name == ros2_type(DEFINITION.name):
-                merged = self._gatherer.merge(message.payload, static=topic == TF_STATIC)
+            source, topic = ros2_name(message.name).split("/")[1], message.name.rpartition("/")[2]
+            is_transform = topic in (TF, TF_STATIC) and message.key.name == ros2_type(DEFINITION.name)
+            if is_transform and self._graph.merges_transforms_from(source):
+                merged = self._gatherer.merge(message.payload, source, static=topic == TF_STATIC)
                 quality = STATIC_TF if topic == TF_STATIC else MOVING_TF
                 key = TypeKey(message.key.name, quality_text(quality))
                 self._arrived.append(ToRos("/" + topic, key, None, quality.latched, merged))
@@ -166,29 +170,29 @@ class Ros2Bridge:
         except MeshError as error:
             log.debug("daemon-unreachable %s", error)
             return
+        self._refresh_graph(peers)
         found = routes(self._own, [topic for topic in topics if not topic.startswith("bridge/")], peers)
-        table = {} if self._sees_other_bridges() else {ros2_name(name): route for name, route in found.items()}
+        table = {ros2_name(name): route for name, route in found.items() if self._graph.may_read(ros2_name(name))}
         for name in [name for name in self._subscriptions if name not in table]:
             self._node.destroy_subscription(self._subscriptions.pop(name)[1])
         self._came_last = {name: known for name, known in self._came_last.items() if name in table}
         for name, route in table.items():
             self._refresh_subscription(name, route)
 
-    def _sees_other_bridges(self) -> bool:
-        """Whether other robots' bridges are in this robot's graph. Each publishes what it receives under the name that
-        its source reads, so messages would go in circles."""
-        nodes = self._node.get_node_names_and_namespaces()
-        others = {space for name, space in nodes if name == NODE and space != self._node.get_namespace()}
-        if others and others != self._others:
+    def _refresh_graph(self, peers: Iterable[str]) -> None:
+        """Updates which robots' bridges are in this robot's graph."""
+        nodes, namespace = self._node.get_node_names_and_namespaces(), self._node.get_namespace()
+        known, self._graph = self._graph, shared_graph(self._own, other_bridges(nodes, NODE, namespace), peers)
+        if self._graph.is_shared and self._graph != known:
             log.error(
-                "bridges-in-one-graph others=%s: ROS 2 itself connects these robots, so nothing is sent over the mesh; "
-                "give each robot a ROS_DOMAIN_ID of its own or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
-                ",".join(sorted(others)),
+                "%s; give each robot a ROS_DOMAIN_ID of its own or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST",
+                self._graph,
             )
-        elif self._others and not others:
-            log.info("bridges-apart: messages are sent over the mesh again")
-        self._others = others
-        return bool(others)
+        elif known.is_shared and not self._graph.is_shared:
+            log.info("bridges-apart: everything is sent over the mesh again")
+        if self._gatherer is not None:
+            for robot in self._graph.robots:
+                self._gatherer.forget(robot)
 
     def _type_published(self, name: str, infos: Sequence[Any]) -> str:
         listed = {bytes(info.endpoint_gid): str(info.topic_type) for info in infos}
