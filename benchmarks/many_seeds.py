@@ -1,8 +1,8 @@
 """Goals 8 and 9 and the shared logs over many seeds: `python -m benchmarks.many_seeds [--seeds 20] [--fill]`.
 
 The cells of `benchmarks.one_channel` and the ways of `benchmarks.shared_logs`, each with the same seeds, on all cores
-by the engine of `udp-mesh sim sweep`. An interrupted run continues. Means have Student's 95 % intervals, shares of
-seeds that meet the goal Wilson's. `--tables` prints the results that exist.
+by the engine of `udp-mesh sim sweep`. An interrupted run continues. Medians have 95 % intervals of order statistics,
+shares of seeds that meet the goal Wilson's. `--tables` prints the results that exist.
 """
 
 from __future__ import annotations
@@ -11,14 +11,17 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
+from itertools import accumulate
+from math import comb
 from pathlib import Path
+from statistics import median
 
 from benchmarks import one_channel, shared_logs
 from benchmarks.page import fill
 from benchmarks.tables import row
 from mesh_sweep.cases import Case, Settings, cases_of, parse_seeds, settings_order, settings_text
 from mesh_sweep.executors import ProcessWorkers, core_count
-from mesh_sweep.intervals import Interval, mean_interval, share_interval
+from mesh_sweep.intervals import CONFIDENCE, Interval, share_interval
 from mesh_sweep.results import Identity, Result, decode
 from mesh_sweep.results_file import ResultsFile
 from mesh_sweep.run import run_cases
@@ -93,8 +96,8 @@ def tables(results: Sequence[Result]) -> str:
         lines.append(row(["---"] * (len(heads) + len(columns) + 2)))
         for key, runs in cells_of_set.items():
             labels = [_label(path, value) for path, value in key if path != "set"]
-            means = [_mean(runs, figure, factor) for figure, factor, _ in columns]
-            lines.append(row([*labels, str(len(runs)), *means, _met(runs)]))
+            medians = [_median(runs, figure, factor) for figure, factor, _ in columns]
+            lines.append(row([*labels, str(len(runs)), *medians, _met(runs)]))
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
 
@@ -103,9 +106,21 @@ def _label(path: str, value: str) -> str:
     return f"{float(value):.0%}" if path == "loss" else value
 
 
-def _mean(runs: Sequence[Result], figure: str, factor: float) -> str:
+def _median(runs: Sequence[Result], figure: str, factor: float) -> str:
     values = [value * factor for run in runs if (value := run.figures[figure]) is not None]
-    return _shown(mean_interval(values)) if values else "none"
+    return _shown(median_interval(values)) if values else "none"
+
+
+def median_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> Interval:
+    """The median, and the k-th smallest and largest of the values with the largest k for which both enclose the
+    distribution's median with this confidence, whatever the distribution. There is no k for fewer than six values."""
+    ordered, count = sorted(values), len(values)
+    # the chance that at most k values lie below the distribution's median
+    below = accumulate(comb(count, k) / 2**count for k in range(count))
+    outside = sum(chance <= (1 - confidence) / 2 for chance in below)
+    if outside == 0:
+        return Interval(median(ordered), None, None)
+    return Interval(median(ordered), ordered[outside - 1], ordered[-outside])
 
 
 def _shown(one: Interval) -> str:
