@@ -64,7 +64,11 @@ Brief = Annotated[bool, typer.Option("--brief/--full", help="Hide file diffs.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation.")]
 Rate = Annotated[float | None, typer.Option("--rate", metavar="KB_S", help="Upload limit per node in kB/s.")]
 
-
+# `provision` and `resume` reach such nodes before they plan; at a site they have the worker plan.
+Reconnect = Annotated[
+    bool,
+    typer.Option("--reconnect", hidden=True, help="Let neighbors remove stale station entries of unreachable nodes."),
+]
 Direct = Annotated[
     bool, typer.Option("--direct", help="Connect to nodes of sites from here, instead of through their workers.")
 ]
@@ -82,6 +86,7 @@ def plan(
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",
     direct: Direct = False,
+    reconnect: Reconnect = False,
     brief: Brief = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
@@ -100,7 +105,7 @@ def plan(
                     write_file(out, dump_site_plans(made.saved(opened, choices)))
                 raise typer.Exit(report_everywhere(opened, made, choices, as_json=as_json, brief=brief))
         opened = with_sent_states(opened)
-        prepared = prepare_plan(opened, own, choices)
+        prepared = prepare_plan(opened, own, choices, reconnects=reconnect)
         hand_over(prepared)
         if out is not None:
             write_file(out, dump(saved_plan(opened, prepared, choices)))
@@ -112,6 +117,7 @@ def apply(
     inventory: InventoryPath = Path(),
     dry_run: DryRun = False,
     rate: Rate = None,
+    reconnect: Reconnect = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
@@ -134,7 +140,7 @@ def apply(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         check_fleet(saved.plan.fleet, opened.fleet, str(plan_file))
         opened = with_sent_states(opened)
-        agreed = prepare_agreed(opened, saved)
+        agreed = prepare_agreed(opened, saved, reconnects=reconnect or not dry_run)
         if dry_run:
             hand_over(agreed)
             choices = PlanOptions(saved.with_firmware)
@@ -145,7 +151,7 @@ def apply(
 def _apply_everywhere(
     opened: Session, inventory: Path, saved: SavedSitePlans, file: str, options: RunOptions, *, dry_run: bool
 ) -> typer.Exit:
-    with closing(prepare_saved(opened, inventory, saved, file)) as made:
+    with closing(prepare_saved(opened, inventory, saved, file, reconnects=not dry_run)) as made:
         if dry_run:
             return typer.Exit(report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=False))
         confirm_everywhere(opened, made, yes=True)

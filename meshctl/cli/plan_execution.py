@@ -74,9 +74,11 @@ def saved_plan(opened: Session, prepared: Prepared, choices: PlanOptions) -> Sav
     return SavedPlan(prepared.plan, prepared.salt, opened.inventory, choices.with_firmware)
 
 
-def prepare_agreed(opened: Session, saved: SavedPlan) -> Prepared:
+def prepare_agreed(opened: Session, saved: SavedPlan, *, reconnects: bool) -> Prepared:
     """What still applies of a saved plan."""
-    fresh = prepare_plan(opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt)
+    fresh = prepare_plan(
+        opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt, reconnects=reconnects
+    )
     return replace(fresh, plan=as_agreed(saved.plan, fresh.plan))
 
 

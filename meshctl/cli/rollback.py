@@ -81,7 +81,7 @@ def rollback(
             if sites:
                 options = RunOptions("rollback", choices, as_json, rate, undoes=run)
                 raise change_everywhere(opened, inventory, own, sites, options, yes=yes, brief=brief, dry_run=dry_run)
-            prepared = prepare_plan(opened, own, choices)
+            prepared = prepare_plan(opened, own, choices, reconnects=not dry_run)
             confirm_and_execute(
                 opened,
                 prepared,

@@ -126,18 +126,20 @@ def prepare_everywhere(
     _check_meshes(opened, sites)
     direct = prepare_plan(opened, own, choices, reconnects=reconnects) if own else None
     bundle_of = _bundles(opened, inventory, choices)
-    return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, _options(choices))))
+    options = [*_options(choices), *_reconnect_option(reconnects)]
+    return WholePlan(direct, tuple(prepare_sites(opened.fleet, sites, opened.access, bundle_of, options)))
 
 
-def prepare_saved(opened: Session, inventory: Path, saved: SavedSitePlans, file: str) -> WholePlan:
+def prepare_saved(opened: Session, inventory: Path, saved: SavedSitePlans, file: str, *, reconnects: bool) -> WholePlan:
     """What still applies of saved plans; the workers check those of their sites. Raises InputError."""
     check_placement(saved, opened.fleet, file)
     nodes = {name: tuple(plan.plan.nodes) for name, plan in saved.sites.items()}
     _check_meshes(opened, nodes)
-    direct = prepare_agreed(opened, saved.direct) if saved.direct is not None else None
+    direct = prepare_agreed(opened, saved.direct, reconnects=reconnects) if saved.direct is not None else None
     bundle_of = _bundles(opened, inventory, PlanOptions(saved.with_firmware))
     agreed = {name: dump(plan) for name, plan in saved.sites.items()}
-    sites = prepare_sites(opened.fleet, nodes, opened.access, bundle_of, (), agreed) if nodes else []
+    options = _reconnect_option(reconnects)
+    sites = prepare_sites(opened.fleet, nodes, opened.access, bundle_of, options, agreed) if nodes else []
     for name, missing in saved.unplanned.items():
         error = InputError(f"{file} has no plan of site {name}: {missing.error}", hint="make a new plan")
         sites.append(SitePlan(opened.fleet.sites[name], missing.nodes, "", error=error))
@@ -185,6 +187,11 @@ def _options(choices: PlanOptions) -> list[str]:
     if choices.accept_cuts:
         words += ["--accept-cut", ",".join(choices.accept_cuts)]
     return [*words, "--together"] if choices.together else words
+
+
+def _reconnect_option(reconnects: bool) -> list[str]:
+    """The option of `meshctl plan` and `apply` at a site with which they reach nodes as `provision` does."""
+    return ["--reconnect"] if reconnects else []
 
 
 def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:

@@ -224,7 +224,7 @@ class NatsWorker:
         run.create(part, {path: self.directory.image(sha256) for path, sha256 in images.items()})
         run.plan.write_text(str(message["plan"]), encoding="utf-8")
         if order.reply_to:
-            options = ["-i", str(run.inventory), *runner.key_options(self.directory)]
+            options = ["--reconnect", "-i", str(run.inventory), *runner.key_options(self.directory)]
             run_command(self.directory, run, self.environ, "apply", str(run.plan), "--dry-run", "--json", *options)
             replaced = json.dumps(run.taken_replaced()).encode()
             run.replaced.write_bytes(sealed_for_reply(replaced, order.reply_to))

@@ -134,13 +134,13 @@ class Worker:
         images = {str(path): self._directory.image(_file_name(sha256)) for path, sha256 in request["images"].items()}
         self._planned.append(run)
         run.create(_bytes_of(request["part"]), images)
-        options = ["-i", str(run.inventory), *runner.key_options(self._directory)]
+        options = ["-i", str(run.inventory), *runner.key_options(self._directory), *map(str, request["options"])]
         if agreed := str(request.get("agreed", "")):
             run.plan.write_text(agreed, encoding="utf-8")
             done = self._command(run, "apply", str(run.plan), "--dry-run", "--json", *options)
             text = done.stdout.decode("utf-8", "replace")
         else:
-            words = [*map(str, request["nodes"]), "--out", str(run.plan), "--brief", *map(str, request["options"])]
+            words = [*map(str, request["nodes"]), "--out", str(run.plan), "--brief"]
             done = self._command(run, "plan", *words, *options)
             text = run.plan.read_text(encoding="utf-8") if run.plan.exists() else ""
         if not text.strip():

@@ -15,8 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.plan.radios import SLACK_S
 from meshctl.sites.runs import SiteDirectory, closing
-from tests.meshctl.sites.rig import NORTH, SECRETS, SOUTH, SitesRig
+from meshlab.fleet import VirtualFleet, VirtualNode
+from tests.meshctl.sites.rig import LIMIT_S, NORTH, SECRETS, SOUTH, SitesRig
 from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("sites"), pytest.mark.timeout(600)]
@@ -284,6 +286,28 @@ def test_a_saved_plan_is_applied_by_the_workers_as_it_was_shown_or_refused(rig: 
     assert set(late.results.values()) == {"refused"}, late
     rig.run(*_PROVISION, expected=0)
     assert _files_with_secrets(rig.site_directory("north")) == []
+
+
+def test_a_node_that_is_back_in_its_mesh_but_unreachable_is_reached_by_the_worker(rig: SitesRig) -> None:
+    """Its radio counts its frames from 0 again, and its neighbor at the site drops them (docs/lab.md)."""
+    # the worker learns who hears whom
+    rig.run("provision", *NORTH, "--check", expected=0)
+    lab = VirtualFleet.attach(rig.lab)
+    # no other node is behind this one
+    holders = [lab.node(name) for name in NORTH if name != "n2"]
+    until(lambda: all(_known_for_s(holder) > SLACK_S + 2 for holder in holders), "its neighbors to know it for a while")
+    lab.node("n2").exec("wifi down; wifi").check("restart its radio")
+    # what changes nothing leaves station entries alone, too
+    is_dropped = re.compile(r"^n2 +away: .*heard by n", re.MULTILINE)
+    until(lambda: is_dropped.search(rig.run("plan", "n2", "--brief").out), "its frames to be dropped", wait_s=LIMIT_S)
+    ended = rig.run("provision", *NORTH, "--yes", "--json", expected=0)
+    assert ended.results == dict.fromkeys(NORTH, "unchanged")
+
+
+def _known_for_s(holder: VirtualNode) -> int:
+    """For how long it has known the radio that it has heard for the shortest time."""
+    dump = holder.exec("iw dev mesh0 station dump").check(f"{holder.name}: stations").stdout
+    return min(map(int, re.findall(r"connected time:\s*(\d+)", dump)), default=0)
 
 
 def test_backup_restore_and_replace_reach_nodes_through_the_gateway(rig: SitesRig, tmp_path: Path) -> None:
