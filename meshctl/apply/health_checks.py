@@ -24,6 +24,7 @@ from meshctl.uci import Package, Section
 # The share of its former neighbors a node must hear again; not all, because robots move.
 MIN_NEIGHBOR_SHARE = 0.5
 RELOADING = "its services are still reloading"
+NEEDS_LONGER_WINDOW = "it needs a longer confirm_window_s"
 # scripts/reload.sh: the window was about to end
 _RELOAD_WAS_LATE = 75
 # netifd, proto.c (proto_attach_interface): a protocol without a handler
@@ -97,7 +98,7 @@ def _reload(after: Observation) -> tuple[str, ...]:
     if status is None:
         return (RELOADING,)
     if status == _RELOAD_WAS_LATE:
-        return ("its services had not reloaded within the confirm window: it needs a longer confirm_window_s",)
+        return (f"its services had not reloaded within the confirm window: {NEEDS_LONGER_WINDOW}",)
     return (f"reloading its services failed with exit status {status}",) if status != 0 else ()
 
 

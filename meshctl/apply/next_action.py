@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from meshctl.apply.health_checks import RELOADING
+from meshctl.apply.health_checks import NEEDS_LONGER_WINDOW, RELOADING
 from meshctl.device.observation import ChangeStatus, Observation
 
 
@@ -108,6 +108,8 @@ def rollback_reason(
     # a node whose network has reloaded halfway says no more than that
     seen = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
     failed = "; ".join(seen)
+    if word == "timeout" and tuple(seen) == (RELOADING,):
+        failed = f"{RELOADING}: {NEEDS_LONGER_WINDOW}"
     first, second = (failed, login_refused) if word == "abort" else (login_refused, failed)
     details = first or second or (connect_error and f"it was unreachable: {connect_error}")
     return f"{reason}: {details}" if details else reason

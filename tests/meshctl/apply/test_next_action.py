@@ -129,4 +129,6 @@ def test_the_connection_error_is_reported_only_if_no_check_was_unmet() -> None:
     assert "reached" not in rollback_reason(late, ("its LAN is down",), "", "cannot connect")
     # it was still reloading when it was last reached
     assert rollback_reason(late, (RELOADING,), "", "cannot connect") == reason.replace(": Connection refused", "")
-    assert rollback_reason(late, (RELOADING,)) == f"it was not confirmed in time: {RELOADING}"
+    assert rollback_reason(late, (RELOADING,)) == (
+        "it was not confirmed in time: its services are still reloading: it needs a longer confirm_window_s"
+    )
