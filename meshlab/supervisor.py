@@ -47,6 +47,7 @@ class Supervisor:
         self.fleet = FleetState(spec, directory, deny_setgroups=deny_setgroups)
         self.stopping = asyncio.Event()
         self._runner = runner
+        self._events = -1
         self._waiting: list[str] = []
         self._requests: dict[int, asyncio.Future[tuple[dict[str, Any], list[int]]]] = {}
         self._serial = 0
@@ -72,8 +73,8 @@ class Supervisor:
         loop = asyncio.get_running_loop()
         self._runner.setblocking(False)
         loop.add_reader(self._runner, self._on_runner_event)
-        events = os.open(self.directory / "events", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-        loop.add_reader(events, self._on_events, events)
+        events = self._open_events()
+        loop.add_reader(events, self._on_events)
         for ending in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(ending, self.stopping.set)
         self.port_forwarder.open()
@@ -90,6 +91,10 @@ class Supervisor:
             loop.remove_reader(self._runner)
             loop.remove_reader(events)
             os.close(events)
+
+    def _open_events(self) -> int:
+        self._events = os.open(self.directory / "events", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        return self._events
 
     def _make(self, number: int) -> None:
         node = self.spec.nodes[number]
@@ -208,6 +213,8 @@ class Supervisor:
         elif event["event"] == "started":
             self.fleet.nodes[event["node"]].pid = event["pid"]
         elif event["event"] == "exit":
+            # what it wrote before it ended is not of its next boot
+            self._on_events()
             self._exited(self.fleet.nodes[event["node"]], event["status"], event["reason"])
 
     def _exited(self, state: NodeState, status: int, reason: str) -> None:
@@ -227,9 +234,9 @@ class Supervisor:
 
     # -- the events pipe --
 
-    def _on_events(self, events: int) -> None:
+    def _on_events(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            for line in os.read(events, 65536).decode("utf-8", "replace").splitlines():
+            for line in os.read(self._events, 65536).decode("utf-8", "replace").splitlines():
                 word, _, rest = line.partition(" ")
                 name, _, detail = rest.partition(" ")
                 if name not in self.fleet.nodes:

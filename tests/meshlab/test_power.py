@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import fcntl
+import json
 import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +21,8 @@ from meshlab import rootfs
 from meshlab.errors import LabError
 from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.spec import FleetSpec, NodeSpec
+from meshlab.state import Power
+from meshlab.supervisor import Supervisor
 from tests.meshlab.conftest import KEYS
 from tests.meshlab.fleet_report import fleets_of, report
 from tests.meshlab.power_cycles import cycle
@@ -81,6 +86,33 @@ def test_a_node_shell_closes_inherited_descriptors_of_other_nodes() -> None:
     subprocess.run((sys.executable, "-c", program), check=True, timeout=60)
 
 
+def test_what_a_node_says_at_the_end_of_its_boot_is_not_taken_for_its_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its power is cut just then, and a busy supervisor sees that it has ended before it reads the rest."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    os.mkfifo(tmp_path / "events")
+
+    async def cut_at_the_end_of_a_boot() -> tuple[Power, str]:
+        supervisor = Supervisor(FleetSpec("one", (NodeSpec("here"),)), tmp_path, ours, deny_setgroups=False)
+        # its next boot has begun, and has not said anything
+        monkeypatch.setattr(supervisor, "_boot", lambda state: setattr(state, "power", Power.BOOTING))
+        supervisor._make(0)
+        state = supervisor.fleet.nodes["here"]
+        state.power, state.pid = Power.BOOTING, 7
+        events = supervisor._open_events()
+        supervisor.power_off("here", back=True)
+        os.write(events, b"up here earlier-boot\n")
+        theirs.send(json.dumps({"event": "exit", "node": "here", "status": -9, "reason": ""}).encode())
+        supervisor._on_runner_event()
+        supervisor._on_events()
+        os.close(events)
+        return state.power, state.boot_id
+
+    with ours, theirs:
+        assert asyncio.run(cut_at_the_end_of_a_boot()) == (Power.BOOTING, "")
+
+
 def _has_ended(lines: int) -> bool:
     """Read the available data; returns whether the other end is closed."""
     try:
@@ -132,4 +164,4 @@ def test_every_node_survives_a_thousand_power_cycles(tmp_path: Path) -> None:
     names = [f"n{number}" for number in range(8)]
     spec = FleetSpec("eight", tuple(NodeSpec(name, host_key_types=KEYS) for name in names))
     with VirtualFleet(spec, tmp_path / "fleet") as fleet:
-        cycle(fleet, names, 1000, random.Random(1), wait_s=180.0)
+        assert list(cycle(fleet, names, 1000, random.Random(1), wait_s=180.0))

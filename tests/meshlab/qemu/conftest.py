@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -174,6 +174,12 @@ class Lab:
         known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
         return {names[one["orig_address"]]: names[one["neigh_address"]] for one in known if one.get("best")}
 
+    def fresh_originators(self, node: str) -> set[str]:
+        """The nodes of which the node's batman-adv has had news within the last seconds, over any path."""
+        names = self.names()
+        known = json.loads(self.on(node, "batctl meshif bat0 originators_json"))
+        return {names[one["orig_address"]] for one in known if one["last_seen_msecs"] < 5000}
+
     def neighbors(self, node: str) -> set[str]:
         """The neighbors that the node's batman-adv has heard within the last seconds."""
         names = self.names()
@@ -205,6 +211,12 @@ class Lab:
             until(lambda: self.answers("base-station", self.FAR_COMPUTER), "the Husky's computer to answer")
         except AssertionError as error:
             raise AssertionError(f"{error}\n{self.tables()}") from error
+
+    def meet(self, names: Sequence[str]) -> None:
+        """Wait until the base hears each of these nodes through its mesh, and each of them the base."""
+        others = [name for name in (self.NODES if "base" in names else names) if name != "base"]
+        pairs = [*(("base", name) for name in others), *((name, "base") for name in others if name in names)]
+        until(lambda: all(target in self.fresh_originators(at) for at, target in pairs), f"the mesh to meet {names}")
 
     def tables(self) -> str:
         """The kernel tables of each node, for the report of a mesh that does not forward."""

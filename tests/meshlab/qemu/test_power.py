@@ -42,5 +42,5 @@ def test_no_two_nodes_have_a_process_with_the_same_id(lab: Lab) -> None:
 @pytest.mark.proof
 @pytest.mark.timeout(7200)
 def test_every_node_survives_two_hundred_power_cycles(lab: Lab) -> None:
-    cycle(lab.fleet, lab.NODES, 200, random.Random(1), wait_s=WAIT_S)
+    assert list(cycle(lab.fleet, lab.NODES, 200, random.Random(1), wait_s=WAIT_S, met=lab.meet))
     lab.settle()
