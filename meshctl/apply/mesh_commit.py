@@ -16,7 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from meshctl.apply.change_in_progress import (
     ChangeInProgress,
@@ -185,7 +185,8 @@ def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
             # it may have started before it was aborted
             outcome = poll(change)
             if not outcome.result.is_good:
-                participant.failure = participant.failure or outcome
+                why = f"{reason}; {outcome.reason}"
+                participant.failure = participant.failure or replace(outcome, reason=why)
 
     commit.each(commit.participants, cancel_one)
     return {

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from meshctl.apply import mesh_commit
+from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.mesh_commit import commit_mesh
 from meshctl.apply.next_action import Action
@@ -110,3 +113,28 @@ def test_no_node_is_armed_while_another_one_is_in_its_first_boot(monkeypatch: py
     assert armed == []
     assert (ended["b01"].result, ended["b02"].result) == (Result.PENDING, Result.FAILED)
     assert "b02 could not be armed: b02: its first boot has not ended" in ended["b01"].reason
+
+
+def test_a_node_that_was_scheduled_names_the_one_for_which_it_is_called_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen on real OpenWrt: b03's power was cut, and the others said no more than that they had been aborted."""
+
+    @contextmanager
+    def borrow(_: object) -> Iterator[None]:
+        yield None
+
+    def scheduled(name: str) -> Participant:
+        ctx = cast("NodeContext", SimpleNamespace(name=name, node=None))
+        change = cast("ChangeInProgress", SimpleNamespace(is_abandoned=False, last_error=""))
+        return Participant(ctx, change=change, is_scheduled=True)
+
+    monkeypatch.setattr(mesh_commit, "abort", lambda *change: None)
+    monkeypatch.setattr(mesh_commit, "unlock", lambda *change: None)
+    monkeypatch.setattr(mesh_commit, "poll", lambda change: Outcome("b01", Result.ROLLED_BACK, "it was aborted"))
+    lost = Outcome("b03", Result.FAILED, "the connection broke")
+    participants = [scheduled("b01"), replace(scheduled("b03"), failure=lost)]
+    run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow)))
+    with ThreadPoolExecutor(1) as pool:
+        commit = mesh_commit._MeshCommit(run, participants, 60, 1, (), is_together=False, pool=pool)
+        ended = mesh_commit._cancel(commit, canceled_because(participants, "scheduled"))
+    why = "the mesh change was canceled: b03 could not be scheduled: the connection broke; it was aborted"
+    assert ended == {"b01": Outcome("b01", Result.ROLLED_BACK, why), "b03": lost}
