@@ -145,7 +145,8 @@ class Client(asyncio.Protocol):
         self._write({"event": "dropped", "messages": dropped})
 
     def _write(self, header: Header, payload: bytes = b"") -> None:
-        if self._transport is not None:
+        # To a connection that broke, asyncio would log each write.
+        if self._transport is not None and not self._transport.is_closing():
             frame = encode_frame(header, payload)
             self.written_bytes += len(frame)
             self._transport.write(frame)

@@ -56,7 +56,7 @@ class DirectoryStore:
         # Used by the caller's thread only. A write that has not started is canceled when its message is delivered.
         self._writes: dict[int, Future[None]] = {}
         # Used by the writer thread only.
-        self._unsynced: set[Path] = set()
+        self._unsynced: dict[int, Path] = {}
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="outbox")
 
     def check_writable(self) -> None:
@@ -111,21 +111,29 @@ class DirectoryStore:
             temporary.rename(path)
         except OSError as error:
             # The disk is full: remove the partial file.
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            with self._lock:
-                self.bytes -= self._sizes.pop(key, 0)
-                self._refuse("outbox-write-failed", f"path={path} error={error}")
+            self._give_up(key, temporary, error)
             return
-        self._unsynced.add(path)
+        self._unsynced[key] = path
+
+    def _give_up(self, key: int, path: Path, error: OSError) -> None:
+        """The disk failed: the message is in memory only."""
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+        with self._lock:
+            self.bytes -= self._sizes.pop(key, 0)
+            self._refuse("outbox-write-failed", f"path={path} error={error}")
 
     def _refuse(self, event: str, details: str) -> None:
-        """Counts every refusal but limits the log lines: a disk stays full for long."""
+        """Counts every refusal but limits the log lines."""
         self.refused += 1
+        self._log(event, f"held-in-memory={self.refused} {details}")
+
+    def _log(self, event: str, details: str) -> None:
+        """A disk stays full, or broken, for long."""
         now = time.monotonic()
         if now - self._logged_at >= LOG_AGAIN_S:
             self._logged_at = now
-            log.error("%s held-in-memory=%d %s", event, self.refused, details)
+            log.error("%s %s", event, details)
 
     def remove(self, key: int) -> None:
         with self._lock:
@@ -136,14 +144,15 @@ class DirectoryStore:
         write = self._writes.pop(key, None)
         if write is not None:
             write.cancel()
-        self._disk.submit(self._unlink, self._path(key))
+        self._disk.submit(self._unlink, key)
 
-    def _unlink(self, path: Path) -> None:
-        self._unsynced.discard(path)
+    def _unlink(self, key: int) -> None:
+        self._unsynced.pop(key, None)
+        path = self._path(key)
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
-            log.error("outbox-remove-failed path=%s error=%s", path, error)
+            self._log("outbox-remove-failed", f"path={path} error={error}")
 
     def holds(self, key: int) -> bool:
         """Whether it is on disk or queued to be written."""
@@ -184,18 +193,20 @@ class DirectoryStore:
         return self._disk.submit(self._sync_all)
 
     def _sync_all(self) -> None:
-        paths = sorted(self._unsynced)
-        self._unsynced.clear()
-        for path in paths:
+        unsynced, self._unsynced = self._unsynced, {}
+        written: list[tuple[int, Path]] = []
+        for key, path in sorted(unsynced.items()):
             try:
                 _sync(path, os.O_RDONLY)
+                written.append((key, path))
             except OSError as error:
-                log.error("outbox-flush-failed path=%s error=%s", path, error)
+                self._give_up(key, path, error)
         try:
-            if paths:
+            if written:
                 _sync(self._directory, os.O_RDONLY | os.O_DIRECTORY)
         except OSError as error:
-            log.error("outbox-flush-failed path=%s error=%s", self._directory, error)
+            for key, path in written:
+                self._give_up(key, path, error)
 
     def close(self) -> None:
         """Waits until everything put is written."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +36,7 @@ from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.log_store import Put, SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
+from udp_mesh.daemon.outcomes import Outcomes
 from udp_mesh.daemon.pings import Pings
 from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.radio_paths import RadioReport, with_radio
@@ -47,8 +47,6 @@ from udp_mesh.daemon.thin_ports import ThinPorts
 
 log = logging.getLogger(__name__)
 
-MAX_OUTCOMES = 65_536
-"""Messages whose outcome a client asked for, in case clients never read."""
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
 
@@ -93,7 +91,7 @@ class Service:
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
         self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority, self._announce_subscriptions)
         self._watchers: set[Client] = set()
-        self._outcomes: OrderedDict[int, Client] = OrderedDict()
+        self._outcomes = Outcomes()
         self.pings = Pings(self.driver)
         self._tasks: set[asyncio.Task[None]] = set()
         self._conditions_timer: asyncio.TimerHandle | None = None
@@ -158,6 +156,7 @@ class Service:
 
     def client_gone(self, client: Client) -> None:
         self.subscriptions.remove_client(client)
+        self._outcomes.remove_client(client)
         self._watchers.discard(client)
 
     def subscribe_events(self, client: Client) -> None:
@@ -189,10 +188,8 @@ class Service:
                 destination=destination,
                 reliable=settings.reliable,
             )
-        if client is not None:
-            self._outcomes[outcome] = client
-            if len(self._outcomes) > MAX_OUTCOMES:
-                self._outcomes.popitem(last=False)
+        if client is not None and settings is not None and settings.reliable:
+            self._outcomes.add(outcome, client, destination=destination)
         if settings is not None and settings.log is not None:
             put = self.log_store.last_put
             assert put is not None
@@ -313,7 +310,7 @@ class Service:
             case MessageReceived():
                 self._on_message(event)
             case MessageDelivered() | MessageExpired() | MessagePeerLost():
-                client = self._outcomes.get(event.message_id)
+                client = self._outcomes.publisher(event.message_id)
                 if client is not None:
                     fields = event_json(event)
                     outcome = event_name(event).removeprefix("message-")

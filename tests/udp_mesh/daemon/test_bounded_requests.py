@@ -192,17 +192,40 @@ def test_paths_outside_the_state_directory_are_detected(tmp_path: Path) -> None:
         assert not is_below(path, state)
 
 
+class Handler:
+    """Accepts every request."""
+
+    def __init__(self) -> None:
+        self.gone = asyncio.Event()
+
+    def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
+        client.reply(header.get("id"))
+
+    def client_read(self) -> None:
+        pass
+
+    def client_gone(self, client: api.Client) -> None:
+        self.gone.set()
+
+
+def test_replies_to_a_client_that_has_gone_are_not_logged_one_by_one(caplog: pytest.LogCaptureFixture) -> None:
+    async def work(path: Path) -> None:
+        handler = Handler()
+        server = api.LocalServer(handler, path, mode=0o600, group=None, max_payload_bytes=lambda: 1000)
+        await server.start()
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(path))
+            client.sendall(b"".join(encode_frame({"op": "x", "id": number}, b"") for number in range(100)))
+        await handler.gone.wait()
+        await server.close()
+
+    with tempfile.TemporaryDirectory(prefix="udp-mesh-") as folder:
+        asyncio.run(work(Path(folder) / "s"))
+    assert not caplog.records
+
+
 def test_an_incomplete_request_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(api, "PARTIAL_REQUEST_TIMEOUT_S", 0.05)
-
-    class Handler:
-        def request(self, client: api.Client, header: dict[str, object], payload: bytes) -> None:
-            client.reply(header.get("id"))
-
-        def client_read(self) -> None:
-            pass
-
-        def client_gone(self, client: api.Client) -> None: ...
 
     async def work(path: Path) -> None:
         server = api.LocalServer(Handler(), path, mode=0o600, group=None, max_payload_bytes=lambda: 1000)

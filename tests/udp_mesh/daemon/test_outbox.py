@@ -1,7 +1,10 @@
 """Messages on disk: stored messages are loaded again, however the process ended."""
 
 import asyncio
+import errno
+import os
 import signal
+import stat
 import subprocess
 import sys
 import tempfile
@@ -208,6 +211,28 @@ assert [store.holds(key) for key in range(3)] == [True, False, True]
     assert "Traceback" not in ended.stderr
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".message", ".message"]
     assert [kept.key for kept in DirectoryStore(tmp_path, 1 << 30).load()] == [0, 2]
+
+
+@pytest.mark.parametrize("broken", ["files", "directory"])
+def test_what_the_disk_does_not_confirm_is_not_on_disk(
+    broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A failed fsync says that the data may be gone; a disk that fails is not logged for each message."""
+
+    def fsync(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode) == (broken == "directory"):
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    store = DirectoryStore(tmp_path, 1 << 20)
+    for key in range(5):
+        store.put(message(key))
+    store.flush().result(WAIT_S)
+    assert not any(store.holds(key) for key in range(5))
+    assert (store.refused, store.bytes) == (5, 0)
+    store.close()
+    assert not DirectoryStore(tmp_path, 1 << 20).load()
+    assert [record.getMessage().split()[0] for record in caplog.records] == ["outbox-write-failed"]
 
 
 def test_an_unusable_directory_is_reported_before_the_first_message(
