@@ -10,7 +10,7 @@ MAX_MESSAGES_TO_SEVERAL = 65_536
 """Of messages to several peers: nothing says which of their outcomes is the last one."""
 
 
-class Outcomes:
+class AwaitedOutcomes:
     """A message to one peer is remembered until it ends, for hours if it waits in an outbox."""
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Outcomes:
             self._to_several.popitem(last=False)
 
     def publisher(self, message: int) -> Client | None:
-        """Whom to inform of an outcome of the message; None: nobody asked for it."""
+        """Whom to inform of an outcome of the message; None: no client asked."""
         return self._to_one.pop(message, None) or self._to_several.get(message)
 
     def remove_client(self, client: Client) -> None:

@@ -36,7 +36,7 @@ from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.log_store import Put, SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
-from udp_mesh.daemon.outcomes import Outcomes
+from udp_mesh.daemon.outcomes import AwaitedOutcomes
 from udp_mesh.daemon.pings import Pings
 from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.radio_paths import RadioReport, with_radio
@@ -91,7 +91,7 @@ class Service:
         self.commands: dict[str, Callable[[Service, Client, Header, bytes], Header | Awaitable[Header] | None]] = {}
         self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority, self._announce_subscriptions)
         self._watchers: set[Client] = set()
-        self._outcomes = Outcomes()
+        self._outcomes = AwaitedOutcomes()
         self.pings = Pings(self.driver)
         self._tasks: set[asyncio.Task[None]] = set()
         self._conditions_timer: asyncio.TimerHandle | None = None

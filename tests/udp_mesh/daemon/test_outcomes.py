@@ -8,7 +8,7 @@ import pytest
 
 from udp_mesh.daemon import outcomes
 from udp_mesh.daemon.api import Client, LocalServer
-from udp_mesh.daemon.outcomes import Outcomes
+from udp_mesh.daemon.outcomes import AwaitedOutcomes
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ class FewBytes:
 
 
 def test_a_message_to_a_peer_that_is_away_is_remembered_whatever_is_published_meanwhile(client: Client) -> None:
-    waiting = Outcomes()
+    waiting = AwaitedOutcomes()
     waiting.add(0, client, destination="base")
     for message in range(1, 100):
         waiting.add(message, client, destination="spot")
@@ -33,14 +33,14 @@ def test_a_message_to_a_peer_that_is_away_is_remembered_whatever_is_published_me
 
 
 def test_a_message_to_several_peers_has_several_outcomes_until_enough_others_follow(client: Client) -> None:
-    waiting = Outcomes()
+    waiting = AwaitedOutcomes()
     for message in range(4):
         waiting.add(message, client, destination=None)
     assert [waiting.publisher(message) for message in (0, 3, 3, 3)] == [None, client, client, client]
 
 
 def test_a_client_that_has_gone_is_forgotten(client: Client) -> None:
-    waiting = Outcomes()
+    waiting = AwaitedOutcomes()
     waiting.add(0, client, destination="base")
     waiting.add(1, client, destination=None)
     waiting.remove_client(client)

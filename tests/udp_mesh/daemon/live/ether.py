@@ -1,0 +1,218 @@
+"""A hostile network in user space: every Ethernet frame between namespaces passes through `Ether`.
+
+Each port is one end of a veth pair, read and written as raw frames; its other end is the only interface of a robot. Per
+direction, a path loses, delays, reorders, duplicates, damages, truncates or swallows large datagrams; a channel shared
+by all has a rate and a queue. A port can be behind a NAT, and recorded datagrams can be sent again, from anywhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import random
+import select
+import socket
+import struct
+import threading
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+ETH_P_ALL, ETH_P_IP, ETH_P_ARP = 0x0003, 0x0800, 0x0806
+PACKET_OUTGOING = 4
+IP_START, IP_BYTES, UDP_BYTES = 14, 20, 8
+UDP_START, PAYLOAD = IP_START + IP_BYTES, IP_START + IP_BYTES + UDP_BYTES
+PORT = 8700
+MAX_QUEUE_S = 0.25
+"""Of the channel: what would wait longer is dropped."""
+RECORDED = 400
+MULTICAST = 1
+
+
+@dataclass
+class Direction:
+    """From one port to another."""
+
+    up: bool = True
+    loss: float = 0.0
+    delay_s: float = 0.0005
+    jitter_s: float = 0.0
+    duplicates: float = 0.0
+    damage: float = 0.0
+    """Share of datagrams with a changed bit, or truncated; their checksum is right."""
+    mtu: int = 1500
+    """Larger IP packets vanish."""
+
+
+@dataclass(order=True)
+class _Due:
+    at: float
+    order: int
+    port: str = field(compare=False)
+    frame: bytes = field(compare=False)
+
+
+class Ether(threading.Thread):
+    """Runs until `close`. Attributes may be changed at any time."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(name="ether", daemon=True)
+        self.rng = random.Random(seed)
+        self.paths: dict[tuple[str, str], Direction] = {}
+        self.rate_bits_per_s = 50e6
+        self.outside_ports: dict[str, int] = {}
+        """By port: the UDP port that its datagrams leave with, as behind a NAT that lost its state."""
+        self.datagrams: Counter[str] = Counter()
+        """Sent by each port."""
+        self.too_long: set[tuple[str, str]] = set()
+        """Directions in which a datagram exceeded the path's MTU."""
+        self.failure: Exception | None = None
+        self._recorded: deque[tuple[str, bytes]] = deque(maxlen=RECORDED)
+        self._sockets: dict[str, socket.socket] = {}
+        self._names: dict[int, str] = {}
+        self._macs: dict[bytes, str] = {}
+        self._due: list[_Due] = []
+        self._order = 0
+        self._busy_until = 0.0
+        self._lock = threading.Lock()
+        self._poll = select.poll()
+        self._ended = threading.Event()
+
+    def plug_in(self, name: str, interface: str) -> None:
+        """Attach the near end of a veth pair."""
+        own = socket.socket(socket.AF_PACKET, socket.SOCK_RAW | socket.SOCK_NONBLOCK, 0)
+        own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        own.bind((interface, ETH_P_ALL))
+        with self._lock:
+            for other in self._sockets:
+                self.paths[name, other], self.paths[other, name] = Direction(), Direction()
+            self._sockets[name] = own
+            self._names[own.fileno()] = name
+            self._poll.register(own, select.POLLIN)
+
+    def replay(self, count: int, *, source: tuple[str, int] | None = None) -> None:
+        """Send recorded datagrams again; `source` (IPv4 address and port) replaces their sender's."""
+        with self._lock:
+            chosen = self.rng.choices(self._recorded, k=count) if self._recorded else []
+            for port, frame in chosen:
+                self._send_at(time.monotonic() + self.rng.uniform(0, 0.5), port, _from(frame, source))
+
+    def close(self) -> None:
+        self._ended.set()
+        self.join()
+        for own in self._sockets.values():
+            own.close()
+
+    def run(self) -> None:
+        try:
+            while not self._ended.is_set():
+                self._turn()
+        except Exception as error:  # noqa: BLE001
+            self.failure = error
+
+    def _turn(self) -> None:
+        with self._lock:
+            wait_s = self._due[0].at - time.monotonic() if self._due else 0.05
+        for descriptor, _ in self._poll.poll(max(0.0, min(wait_s, 0.05)) * 1000):
+            self._read(self._names[descriptor])
+        now = time.monotonic()
+        while True:
+            with self._lock:
+                if not self._due or self._due[0].at > now:
+                    return
+                due = heapq.heappop(self._due)
+            # The interface is down.
+            with contextlib.suppress(OSError):
+                self._sockets[due.port].send(due.frame)
+
+    def _read(self, name: str) -> None:
+        for _ in range(64):
+            try:
+                frame, address = self._sockets[name].recvfrom(1 << 16)
+            except BlockingIOError:
+                return
+            except OSError:
+                return
+            if address[2] == PACKET_OUTGOING:
+                continue
+            self._macs[frame[6:12]] = name
+            to = self._macs.get(frame[:6])
+            kind = int.from_bytes(frame[12:14], "big")
+            with self._lock:
+                for other in list(self._sockets):
+                    if other == name or (not frame[0] & MULTICAST and to is not None and to != other):
+                        continue
+                    if kind == ETH_P_ARP:
+                        if self.paths[name, other].up:
+                            self._send_at(time.monotonic(), other, frame)
+                    elif kind == ETH_P_IP and frame[IP_START + 9] == socket.IPPROTO_UDP and frame[IP_START] == 0x45:
+                        self._pass_on(name, other, frame)
+
+    def _pass_on(self, name: str, other: str, frame: bytes) -> None:
+        path, rng, now = self.paths[name, other], self.rng, time.monotonic()
+        self.datagrams[name] += 1
+        # Without a checksum: the kernel left it to the hardware.
+        frame = frame[: UDP_START + 6] + b"\0\0" + frame[PAYLOAD:]
+        if not path.up or rng.random() < path.loss:
+            return
+        if len(frame) - IP_START > path.mtu:
+            self.too_long.add((name, other))
+            return
+        translated = self._translated(name, other, frame)
+        if translated is None:
+            return
+        frame = translated
+        self._busy_until = max(self._busy_until, now) + len(frame) * 8 / self.rate_bits_per_s
+        if self._busy_until - now > MAX_QUEUE_S:
+            self._busy_until -= len(frame) * 8 / self.rate_bits_per_s
+            return
+        self._recorded.append((other, frame))
+        for _ in range(2 if rng.random() < path.duplicates else 1):
+            at = self._busy_until + path.delay_s + rng.random() * path.jitter_s
+            self._send_at(at, other, self._damaged(frame) if rng.random() < path.damage else frame)
+
+    def _translated(self, name: str, other: str, frame: bytes) -> bytes | None:
+        """With the ports that a NAT gives; None if it does not know whom the datagram is for."""
+        source, target = struct.unpack_from(">HH", frame, UDP_START)
+        if source == PORT:
+            source = self.outside_ports.get(name, source)
+        inside = self.outside_ports.get(other)
+        if inside is not None and not frame[0] & MULTICAST:
+            if target != inside:
+                return None
+            target = PORT
+        return frame[:UDP_START] + struct.pack(">HH", source, target) + frame[UDP_START + 4 :]
+
+    def _damaged(self, frame: bytes) -> bytes:
+        if len(frame) <= PAYLOAD + 1:
+            return frame
+        at = self.rng.randrange(PAYLOAD, len(frame))
+        if self.rng.random() < 0.3:
+            return _of_length(frame, at)
+        return frame[:at] + bytes([frame[at] ^ 1 << self.rng.randrange(8)]) + frame[at + 1 :]
+
+    def _send_at(self, at: float, port: str, frame: bytes) -> None:
+        self._order += 1
+        heapq.heappush(self._due, _Due(at, self._order, port, frame))
+
+
+def _of_length(frame: bytes, length: int) -> bytes:
+    """The datagram cut to this length, with the lengths in its headers."""
+    udp = struct.pack(">H", length - UDP_START)
+    cut = frame[: UDP_START + 4] + udp + frame[UDP_START + 6 : length]
+    return _with_ip_checksum(cut[: IP_START + 2] + struct.pack(">H", length - IP_START) + cut[IP_START + 4 :])
+
+
+def _from(frame: bytes, source: tuple[str, int] | None) -> bytes:
+    if source is None:
+        return frame
+    changed = frame[: IP_START + 12] + socket.inet_aton(source[0]) + frame[IP_START + 16 :]
+    return _with_ip_checksum(changed[:UDP_START] + struct.pack(">H", source[1]) + changed[UDP_START + 2 :])
+
+
+def _with_ip_checksum(frame: bytes) -> bytes:
+    header = frame[IP_START : IP_START + 10] + b"\0\0" + frame[IP_START + 12 : UDP_START]
+    total = sum(struct.unpack(">10H", header))
+    total = (total & 0xFFFF) + (total >> 16)
+    total = (total & 0xFFFF) + (total >> 16)
+    return frame[:IP_START] + header[:10] + struct.pack(">H", total ^ 0xFFFF) + header[12:] + frame[UDP_START:]

@@ -1,0 +1,391 @@
+"""A team of real daemons on a hostile network, and what their programs were promised.
+
+It runs as root of a network and mount namespace of its own (`promises`). Each robot has a network namespace with one
+interface, whose other end is a port of `Ether`, and a small disk of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.udp_mesh.daemon.live.ether import Ether
+from tests.udp_mesh.daemon.live.programs import Broken, Reader, Sent, Writer
+from tests.udp_mesh.daemon.processes import KEY, OTHER_KEY, RunningDaemon
+from udp_mesh.client import MeshError
+
+TOPICS = """
+stop = { priority = 0 }
+pose = { priority = 2, keep_last = 1, deadline_s = 0.5 }
+order = { priority = 3, deadline_s = 3.0 }
+status = { priority = 4, keep_last = 2 }
+view = { priority = 5, reliable = false }
+kept = { priority = 6, outbox = "all", outbox_bytes = 2000000 }
+newest = { priority = 6, outbox = "last" }
+stored = { priority = 7, outbox = "all", outbox_on_disk = true }
+limited = { priority = 7, rate_limit_bytes_per_s = 40000 }
+map = { priority = 9, compression = true }
+grid = { priority = 10, delta = true }
+alert = { priority = 1, repair = true, reliable = false }
+artifact = { priority = 4, log = { readers = ["a", "b"] } }
+"""
+BEST_EFFORT = ("view", "alert")
+OUTBOXES = ("kept", "newest", "stored")
+NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
+"""Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
+peer lost."""
+DISK_BYTES = 6_000_000
+PASSED_ON_S = 10.0
+"""Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
+RATES = """
+[rates]
+heartbeat_s = 0.2
+heartbeat_sparse_s = 0.5
+offline_s = 3.0
+peer_lost_s = 8.0
+"""
+
+
+def run(command: str) -> None:
+    subprocess.run(command.split(), check=True)
+
+
+class Robot:
+    """One computer: a namespace, an interface, a disk and a daemon."""
+
+    def __init__(self, folder: Path, name: str, place: int, ether: Ether, *, key: str = KEY, called: str = "") -> None:
+        self.name, self.ether, self.place = name, ether, place
+        self.called = called or name
+        """What its daemon says it is called."""
+        self.host = place + 1
+        self.runs = 0
+        self.suspended = False
+        self.reader: Reader | None = None
+        self.writer: Writer | None = None
+        self._filler = folder / f"{name}.disk" / "filler"
+        # Ends with this process, whose end of the pipe is then closed.
+        self.holder = subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE)
+        disk = folder / f"{name}.disk"
+        disk.mkdir()
+        run(f"mount -t tmpfs -o size={DISK_BYTES} none {disk}")
+        (folder / f"{name}.key").write_text(key + "\n")
+        self.daemon = RunningDaemon(folder, name, self.configuration(folder))
+        self.daemon.prefix = ["nsenter", "-t", str(self.holder.pid), "-n", "--"]
+        # `unshare` has left this namespace once the interface can be moved.
+        while Path(f"/proc/{self.holder.pid}/ns/net").readlink() == Path("/proc/self/ns/net").readlink():
+            time.sleep(0.005)
+        # Segmentation by the kernel: the ether sees the datagrams that a radio would.
+        run(f"ip link add port{place} gso_max_segs 1 type veth peer name mesh0 gso_max_segs 1 netns {self.holder.pid}")
+        run(f"ip link set port{place} up")
+        self.ip("link set lo up")
+        self.ip("link set mesh0 up")
+        self.ip(f"addr add {self.address} broadcast + dev mesh0")
+        ether.plug_in(name, f"port{place}")
+
+    @property
+    def address(self) -> str:
+        return f"10.7.{self.host >> 8}.{self.host & 255}/16"
+
+    def configuration(self, folder: Path, stop_priority: int = 0, topics: str = TOPICS) -> str:
+        return f"""
+name = "{self.called}"
+key_file = "{folder}/{self.name}.key"
+[topics]
+{topics.replace("priority = 0", f"priority = {stop_priority}")}
+{RATES}
+[daemon]
+socket = "{folder}/{self.name}.sock"
+state_directory = "{folder}/{self.name}.disk"
+"""
+
+    def ip(self, words: str) -> None:
+        """`ip WORDS` in its namespace."""
+        run(f"nsenter -t {self.holder.pid} -n ip {words}")
+
+    def start(self) -> None:
+        if self.daemon.process is None:
+            self.runs += 1
+            self.daemon.start()
+
+    @property
+    def running(self) -> bool:
+        return self.daemon.process is not None and not self.suspended
+
+    def suspend(self) -> None:
+        self.daemon.signal(signal.SIGSTOP)
+        self.suspended = True
+
+    def resume(self) -> None:
+        if self.suspended:
+            self.daemon.signal(signal.SIGCONT)
+        self.suspended = False
+
+    def end(self, *, politely: bool) -> None:
+        """End the daemon; its programs lose their connection."""
+        self.resume()
+        for program in (self.reader, self.writer):
+            if program is not None:
+                program.close()
+        self.reader = self.writer = None
+        if politely:
+            if (code := self.daemon.stop()) != 0:
+                raise Broken(f"{self.name} ended with {code}: {self.daemon.log.read_text()[-2000:]}")
+        elif self.daemon.process is not None:
+            self.daemon.kill()
+
+    def move(self, host: int) -> None:
+        """Another address, as from another DHCP lease."""
+        old, self.host = self.address, host
+        self.ip(f"addr del {old} dev mesh0")
+        self.ip(f"addr add {self.address} broadcast + dev mesh0")
+
+    def fill_disk(self) -> None:
+        with contextlib.suppress(OSError), self._filler.open("wb") as file:
+            while True:
+                file.write(bytes(4096))
+                file.flush()
+
+    def free_disk(self) -> None:
+        self._filler.unlink(missing_ok=True)
+
+    def usage(self) -> tuple[float, int]:
+        """Seconds of processor used, and memory in bytes."""
+        assert self.daemon.process is not None
+        stat = Path(f"/proc/{self.daemon.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(stat[11]) + int(stat[12])) / 100, int(stat[21]) * 4096
+
+    def close(self) -> None:
+        with contextlib.suppress(Broken):
+            self.end(politely=True)
+        self.holder.kill()
+        self.holder.wait()
+
+
+class LiveTeam:
+    """Robots a, b, c ..; what was sent and what came. Use as a context."""
+
+    def __init__(self, seed: int, size: int | None = None) -> None:
+        self.dice = random.Random(seed)
+        self.size = size or self.dice.randint(2, 4)
+        self.names = [chr(ord("a") + place) if place < 26 else f"r{place}" for place in range(self.size)]
+        self.robots: dict[str, Robot] = {}
+        self.others: list[Robot] = []
+        """Robots of another fleet, and with a name that another one has."""
+        self.sent: dict[bytes, Sent] = {}
+        self.received: dict[str, set[bytes]] = {name: set() for name in self.names}
+        self.copies: dict[str, Counter[tuple[int, bytes]]] = {name: Counter() for name in self.names}
+        """By robot: (run of its daemon, key)."""
+        self.readers: list[Reader] = []
+        self.excused: set[tuple[str, bytes]] = set()
+        """(receiver, key): sent again after a reader that had not acknowledged it left."""
+        self.contested: set[str] = set()
+        """Names that another robot had as well at some time."""
+        self.disk_trouble: set[str] = set()
+        """Robots whose disk was full at some time."""
+        self.latencies: dict[str, list[float]] = {}
+        self.outcomes: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.changes: list[str] = []
+        self._serial = 0
+        self._later: list[tuple[float, Callable[[], None]]] = []
+        self._stack = contextlib.ExitStack()
+        self.ether = Ether(seed)
+
+    def __enter__(self) -> LiveTeam:
+        folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="live-", dir="/tmp")))
+        self.folder = folder
+        run(f"mount -t tmpfs none {folder}")
+        self._stack.callback(run, f"umount -l {folder}")
+        self.ether.start()
+        self._stack.callback(self.ether.close)
+        for name in self.names:
+            self._add(name)
+        for name in self.names:
+            self.open_reader(name)
+            self.open_writer(name)
+        return self
+
+    def _add(self, name: str, **more: str) -> Robot:
+        place = len(self.robots) + len(self.others)
+        robot = Robot(self.folder, name, place, self.ether, **more)
+        self._stack.callback(robot.close)
+        robot.start()
+        if more:
+            self.others.append(robot)
+        else:
+            self.robots[name] = robot
+        return robot
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    # Programs
+
+    def open_reader(self, name: str) -> None:
+        robot = self.robots[name]
+        if robot.running and robot.reader is None:
+            acknowledges = self.dice.random() < 0.5
+            with contextlib.suppress(MeshError):
+                robot.reader = Reader(str(robot.daemon.socket), robot.runs, self.dice, acknowledges=acknowledges)
+                self.readers.append(robot.reader)
+
+    def close_reader(self, name: str) -> None:
+        robot = self.robots[name]
+        if robot.reader is not None:
+            robot.reader.close()
+            self.excused |= {(name, key) for key in robot.reader.unacknowledged}
+            robot.reader = None
+
+    def open_writer(self, name: str) -> None:
+        robot = self.robots[name]
+        if robot.running and robot.writer is None:
+            with contextlib.suppress(MeshError):
+                robot.writer = Writer(str(robot.daemon.socket), robot.runs)
+
+    def close_writer(self, name: str) -> None:
+        robot = self.robots[name]
+        if robot.writer is not None:
+            robot.writer.close()
+            robot.writer = None
+
+    def end(self, name: str, *, politely: bool) -> None:
+        """End a robot's daemon, and its programs before it."""
+        self.close_reader(name)
+        self.close_writer(name)
+        self.robots[name].end(politely=politely)
+
+    def publish(self, name: str, topic: str, to: str | None, size: int) -> None:
+        robot = self.robots[name]
+        if robot.writer is None or not robot.running:
+            return
+        self._serial += 1
+        key = f"{name} {robot.runs} {self._serial}".encode()
+        sent = self.sent[key] = Sent(name, robot.runs, topic, key, to, size, time.monotonic())
+        robot.writer.publish(sent)
+
+    # Time
+
+    def later(self, after_s: float, action: Callable[[], None]) -> None:
+        self._later.append((time.monotonic() + after_s, action))
+
+    def go(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        """Poll the programs for so long, or until something is so."""
+        end, look_at = time.monotonic() + seconds, 0.0
+        while True:
+            self._poll()
+            now = time.monotonic()
+            if until is not None and now >= look_at:
+                if until():
+                    return True
+                look_at = time.monotonic() + 0.2
+            if now >= end:
+                return False
+            time.sleep(0.01)
+
+    def _poll(self) -> None:
+        if self.ether.failure is not None:
+            raise self.ether.failure
+        now = time.monotonic()
+        due = [action for at, action in self._later if at <= now]
+        self._later = [(at, action) for at, action in self._later if at > now]
+        for action in due:
+            action()
+        for robot in [*self.robots.values(), *self.others]:
+            if robot.daemon.process is not None and (code := robot.daemon.process.poll()) is not None:
+                raise Broken(f"{robot.name} ended by itself with {code}: {robot.daemon.log.read_text()[-3000:]}")
+        for name, robot in self.robots.items():
+            if robot.reader is not None:
+                for header, key in robot.reader.poll():
+                    self._on_message(name, robot, header, key)
+            if robot.writer is not None:
+                for sent, header in robot.writer.poll():
+                    self._on_outcome(sent, header)
+
+    def _on_message(self, name: str, robot: Robot, header: dict[str, object], key: bytes) -> None:
+        sent = self.sent.get(key)
+        if sent is None or sent.topic != header["topic"] or sent.source != header["source"]:
+            raise Broken(f"{name} received {header} with {key!r}, which was {sent}")
+        assert robot.reader is not None
+        self.received[name].add(key)
+        self.copies[name][robot.runs, key] += 1
+        if self.copies[name][robot.runs, key] < 2:
+            return
+        again = sent.topic == "stored" and (sent.abandoned or self.robots[sent.source].runs != sent.run)
+        narrowed = (sent.source, name) in self.ether.too_long
+        held = sent.to is None and sent.topic in OUTBOXES
+        known = (name, key) in self.excused or again or narrowed or held or name in self.disk_trouble
+        if not known:
+            raise Broken(f"{name} received {sent} twice, the second time with {header}")
+
+    def _on_outcome(self, sent: Sent, header: dict[str, object]) -> None:
+        peer, outcome = str(header["peer"]), str(header["outcome"])
+        said = outcome if outcome != "expired" else f"expired: {header['reason']}"
+        self.outcomes[said] += 1
+        if peer in sent.ends:
+            raise Broken(f"{sent} ended again: {header}")
+        if sent.to is not None and peer != sent.to:
+            raise Broken(f"{sent} ended at {peer}: {header}")
+        sent.ends[peer] = said
+        if said in ("expired: refused", "expired: disk") or (
+            outcome == "expired" and sent.topic in NEVER_EXPIRE and "not wanted" not in said
+        ):
+            raise Broken(f"{sent}: {header}")
+        if outcome == "delivered":
+            self.latencies.setdefault(sent.topic, []).append(float(str(header["latency_s"])))
+            reader = self.robots[peer].reader if peer in self.robots else None
+            if reader is not None and reader.since < sent.at:
+                sent.readers.append((peer, reader, time.monotonic()))
+
+    # What must hold in the end
+
+    def unfinished(self) -> list[Sent]:
+        """Accepted reliable messages to one peer without an outcome, and durable ones that did not arrive."""
+        return [
+            sent
+            for sent in self.sent.values()
+            if sent.accepted_at is not None
+            and sent.to is not None
+            and (
+                (not sent.abandoned and not sent.ends and sent.topic not in BEST_EFFORT)
+                or (self.is_durable(sent) and sent.key not in self.received[sent.to])
+            )
+        ]
+
+    def is_durable(self, sent: Sent) -> bool:
+        """Whether a message has to arrive whatever ends."""
+        said = sent.ends.get(sent.to or "", "delivered")
+        return (
+            sent.topic == "stored"
+            and sent.accepted_at is not None
+            and said == "delivered"
+            and sent.to not in self.contested
+            and (sent.source not in self.disk_trouble or bool(sent.ends))
+        )
+
+    def not_passed_on(self) -> list[Sent]:
+        """What was reported as delivered but has not reached a program that was subscribed there and stayed."""
+        return [
+            sent
+            for sent in self.sent.values()
+            for peer, reader, at in sent.readers
+            if sent.key not in reader.keys
+            and not reader.dropped
+            and peer not in self.contested
+            and (reader.ended_at is None or reader.ended_at > max(at, reader.paused_until) + PASSED_ON_S)
+        ]
+
+    def add_stranger(self) -> None:
+        """A robot of another fleet with the same names of topics."""
+        self._add(f"x{len(self.others)}", key=OTHER_KEY)
+
+    def add_twin(self, name: str) -> Robot:
+        """A robot that has another one's name."""
+        self.contested.add(name)
+        return self._add(f"t{len(self.others)}", called=name)
