@@ -199,6 +199,13 @@ class LiveTeam:
         self.ether = Ether(seed)
 
     def __enter__(self) -> LiveTeam:
+        with contextlib.ExitStack() as undo:
+            undo.callback(self._stack.close)
+            self._begin()
+            undo.pop_all()
+        return self
+
+    def _begin(self) -> None:
         folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="live-", dir="/tmp")))
         self.folder = folder
         run(f"mount -t tmpfs none {folder}")
@@ -210,7 +217,6 @@ class LiveTeam:
         for name in self.names:
             self.open_reader(name)
             self.open_writer(name)
-        return self
 
     def _add(self, name: str, **more: str) -> Robot:
         place = len(self.robots) + len(self.others)
