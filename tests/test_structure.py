@@ -33,6 +33,8 @@ MAX_LINES, MAX_TEST_LINES = 400, 500
 LONG = {
     "udp_mesh/core/congestion/delay_based.py": 460,
     "udp_mesh/core/sender/sender.py": 465,
+    # Programs copy this one file.
+    "udp_mesh/client/mesh_client.py": 430,
 }
 
 

@@ -11,13 +11,19 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from udp_mesh.client.mesh_client import MeshClient as MeshClient
+    from udp_mesh.client.mesh_client import MeshError as MeshError
+    from udp_mesh.client.mesh_client import Message as Message
+    from udp_mesh.client.mesh_client import MessageOutcome as MessageOutcome
+    from udp_mesh.core.events import ExpiryReason as ExpiryReason
     from udp_mesh.core.events import MessageDelivered as MessageDelivered
     from udp_mesh.core.events import MessageExpired as MessageExpired
     from udp_mesh.core.events import MessagePeerLost as MessagePeerLost
     from udp_mesh.core.events import MessageReceived as MessageReceived
     from udp_mesh.core.events import PeerOffline as PeerOffline
     from udp_mesh.core.events import PeerOnline as PeerOnline
+    from udp_mesh.core.events import RejectReason as RejectReason
     from udp_mesh.core.settings import Limits as Limits
+    from udp_mesh.core.settings import Log as Log
     from udp_mesh.core.settings import Neighbour as Neighbour
     from udp_mesh.core.settings import Outbox as Outbox
     from udp_mesh.core.settings import Rates as Rates
@@ -49,7 +55,13 @@ _EXPORTS = {
     "PeerOnline": "udp_mesh.core.events",
     "PeerOffline": "udp_mesh.core.events",
     "Key": "udp_mesh.crypto.keys",
+    "ExpiryReason": "udp_mesh.core.events",
+    "RejectReason": "udp_mesh.core.events",
+    "Log": "udp_mesh.core.settings",
     "MeshClient": "udp_mesh.client.mesh_client",
+    "MeshError": "udp_mesh.client.mesh_client",
+    "Message": "udp_mesh.client.mesh_client",
+    "MessageOutcome": "udp_mesh.client.mesh_client",
 }
 
 

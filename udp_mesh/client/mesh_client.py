@@ -10,9 +10,12 @@ On the daemon's Unix socket both sides send frames: two big-endian 32-bit length
 (the header), raw bytes of the second (the payload). A request has "op" and a number "id"; its reply repeats the id
 and has "ok". Unsolicited frames of the daemon have "event". docs/local-api.md lists them all.
 
-Threads: `publish(..., wait=False)` may be called from any thread; everything else from one thread at a time.
+Threads may share a client: each gets the replies to its own requests, and each message goes to one of those that wait
+for messages. `close` from another thread ends the waits.
 """
 
+import contextlib
+import itertools
 import json
 import os
 import select
@@ -22,9 +25,11 @@ import struct
 import threading
 import time
 from collections import deque
-from typing import Any, Deque, Dict, Iterator, List, NamedTuple, Optional, Tuple, Union
+from typing import Any, Callable, Deque, Dict, Iterator, List, NamedTuple, Optional, Set, Tuple, TypeVar, Union
 
 DEFAULT_SOCKET = "/run/udp-mesh/udp-mesh.sock"
+SOCKET_VARIABLE = "UDP_MESH_SOCKET"
+"""Environment variable that names another socket."""
 MAX_HEADER_BYTES = 1 << 16
 """Maximum header size of a request, enforced by the daemon."""
 MAX_REPLY_HEADER_BYTES = 1 << 26
@@ -35,10 +40,12 @@ _READ_BYTES = 1 << 18
 
 Header = Dict[str, Any]
 Frame = Tuple[Header, bytes]
+T = TypeVar("T")
 
 
 class MeshError(Exception):
-    """The daemon refused a request or cannot be reached. `code` is a word such as "unknown-topic" or "unreachable"."""
+    """The daemon refused a request or cannot be reached, or the client was closed. `code` is a word such as
+    "unknown-topic", "unreachable", "timeout" or "closed"."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
@@ -58,6 +65,22 @@ class Message(NamedTuple):
     """To pass to `MeshClient.acknowledge` once the message is processed. None: nothing waits for that."""
     number: Optional[int] = None
     """Its number in its source's log, if the topic is one: (source, topic, number) names the item."""
+
+
+class MessageOutcome(NamedTuple):
+    """How a message to one peer ended."""
+
+    peer: str
+    outcome: str
+    """"delivered", "expired" or "peer-lost"."""
+    reason: str = ""
+    """Why it expired."""
+    latency_s: Optional[float] = None
+    """From its acceptance until it was acknowledged."""
+
+    @property
+    def delivered(self) -> bool:
+        return self.outcome == "delivered"
 
 
 def encode_frame(header: Header, payload: Union[bytes, memoryview] = b"") -> bytes:
@@ -121,15 +144,24 @@ def _is_socket(path: str) -> bool:
 class MeshClient:
     """One connection to the daemon."""
 
-    def __init__(self, path: str = DEFAULT_SOCKET, timeout_s: float = 10.0) -> None:
-        """Connects. Raises MeshError ("unreachable") if no daemon listens at `path`."""
-        self.path = path
+    def __init__(self, path: Optional[str] = None, timeout_s: float = 10.0) -> None:
+        """Connects to the socket at `path` (default: that of UDP_MESH_SOCKET in the environment, or the daemon's
+        usual one). Raises MeshError ("unreachable") if no daemon listens there."""
+        self.path = path = path or os.environ.get(SOCKET_VARIABLE) or DEFAULT_SOCKET
         self.timeout_s = timeout_s
         self._reader = FrameReader()
         self._events: Deque[Frame] = deque()
         self._replies: Dict[int, Frame] = {}
-        self._next_id = 1
+        self._delivering: Set[int] = set()
+        """Requests whose outcome a thread waits for; these come to `_outcomes`."""
+        self._outcomes: Dict[int, Header] = {}
+        self._ids = itertools.count(1)
         self._write_lock = threading.Lock()
+        self._arrived = threading.Condition()
+        """Guards what arrived and the two below; notified when something arrives."""
+        self._is_reading = False
+        """Whether a thread reads the socket, for itself and the others."""
+        self._is_closed = False
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self._socket.connect(path)
@@ -150,10 +182,19 @@ class MeshClient:
         self.close()
 
     def close(self) -> None:
-        self._socket.close()
+        """Closes the connection. Threads that wait for messages stop waiting."""
+        with self._arrived:
+            self._is_closed = True
+            if not self._is_reading:
+                self._socket.close()
+                return
+            # The thread that reads is woken by this, and closes the socket.
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
 
     def fileno(self) -> int:
-        """For `select`: if readable, `next_frame(0)` may return something."""
+        """For `select`: if readable, `next_frame(0)` may return something. It may also do so after any other call,
+        which keeps the messages that come before its reply."""
         return self._socket.fileno()
 
     # Requests
@@ -164,23 +205,23 @@ class MeshClient:
 
     def request_frame(self, op: str, payload: bytes = b"", **fields: Any) -> Frame:
         """Like `request`, but also returns the reply's payload."""
-        number = self._next_id
-        self._next_id += 1
+        return self._request(next(self._ids), op, payload, fields)
+
+    def _request(self, number: int, op: str, payload: bytes, fields: Header) -> Frame:
         try:
             self._write(dict(fields, op=op, id=number), payload)
         except MeshError as error:
-            if error.code == "bad-request":
-                raise
-            self._drain()
-            raise self._gone(str(error)) from error
-        deadline = time.monotonic() + self.timeout_s
-        while number not in self._replies:
-            if not self._read(deadline - time.monotonic()):
-                raise MeshError("timeout", "no reply to {!r} from the daemon within {:g} s".format(op, self.timeout_s))
-        header, body = self._replies.pop(number)
+            if error.code == "unreachable":
+                # What the daemon sent before it closed the connection says why.
+                self._wait_for(lambda: None, 0.0)
+            raise
+        reply = self._wait_for(lambda: self._replies.pop(number, None), self.timeout_s)
+        if reply is None:
+            raise MeshError("timeout", "no reply to {!r} from the daemon within {:g} s".format(op, self.timeout_s))
+        header = reply[0]
         if not header.get("ok"):
             raise MeshError(str(header.get("code", "error")), str(header.get("error", "refused")))
-        return header, body
+        return reply
 
     def publish(
         self,
@@ -197,17 +238,33 @@ class MeshClient:
         destination of a reliable topic. With `wait=False` nothing is returned, and a refusal arrives as an event
         "rejected".
         """
-        fields: Header = {"topic": topic}
-        if to is not None:
-            fields["to"] = to
-        if type:
-            fields["type"] = type
-        if notify:
-            fields["notify"] = True
+        fields = _publication(topic, to, type, notify=notify)
         if not wait:
             self._write(dict(fields, op="publish"), payload)
             return None
         return int(self.request("publish", payload, **fields)["message"])
+
+    def deliver(
+        self, topic: str, payload: bytes, to: str, type: str = "", timeout_s: Optional[float] = None
+    ) -> MessageOutcome:
+        """Publishes a message of a reliable topic to one peer, and returns how it ended.
+
+        Without `timeout_s` this takes as long as the message may: until its deadline, or until its peer is lost or
+        (with an outbox) returns. After `timeout_s` seconds it raises MeshError ("timeout"); the message stays sent.
+        """
+        number = next(self._ids)
+        self._delivering.add(number)
+        try:
+            reply = self._request(number, "publish", payload, _publication(topic, to, type, notify=True))[0]
+            if not reply.get("reliable", True):
+                raise MeshError("best-effort", "topic {} is best effort and reports no outcomes".format(topic))
+            ended = self._wait_for(lambda: self._outcomes.pop(number, None), timeout_s)
+        finally:
+            self._delivering.discard(number)
+            self._outcomes.pop(number, None)
+        if ended is None:
+            raise MeshError("timeout", "{} to {} has no outcome after {} s".format(topic, to, timeout_s))
+        return MessageOutcome(to, str(ended["outcome"]), str(ended.get("reason", "")), ended.get("latency_s"))
 
     def subscribe(
         self,
@@ -235,9 +292,15 @@ class MeshClient:
     # Receive
 
     def messages(self, timeout_s: Optional[float] = None) -> Iterator[Message]:
-        """Yields messages as they arrive; drops other events. Ends after `timeout_s` without one (None: never)."""
+        """Yields messages as they arrive; drops other events. Ends after `timeout_s` without one (None: never), and
+        when another thread closes the client."""
         while True:
-            frame = self.next_frame(timeout_s)
+            try:
+                frame = self.next_frame(timeout_s)
+            except MeshError as error:
+                if error.code == "closed":
+                    return
+                raise
             if frame is None:
                 return
             message = as_message(frame)
@@ -245,12 +308,9 @@ class MeshClient:
                 yield message
 
     def next_frame(self, timeout_s: Optional[float] = None) -> Optional[Frame]:
-        """The next event with its payload; None after `timeout_s` seconds. Raises MeshError when the daemon is gone."""
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while not self._events:
-            if not self._read(None if deadline is None else deadline - time.monotonic()):
-                return None
-        return self._events.popleft()
+        """The next event with its payload; None after `timeout_s` seconds. Raises MeshError when the daemon is gone or
+        the client was closed."""
+        return self._wait_for(lambda: self._events.popleft() if self._events else None, timeout_s)
 
     # The socket
 
@@ -264,18 +324,42 @@ class MeshClient:
             with self._write_lock:
                 self._socket.sendall(frame)
         except OSError as error:
-            raise MeshError("unreachable", "the daemon closed the connection: {}".format(error.strerror)) from error
+            raise self._gone("the daemon closed the connection: {}".format(error.strerror)) from error
 
-    def _drain(self) -> None:
-        """Reads what the daemon sent before it closed the connection."""
+    def _wait_for(self, take: Callable[[], Optional[T]], timeout_s: Optional[float]) -> Optional[T]:
+        """What `take` finds among what arrived; None after `timeout_s` seconds. One of the threads that wait reads."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        with self._arrived:
+            while True:
+                found = take()
+                if found is not None:
+                    return found
+                if self._is_closed:
+                    raise self._gone("")
+                left_s = None if deadline is None else deadline - time.monotonic()
+                if self._is_reading:
+                    if not self._arrived.wait(left_s):
+                        return take()
+                elif not self._read_for_all(left_s):
+                    return take()
+
+    def _read_for_all(self, timeout_s: Optional[float]) -> bool:
+        """Reads once, while other threads may take what arrived; False on timeout."""
+        self._is_reading = True
+        self._arrived.release()
         try:
-            while self._poll.poll(0) and self._read_once():
-                pass
-        except (OSError, MeshError):
-            return
+            return self._read(timeout_s)
+        finally:
+            self._arrived.acquire()
+            self._is_reading = False
+            if self._is_closed:
+                self._socket.close()
+            self._arrived.notify_all()
 
     def _gone(self, reason: str) -> MeshError:
         """The error for a closed connection, with the daemon's reason if it sent one."""
+        if self._is_closed:
+            return MeshError("closed", "the client was closed")
         for header, _ in self._events:
             if header.get("event") == "rejected" and header.get("code") == "too-many-clients":
                 return MeshError(
@@ -299,13 +383,29 @@ class MeshClient:
         data = self._socket.recv(_READ_BYTES)
         if not data:
             return False
-        for frame in self._reader.feed(data):
-            number = frame[0].get("id")
-            if isinstance(number, int) and "event" not in frame[0]:
-                self._replies[number] = frame
-            else:
-                self._events.append(frame)
+        frames = self._reader.feed(data)
+        with self._arrived:
+            for header, payload in frames:
+                number = header.get("id")
+                if isinstance(number, int) and "event" not in header:
+                    self._replies[number] = (header, payload)
+                elif header.get("event") == "outcome" and header.get("request") in self._delivering:
+                    self._outcomes[header["request"]] = header
+                else:
+                    self._events.append((header, payload))
         return True
+
+
+def _publication(topic: str, to: Optional[str], type_name: str, *, notify: bool) -> Header:
+    """The fields of a request `publish`."""
+    fields: Header = {"topic": topic}
+    if to is not None:
+        fields["to"] = to
+    if type_name:
+        fields["type"] = type_name
+    if notify:
+        fields["notify"] = True
+    return fields
 
 
 def as_message(frame: Frame) -> Optional[Message]:

@@ -79,12 +79,10 @@ def send(
             RejectReason.UNKNOWN_TOPIC,
             f"too many topics, or the type name is not printable text of at most {MAX_TYPE_BYTES} bytes",
         )
-    if destination is not None:
-        names = [destination]
-    elif topic.destinations:
-        names = [name for name in topic.destinations if name != state.settings.name]
-    else:
-        names = []
+    wanted = topic.destinations if destination is None else (destination,)
+    names = [name for name in wanted if name != state.settings.name]
+    if wanted and not names:
+        return Rejected(RejectReason.UNKNOWN_PEER, f"{wanted[0]} is this node, and messages go to others")
     rejected = _check_capacity(state, topic, names, len(payload))
     if rejected is not None:
         return rejected

@@ -92,6 +92,10 @@ class Node:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.driver.close()
+        for future in self._outcomes.values():
+            if not future.done():
+                # Messages that wait on disk have no outcome yet.
+                future.set_exception(RuntimeError("the node was closed before the outcome of the message was known"))
         self._arrived.set()
         self._happened.set()
 
@@ -113,7 +117,11 @@ class Node:
         return outcome
 
     async def deliver(self, topic: str, payload: bytes, *, to: str, type_name: str = "") -> Outcome:
-        """Sends a message of a reliable topic to one peer and waits for its outcome. Raises SendRefusedError."""
+        """Sends a message of a reliable topic to one peer and waits for its outcome. Raises SendRefusedError,
+        ValueError for a best-effort topic, and RuntimeError if the node is closed before the outcome is known."""
+        found = next((one for one in self._settings.topics if one.name == topic), self._settings.undeclared)
+        if found is not None and not found.reliable:
+            raise ValueError(f"topic {topic} is best effort and reports no outcomes: use `send`, or make it reliable")
         outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)
         if isinstance(outcome, Rejected):
             raise SendRefusedError(outcome)
@@ -150,7 +158,9 @@ class Node:
 
     def apply(self, settings: Settings) -> list[str]:
         """Changes topics, window, rates, limits, keys, neighbors. Drops no message. Raises ValueError."""
-        return self.driver.apply(replace(settings, confirms=True))
+        changes = self.driver.apply(replace(settings, confirms=True))
+        self._settings = settings
+        return changes
 
     def conditions(self) -> Conditions:
         return self.driver.conditions()

@@ -29,6 +29,7 @@ from udp_mesh.daemon.neighbours import (
     parse_address,
     read_neighbour,
 )
+from udp_mesh.daemon.outcomes import Publisher
 from udp_mesh.daemon.position_requests import publish_meter, set_position, set_radio
 from udp_mesh.daemon.radio_paths import with_radio
 from udp_mesh.daemon.service import Service
@@ -93,7 +94,7 @@ def _request_error(error: ConfigurationError) -> RequestError:
 
 def publish(service: Service, client: Client, header: Header, payload: bytes) -> Header | Awaitable[Header]:
     topic, destination = _text(header, "topic"), _optional_text(header, "to")
-    notify = client if header.get("notify") else None
+    publisher = Publisher(client, header.get("id")) if header.get("notify") else None
     type_name = _text(header, "type") if header.get("type") else ""
     # Refuse here, with a clear error, what every receiver would drop.
     if not is_topic_name(topic):
@@ -104,8 +105,12 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
         raise RequestError(
             "bad-request", f"type: expected printable text of at most {MAX_TYPE_BYTES} bytes, found {type_name[:60]!r}"
         )
-    message = service.publish(topic, payload, destination, type_name, notify)
+    message = service.publish(topic, payload, destination, type_name, publisher)
     if isinstance(message, int):
+        settings = service.topic(topic)
+        if publisher is not None and settings is not None and not settings.reliable:
+            # No outcome will follow.
+            return {"message": message, "reliable": False}
         return {"message": message}
 
     async def later() -> Header:

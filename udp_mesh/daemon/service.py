@@ -36,12 +36,12 @@ from udp_mesh.daemon.latencies import Latencies
 from udp_mesh.daemon.legacy_positions import LegacyPositions
 from udp_mesh.daemon.log_store import Put, SqliteLogStore
 from udp_mesh.daemon.outbox import DirectoryStore, Flusher
-from udp_mesh.daemon.outcomes import AwaitedOutcomes
+from udp_mesh.daemon.outcomes import AwaitedOutcomes, Publisher
 from udp_mesh.daemon.pings import Pings
 from udp_mesh.daemon.position_exchange import PositionExchange
 from udp_mesh.daemon.radio_paths import RadioReport, with_radio
 from udp_mesh.daemon.recording import Recorder
-from udp_mesh.daemon.status import TopicCount, conditions_json, event_json, event_name
+from udp_mesh.daemon.status import TopicCount, conditions_json, event_json
 from udp_mesh.daemon.subscriptions import Subscriptions
 from udp_mesh.daemon.thin_ports import ThinPorts
 
@@ -164,7 +164,7 @@ class Service:
         self._watchers.add(client)
 
     def publish(
-        self, topic: str, payload: bytes, destination: str | None, type_name: str, client: Client | None
+        self, topic: str, payload: bytes, destination: str | None, type_name: str, publisher: Publisher | None
     ) -> int | Awaitable[int]:
         """Accepts a message; returns an awaitable if it must be on disk first. Raises RequestError."""
         if topic.startswith(RESERVED_PREFIX) and topic != BENCH_TOPIC:
@@ -188,8 +188,8 @@ class Service:
                 destination=destination,
                 reliable=settings.reliable,
             )
-        if client is not None and settings is not None and settings.reliable:
-            self._outcomes.add(outcome, client, destination=destination)
+        if publisher is not None and settings is not None and settings.reliable:
+            self._outcomes.add(outcome, publisher, destination=destination)
         if settings is not None and settings.log is not None:
             put = self.log_store.last_put
             assert put is not None
@@ -310,11 +310,9 @@ class Service:
             case MessageReceived():
                 self._on_message(event)
             case MessageDelivered() | MessageExpired() | MessagePeerLost():
-                client = self._outcomes.publisher(event.message_id)
-                if client is not None:
-                    fields = event_json(event)
-                    outcome = event_name(event).removeprefix("message-")
-                    client.send_event({**fields, "event": "outcome", "outcome": outcome})
+                publisher = self._outcomes.publisher(event.message_id)
+                if publisher is not None:
+                    publisher.report(event)
             case _:
                 fields = event_json(event)
                 log.info("%s %s", fields["event"], " ".join(f"{k}={v}" for k, v in fields.items() if k != "event"))

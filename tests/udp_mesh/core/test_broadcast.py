@@ -197,6 +197,16 @@ def test_an_outbox_on_disk_survives_a_restart_until_its_messages_are_delivered()
     assert disk.kept == {}
 
 
+@pytest.mark.parametrize("destination", ["a", None])
+def test_a_message_to_oneself_is_refused(destination: str | None) -> None:
+    """It would wait in the outbox forever; and a topic for this node alone is not one for all."""
+    world = team(Topic("t", destinations=("a",), outbox=Outbox.ALL))
+    answer = world.send("a", "t", b"x", destination)
+    assert isinstance(answer, Rejected)
+    assert answer.reason is RejectReason.UNKNOWN_PEER
+    assert answer.detail == "a is this node, and messages go to others"
+
+
 def test_a_message_to_an_unknown_peer_requires_an_outbox() -> None:
     both = pair(Topic("t"), Topic("kept", outbox=Outbox.ALL))
     answer = both.a.send("t", b"x", destination="nobody", now=both.now)

@@ -3,20 +3,27 @@
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from udp_mesh import Key, LinkConfig, Neighbour, Node, SendRefusedError, Settings, Topic
+from udp_mesh import DirectoryStore, Key, LinkConfig, Neighbour, Node, Outbox, SendRefusedError, Settings, Topic
 from udp_mesh.core.events import MessageDelivered, MessageExpired, PeerOffline, PeerOnline
 from udp_mesh.core.settings import Rates
 
 KEY = Key(bytes(range(32)))
-TOPICS = (Topic("status", priority=0), Topic("map", priority=7), Topic("short", deadline_s=0.2))
+TOPICS = (
+    Topic("status", priority=0),
+    Topic("map", priority=7),
+    Topic("short", deadline_s=0.2),
+    Topic("video", reliable=False),
+    Topic("stored", outbox=Outbox.ALL, outbox_on_disk=True),
+)
 
 
-def make(name: str, own: int, other: int, port: int) -> Node:
+def make(name: str, own: int, other: int, port: int, store: DirectoryStore | None = None) -> Node:
     settings = Settings(
         name=name,
         port=port,
@@ -25,7 +32,7 @@ def make(name: str, own: int, other: int, port: int) -> Node:
         neighbours=(Neighbour((f"127.0.4.{other}", port)),),
         rates=Rates(heartbeat_s=0.2, heartbeat_sparse_s=0.2, offline_s=1.0),
     )
-    return Node(settings, links=(LinkConfig(address=f"127.0.4.{own}", broadcast=False),))
+    return Node(settings, links=(LinkConfig(address=f"127.0.4.{own}", broadcast=False),), store=store)
 
 
 async def online(node: Node, peer: str) -> None:
@@ -75,6 +82,23 @@ def test_a_refused_message_raises_with_the_reason() -> None:
             await alice.send("status", b"", to="nobody")
 
     run(body)
+
+
+def test_deliver_does_not_wait_for_an_outcome_that_never_comes(tmp_path: Path) -> None:
+    async def body(alice: Node, _: Node) -> None:
+        with pytest.raises(ValueError, match="topic video is best effort"):
+            await alice.deliver("video", b"", to="bob")
+
+    run(body)
+
+    async def close_meanwhile() -> None:
+        async with make("alice", 1, 2, free_port(), DirectoryStore(tmp_path, 1 << 20)) as alice:
+            waiting = asyncio.ensure_future(alice.deliver("stored", b"entry", to="bob"))
+            await asyncio.sleep(0)
+        with pytest.raises(RuntimeError, match="closed before the outcome"):
+            await waiting
+
+    asyncio.run(asyncio.wait_for(close_meanwhile(), WAIT_S))
 
 
 def test_leaving_is_reported_at_once_and_a_message_to_a_peer_that_left_expires() -> None:

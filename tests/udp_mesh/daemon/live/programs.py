@@ -68,8 +68,7 @@ class Program(MeshClient):
 
     def post(self, op: str, payload: bytes = b"", **fields: object) -> int:
         """Send a request; its reply comes from `poll`."""
-        number = self._next_id
-        self._next_id += 1
+        number = next(self._ids)
         try:
             self._write(dict(fields, op=op, id=number), payload)
         except MeshError:
