@@ -30,6 +30,7 @@ from udp_mesh.core.subscriptions.messages import Subscription
 from udp_mesh.daemon.api import Client, RequestError
 from udp_mesh.daemon.configuration import Configuration, load
 from udp_mesh.daemon.driver import Driver
+from udp_mesh.daemon.event_log import EventLog
 from udp_mesh.daemon.inbox import Inbox
 from udp_mesh.daemon.interface import BENCH_TOPIC, CONDITIONS_TOPIC, RESERVED_PREFIX
 from udp_mesh.daemon.latencies import Latencies
@@ -92,6 +93,7 @@ class Service:
         self.subscriptions = Subscriptions(self.inbox, self._spawn, self._priority, self._announce_subscriptions)
         self._watchers: set[Client] = set()
         self._outcomes = AwaitedOutcomes()
+        self._event_log = EventLog(self.driver.now)
         self.pings = Pings(self.driver)
         self._tasks: set[asyncio.Task[None]] = set()
         self._conditions_timer: asyncio.TimerHandle | None = None
@@ -315,7 +317,7 @@ class Service:
                     publisher.report(event)
             case _:
                 fields = event_json(event)
-                log.info("%s %s", fields["event"], " ".join(f"{k}={v}" for k, v in fields.items() if k != "event"))
+                self._event_log.write(fields)
                 for client in self._watchers:
                     client.send_event(fields)
 

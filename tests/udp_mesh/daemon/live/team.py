@@ -36,6 +36,7 @@ grid = { priority = 10, delta = true }
 alert = { priority = 1, repair = true, reliable = false }
 artifact = { priority = 4, log = { readers = ["a", "b"] } }
 """
+LOG_READERS = ("a", "b")
 BEST_EFFORT = ("view", "alert")
 OUTBOXES = ("kept", "newest", "stored")
 NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
@@ -362,6 +363,21 @@ class LiveTeam:
                 (not sent.abandoned and not sent.ends and sent.topic not in BEST_EFFORT)
                 or (self.is_durable(sent) and sent.key not in self.received[sent.to])
             )
+        ]
+
+    def missing_items(self) -> list[str]:
+        """Items of the log that a reader has not got."""
+        troubled = self.disk_trouble | self.contested
+        return [
+            f"{sent} at {reader}"
+            for sent in self.sent.values()
+            for reader in LOG_READERS
+            if sent.topic == "artifact"
+            and sent.accepted_at is not None
+            and reader in self.names
+            and sent.source != reader
+            and not {sent.source, reader} & troubled
+            and sent.key not in self.received[reader]
         ]
 
     def is_durable(self, sent: Sent) -> bool:
