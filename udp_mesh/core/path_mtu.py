@@ -19,8 +19,9 @@ def update_mtu(state: State, session: Session, mtu: int) -> None:
         mtu = min(mtu, path.mtu)
     before = path.mtu
     path.switch_to(path.link, path.address, mtu, state.settings.fragment_bytes)
-    if sender is not None and mtu < before:
+    if sender is not None and session.peer is not None and mtu < before:
         refragment(sender, path, include_sent=False)
+        state.ready[session.peer] = None
 
 
 def refragment(sender: Sender, path: Path, *, include_sent: bool) -> None:

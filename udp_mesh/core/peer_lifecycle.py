@@ -254,8 +254,9 @@ def _switch_path(state: State, session: Session, link: str, source: Address, now
         state.event_queue.emit(PeerAddressChanged(session.name, old, source, link))
     if sender is not None and path.fragment_bytes < before:
         refragment(sender, path, include_sent=False)
-    if first and sender is not None and session.peer is not None:
-        # A boot that was first heard over a link that is gone had no path: what waits for it has no timer.
+    if sender is not None and session.peer is not None and (first or path.fragment_bytes < before):
+        # A boot that was first heard over a link that is gone had no path: what waits for it has no timer. Nor has a
+        # message that was restarted while its topic's rate limit held everything else.
         state.ready[session.peer] = None
 
 

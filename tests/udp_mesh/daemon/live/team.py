@@ -42,7 +42,7 @@ OUTBOXES = ("kept", "newest", "stored")
 NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
 """Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
 peer lost."""
-DISK_BYTES = 6_000_000
+DISK_BYTES = 40_000_000
 PASSED_ON_S = 10.0
 """Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
 RATES = """
