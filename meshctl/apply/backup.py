@@ -26,7 +26,7 @@ from meshctl.archive import TarMember, tar_of
 from meshctl.device import deadman, openwrt
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import Change, NewFile
-from meshctl.device.observation import Observation
+from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
@@ -40,6 +40,8 @@ from meshctl.plan.seen import CONFIG, WIRELESS, management_address, packages_see
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
+# States of the dead-man's switch in which no file has been changed.
+_UNTOUCHED = ("absent", "idle", "staged", "armed")
 # Far above the size of a router's /etc; bounds a hostile or broken archive.
 MAX_FILES, MAX_BYTES = 4000, 64 << 20
 # The dead-man's switch accepts absolute paths of at least two parts and plain characters, except its own state.
@@ -72,7 +74,7 @@ class Backup:
 
 
 def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
-    """The node's backup as one tar.gz file. Raises NodeError when the node sends something else."""
+    """The node's backup as one tar.gz file. Raises NodeError when it sends something else, or is being changed."""
     info = {
         "node": node,
         "board": seen.board.board_name if seen.board else "",
@@ -81,6 +83,8 @@ def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
         "packages": sorted(seen.packages or ()),
     }
     archive = openwrt.backup(connection)
+    if reason := unconfirmed(node, seen.change, deadman.status(connection)):
+        raise NodeError(reason, hint="repeat it when that change has ended")
     try:
         # sysupgrade does not save meshctl's own files; the marker identifies the configuration
         own = openwrt.fetch_files(connection, [f"/{MARKER_PATH}"])
@@ -89,6 +93,17 @@ def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
     except InputError as error:
         raise NodeError(f"{node}: expected a backup archive: {error}") from error
     return whole
+
+
+def unconfirmed(node: str, before: ChangeStatus | None, after: ChangeStatus) -> str:
+    """Why a backup taken between these two states of the dead-man's switch may hold files that were never confirmed;
+    empty if it cannot."""
+    last_id = "" if before is None else before.last_id
+    if (before is None or before.state in _UNTOUCHED) and after.state in _UNTOUCHED and last_id == after.last_id:
+        return ""
+    owner = after.owner or ("" if before is None else before.owner)
+    who = f"{owner} changes it" if owner else "it was changed"
+    return f"{node}: {who} while it is backed up, and may take that back: nothing was saved"
 
 
 def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, bytes] = MappingProxyType({})) -> bytes:

@@ -1,13 +1,16 @@
 """Replace a node's hardware: another device takes over its name, address and role.
 
-The new device is a spare of the inventory, or one on the bench. `adopt` pins its host key under the old name; the old
-node's configuration is then applied as any other change, and the inventory gets the new MAC, serial number and label
-(`identity_edits`, pure). If the change fails, pins and inventory stay as they were.
+The new device is a spare of the inventory, or one on the bench. `adopt` also pins its host key under the old name; the
+old node's configuration is then applied as any other change, and the inventory gets the new MAC, serial number and
+label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were. If meshctl is killed, both
+devices are trusted under the old name, and the same command completes what is left: a spare that has taken over by then
+is known by its host key.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -40,9 +43,11 @@ def adopt(
     *,
     spare: Node | None,
     target: BenchTarget | None,
+    has_taken_over: bool,
     interrupt: Interrupt,
 ) -> Replacement:
-    """Connect to the new device and pin its key under the old node's name.
+    """Connect to the new device and pin its key under the old node's name, too. A spare that `has_taken_over` answers
+    at the old node's address.
 
     Raises NodeError when the new device does not answer.
     """
@@ -53,7 +58,7 @@ def adopt(
         key = recorder.key
     elif spare is not None:
         # checked against its own pin
-        connection = _open_spare(connections, spare, old)
+        connection = connections.open(old) if has_taken_over else _open_spare(connections, spare, old)
         key = connection.host_key
     else:
         raise InputError("expected a spare of the inventory, or a device on the bench")
@@ -65,10 +70,12 @@ def adopt(
         connection.close()
         raise
     pins = trust.pinned(old.name)
-    trust.replace(old.name, key)
+    # that of the old device stays until the change is confirmed: whatever ends this process, either is trusted
+    trust.replace(old.name, key, *pins)
     if (target is not None and not target.site) or (spare is not None and spare.name in connections.on_bench):
         connections.on_bench.add(old.name)
-    connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
+    if not has_taken_over:
+        connections.bench_endpoints[old.name] = replace(connection.endpoint, identity=old.name)
     if connection.endpoint.interface:
         connections.interfaces[old.name] = connection.endpoint.interface
     connections.release(old.name, connection)
@@ -95,15 +102,21 @@ def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConne
     return connection
 
 
-def require_off(connections: ConnectionPool, old: Node) -> None:
-    """The old device must be off: two devices with the same address conflict. Raises NodeError, also if the
-    gateway on the way to it cannot be asked."""
+def require_off(connections: ConnectionPool, trust: TrustStore, old: Node, spare: Node | None) -> bool:
+    """The old device must be off: two devices with the same address conflict. Returns whether the spare answers there,
+    because a replacement by it was cut short after its change.
+
+    Raises NodeError, also if the gateway on the way to it cannot be asked.
+    """
     try:
-        connections.open(old).close()
+        connection = connections.open(old)
     except NodeError as error:
         if error.gateway_of:
             raise
-        return
+        return False
+    with closing(connection):
+        if spare is not None and connection.host_key in trust.pinned(spare.name):
+            return True
     raise still_on(old, str(connections.endpoint(old).address))
 
 

@@ -169,10 +169,12 @@ def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) ->
     """POSIX sh that starts a background process on the holder, which for `for_s` removes those of its entries that
     become stale. It replaces a process that already watches for `node`."""
     watched = [f"{entry.ifname}/{entry.mac}" for entry in entries]
-    loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}"
     pid_file = quoted(f"/tmp/meshctl/forget.{node}.pid")
+    loop = f"{script('stale_station.sh')}watch_stale {math.ceil(for_s)} {quoted(*watched)}\nrm -f {pid_file}"
+    # of a watch that was killed the number stays, and may be another process's by now
     return (
-        f"mkdir -p /tmp/meshctl; [ ! -f {pid_file} ] || kill $(cat {pid_file}) 2>/dev/null; rm -f {pid_file}\n"
+        f"mkdir -p /tmp/meshctl; pid=$(cat {pid_file} 2>/dev/null); rm -f {pid_file}\n"
+        '[ -z "$pid" ] || ! grep -q watch_stale "/proc/$pid/cmdline" 2>/dev/null || kill "$pid"\n'
         f"start-stop-daemon -S -q -b -m -p {pid_file} -x /bin/sh -- -c {quoted(loop)} && echo watching\n"
     )
 

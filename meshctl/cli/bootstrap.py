@@ -196,11 +196,12 @@ def replace(
     with session(inventory, key_files=key or (), lab=lab) as opened:
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
-        if not old_is_off:
-            _require_off(opened, inventory, old_node)
+        has_taken_over = not old_is_off and _require_off(opened, inventory, old_node, spare)
         given = named_places([at] if at else [], [interface] if interface else [], at_site)
         spots = given or [BenchTarget()][: spare is None or at_site != ""]
         place = with_site(opened.fleet, with_changes(spots[0], node=old_node.name), at_site) if spots else None
+        if has_taken_over:
+            place = None
         fleet = with_identity(opened.fleet, old_node, spare)
         opened = with_changes(opened, fleet=fleet, renderer=with_changes(opened.renderer, fleet=fleet))
         node = fleet.nodes[old_node.name]
@@ -212,6 +213,7 @@ def replace(
                 node,
                 spare=spare,
                 target=place,
+                has_taken_over=has_taken_over,
                 interrupt=opened.interrupt,
             )
         if not as_json:
@@ -268,16 +270,17 @@ def _replaced(fleet: Fleet, word: str) -> Node:
     return node
 
 
-def _require_off(opened: Session, inventory: Path, old: Node) -> None:
-    """Raises NodeError if the old device answers, or if its site cannot be asked."""
+def _require_off(opened: Session, inventory: Path, old: Node, spare: Node | None) -> bool:
+    """Whether the spare has already taken over. Raises NodeError if the old device answers, or if its site cannot be
+    asked."""
     try:
         if opened.fleet.gateway_site(old) is None and (observer := site_observer(opened, inventory)) is not None:
             with closing(observer):
                 if site := observer.site_of(old):
                     if isinstance(observer.observe(site, [old.name]).get(old.name), Observation):
                         raise still_on(old, f"site {site}")
-                    return
-        require_off(opened.access, old)
+                    return False
+        return require_off(opened.access, opened.trust, old, spare)
     except NodeError as error:
         if error.gateway_of:
             hint = f"pass --old-is-off if you know that it is{f'; {error.hint}' if error.hint else ''}"
@@ -305,8 +308,7 @@ def _record_identity(
     mine, theirs = identity_edits(node, spare, found.seen)
     if dry_run:
         return _identity_changes(inventory, node, spare, found, mine, theirs)
-    if spare is not None:
-        opened.trust.forget(spare.name)
+    opened.trust.replace(node.name, found.key)
     try:
         changes = _identity_changes(inventory, node, spare, found, mine, theirs)
         save(changes)
@@ -315,8 +317,11 @@ def _record_identity(
         edits = {name: edit for name, edit in both.items() if edit}
         raise InputError(
             f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
-            hint=f"fix the inventory, then add under `nodes`: {json.dumps(edits)}",
+            hint=f"fix the inventory, then repeat the command, or add under `nodes`: {json.dumps(edits)}",
         ) from error
+    # last: by it, a repeated command knows the spare that has taken over
+    if spare is not None:
+        opened.trust.forget(spare.name)
     return changes
 
 

@@ -19,13 +19,14 @@ from meshctl.apply.backup import (
     incompatibility,
     lockout_by,
     read_backup,
+    unconfirmed,
     uninstalled_packages,
     with_info,
     without_wireless,
 )
 from meshctl.device.connection import OwnKey
 from meshctl.device.deadman import NewFile
-from meshctl.device.observation import BoardInfo, Observation
+from meshctl.device.observation import BoardInfo, ChangeStatus, Observation
 from meshctl.errors import InputError
 from tests.meshctl.plan.support import fleet, running
 
@@ -94,6 +95,19 @@ def test_corrupted_bytes_raise_only_input_errors(noise: bytes, at: int) -> None:
     data[at : at + len(noise)] = noise
     with contextlib.suppress(InputError):
         read_backup(bytes(data), "b.tgz")
+
+
+def test_a_backup_of_a_node_that_is_being_changed_is_refused() -> None:
+    idle, armed = ChangeStatus("idle", last_id="c1"), ChangeStatus("armed", owner="anna@base:7", last_id="c1")
+    applied = replace(armed, state="applied")
+    for before, after in ((idle, idle), (armed, armed), (None, ChangeStatus("absent", installed=False))):
+        assert unconfirmed("b01", before, after) == ""
+    for before, after in ((applied, applied), (idle, applied), (applied, idle)):
+        assert unconfirmed("b01", before, after).startswith("b01: anna@base:7 changes it while it is backed up")
+    # begun and rolled back in between, or the switch is new
+    ended = ChangeStatus("idle", last_id="c2", last_outcome="restored")
+    assert unconfirmed("b01", idle, ended).startswith("b01: it was changed while")
+    assert unconfirmed("b01", None, ended)
 
 
 def test_a_backup_is_restored_only_to_its_own_node_and_board() -> None:

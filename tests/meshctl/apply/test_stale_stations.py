@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -196,6 +198,8 @@ sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
     "sleep": 'now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"',
     "start-stop-daemon": 'while [ "$1" != -- ]; do shift; done; shift; exec sh "$@"',
     "mkdir": ":",
+    # so that pauses use `sleep`
+    "mkfifo": "exit 1",
 }
 
 
@@ -213,6 +217,7 @@ def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0
         (place / "net" / "mesh0" / "master").unlink(missing_ok=True)
         (place / "net" / "mesh0" / "master").symlink_to(f"../{bat}")
     text = text.replace("/sys/class/net", str(place / "net")).replace("/proc/uptime", str(place / "uptime"))
+    text = text.replace("/tmp/meshctl", str(place / "memory"))
     environ = {"PATH": f"{place}:/usr/bin:/bin", "HERE": str(place)}
     done = subprocess.run(
         ("sh", "-c", text), env=environ, cwd=place, capture_output=True, text=True, check=False, timeout=120
@@ -306,6 +311,23 @@ def test_a_radio_that_comes_back_as_a_new_station_is_left_alone(tmp_path: Path) 
 
 def test_an_ineffective_removal_is_attempted_at_most_three_times(tmp_path: Path) -> None:
     assert len(watched(tmp_path, [Second(100, 500 + at, LOST) for at in range(60)])) == 3
+
+
+def test_a_watch_leaves_no_file_behind_and_replaces_only_a_watch(tmp_path: Path) -> None:
+    (tmp_path / "memory").mkdir()
+    number = tmp_path / "memory" / "forget.b02.pid"
+    sleeping = [sys.executable, "-c", "import time; time.sleep(600)"]
+    for words, is_watch in ((["watch_stale"], True), (["something else"], False)):
+        with subprocess.Popen([*sleeping, *words]) as process:
+            # of a watch that was killed, its number is another process's by now
+            number.write_text(f"{process.pid}\n")
+            watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(5)])
+            if is_watch:
+                assert process.wait(60) == -signal.SIGTERM
+            else:
+                assert process.poll() is None
+                process.kill()
+        assert list((tmp_path / "memory").iterdir()) == []
 
 
 def test_values_reported_by_a_node_are_never_executed_by_the_shell(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -31,6 +31,7 @@ from meshlab.spec import MESH_PACKAGES, FleetSpec, LinkSpec, Medium, NodeSpec
 from tests.meshctl import forked_commands
 from tests.meshctl.inventories import compex_hardware
 
+QUORUM = 0.6
 COMMAND_LIMIT_S = forked_commands.LIMIT_S
 INVENTORY = """\
 meshctl: 1
@@ -39,7 +40,7 @@ country: US
 operators:
   ssh_keys: ["{key}"]
 system: {{log_size_kib: {log_size}}}
-apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, quorum: 0.6{policy}}}
+apply: {{max_down: {count}, canary: false, stop_after_failures: 100000, quorum: {quorum}{policy}}}
 hardware:
 {hardware}{firmware}
 meshes:
@@ -134,6 +135,7 @@ class Rig:
             text = INVENTORY.format(
                 key=public.decode() + " proof",
                 count=self.count,
+                quorum=QUORUM,
                 hardware=compex_hardware(self.release.value, confirm_window_s=self.window_s),
                 policy="" if self.parallel is None else f", parallel: {self.parallel}",
                 firmware=self.firmware.get(variant, ""),
@@ -228,11 +230,8 @@ class Rig:
 
     def state_of(self, name: str, old: str, new: str) -> str:
         """`old`, `new`, or `mixed` with the paths that are neither here nor there."""
-        there = dict(self._files(name))
-        system = parse(there.get("etc/config/system", b"").decode(), "system")
-        compat = next((text for section in system.sections if (text := section.get("compat_version"))), "")
-        before = self.rendered(old, name, DeviceFacts(compat))
-        after = self.rendered(new, name, DeviceFacts(compat))
+        there = self._files(name)
+        before, after = (self._rendered_for(there, variant, name) for variant in (old, new))
         differing = [path for path in after if before.get(path) != after[path]]
         if all(there.get(path) == after[path] for path in differing):
             return "new"
@@ -240,13 +239,36 @@ class Rig:
             return "old"
         return "mixed: " + ", ".join(path for path in differing if there.get(path) != before[path])
 
-    def _files(self, name: str) -> Iterator[tuple[str, bytes]]:
+    def variant_of(self, name: str, there: Mapping[str, bytes] | None = None) -> str:
+        """Which inventory the node's files are wholly of, or `a mixture`; `there` are files of a backup instead."""
+        there = self._files(name) if there is None else there
+        rendered = {variant: self._rendered_for(there, variant, name) for variant in VARIANTS}
+        differing = [path for path, first in rendered["a"].items() if any(r[path] != first for r in rendered.values())]
+        for variant, files in rendered.items():
+            if all(there.get(path) == files[path] for path in differing):
+                return variant
+        return "a mixture"
+
+    def has_files_of(self, device: str, variant: str, name: str) -> bool:
+        """Whether a device has all files that inventory `variant` wants of node `name`."""
+        there = self._files(device)
+        return all(there.get(path) == content for path, content in self._rendered_for(there, variant, name).items())
+
+    def _rendered_for(self, there: Mapping[str, bytes], variant: str, name: str) -> dict[str, bytes]:
+        """What inventory `variant` wants of a node that has these files."""
+        system = parse(there.get("etc/config/system", b"").decode(), "system")
+        compat = next((text for section in system.sections if (text := section.get("compat_version"))), "")
+        return self.rendered(variant, name, DeviceFacts(compat))
+
+    def _files(self, name: str) -> dict[str, bytes]:
         done = self.fleet.node(name).exec("cd / && tar -cf - etc/config etc/dropbear etc/meshctl/node")
+        files = {}
         with tarfile.open(fileobj=io.BytesIO(done.stdout_bytes)) as tar:
             for member in tar:
                 stream = tar.extractfile(member)
                 if stream is not None:
-                    yield member.name, stream.read()
+                    files[member.name] = stream.read()
+        return files
 
     def settle(self) -> None:
         """Repaired, up and completely on `current`, whatever was done before."""
@@ -259,9 +281,11 @@ class Rig:
             if ended.code != 0:
                 raise AssertionError(f"the fleet cannot be brought back: {ended.out} {ended.err}")
 
-    def wait_all_up(self) -> None:
+    def wait_all_up(self, off: Sequence[str] = ()) -> None:
+        """Wait for all nodes except those that are `off`."""
         for name in ("base", *self.names):
-            self.fleet.node(name).wait_up(wait_s=120.0)
+            if name not in off:
+                self.fleet.node(name).wait_up(wait_s=120.0)
 
 
 # a, b: another distance, hop penalty and log size; split: another channel

@@ -67,3 +67,11 @@ def test_a_spare_takes_over_a_dead_nodes_name_address_and_pin(tmp_path: Path) ->
         assert '{"n001": {"label": "S3", "state": "deployed"}, "n003": {"state": "retired"}}' in stderr
         inventory.write_text(good, encoding="utf-8")
         assert rig.fleet.node("n003").address == "10.42.1.1"
+        # the same command knows that its spare has taken over, and records it
+        repeated = rig.meshctl("replace", "spare", "n001", "n003", "--yes", "--json")
+        assert (repeated.code, repeated.results) == (0, {"n001": "unchanged"}), repeated.out + repeated.err
+        fleet = load_fleet(inventory)
+        assert (fleet.nodes["n001"].label, fleet.nodes["n003"].state.value) == ("S3", "retired")
+        # what answers for n001 by now is no spare of anyone
+        refused = rig.meshctl("replace", "spare", "n001", "bench", "--yes")
+        assert "still answers" in refused.err
