@@ -184,10 +184,9 @@ def stage(
     """
     path = f"{BUNDLE_DIRECTORY}/{change.change_id}.tgz"
     upload(connection, bundle(change), path, mode=0o600, rate_bytes_per_s=rate_bytes_per_s, progress=progress)
-    try:
-        _verb(connection, "stage", owner, change.change_id, path, timeout_s=STAGE_TIMEOUT_S)
-    finally:
-        connection.run(f"rm -f {shlex.quote(path)}")
+    # by the same command: it also goes if this process is killed, or the link is cut, while it is staged
+    then = f"rm -f {shlex.quote(path)}"
+    _verb(connection, "stage", owner, change.change_id, path, timeout_s=STAGE_TIMEOUT_S, then=then)
 
 
 def arm(connection: Connection, owner: str, change_id: str, *, nonce: Secret, window_s: int) -> None:
@@ -280,11 +279,14 @@ def _verb(
     *words: str,
     stdin: bytes | Iterable[bytes] = b"",
     timeout_s: float | None = None,
+    then: str = "",
 ) -> dict[str, str]:
+    """Run a verb, and `then` whatever it says."""
     for word in words:
         if not _WORD.fullmatch(word) and not word.startswith("/"):
             raise ValueError(f"{verb}: expected letters, digits and @._:+-, found {word!r}")
-    done = connection.run(shlex.join([PROGRAM, verb, *words]), stdin=stdin, timeout_s=timeout_s)
+    command = shlex.join([PROGRAM, verb, *words]) + (f"; s=$?; {then}; exit $s" if then else "")
+    done = connection.run(command, stdin=stdin, timeout_s=timeout_s)
     answer = parse_answer(done.stdout)
     if answer.ok:
         return answer.values
