@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+from pathlib import Path
 
 import pytest
 
@@ -122,8 +123,8 @@ def test_ctrl_c_finishes_active_nodes_and_resume_continues_the_rest(rig: Rig) ->
     assert (resumed.code, resumed.results) == (0, dict.fromkeys(sorted(left), "done")), resumed.err
 
 
-def test_a_backup_restores_the_previous_configuration(rig: Rig) -> None:
-    folder = rig.directory / "backups"
+def test_a_backup_restores_the_previous_configuration(rig: Rig, tmp_path: Path) -> None:
+    folder = tmp_path / "backups"
     assert rig.meshctl("backup", rig.current, "n001", "--out", str(folder)).code == 0
     (file,) = folder.iterdir()
     assert file.stat().st_mode & 0o077 == 0
