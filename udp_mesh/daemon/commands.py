@@ -107,8 +107,7 @@ def publish(service: Service, client: Client, header: Header, payload: bytes) ->
         )
     message = service.publish(topic, payload, destination, type_name, publisher)
     if isinstance(message, int):
-        settings = service.topic(topic)
-        if publisher is not None and settings is not None and not settings.reliable:
+        if publisher is not None and (settings := service.topic(topic)) is not None and not settings.reliable:
             # No outcome will follow.
             return {"message": message, "reliable": False}
         return {"message": message}
