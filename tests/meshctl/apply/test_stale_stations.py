@@ -321,11 +321,13 @@ def test_a_watch_leaves_no_file_behind_and_replaces_only_a_watch(tmp_path: Path)
         with subprocess.Popen([*sleeping, *words]) as process:
             # of a watch that was killed, its number is another process's by now
             number.write_text(f"{process.pid}\n")
-            watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(5)])
-            if is_watch:
-                assert process.wait(60) == -signal.SIGTERM
-            else:
-                assert process.poll() is None
+            try:
+                watched(tmp_path, [Second(100, 500 + at, ANSWERED) for at in range(5)])
+                if is_watch:
+                    assert process.wait(60) == -signal.SIGTERM
+                else:
+                    assert process.poll() is None
+            finally:
                 process.kill()
         assert list((tmp_path / "memory").iterdir()) == []
 
