@@ -39,10 +39,9 @@ MARKER_PATH = "/etc/meshctl/flashed"
 HOST_KEYS = "/etc/dropbear/dropbear_*_host_key"
 # For sysupgrade's copy of busybox and what it runs in RAM; with less, the kernel kills it half way.
 HEADROOM_BYTES = 4 << 20
-# Writing 16 MB of NOR takes up to 3 minutes and the first boot 2 more; then keys are made and the mesh is joined.
-RETURN_TIMEOUT_S = 900.0
 # If sysupgrade does not run by then, it was not started, or the node has booted without it.
 START_TIMEOUT_S = 120.0
+STILL_UPGRADING = "its sysupgrade has not ended"
 
 
 def checked_image(profile: HardwareProfile) -> Path:
@@ -78,7 +77,7 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
         _check_memory(ctx.before, size)
         # for its lock: a factory device has none
         install_switch(ctx, connection)
-        deadman.lock(connection, ctx.run.owner, ttl_s=int(RETURN_TIMEOUT_S) + LOCK_SLACK_S)
+        deadman.lock(connection, ctx.run.owner, ttl_s=_longest_s(ctx.node.hardware) + LOCK_SLACK_S)
     with ctx.step("upload"):
         upload(
             connection, image, IMAGE_PATH, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress, mode=0o600
@@ -100,7 +99,7 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
         upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
-    listener.armed(None, for_s=RETURN_TIMEOUT_S)
+    listener.armed(None, for_s=_longest_s(ctx.node.hardware))
     listener.started()
     openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
@@ -127,9 +126,17 @@ def archive(desired: DesiredState, host_keys: Mapping[str, FetchedFile], marker:
     return gzip.compress(tar_of(members), mtime=0)
 
 
+def _longest_s(hardware: HardwareProfile) -> int:
+    """How long a flash may take: before the previous firmware is left, and after that."""
+    return 2 * hardware.flash_timeout_s
+
+
 def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Outcome:
-    """Poll the node until it is back and verified, or the timeout."""
-    backoff = Backoff(RETURN_TIMEOUT_S, ctx.run.interrupt)
+    """Poll the node until it is back and verified, or the timeout, which counts from its last answer with the previous
+    firmware: on a slow processor minutes pass before the flash is written."""
+    hardware = ctx.node.hardware
+    since_start = Backoff(hardware.flash_timeout_s, ctx.run.interrupt)
+    backoff = since_start
     last_error = ""
     while not backoff.is_over and not ctx.run.interrupt.leaving:
         try:
@@ -147,16 +154,27 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
             if upgrade is None:
                 listener.ended(seen, rebooted=True)
                 return verdict(ctx.name, ctx.node.hardware, seen, marker)
-            if (why := why_not_flashed(*upgrade, after_s=backoff.elapsed_s)) is not None:
+            if (why := why_not_flashed(*upgrade, after_s=since_start.elapsed_s)) is not None:
                 return Outcome(ctx.name, Result.FAILED, f"{why}; it runs the previous firmware")
-            last_error = "its sysupgrade has not ended"
+            last_error = STILL_UPGRADING
+            if not since_start.is_over:
+                backoff = Backoff(hardware.flash_timeout_s, ctx.run.interrupt)
         backoff.pause()
-    return Outcome(
-        ctx.name,
-        Result.UNCERTAIN,
-        f"not back after it was flashed ({last_error})",
-        hint=ctx.node.hardware.recovery or "run `meshctl resume` to check it again",
-    )
+    return not_back(ctx.name, hardware, last_error, interrupted=ctx.run.interrupt.leaving)
+
+
+def not_back(name: str, hardware: HardwareProfile, last_error: str, *, interrupted: bool) -> Outcome:
+    """The outcome of a node that has not come back in time: its flash may still be written."""
+    limit = f"within flash_timeout_s, {hardware.flash_timeout_s} s"
+    if interrupted:
+        reason = f"interrupted while it was being flashed ({last_error or 'not looked at yet'})"
+    elif last_error == STILL_UPGRADING:
+        reason = f"{last_error} {limit}"
+    else:
+        reason = f"not back {limit} after it was last seen with its previous firmware ({last_error})"
+    hint = "leave it on: a slow flash may still be written; `meshctl resume` checks it again"
+    recovery = f"; if it stays away: {hardware.recovery}" if hardware.recovery else ""
+    return Outcome(name, Result.UNCERTAIN, reason, hint=f"{hint}{recovery}")
 
 
 def why_not_flashed(upgrade: openwrt.Upgrade, said: str, *, after_s: float) -> str | None:

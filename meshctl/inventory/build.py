@@ -175,6 +175,7 @@ def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> Hardw
         packages=tuple(document.packages),
         package_files=tuple(document.package_files),
         confirm_window_s=document.confirm_window_s,
+        flash_timeout_s=document.flash_timeout_s,
         recovery=document.recovery,
         switch_vlans=tuple(document.switch_vlans.items()),
     )

@@ -76,6 +76,7 @@ class HardwareProfile:
     packages: tuple[str, ...] = ()
     package_files: tuple[str, ...] = ()
     confirm_window_s: int = 120
+    flash_timeout_s: int = 900
     recovery: str = ""
     switch_vlans: tuple[tuple[str, str], ...] = ()
 

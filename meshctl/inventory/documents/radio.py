@@ -78,6 +78,8 @@ class HardwareDocument(Document):
     """Package files to install without internet; relative to the inventory."""
     confirm_window_s: Whole = Field(default=120, ge=10, le=3600)
     """Seconds that a node waits for confirmation of a change before it rolls back."""
+    flash_timeout_s: Whole = Field(default=900, ge=300, le=14_400)
+    """Seconds after which a flashed device that has not come back is reported as uncertain; more for a slow flash."""
     recovery: Text = ""
     """How to recover the device by hand; printed before it is flashed."""
 

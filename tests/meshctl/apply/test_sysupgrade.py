@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import io
 import tarfile
+import time
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from meshctl.apply import sysupgrade
+from meshctl.apply.context import NodeContext
 from meshctl.apply.sysupgrade import MARKER_PATH, archive, has_booted, verdict, why_not_flashed
 from meshctl.device import deadman
 from meshctl.device.observation import BoardInfo, FileInfo, Observation, ReleaseInfo
 from meshctl.device.openwrt import FetchedFile, Upgrade
-from meshctl.fleet import Result
+from meshctl.errors import NodeError
+from meshctl.fleet import Outcome, Result
+from meshctl.nodes.backoff import Backoff
 from tests.meshctl.plan.support import fleet, wanted
 
 KEYS = {"/etc/dropbear/dropbear_ed25519_host_key": FetchedFile(b"private", 0o600)}
@@ -105,3 +112,70 @@ def test_an_upgrade_that_failed_is_reported_with_what_it_said() -> None:
     # start-stop-daemon answers before it has written the process id
     assert why_not_flashed(Upgrade.NOT_STARTED, "", after_s=3.0) is None
     assert why_not_flashed(Upgrade.NOT_STARTED, "", after_s=121.0) == "no sysupgrade runs on it"
+
+
+class SlowNode:
+    """A node that answers with its previous firmware until `leaves_s`, then not, and with the new one from `back_s`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, leaves_s: float, back_s: float, timeout_s: int) -> None:
+        self.now_s, self.leaves_s, self.back_s = 0.0, leaves_s, back_s
+        monkeypatch.setattr(time, "monotonic", lambda: self.now_s)
+        monkeypatch.setattr(
+            sysupgrade, "Backoff", lambda limit_s, interrupt: Backoff(limit_s, interrupt, _began=self.now_s)
+        )
+        monkeypatch.setattr(sysupgrade, "observe", lambda _connection, **_: self.observed())
+        monkeypatch.setattr("meshctl.device.openwrt.upgrade_state", lambda _connection: (Upgrade.RUNNING, ""))
+        keys = (
+            f"firmware: {{image: new.bin, revision: {NEW}}}",
+            f"flash_timeout_s: {timeout_s}",
+            "recovery: press reset",
+        )
+        self.node = fleet(firmware="\n    ".join(keys)).nodes["b01"]
+
+    def observed(self) -> Observation:
+        return seen(NEW, "boot-2", "mark") if self.now_s >= self.back_s else seen(OLD, "boot-1", None)
+
+    def open(self, _node: object) -> object:
+        if self.leaves_s <= self.now_s < self.back_s:
+            raise NodeError("b01: cannot connect: timed out")
+        return SimpleNamespace(close=lambda: None)
+
+    def wait(self, for_s: float) -> None:
+        self.now_s += for_s
+
+    def outcome(self) -> Outcome:
+        run = SimpleNamespace(
+            interrupt=SimpleNamespace(leaving=False, wait=self.wait), connections=self, record=lambda *_: None
+        )
+        ctx = SimpleNamespace(name="b01", node=self.node, before=BEFORE, run=run)
+        listener = SimpleNamespace(unreachable=lambda: None, ended=lambda *_, **__: None)
+        return sysupgrade._await_return(cast(NodeContext, ctx), "mark", cast(Any, listener))
+
+
+def test_the_time_of_a_flash_counts_from_when_the_node_was_last_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a slow processor minutes pass before anything is written."""
+    assert SlowNode(monkeypatch, leaves_s=290, back_s=580, timeout_s=300).outcome().result is Result.DONE
+
+
+def test_a_slower_flash_is_waited_for_if_the_inventory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert SlowNode(monkeypatch, leaves_s=20, back_s=3000, timeout_s=900).outcome().result is Result.UNCERTAIN
+    assert SlowNode(monkeypatch, leaves_s=20, back_s=3000, timeout_s=3600).outcome().result is Result.DONE
+
+
+def test_a_flash_that_is_late_may_still_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = SlowNode(monkeypatch, leaves_s=20, back_s=3000, timeout_s=300)
+    late = node.outcome()
+    assert late.result is Result.UNCERTAIN
+    # it is looked at every two seconds
+    assert 318 <= node.now_s <= 320
+    assert "within flash_timeout_s, 300 s after it was last seen" in late.reason
+    assert "leave it on" in late.hint
+    assert late.hint.endswith("press reset")
+
+
+def test_an_upgrade_that_never_ends_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = SlowNode(monkeypatch, leaves_s=1e9, back_s=1e9, timeout_s=300)
+    late = node.outcome()
+    assert late.result is Result.UNCERTAIN
+    assert 598 <= node.now_s <= 600
+    assert late.reason == "its sysupgrade has not ended within flash_timeout_s, 300 s"
