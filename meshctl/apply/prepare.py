@@ -71,7 +71,7 @@ def prepare(
 ) -> Prepared:
     """The plan for these nodes. Raises InvalidInput when one of them cannot be rendered.
 
-    `reconnects`: neighbors that hear an unreachable node remove their stale entries of it, and it is tried again,
+    `reconnects`: neighbors that hear an unreachable node repair their links to it (`reconnect`), and it is tried again,
     except the nodes in `tried`. Where the plan cuts a running mesh, the whole mesh is observed: distances and cut
     vertices need all of it.
     """
@@ -108,8 +108,8 @@ def prepare(
     if reconnects and away and not (interrupt is not None and interrupt.stopping):
         owners = known_macs(fleet, journal.last_known(fleet.name))
         untried = {name: why for name, why in away.items() if name not in tried}
-        removed = reconnect(connections, fleet, replace(seen, unreachable=untried), owners)
-        if removed:
+        repaired = reconnect(connections, fleet, replace(seen, unreachable=untried), owners)
+        if repaired.nodes:
             (interrupt or Interrupt()).wait(RELEARN_S)
             again = prepare(
                 renderer,
@@ -123,10 +123,9 @@ def prepare(
                 observer=observer,
                 reconnects=True,
                 # the nodes behind these may be reachable now, and in the same state
-                tried=tried | removed.keys(),
+                tried=tried | repaired.nodes,
             )
-            notes = (f"{name}: {', '.join(by)} removed a stale entry of its radio" for name, by in removed.items())
-            return replace(again, plan=replace(again.plan, notes=(*notes, *again.plan.notes)))
+            return replace(again, plan=replace(again.plan, notes=(*repaired.notes, *again.plan.notes)))
     pace = Pace.of(journal.change_durations_s(fleet.name))
     return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace)
 

@@ -1,71 +1,114 @@
-"""Reach nodes that are back in their mesh, but whose unicast frames a neighbor drops.
+"""Reach nodes that are back in their mesh, but whose unicast frames a neighbor drops, or that drop a neighbor's.
 
 A node that rebooted within a minute numbers its frames from 0 again, and each neighbor that still has its station entry
 drops them until the numbers have caught up: batman-adv hears it, logins time out for minutes (docs/lab.md). `reconnect`
 has the neighbors that hear such a node remove their entries if they are stale, which they verify (`stale_stations`).
+If a relay has rebooted, a node behind it drops the relay's frames, and only the relay can reach it: its numbers catch
+up with as many echo requests as it takes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
-from meshctl.apply.stale_stations import GONE, MAX_QUERIED, StationEntry, flush_script
+from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, reconnect_script
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import FleetObservation
 from meshctl.nodes.connections import ConnectionPool
+from meshctl.topology import mesh_macs
 
 # A neighbor on the air sends several times a second.
 HEARD_MS = 2000
 # Each entry costs its holder up to 3 s.
 QUERY_TIMEOUT_S = 30.0
+# A minute, or twice that on a slow processor (docs/facts/openwrt-checked.md).
+CATCH_UP_TIMEOUT_S = 150.0
+# For at most so many neighbors a holder sends until their numbers have caught up.
+MAX_CAUGHT_UP = 3
 # Then the neighbor learns the node from its next beacon, and the operator's machine its MAC: after three ARP requests
 # without an answer, Linux waits 3 s.
 RELEARN_S = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class Reconnected:
+    """Nodes that may be reachable now, and what was done, for the operator."""
+
+    nodes: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
+
+
 def reconnect(
     connections: ConnectionPool, fleet: Fleet, seen: FleetObservation, owners: Mapping[str, str]
-) -> dict[str, tuple[str, ...]]:
-    """Unreachable node -> neighbors that removed a stale entry of one of its radios. `owners`: MAC -> node."""
+) -> Reconnected:
+    """Have the neighbors of unreachable nodes repair their links to them. `owners`: MAC -> node."""
     asked = entries_of_unreachable(seen, owners)
     if not asked:
-        return {}
+        return Reconnected()
 
     def ask(holder: str) -> str:
-        script = flush_script(asked[holder], older_than_s=0.0)
+        entries = asked[holder]
+        script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP)
+        timeout_s = QUERY_TIMEOUT_S + CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
         try:
             with connections.borrow(fleet.nodes[holder]) as connection:
-                return connection.run(script, timeout_s=QUERY_TIMEOUT_S).stdout
+                return connection.run(script, timeout_s=timeout_s).stdout
         except NodeError:
             return ""
 
-    found: dict[str, tuple[str, ...]] = {}
     with ThreadPoolExecutor(len(asked), thread_name_prefix="reconnect") as pool:
-        for holder, answer in zip(asked, pool.map(ask, asked), strict=True):
-            for name in dict.fromkeys(_removed(answer, owners)):
-                found[name] = (*found.get(name, ()), holder)
-    return found
+        return repaired(dict(zip(asked, pool.map(ask, asked), strict=True)), seen, owners)
 
 
-def _removed(answer: str, owners: Mapping[str, str]) -> Iterator[str]:
-    for line in answer.splitlines():
-        word, _, mac = line.partition(" ")
-        if word == GONE and mac.lower() in owners:
-            yield owners[mac.lower()]
+def repaired(answers: Mapping[str, str], seen: FleetObservation, owners: Mapping[str, str]) -> Reconnected:
+    """What the holders' answers say. Pure."""
+    by_text: dict[tuple[str, str], list[str]] = {}
+    nodes: set[str] = set()
+    for holder, answer in answers.items():
+        for line in answer.splitlines():
+            word, _, mac = line.partition(" ")
+            if word not in _DONE:
+                continue
+            owner = owners.get(mac.lower())
+            nodes |= _without_mac(seen, owners) if owner is None else {owner}
+            who = f"{mac}, a radio of an unknown node" if owner is None else owner
+            holders = by_text.setdefault((who, _DONE[word]), [])
+            if holder not in holders:
+                holders.append(holder)
+    notes = tuple(f"{who}: {', '.join(holders)} {text}" for (who, text), holders in by_text.items())
+    return Reconnected(frozenset(nodes), notes)
+
+
+_DONE = {
+    GONE: "removed a stale entry of its radio",
+    CAUGHT_UP: "sent echo requests until it no longer dropped them (the sender's radio had restarted)",
+}
 
 
 def entries_of_unreachable(seen: FleetObservation, owners: Mapping[str, str]) -> dict[str, list[StationEntry]]:
-    """Holder -> its entries of radios of unreachable nodes that it hears now."""
+    """Holder -> its entries of radios that it hears now and that belong to unreachable nodes. An unknown MAC may
+    be that of an unreachable node without a known one; a stranger's radio, which takes no part in the mesh, answers no
+    echo request either way, and is left alone."""
+    observed = {mac for observation in seen.observations.values() for mac in mesh_macs(observation)}
+    is_any_unknown = bool(_without_mac(seen, owners))
     found: dict[str, list[StationEntry]] = {}
     for holder, observation in seen.observations.items():
         for station in observation.stations or ():
-            is_heard = station.inactive_ms is not None and station.inactive_ms < HEARD_MS
-            if is_heard and owners.get(station.mac.lower()) in seen.unreachable and len(found) < MAX_QUERIED:
+            mac = station.mac.lower()
+            if station.inactive_ms is None or station.inactive_ms >= HEARD_MS or mac in observed:
+                continue
+            is_away = owners[mac] in seen.unreachable if mac in owners else is_any_unknown
+            if is_away and (holder in found or len(found) < MAX_QUERIED):
                 found.setdefault(holder, []).append(StationEntry(holder, station.ifname, station.mac))
     return found
+
+
+def _without_mac(seen: FleetObservation, owners: Mapping[str, str]) -> set[str]:
+    return set(seen.unreachable) - set(owners.values())
 
 
 def last_relays(names: Iterable[str], known: Mapping[str, LastKnown]) -> Iterator[str]:

@@ -31,11 +31,15 @@ from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 # on the air. The pause doubles each time, up to a minute: Linux drops an inactive station of an ad-hoc cell after that
 # (IEEE80211_IBSS_INACTIVITY_LIMIT, net/mac80211/ibss.c).
 FIRST_PAUSE_S, MAX_PAUSE_S = 5.0, 60.0
+# Once its entry is removed, a neighbor is learned again from its next beacon.
+RELEARN_S = 3
 # More neighbors than any radio here has; bounds the cost of a hostile station table.
 MAX_QUERIED = 16
 # What a holder prints for an entry that is old enough: removed, cannot be removed, cannot be verified. It prints
 # `answers` for one that is not stale.
 GONE, KEPT, UNKNOWN = "gone", "kept", "unknown"
+# What a holder prints once a neighbor answers it again because the holder has sent enough.
+CAUGHT_UP = "caught-up"
 # all wireless interfaces, for sh; Linux allows no blank in an interface name
 _EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')\""
 
@@ -163,6 +167,15 @@ def flush_script(entries: Iterable[StationEntry], *, older_than_s: float, has_re
         for entry in entries
     ]
     return "".join((script("stale_station.sh"), *calls))
+
+
+def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int) -> str:
+    """POSIX sh that repairs a holder's links to these neighbors: it removes stale entries, then sends to the first
+    `caught_up` of those that still do not answer. It prints a line for each of both."""
+    words = [(quoted(entry.ifname), quoted(entry.mac)) for entry in entries]
+    flushes = [f"flush_stale {ifname} {mac} 0\n" for ifname, mac in words]
+    sends = [f"catch_up {ifname} {mac}\n" for ifname, mac in words[:caught_up]]
+    return "".join((script("stale_station.sh"), *flushes, f"pause {RELEARN_S}\n", *sends))
 
 
 def watch_script(node: str, entries: Iterable[StationEntry], *, for_s: float) -> str:

@@ -5,10 +5,15 @@
 # and drops the neighbor's unicast frames; broadcasts pass. The holder detects that here: it hears the neighbor, but gets
 # no reply to batman-adv echo requests (layer 2, so no firewall matters). Removing the entry of a radio that did not
 # restart causes the same loss in the other direction.
+#
+# `catch_up` is for the other way round: this node's radio restarted, and the neighbor, which nobody can ask, holds the old
+# entry. It drops only what is numbered before its window, half of all numbers at most, so this node sends so many frames.
 HEARD_MS=2000  # a neighbor sends several times a second: beacons, and OGMs that it originates or repeats
 ECHOES=3       # each is sent up to seven times on the air: a link that loses all of them is useless anyway
 WATCH_PAUSE_S=2
 FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
+SENDERS=40     # of `catch_up`: each sends one echo request per second, until it is answered; 2,080 in all, of 4,096 numbers
+SENT_EACH=52
 
 # number_after WORDS TEXT: NUMBER, the one that follows WORDS and a colon; empty if there is none
 number_after() {
@@ -47,10 +52,11 @@ echo_state() {
 	ECHO=unknown
 	mesh_of "$1" || return 0
 	# batctl of 19.07 needs -m, which later versions deprecate
+	interface_option=meshif
 	answer=$(batctl meshif "$mesh" ping -c "${3:-$ECHOES}" -t 1 "$2" 2>/dev/null)
 	case $answer in
 	PING* | *' bytes from '* | *'timed out'* | *nreachable*) ;;
-	*) answer=$(batctl -m "$mesh" ping -c "${3:-$ECHOES}" -t 1 "$2" 2>/dev/null) ;;
+	*) interface_option=-m && answer=$(batctl -m "$mesh" ping -c "${3:-$ECHOES}" -t 1 "$2" 2>/dev/null) ;;
 	esac
 	case $answer in
 	*' bytes from '*) ECHO=answered ;;
@@ -83,6 +89,28 @@ flush_restarted() {
 	for dev in $1; do
 		look "$dev" "$2"
 		! is_old "$3" || remove "$dev" "$2"
+	done
+}
+
+# catch_up DEVICES MAC: sends echo requests to a neighbor that is heard and does not answer, until it does; prints
+# `caught-up`, `silent` (it still does not answer), `answers`, or `unknown` MAC
+catch_up() {
+	for dev in $1; do
+		look "$dev" "$2"
+		is_old 0 && is_heard || continue
+		echo_state "$dev" "$2"
+		case $ECHO in
+		answered) echo "answers $2" && continue ;;
+		unknown) echo "unknown $2" && continue ;;
+		esac
+		senders=0
+		while [ $senders -lt $SENDERS ]; do
+			batctl $interface_option "$mesh" ping -i 0.01 -c $SENT_EACH -t 1 "$2" >/dev/null 2>&1 &
+			senders=$((senders + 1))
+		done
+		wait
+		echo_state "$dev" "$2"
+		case $ECHO in answered) echo "caught-up $2" ;; *) echo "silent $2" ;; esac
 	done
 }
 

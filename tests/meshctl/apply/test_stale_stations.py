@@ -24,6 +24,7 @@ from meshctl.apply.stale_stations import (
     next_query_s,
     own_entries,
     possible_holders,
+    reconnect_script,
     routed_through,
     unflushed_boot_s,
     watch_script,
@@ -193,6 +194,10 @@ del) echo "$now $2 $5" >>"$HERE/deleted"; [ ! -f "$HERE/renews" ] || : >"$HERE/r
 esac""",
     "batctl": """echo "$@" >>"$HERE/asked"
 [ ! -f "$HERE/renewed" ] || { echo "20 bytes from x"; exit 0; }
+if [ -f "$HERE/numbers" ] && [ "$(grep -c -- '-c 52 ' "$HERE/asked")" -ge "$(cat "$HERE/numbers")" ]; then
+    echo "20 bytes from x"
+    exit 0
+fi
 sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
 """,
     "sleep": 'now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"',
@@ -284,6 +289,45 @@ def test_an_entry_without_a_known_interface_is_flushed_on_all_interfaces(tmp_pat
     assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
 
 
+def reconnected(place: Path, now: Second, *, numbers: int | None = None) -> list[str]:
+    """What a holder prints whose neighbor drops its frames until so many senders have sent."""
+    if numbers is not None:
+        (place / "numbers").write_text(f"{numbers}")
+    text = reconnect_script([StationEntry("b01", "mesh0", MAC)], caught_up=1)
+    return deletions(place, [now] * 5, text)[0].splitlines()
+
+
+def test_a_neighbor_that_drops_frames_until_their_numbers_catch_up_is_sent_enough(tmp_path: Path) -> None:
+    """The holder's radio restarted, and the neighbor has the old entry; removing one's own entry is of no help."""
+    assert reconnected(tmp_path, Second(100, 50, LOST), numbers=40) == [f"gone {MAC}", f"caught-up {MAC}"]
+    sent = [line for line in (tmp_path / "asked").read_text().splitlines() if " -c 52 " in line]
+    # 12 bits of numbers, of which the half that is behind the window is dropped
+    assert sent == [f"meshif bat0 ping -i 0.01 -c 52 -t 1 {MAC}"] * 40
+    assert len(sent) * 52 > 4096 / 2
+
+
+def test_a_neighbor_that_still_does_not_answer_is_sent_no_more(tmp_path: Path) -> None:
+    assert reconnected(tmp_path, Second(100, 50, LOST), numbers=41) == [f"gone {MAC}", f"silent {MAC}"]
+
+
+@pytest.mark.parametrize(
+    ("now", "renews", "printed"),
+    [
+        (Second(100, 50, LOST), True, [f"gone {MAC}", f"answers {MAC}"]),
+        (Second(100, 50, ANSWERED), False, [f"answers {MAC}"] * 2),
+        (Second(5000, 50, LOST), False, []),
+        (Second(100, 50, UNREACHABLE), False, [f"unknown {MAC}"] * 2),
+    ],
+)
+def test_nothing_is_sent_to_a_neighbor_that_answers_or_is_not_heard(
+    tmp_path: Path, now: Second, renews: bool, printed: list[str]
+) -> None:
+    if renews:
+        (tmp_path / "renews").touch()
+    assert reconnected(tmp_path, now) == printed
+    assert not (tmp_path / "asked").exists() or " -c 52 " not in (tmp_path / "asked").read_text()
+
+
 def watched(place: Path, seconds: list[Second]) -> list[int]:
     """When an entry like this is deleted by a holder that watches it."""
     text = watch_script("b02", [StationEntry("b01", "mesh0", MAC)], for_s=len(seconds))
@@ -336,6 +380,7 @@ def test_values_reported_by_a_node_are_never_executed_by_the_shell(tmp_path: Pat
     evil = [StationEntry("b01", "mesh0; touch x", "$(touch x)"), StationEntry("b01", "'; touch x; '", "`touch x`")]
     for has_restarted in (False, True):
         text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)
+        text += reconnect_script(evil, caught_up=1)
         deletions(tmp_path, [Second(100, 5000, LOST)] * 9, text)
         assert (tmp_path / "deleted").exists()
         assert not (tmp_path / "x").exists()

@@ -15,7 +15,7 @@ import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
-from meshctl.apply.reconnect import HEARD_MS, entries_of_unreachable, last_relays
+from meshctl.apply.reconnect import HEARD_MS, Reconnected, entries_of_unreachable, last_relays, repaired
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
 from meshctl.device.ssh import SshConnection
@@ -30,6 +30,7 @@ from tests.meshctl.plan.support import fleet, running
 from tests.meshctl.proof.rig import Ended, Rig
 
 MAC = "02:00:00:00:01:02"
+OTHER = "02:00:00:00:01:99"
 MACS = {"b01": "02:00:00:00:01:01", "b02": MAC, "b03": "02:00:00:00:01:03", "b04": "02:00:00:00:01:04"}
 
 
@@ -257,6 +258,34 @@ def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_en
         "b01": [("mesh0", MAC)]
     }
     assert entries_of_unreachable(FleetObservation(around, {}), owners) == {}
+
+
+def test_an_unknown_radio_may_belong_to_a_node_without_a_known_mac() -> None:
+    """A node that was never seen, and whose MAC the inventory does not have, such as at a site with a new journal."""
+    heard = tuple(Station("mesh0", MACS[name], inactive_ms=30) for name in ("b02", "b03", "b04"))
+    around = {"b01": replace(node("b01"), stations=heard), "b03": node("b03")}
+    without = {MACS[name]: name for name in ("b01", "b04")}
+    asked = entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), without)
+    # b03 was observed, and b04 is known and reachable
+    assert [(one.holder, one.mac) for one in asked["b01"]] == [("b01", MAC)]
+    assert entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), {**without, OTHER: "b02"}) == {}
+
+
+def test_what_was_repaired_is_reported_once_for_each_radio() -> None:
+    seen = FleetObservation({}, {"b02": "no answer", "b04": "no answer"})
+    owners = {MACS["b04"]: "b04"}
+    answers = {
+        "b01": f"gone {MACS['b04'].upper()}\nanswers {MACS['b04']}\n",
+        "b03": f"gone {MACS['b04']}\n",
+        "base": "",
+    }
+    assert repaired(answers, seen, owners) == Reconnected(
+        frozenset({"b04"}), ("b04: b01, b03 removed a stale entry of its radio",)
+    )
+    unknown = repaired({"b01": f"silent {MAC}\ncaught-up {MAC}\n"}, seen, owners)
+    assert unknown.nodes == {"b02"}
+    assert unknown.notes[0].startswith(f"{MAC}, a radio of an unknown node: b01 sent echo requests until")
+    assert repaired({"b01": f"kept {MAC}\nsilent {MAC}\n"}, seen, owners) == Reconnected()
 
 
 def test_the_relays_to_an_unreachable_node_are_those_of_its_last_path() -> None:
