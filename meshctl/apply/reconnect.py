@@ -50,7 +50,7 @@ def reconnect(
     if not asked:
         return Reconnected()
 
-    def ask(holder: str) -> str:
+    def ask(holder: str) -> str | None:
         entries = asked[holder]
         script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP)
         timeout_s = QUERY_TIMEOUT_S + CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
@@ -58,34 +58,45 @@ def reconnect(
             with connections.borrow(fleet.nodes[holder]) as connection:
                 return connection.run(script, timeout_s=timeout_s).stdout
         except NodeError:
-            return ""
+            return None
 
     with ThreadPoolExecutor(len(asked), thread_name_prefix="reconnect") as pool:
-        return repaired(dict(zip(asked, pool.map(ask, asked), strict=True)), seen, owners)
+        answers = dict(zip(asked, pool.map(ask, asked), strict=True))
+    return repaired(answers, asked, seen.unreachable, owners)
 
 
-def repaired(answers: Mapping[str, str], seen: FleetObservation, owners: Mapping[str, str]) -> Reconnected:
-    """What the holders' answers say. Pure."""
+def repaired(
+    answers: Mapping[str, str | None],
+    asked: Mapping[str, Iterable[StationEntry]],
+    unreachable: Iterable[str],
+    owners: Mapping[str, str],
+) -> Reconnected:
+    """What the holders' answers say. One that has not answered may have done its part and lost its own link meanwhile,
+    if it has restarted: its nodes are tried again, too. Pure."""
+    without_mac = set(unreachable) - set(owners.values())
     by_text: dict[tuple[str, str], list[str]] = {}
     nodes: set[str] = set()
     for holder, answer in answers.items():
-        for line in answer.splitlines():
-            word, _, mac = line.partition(" ")
-            if word not in _DONE:
+        lost = asked[holder] if answer is None else ()
+        done = [line.partition(" ") for line in (answer or "").splitlines()]
+        for word, mac in (*((word, mac) for word, _, mac in done), *((_LOST, entry.mac) for entry in lost)):
+            if word not in _TEXTS:
                 continue
             owner = owners.get(mac.lower())
-            nodes |= _without_mac(seen, owners) if owner is None else {owner}
+            nodes |= without_mac if owner is None else {owner}
             who = f"{mac}, a radio of an unknown node" if owner is None else owner
-            holders = by_text.setdefault((who, _DONE[word]), [])
+            holders = by_text.setdefault((who, _TEXTS[word]), [])
             if holder not in holders:
                 holders.append(holder)
     notes = tuple(f"{who}: {', '.join(holders)} {text}" for (who, text), holders in by_text.items())
     return Reconnected(frozenset(nodes), notes)
 
 
-_DONE = {
+_LOST = "no answer"
+_TEXTS = {
     GONE: "removed a stale entry of its radio",
     CAUGHT_UP: "sent echo requests until it no longer dropped them (the sender's radio had restarted)",
+    _LOST: "hears it, and did not answer when asked to repair the link",
 }
 
 
@@ -94,7 +105,7 @@ def entries_of_unreachable(seen: FleetObservation, owners: Mapping[str, str]) ->
     be that of an unreachable node without a known one; a stranger's radio, which takes no part in the mesh, answers no
     echo request either way, and is left alone."""
     observed = {mac for observation in seen.observations.values() for mac in mesh_macs(observation)}
-    is_any_unknown = bool(_without_mac(seen, owners))
+    is_any_unknown = bool(set(seen.unreachable) - set(owners.values()))
     found: dict[str, list[StationEntry]] = {}
     for holder, observation in seen.observations.items():
         for station in observation.stations or ():
@@ -105,10 +116,6 @@ def entries_of_unreachable(seen: FleetObservation, owners: Mapping[str, str]) ->
             if is_away and (holder in found or len(found) < MAX_QUERIED):
                 found.setdefault(holder, []).append(StationEntry(holder, station.ifname, station.mac))
     return found
-
-
-def _without_mac(seen: FleetObservation, owners: Mapping[str, str]) -> set[str]:
-    return set(seen.unreachable) - set(owners.values())
 
 
 def last_relays(names: Iterable[str], known: Mapping[str, LastKnown]) -> Iterator[str]:

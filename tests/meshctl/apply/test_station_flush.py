@@ -16,6 +16,7 @@ import pytest
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
 from meshctl.apply.reconnect import HEARD_MS, Reconnected, entries_of_unreachable, last_relays, repaired
+from meshctl.apply.stale_stations import StationEntry
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.device.observation import Observation, Originator, Station, WirelessLink
 from meshctl.device.ssh import SshConnection
@@ -272,20 +273,28 @@ def test_an_unknown_radio_may_belong_to_a_node_without_a_known_mac() -> None:
 
 
 def test_what_was_repaired_is_reported_once_for_each_radio() -> None:
-    seen = FleetObservation({}, {"b02": "no answer", "b04": "no answer"})
     owners = {MACS["b04"]: "b04"}
+    asked = {name: [StationEntry(name, "mesh0", MAC)] for name in ("b01", "b03", "base")}
     answers = {
         "b01": f"gone {MACS['b04'].upper()}\nanswers {MACS['b04']}\n",
         "b03": f"gone {MACS['b04']}\n",
         "base": "",
     }
-    assert repaired(answers, seen, owners) == Reconnected(
+    away = ("b02", "b04")
+    assert repaired(answers, asked, away, owners) == Reconnected(
         frozenset({"b04"}), ("b04: b01, b03 removed a stale entry of its radio",)
     )
-    unknown = repaired({"b01": f"silent {MAC}\ncaught-up {MAC}\n"}, seen, owners)
+    unknown = repaired({"b01": f"silent {MAC}\ncaught-up {MAC}\n"}, asked, away, owners)
     assert unknown.nodes == {"b02"}
     assert unknown.notes[0].startswith(f"{MAC}, a radio of an unknown node: b01 sent echo requests until")
-    assert repaired({"b01": f"kept {MAC}\nsilent {MAC}\n"}, seen, owners) == Reconnected()
+    assert repaired({"b01": f"kept {MAC}\nsilent {MAC}\n"}, asked, away, owners) == Reconnected()
+
+
+def test_a_neighbor_that_loses_its_own_link_meanwhile_has_its_nodes_tried_again() -> None:
+    asked = {"b01": [StationEntry("b01", "mesh0", MAC)]}
+    assert repaired({"b01": None}, asked, ("b02",), {MAC: "b02"}) == Reconnected(
+        frozenset({"b02"}), ("b02: b01 hears it, and did not answer when asked to repair the link",)
+    )
 
 
 def test_the_relays_to_an_unreachable_node_are_those_of_its_last_path() -> None:
