@@ -78,9 +78,11 @@ def repaired(
     nodes: set[str] = set()
     for holder, answer in answers.items():
         lost = asked[holder] if answer is None else ()
+        # a node may print anything
+        macs = {entry.mac.lower() for entry in asked[holder]}
         done = [line.partition(" ") for line in (answer or "").splitlines()]
         for word, mac in (*((word, mac) for word, _, mac in done), *((_LOST, entry.mac) for entry in lost)):
-            if word not in _TEXTS:
+            if word not in _TEXTS or mac.lower() not in macs:
                 continue
             owner = owners.get(mac.lower())
             nodes |= without_mac if owner is None else {owner}

@@ -274,7 +274,8 @@ def test_an_unknown_radio_may_belong_to_a_node_without_a_known_mac() -> None:
 
 def test_what_was_repaired_is_reported_once_for_each_radio() -> None:
     owners = {MACS["b04"]: "b04"}
-    asked = {name: [StationEntry(name, "mesh0", MAC)] for name in ("b01", "b03", "base")}
+    entries = [StationEntry("", "mesh0", mac) for mac in (MAC, MACS["b04"])]
+    asked = dict.fromkeys(("b01", "b03", "base"), entries)
     answers = {
         "b01": f"gone {MACS['b04'].upper()}\nanswers {MACS['b04']}\n",
         "b03": f"gone {MACS['b04']}\n",
@@ -287,6 +288,7 @@ def test_what_was_repaired_is_reported_once_for_each_radio() -> None:
     unknown = repaired({"b01": f"silent {MAC}\ncaught-up {MAC}\n"}, asked, away, owners)
     assert unknown.nodes == {"b02"}
     assert unknown.notes[0].startswith(f"{MAC}, a radio of an unknown node: b01 sent echo requests until")
+    assert repaired({"b01": "gone \x1b[2J\n"}, asked, away, owners) == Reconnected()
     assert repaired({"b01": f"kept {MAC}\nsilent {MAC}\n"}, asked, away, owners) == Reconnected()
 
 
