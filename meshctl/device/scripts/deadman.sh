@@ -8,7 +8,7 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=9
+VERSION=10
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
@@ -429,6 +429,12 @@ apply() { # OWNER ID now | in SECONDS | at UPTIME_SECONDS
 	detach watch "$ID" $due
 	limit=$((NOW + START_LIMIT_CS))
 	until [ -e "$TIMER/due" ]; do
+		if ! is_armed; then
+			# it has ended before this process looked
+			read -r _ last_outcome _ 2>/dev/null <"$LAST"
+			[ "$last_outcome" != refused ] || refuse moved-on "a file changed since it was staged"
+			break
+		fi
 		# should it start after all, it finds the abort and changes nothing
 		now && [ $NOW -lt $limit ] || { : >"$TIMER/abort" && refuse no-watcher "the timer did not start in time"; }
 		doze
