@@ -76,6 +76,7 @@ def prepare(
     vertices need all of it.
     """
     fleet = renderer.fleet
+    signal = interrupt or Interrupt()
     chosen = tuple(nodes)
     rendered = {node.name: renderer.desired(node) for node in chosen}
     seen = collect(
@@ -83,7 +84,7 @@ def prepare(
         chosen,
         parallel=nodes_in_work(fleet.apply.parallel),
         paths=lambda node: other_paths(rendered[node.name]),
-        interrupt=interrupt,
+        interrupt=signal,
         observer=observer,
     )
     _remember(journal, fleet, seen)
@@ -93,24 +94,25 @@ def prepare(
     rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
-    if rest and not (interrupt is not None and interrupt.stopping):
+    if rest and not signal.stopping:
         others = collect(
             connections,
             rest,
             parallel=nodes_in_work(fleet.apply.parallel),
-            interrupt=interrupt,
+            interrupt=signal,
             observer=observer,
         )
         _remember(journal, fleet, others)
         seen = replace(seen, observations={**seen.observations, **others.observations})
         away |= others.unreachable
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
-    if reconnects and away and not (interrupt is not None and interrupt.stopping):
+    if reconnects and away and not signal.stopping:
         owners = known_macs(fleet, journal.last_known(fleet.name))
         untried = {name: why for name, why in away.items() if name not in tried}
-        repaired = reconnect(connections, fleet, replace(seen, unreachable=untried), owners)
-        if repaired.nodes:
-            (interrupt or Interrupt()).wait(RELEARN_S)
+        unreached = replace(seen, unreachable=untried)
+        repaired = reconnect(connections, fleet, unreached, owners, interrupt=signal, observer=observer)
+        if repaired.nodes and not signal.stopping:
+            signal.wait(RELEARN_S)
             again = prepare(
                 renderer,
                 connections,
@@ -119,7 +121,7 @@ def prepare(
                 salt=salt,
                 owner=owner,
                 choices=choices,
-                interrupt=interrupt,
+                interrupt=signal,
                 observer=observer,
                 reconnects=True,
                 # the nodes behind these may be reachable now, and in the same state

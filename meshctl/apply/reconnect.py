@@ -9,12 +9,15 @@ up with as many echo requests as it takes.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, reconnect_script
+from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
+from meshctl.fleet import Event, EventKind, Interrupt, Observer, silent
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Fleet
 from meshctl.nodes.collect import FleetObservation
@@ -29,6 +32,7 @@ QUERY_TIMEOUT_S = 30.0
 CATCH_UP_TIMEOUT_S = 150.0
 # For at most so many neighbors a holder sends until their numbers have caught up.
 MAX_CAUGHT_UP = 3
+INTERRUPT_LOOK_S = 0.2
 # Then the neighbor learns the node from its next beacon, and the operator's machine its MAC: after three ARP requests
 # without an answer, Linux waits 3 s.
 RELEARN_S = 5.0
@@ -43,26 +47,49 @@ class Reconnected:
 
 
 def reconnect(
-    connections: ConnectionPool, fleet: Fleet, seen: FleetObservation, owners: Mapping[str, str]
+    connections: ConnectionPool,
+    fleet: Fleet,
+    seen: FleetObservation,
+    owners: Mapping[str, str],
+    *,
+    interrupt: Interrupt,
+    observer: Observer = silent,
 ) -> Reconnected:
-    """Have the neighbors of unreachable nodes repair their links to them. `owners`: MAC -> node."""
+    """Have the neighbors of unreachable nodes repair their links to them. `owners`: MAC -> node.
+
+    The first interrupt closes the connections, since it takes minutes and changes nothing that must be finished.
+    """
     asked = entries_of_unreachable(seen, owners)
     if not asked:
         return Reconnected()
+    in_use: list[SshConnection] = []
 
     def ask(holder: str) -> str | None:
         entries = asked[holder]
         script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP)
         timeout_s = QUERY_TIMEOUT_S + CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
+        doing = f"repairs its links to nodes that do not answer (at most {timeout_s:.0f} s)"
+        observer(Event(EventKind.STEP, holder, time.time(), doing))
         try:
             with connections.borrow(fleet.nodes[holder]) as connection:
+                in_use.append(connection)
+                if interrupt.stopping:
+                    # this connection may have come too late to be closed below
+                    return None
                 return connection.run(script, timeout_s=timeout_s).stdout
         except NodeError:
             return None
+        finally:
+            observer(Event(EventKind.FINISHED, holder, time.time()))
 
     with ThreadPoolExecutor(len(asked), thread_name_prefix="reconnect") as pool:
-        answers = dict(zip(asked, pool.map(ask, asked), strict=True))
-    return repaired(answers, asked, seen.unreachable, owners)
+        answers = {holder: pool.submit(ask, holder) for holder in asked}
+        while wait(answers.values(), INTERRUPT_LOOK_S).not_done and not interrupt.stopping:
+            pass
+        if interrupt.stopping:
+            for connection in in_use:
+                connection.close()
+        return repaired({name: answer.result() for name, answer in answers.items()}, asked, seen.unreachable, owners)
 
 
 def repaired(

@@ -15,7 +15,8 @@ from meshctl.apply.prepare import PlanOptions, Prepared, prepare
 from meshctl.apply.station_flush import StationFlushes
 from meshctl.cli.context import Session, confirm, line_width, selected_nodes
 from meshctl.cli.journaled_run import JournaledRun, journaled_run, print_totals, retry_command, run_context
-from meshctl.cli.output import console, echo_error, echo_json
+from meshctl.cli.output import console, echo_json
+from meshctl.cli.query_line import query_line
 from meshctl.cli.site_files import at_site, replaced_by
 from meshctl.errors import ExitCode, MeshctlError
 from meshctl.fleet import Outcome
@@ -53,7 +54,7 @@ def prepare_plan(
     limits: list[str] | None = None,
     reconnects: bool = False,
 ) -> Prepared:
-    with opened.interrupt.on_signals(echo_error):
+    with query_line() as line, opened.interrupt.on_signals(line.print_above, is_only_reading=True):
         prepared = prepare(
             opened.renderer,
             opened.access,
@@ -63,6 +64,7 @@ def prepare_plan(
             owner=opened.owner,
             choices=choices,
             interrupt=opened.interrupt,
+            observer=line,
             reconnects=reconnects,
         )
     if opened.interrupt.stopping:

@@ -58,15 +58,16 @@ class Interrupt:
         return self._leave.wait(timeout_s)
 
     @contextmanager
-    def on_signals(self, say: Callable[[str], None]) -> Iterator[None]:
-        """Within this block SIGINT, SIGTERM and SIGHUP are requests. Only in the main thread."""
+    def on_signals(self, say: Callable[[str], None], *, is_only_reading: bool = False) -> Iterator[None]:
+        """Within this block SIGINT, SIGTERM and SIGHUP are requests; where nothing is changed, the second one ends the
+        process instead. Only in the main thread."""
         self._say = say
 
         def handle(number: int, frame: FrameType | None) -> None:
             if number == signal.SIGHUP and self.stopping:
                 # the shell of a closed terminal sends a second SIGHUP
                 return
-            if self.leaving:
+            if self.leaving or (is_only_reading and self.stopping):
                 _end()
             self.request()
 

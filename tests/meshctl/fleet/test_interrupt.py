@@ -59,12 +59,13 @@ def test_a_request_counts_even_if_the_terminal_is_closed() -> None:
     assert interrupt.stopping
 
 
-def test_a_third_signal_ends_the_process_whatever_its_threads_wait_for() -> None:
+@pytest.mark.parametrize(("options", "signals"), [("", 3), (", is_only_reading=True", 2)])
+def test_the_last_signal_ends_the_process_whatever_its_threads_wait_for(options: str, signals: int) -> None:
     script = (
         "import signal, threading; from meshctl.fleet import Interrupt\n"
         "threading.Thread(target=threading.Event().wait).start()\n"
-        "with Interrupt().on_signals(print):\n"
-        "    for _ in range(3): signal.raise_signal(signal.SIGINT)\n"
+        f"with Interrupt().on_signals(print{options}):\n"
+        f"    for _ in range({signals}): signal.raise_signal(signal.SIGINT)\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (130, "ended\n")
