@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -15,6 +17,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from meshctl.cli.main import build
+from meshctl.cli.netbox_client import fetch
+from meshctl.errors import Unreachable
 from meshctl.interchange.netbox import STATES, rows
 from meshctl.inventory import load_fleet
 from meshctl.resources import shipped
@@ -64,16 +68,24 @@ class RecordedApi(BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture(scope="module")
-def api() -> Iterator[ThreadingHTTPServer]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), RecordedApi)
-    server.requests = []  # type: ignore[attr-defined]
+@contextmanager
+def serving(handler: type[BaseHTTPRequestHandler]) -> Iterator[ThreadingHTTPServer]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, args=(0.05,))
     thread.start()
-    yield server
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+@pytest.fixture(scope="module")
+def api() -> Iterator[ThreadingHTTPServer]:
+    with serving(RecordedApi) as server:
+        server.requests = []  # type: ignore[attr-defined]
+        yield server
 
 
 @pytest.fixture
@@ -138,6 +150,56 @@ def test_a_wrong_token_no_token_no_answer_and_no_pynetbox_have_different_errors(
     missing = run(api, fleet)
     assert missing.exit_code == 2
     assert "pip install 'meshctl-fleet[netbox]'" in missing.output
+
+
+HTML = b"<html>Log in to continue</html>"
+PAGE = {"count": 3, "next": None, "previous": None}
+
+
+@pytest.mark.parametrize(
+    ("status", "answer", "expected"),
+    [
+        (401, {"detail": "No credentials."}, ("401 Unauthorized: No credentials.", "check NETBOX_TOKEN")),
+        (404, HTML, ("404 Not Found", "without /api")),
+        (429, {"detail": "Throttled."}, ("429 Too Many Requests: Throttled.", "repeat the command")),
+        (502, HTML, ("502 Bad Gateway", "the proxy in front of it")),
+        (200, HTML, ("the answer is not JSON: is this NetBox?",)),
+        (200, b"", ("the answer is not JSON: is this NetBox?",)),
+        (200, [1, 2], ("expected a list of devices, found something else: is this NetBox?",)),
+        (200, {"version": "4.1"}, ("expected a list of devices, found something else: is this NetBox?",)),
+        (200, {**PAGE, "results": [None]}, ("expected a list of devices, found something else: is this NetBox?",)),
+        (200, {**PAGE, "results": [{"id": "x"}]}, ("expected devices with a number as their id",)),
+        (200, {**PAGE, "results": [{"id": 1}], "next": "/"}, ("more devices than NetBox counted, 3",)),
+    ],
+)
+def test_an_answer_that_is_no_list_of_devices_is_an_error_that_says_what_to_do(
+    fleet: Path, status: int, answer: object, expected: tuple[str, ...]
+) -> None:
+    before = (fleet / "fleet.yaml").read_bytes()
+
+    class Api(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            content = answer if isinstance(answer, bytes) else json.dumps(answer).encode()
+            content = content.replace(b'"/"', f'"http://{self.headers["Host"]}/api/dcim/devices/"'.encode())
+            self.send_response(status)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with serving(Api) as server:
+        done = run(server, fleet, "--add")
+    assert done.exit_code == 2, done.output
+    for words in expected:
+        assert words in done.output
+    assert (fleet / "fleet.yaml").read_bytes() == before
+
+
+def test_a_server_that_never_answers_is_given_up() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent, pytest.raises(Unreachable, match="no answer: ReadTimeout"):
+        fetch(f"http://127.0.0.1:{silent.getsockname()[1]}", TOKEN, {}, timeout_s=0.2)
 
 
 def test_every_status_of_netbox_has_a_state() -> None:
