@@ -23,6 +23,8 @@ INSTALL_HINT = "install it with: pip install 'meshctl-fleet[labels]' (reportlab 
 NO_KEY = "no host key pinned"
 # ISO/IEC 18004: four modules of white around the code
 QUIET_ZONE_MODULES = 4
+MAX_CODE_SHARE = 0.42
+"""Of a label's width: with more, the fingerprint beside the code becomes too small to read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,22 +143,25 @@ def _draw_label(
     if outlines:
         canvas.setLineWidth(0.25)
         canvas.roundRect(left, bottom, width, height, 4)
-    side = height * 0.94
+    side = min(height * 0.94, width * MAX_CODE_SHARE)
+    edge = height * 0.03
     module = side / (len(modules) + 2 * QUIET_ZONE_MODULES)
-    origin = (left + (height - side) / 2 + QUIET_ZONE_MODULES * module, bottom + height - (height - side) / 2)
+    origin = (left + edge + QUIET_ZONE_MODULES * module, bottom + (height + side) / 2)
     for row, line in enumerate(modules):
         y = origin[1] - (row + 1 + QUIET_ZONE_MODULES) * module
         for column, is_dark in enumerate(line):
             if is_dark:
                 canvas.rect(origin[0] + column * module, y, module, module, stroke=0, fill=1)
-    _draw_text(canvas, label, left + height, bottom, width - height - 4, height)
+    beside = edge + side
+    _draw_text(canvas, label, left + beside, bottom, width - beside - 4, height)
 
 
 def _draw_text(canvas: Any, label: DeviceLabel, left: float, bottom: float, width: float, height: float) -> None:
     """The label's lines, each as large as fits."""
     title = f"{label.label}  {label.name}" if label.label else label.name
     key = label.fingerprints[0] if label.fingerprints else NO_KEY
-    halves = (key[: len(key) // 2 + 4], key[len(key) // 2 + 4 :]) if label.fingerprints else (key, "")
+    half = (len(key) + 1) // 2
+    halves = (key[:half], key[half:]) if label.fingerprints else (key, "")
     lines = [
         (title, "Helvetica-Bold", height * 0.2),
         (label.mac, "Courier", height * 0.13),

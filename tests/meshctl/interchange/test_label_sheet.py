@@ -25,6 +25,7 @@ from tests.meshctl.interchange.devices import SSH_KEY
 
 FINGERPRINT = "SHA256:uNiVztksCsDhcc0u9e8BrrJXVGDuqXGzdRLJJ8Y0wSQ"
 DOTS_PER_POINT = 4
+MIN_READABLE_POINTS = 6.0
 _RECTANGLE = re.compile(r"n ([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+) re f")
 
 
@@ -78,6 +79,17 @@ def test_the_text_has_name_label_mac_and_fingerprint() -> None:
     for word in ("B7", "b07", "02:00:5e:00:00:07", "SN-7"):
         assert word in text
     assert FINGERPRINT in text.replace("\n", "")
+
+
+@pytest.mark.parametrize("paper", SHEETS)
+def test_both_lines_of_the_fingerprint_are_of_one_size_that_can_be_read(paper: str) -> None:
+    operations = PdfReader(io.BytesIO(draw((label(7),), SHEETS[paper]))).pages[0].get_contents()
+    assert operations is not None
+    text = operations.get_data().decode("latin-1")
+    sizes = {line: float(size) for size, line in re.findall(r"/F\d+ ([\d.]+) Tf [^/]*?\((.*?)\) Tj", text)}
+    found = [size for line, size in sizes.items() if line in FINGERPRINT]
+    assert len(found) == 2
+    assert found[0] == found[1] >= MIN_READABLE_POINTS
 
 
 @pytest.mark.parametrize("paper", SHEETS)
