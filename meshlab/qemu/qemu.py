@@ -19,6 +19,7 @@ from pathlib import Path
 from meshlab import namespaces as ns
 from meshlab.errors import LabError
 from meshlab.qemu.guest_protocol import ADDRESS, GATEWAY, NETWORK, PORT, READY
+from meshlab.qemu.time_stamp_counter import counter_khz
 
 QEMU = "qemu-system-x86_64"
 _POLL_S = 0.1
@@ -143,8 +144,10 @@ class Machine:
                 raise
 
     def _command(self, accelerator: Accelerator, monitor: int) -> tuple[str, ...]:
+        khz = counter_khz() if accelerator is TCG else None
+        clock = "tsc=reliable" if khz is None else f"tsc=reliable tsc_early_khz={khz}"
         line = (
-            "console=ttyS0 panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check tsc=reliable "
+            f"console=ttyS0 panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check {clock} "
             f"{_KERNEL_OPTIONS} {_LOCKUP_OPTIONS} lab.radios={self._radios}"
         )
         network = f"user,id=host,restrict=on,net={NETWORK},host={GATEWAY},hostfwd=tcp:127.0.0.1:0-{ADDRESS}:{PORT}"

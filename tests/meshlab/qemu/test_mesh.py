@@ -166,6 +166,19 @@ def test_a_robot_reads_its_radio_path_from_the_kernels_tables(lab: Lab) -> None:
     assert path["bottleneck_bits_per_s"] > 0
 
 
+def test_the_machines_clock_runs_as_fast_as_the_hosts(lab: Lab) -> None:
+    def uptime_s() -> tuple[float, float, float]:
+        """The machine's, and the host's clock before and after."""
+        before_s = time.monotonic()
+        text = control.run(lab.fleet.directory, "cat /proc/uptime").check("read the uptime").stdout
+        return before_s, float(text.split()[0]), time.monotonic()
+
+    earliest_s, started_s, begun_s = uptime_s()
+    time.sleep(2.0)
+    ending_s, ended_s, latest_s = uptime_s()
+    assert 0.95 * (ending_s - begun_s) < ended_s - started_s < 1.05 * (latest_s - earliest_s)
+
+
 def test_a_link_has_the_configured_loss_and_goes_down_at_once(lab: Lab) -> None:
     def quality() -> int:
         known = json.loads(lab.on("b01", "batctl meshif bat0 originators_json"))
