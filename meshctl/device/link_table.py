@@ -103,7 +103,10 @@ def parse_links(sections: Mapping[str, OutputSection], base_macs: Iterable[str],
 
 
 def _signal(station: Station) -> int | None:
-    """The signal of a station that was heard lately: of its last frame, which follows a moving robot."""
+    """The signal of a station that was heard lately: of its last frame, which follows a moving robot. None for a mesh
+    peer whose link is not established, such as one that failed to authenticate: no frame passes."""
+    if not station.can_forward:
+        return None
     if station.inactive_ms is not None and station.inactive_ms > MAX_INACTIVE_MS:
         return None
     return station.signal_dbm if station.signal_dbm is not None else station.signal_avg_dbm

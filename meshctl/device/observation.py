@@ -138,6 +138,13 @@ class Station:
     tx_mcs: str = ""
     """As iw writes it: `MCS 15`, `VHT-MCS 8 NSS 2`; empty for a rate without one."""
     rx_mcs: str = ""
+    mesh_link: str = ""
+    """The state of the 802.11s peer link, such as `ESTAB` or `BLOCKED`; empty in other modes."""
+
+    @property
+    def can_forward(self) -> bool:
+        """Whether frames pass: an 802.11s peer is heard, and refused, until its link is established."""
+        return self.mesh_link in ("", "ESTAB")
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ def report_of(node: str, seen: Observation) -> Report:
         heard = [
             HeardNeighbor(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
             for station in seen.stations or ()
+            if station.can_forward
         ]
         return Report(node, mesh_macs(seen), tuple(heard))
     paths = _paths(seen.originators or ())

@@ -107,6 +107,7 @@ def _station(heading: str, lines: list[str]) -> Station:
         rx_packets=_integer(fields.get("rx packets")),
         tx_mcs=_mcs(fields.get("tx bitrate", "")),
         rx_mcs=_mcs(fields.get("rx bitrate", "")),
+        mesh_link=fields.get("mesh plink", "").strip(),
     )
 
 

@@ -11,7 +11,7 @@ section() { # NAME COMMAND...
 }
 
 stations() { # INTERFACE
-	iw dev "$1" station dump | grep -E '^Station|inactive time:|signal:|signal avg:|expected throughput:'
+	iw dev "$1" station dump | grep -E '^Station|inactive time:|signal:|signal avg:|expected throughput:|mesh plink:'
 }
 
 survey() { # INTERFACE

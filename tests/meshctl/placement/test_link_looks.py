@@ -62,6 +62,16 @@ def test_the_output_of_a_radio_is_a_table_of_fresh_stations_and_the_next_hop() -
     assert parse_links({}, [MACS["base"]], taken_s=5.0) == LinkTable(5.0, {}, {}, "")
 
 
+@pytest.mark.parametrize(("state", "is_link"), [("ESTAB", True), ("BLOCKED", False), ("LISTEN", False)])
+def test_a_mesh_peer_is_a_link_once_it_is_established(state: str, is_link: bool) -> None:
+    nonce = "meshctl-00"
+    station = STATIONS.format(mac=MACS["b01"], inactive=40, signal=-61) + f"\tmesh plink:\t{state}\n"
+    output = f"{nonce} begin iw.stations mesh0\n{station}\n{nonce} end 0\n".encode()
+    found = parse_links(split_sections(output, nonce), [], taken_s=5.0)
+    assert found.signals_dbm == ({MACS["b01"]: -61} if is_link else {})
+    assert "|mesh plink:'" in links_script(nonce, [])
+
+
 def test_the_script_takes_no_word_that_a_shell_would_run() -> None:
     text = links_script("meshctl-1", [MACS["base"], "$(reboot)", "02:00:00:00:00:09"])
     assert f"ROWS={quoted('^[ *]*(02:00:00:00:00:01|02:00:00:00:00:09) ')}" in text
