@@ -1,4 +1,4 @@
-"""The host's counter is measured exactly, and told to an emulated kernel."""
+"""The host's counter is measured exactly, and an emulated kernel gets its frequency."""
 
 from __future__ import annotations
 
