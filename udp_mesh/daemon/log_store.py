@@ -4,6 +4,9 @@
 what is reported as stored survives a power cut), then reports the results on the event loop. However slow the disk, the
 loop never waits for it. A damaged database is renamed and a new one begun, with a new identity: the secret of this
 node's logs is in the database, so that no number is ever used twice. Rows that make no sense are left out (`log_rows`).
+
+A full disk takes no new database, but an old one is opened and read. Without a database on disk, one in memory is used,
+and copied to the disk as soon as that takes it (`_move_to_disk`).
 """
 
 from __future__ import annotations
@@ -35,10 +38,14 @@ MAX_BATCH = 256
 """Jobs in one transaction: a long one delays the answers."""
 LOG_AGAIN_S = 60.0
 """Minimum interval between two log lines about a failing disk."""
+MOVE_AGAIN_S = 10.0
+"""Interval between two attempts to move the database from memory to the disk."""
 _VERSION = 1
 
 Job = Callable[[sqlite3.Connection], Callable[[], None] | None]
 """Runs in the thread, within a transaction; returns what to call on the loop once it is committed."""
+_QueuedJob = tuple[Job, Callable[[], None]]
+"""A job, and what to call on the loop if it fails."""
 
 
 @dataclass(slots=True, eq=False)
@@ -66,8 +73,9 @@ class SqliteLogStore:
         """The latest call of `put`."""
         self._memory_only: str | None = None
         """Why items are kept in memory only."""
+        self._move_at = 0.0
         self._wall_clock = wall_clock
-        self._jobs: queue.SimpleQueue[tuple[Job, Callable[[], None]] | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[_QueuedJob | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._logged_at = float("-inf")
@@ -82,7 +90,7 @@ class SqliteLogStore:
         return int(self._wall_clock() * 1000)
 
     def load(self) -> LogContents:
-        """Opens the database, or a new one. If the disk takes neither, items are kept for this run only, and a line is
+        """Opens the database, or a new one. If the disk takes neither, items are kept in memory for now, and a line is
         logged."""
         try:
             connection, contents = self._open(str(self.path))
@@ -113,9 +121,25 @@ class SqliteLogStore:
     def _in_memory(self, error: Exception) -> tuple[sqlite3.Connection, LogContents]:
         log.error("log-unusable path=%s error=%s: items are kept in memory only", self.path, error)
         self._memory_only = str(error)
+        self._move_at = time.monotonic() + MOVE_AGAIN_S
         return self._open(":memory:")
 
     def _open(self, name: str) -> tuple[sqlite3.Connection, LogContents]:
+        connection = self._connect(name)
+        try:
+            version = connection.execute("PRAGMA user_version").fetchone()[0]
+            if version > _VERSION:
+                raise OSError(f"expected a log of version {_VERSION} or earlier, found {version}")
+            connection.executescript(SCHEMA)
+            if version < _VERSION:
+                # Needless writes would fail on a full disk, where an old database can still be read.
+                connection.execute(f"PRAGMA user_version = {_VERSION}")
+            return connection, self._contents(connection)
+        except BaseException:
+            connection.close()
+            raise
+
+    def _connect(self, name: str) -> sqlite3.Connection:
         if name != ":memory:":
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             os.close(os.open(self.path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600))
@@ -125,15 +149,10 @@ class SqliteLogStore:
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = FULL")
-            version = connection.execute("PRAGMA user_version").fetchone()[0]
-            if version > _VERSION:
-                raise OSError(f"expected a log of version {_VERSION} or earlier, found {version}")
-            connection.executescript(SCHEMA)
-            connection.execute(f"PRAGMA user_version = {_VERSION}")
-            return connection, self._contents(connection)
         except BaseException:
             connection.close()
             raise
+        return connection
 
     def _contents(self, connection: sqlite3.Connection) -> LogContents:
         rows = load_rows(connection, self._wall_clock())
@@ -224,25 +243,53 @@ class SqliteLogStore:
     # The thread
 
     def _run(self, connection: sqlite3.Connection) -> None:
-        with contextlib.closing(connection):
-            while (first := self._jobs.get()) is not None:
-                batch, last = [first], False
-                while len(batch) < MAX_BATCH and not last:
-                    try:
-                        following = self._jobs.get_nowait()
-                    except queue.Empty:
-                        break
-                    if following is None:
-                        last = True
-                    else:
-                        batch.append(following)
+        last = False
+        while not last:
+            batch, last = self._next_batch()
+            if batch:
                 self._report(self._commit(connection, batch))
-                if last:
-                    return
+            if self._memory_only is not None and (last or time.monotonic() >= self._move_at):
+                connection = self._move_to_disk(connection)
+        connection.close()
 
-    def _commit(
-        self, connection: sqlite3.Connection, batch: list[tuple[Job, Callable[[], None]]]
-    ) -> list[Callable[[], None]]:
+    def _next_batch(self) -> tuple[list[_QueuedJob], bool]:
+        """Waits for jobs, while items are in memory only for a limited time; and whether they are the last ones."""
+        batch: list[_QueuedJob] = []
+        with contextlib.suppress(queue.Empty):
+            following = self._jobs.get(timeout=None if self._memory_only is None else MOVE_AGAIN_S)
+            while following is not None:
+                batch.append(following)
+                if len(batch) == MAX_BATCH:
+                    return batch, False
+                following = self._jobs.get_nowait()
+            return batch, True
+        return batch, False
+
+    def _move_to_disk(self, connection: sqlite3.Connection) -> sqlite3.Connection:
+        """Copies the database in memory to the disk, if that takes it now; returns the one to use.
+
+        Not over a database that another daemon uses, or that has items and numbers of its own.
+        """
+        self._move_at = time.monotonic() + MOVE_AGAIN_S
+        try:
+            on_disk = self._connect(str(self.path))
+        except (sqlite3.Error, OSError):
+            return connection
+        try:
+            if on_disk.execute("SELECT count(*) FROM sqlite_master").fetchone() != (0,):
+                on_disk.close()
+                return connection
+            connection.backup(on_disk)
+        except sqlite3.Error:
+            on_disk.close()
+            return connection
+        connection.close()
+        (items,) = on_disk.execute("SELECT count(*) FROM items").fetchone()
+        log.warning("log-moved-to-disk path=%s items=%d", self.path, items)
+        self._memory_only = self.problem = None
+        return on_disk
+
+    def _commit(self, connection: sqlite3.Connection, batch: list[_QueuedJob]) -> list[Callable[[], None]]:
         """Does a batch in one transaction; returns what to call on the loop."""
         try:
             # Deferred: reading must go on while writing is impossible, as on a file system that became read-only.

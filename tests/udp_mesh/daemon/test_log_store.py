@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import resource
 import sqlite3
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 from udp_mesh.core.logs.item import ItemId, LogKey
 from udp_mesh.core.logs.store import ItemUse, LogContents, RememberedLog
 from udp_mesh.crypto.signing import SigningKey
+from udp_mesh.daemon import log_store
 from udp_mesh.daemon.log_rows import FIRST_PLAUSIBLE_S
 from udp_mesh.daemon.log_store import SqliteLogStore
 
@@ -280,3 +283,98 @@ def test_an_exception_in_one_callback_does_not_keep_the_results_of_others(tmp_pa
         assert answers == ["second"]
 
     with_store(tmp_path / "items.db", use)
+
+
+async def put_and_wait(store: Store, number: int) -> str | None:
+    """Why the item is not on disk, or None."""
+    put(store, ItemId(ITEM.log, number), b"data")
+    assert store.last_put is not None
+    await asyncio.wait_for(store.last_put.stored.wait(), 60)
+    return store.last_put.problem
+
+
+FULL = "disk I/O error"
+"""What SQLite makes of EFBIG."""
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file of this process can grow."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_hides_no_items_that_are_on_it(tmp_path: Path) -> None:
+    path, seeds = tmp_path / "items.db", list[bytes]()
+
+    async def write(store: Store, contents: LogContents) -> None:
+        seeds.append(contents.seed)
+        assert await put_and_wait(store, 1) is None
+
+    async def use(store: Store, contents: LogContents) -> None:
+        assert contents.seed == seeds[0]
+        assert [item.id.number for item in contents.items] == [1]
+        assert await put_and_wait(store, 2) == FULL
+        data: list[bytes | None] = []
+        read = asyncio.Event()
+        store.on_done = read.set
+        store.get(ITEM, data.append)
+        await asyncio.wait_for(read.wait(), 60)
+        assert data == [b"data"]
+
+    with_store(path, write)
+    with full_disk():
+        with_store(path, use)
+
+
+@pytest.mark.parametrize("moves_while_running", [True, False])
+def test_a_log_begun_in_memory_moves_to_the_disk_once_there_is_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves_while_running: bool
+) -> None:
+    monkeypatch.setattr(log_store, "MOVE_AGAIN_S", 0.02 if moves_while_running else 3600.0)
+    path, seeds = tmp_path / "logs" / "items.db", list[bytes]()
+
+    async def run() -> None:
+        store = Store(path)
+        with full_disk():
+            seeds.append(store.load().seed)
+            assert await put_and_wait(store, 1) == FULL
+        if moves_while_running:
+            async with asyncio.timeout(60):
+                while store.problem is not None:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+            assert await put_and_wait(store, 2) is None
+        else:
+            # The last attempt is at the end.
+            assert await put_and_wait(store, 2) == FULL
+        await asyncio.to_thread(store.close)
+
+    async def look(_: Store, contents: LogContents) -> None:
+        assert contents.seed == seeds[0]
+        assert [item.id.number for item in contents.items] == [1, 2]
+
+    asyncio.run(run())
+    with_store(path, look)
+
+
+def test_a_log_in_memory_replaces_no_log_that_is_on_the_disk(tmp_path: Path) -> None:
+    path, seeds = tmp_path / "items.db", list[bytes]()
+
+    async def use(store: Store, contents: LogContents) -> None:
+        seeds.append(contents.seed)
+        other = Store(path)
+        other.load()
+        assert await put_and_wait(other, 7) == "database is locked"
+        store.close()
+        other.close()
+
+    async def look(_: Store, contents: LogContents) -> None:
+        assert contents.seed == seeds[0]
+        assert contents.items == ()
+
+    with_store(path, use)
+    with_store(path, look)
