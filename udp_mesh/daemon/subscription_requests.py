@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 from udp_mesh.client.mesh_client import Header
@@ -55,7 +54,7 @@ def _number(header: Header, key: str, low: float, high: float, unit: str) -> flo
     if value is None:
         return None
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not math.isfinite(value) or not low <= value <= high:
+    if not is_number or not low <= value <= high:
         raise RequestError(
             "bad-request", f"{key}: expected a number of {unit} from {low:g} to {high:g}, found {repr(value)[:80]}"
         )

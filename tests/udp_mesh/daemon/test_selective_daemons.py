@@ -108,7 +108,14 @@ def test_a_rate_and_an_age_reach_the_sender_and_hold_for_this_program_alone(pair
 
 @pytest.mark.parametrize(
     "fields",
-    [{"rate_hz": 0}, {"rate_hz": "fast"}, {"rate_hz": True}, {"max_age_s": -1}, {"max_age_s": 1e300}, {"topics": [""]}],
+    [
+        {"rate_hz": 0},
+        {"rate_hz": "fast"},
+        {"rate_hz": True},
+        {"max_age_s": -1},
+        {"max_age_s": 10**400},
+        {"topics": [""]},
+    ],
 )
 def test_faulty_bounds_are_refused(pair: Pair, fields: dict[str, Any]) -> None:
     _, bob = pair
