@@ -52,6 +52,8 @@ class RunningDaemon:
         self.environment: dict[str, str] = {}
         self.prefix: list[str] = []
         """Command prefix for the daemon, such as `unshare --net`."""
+        self.module = ["udp_mesh.cli.main"]
+        """What runs `udp-mesh`, with arguments of its own."""
         self.process: subprocess.Popen[bytes] | None = None
         self.write(configuration)
 
@@ -63,7 +65,7 @@ class RunningDaemon:
         """Starts the process and waits until it answers."""
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [*self.prefix, sys.executable, "-m", "udp_mesh.cli.main", "run", str(self.file)],
+                [*self.prefix, sys.executable, "-m", *self.module, "run", str(self.file)],
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **self.environment},

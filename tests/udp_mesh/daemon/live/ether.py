@@ -18,10 +18,13 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
 
-ETH_P_ALL, ETH_P_IP, ETH_P_ARP = 0x0003, 0x0800, 0x0806
+ETH_P_ALL = 0x0003
+IPV4, ARP, IPV6 = b"\x08\x00", b"\x08\x06", b"\x86\xdd"
+"""Ethertypes."""
 PACKET_OUTGOING = 4
-IP_START, IP_BYTES, UDP_BYTES = 14, 20, 8
-UDP_START, PAYLOAD = IP_START + IP_BYTES, IP_START + IP_BYTES + UDP_BYTES
+IP_START, IPV4_BYTES, IPV6_BYTES, UDP_BYTES = 14, 20, 40, 8
+SOURCE = {IPV4: (IP_START + 12, 4), IPV6: (IP_START + 8, 16)}
+"""Offset and length of the source's address."""
 PORT = 8700
 MAX_QUEUE_S = 0.25
 """Of the channel: what would wait longer is dropped."""
@@ -137,22 +140,18 @@ class Ether(threading.Thread):
                 continue
             self._macs[frame[6:12]] = name
             to = self._macs.get(frame[:6])
-            kind = int.from_bytes(frame[12:14], "big")
             with self._lock:
                 for other in list(self._sockets):
                     if other == name or (not frame[0] & MULTICAST and to is not None and to != other):
                         continue
-                    if kind == ETH_P_ARP:
-                        if self.paths[name, other].up:
-                            self._send_at(time.monotonic(), other, frame)
-                    elif kind == ETH_P_IP and frame[IP_START + 9] == socket.IPPROTO_UDP and frame[IP_START] == 0x45:
+                    if _udp_start(frame):
                         self._pass_on(name, other, frame)
+                    elif _resolves_addresses(frame) and self.paths[name, other].up:
+                        self._send_at(time.monotonic(), other, frame)
 
     def _pass_on(self, name: str, other: str, frame: bytes) -> None:
         path, rng, now = self.paths[name, other], self.rng, time.monotonic()
         self.datagrams[name] += 1
-        # Without a checksum: the kernel left it to the hardware.
-        frame = frame[: UDP_START + 6] + b"\0\0" + frame[PAYLOAD:]
         if not path.up or rng.random() < path.loss:
             return
         if len(frame) - IP_START > path.mtu:
@@ -161,7 +160,7 @@ class Ether(threading.Thread):
         translated = self._translated(name, other, frame)
         if translated is None:
             return
-        frame = translated
+        frame = _finished(translated)
         self._busy_until = max(self._busy_until, now) + len(frame) * 8 / self.rate_bits_per_s
         if self._busy_until - now > MAX_QUEUE_S:
             self._busy_until -= len(frame) * 8 / self.rate_bits_per_s
@@ -173,7 +172,8 @@ class Ether(threading.Thread):
 
     def _translated(self, name: str, other: str, frame: bytes) -> bytes | None:
         """With the ports that a NAT gives; None if it does not know whom the datagram is for."""
-        source, target = struct.unpack_from(">HH", frame, UDP_START)
+        at = _udp_start(frame)
+        source, target = struct.unpack_from(">HH", frame, at)
         if source == PORT:
             source = self.outside_ports.get(name, source)
         inside = self.outside_ports.get(other)
@@ -181,38 +181,69 @@ class Ether(threading.Thread):
             if target != inside:
                 return None
             target = PORT
-        return frame[:UDP_START] + struct.pack(">HH", source, target) + frame[UDP_START + 4 :]
+        return frame[:at] + struct.pack(">HH", source, target) + frame[at + 4 :]
 
     def _damaged(self, frame: bytes) -> bytes:
-        if len(frame) <= PAYLOAD + 1:
+        payload = _udp_start(frame) + UDP_BYTES
+        if len(frame) <= payload + 1:
             return frame
-        at = self.rng.randrange(PAYLOAD, len(frame))
+        at = self.rng.randrange(payload, len(frame))
         if self.rng.random() < 0.3:
-            return _of_length(frame, at)
-        return frame[:at] + bytes([frame[at] ^ 1 << self.rng.randrange(8)]) + frame[at + 1 :]
+            return _finished(frame[:at])
+        return _finished(frame[:at] + bytes([frame[at] ^ 1 << self.rng.randrange(8)]) + frame[at + 1 :])
 
     def _send_at(self, at: float, port: str, frame: bytes) -> None:
         self._order += 1
         heapq.heappush(self._due, _Due(at, self._order, port, frame))
 
 
-def _of_length(frame: bytes, length: int) -> bytes:
-    """The datagram cut to this length, with the lengths in its headers."""
-    udp = struct.pack(">H", length - UDP_START)
-    cut = frame[: UDP_START + 4] + udp + frame[UDP_START + 6 : length]
-    return _with_ip_checksum(cut[: IP_START + 2] + struct.pack(">H", length - IP_START) + cut[IP_START + 4 :])
+def _udp_start(frame: bytes) -> int:
+    """The offset of the UDP header; 0 if there is none."""
+    kind = frame[12:14]
+    if kind == IPV4 and frame[IP_START] == 0x45 and frame[IP_START + 9] == socket.IPPROTO_UDP:
+        return IP_START + IPV4_BYTES
+    if kind == IPV6 and frame[IP_START + 6] == socket.IPPROTO_UDP:
+        return IP_START + IPV6_BYTES
+    return 0
+
+
+def _resolves_addresses(frame: bytes) -> bool:
+    """ARP, or ICMPv6 with neighbor discovery."""
+    kind = frame[12:14]
+    return kind == ARP or (kind == IPV6 and frame[IP_START + 6] == socket.IPPROTO_ICMPV6)
 
 
 def _from(frame: bytes, source: tuple[str, int] | None) -> bytes:
     if source is None:
         return frame
-    changed = frame[: IP_START + 12] + socket.inet_aton(source[0]) + frame[IP_START + 16 :]
-    return _with_ip_checksum(changed[:UDP_START] + struct.pack(">H", source[1]) + changed[UDP_START + 2 :])
+    host, port = source
+    start, count = SOURCE[frame[12:14]]
+    address = socket.inet_pton(socket.AF_INET if count == 4 else socket.AF_INET6, host)
+    at = _udp_start(frame)
+    return _finished(frame[:start] + address + frame[start + count : at] + struct.pack(">H", port) + frame[at + 2 :])
 
 
-def _with_ip_checksum(frame: bytes) -> bytes:
-    header = frame[IP_START : IP_START + 10] + b"\0\0" + frame[IP_START + 12 : UDP_START]
-    total = sum(struct.unpack(">10H", header))
-    total = (total & 0xFFFF) + (total >> 16)
-    total = (total & 0xFFFF) + (total >> 16)
-    return frame[:IP_START] + header[:10] + struct.pack(">H", total ^ 0xFFFF) + header[12:] + frame[UDP_START:]
+def _finished(frame: bytes) -> bytes:
+    """A datagram with the lengths and checksums that follow from its bytes; the kernel leaves its own to the
+    hardware."""
+    at = _udp_start(frame)
+    ip, udp, payload = bytearray(frame[IP_START:at]), bytearray(frame[at : at + UDP_BYTES]), frame[at + UDP_BYTES :]
+    udp[4:] = struct.pack(">HH", UDP_BYTES + len(payload), 0)
+    if at == IP_START + IPV4_BYTES:
+        ip[2:4] = struct.pack(">H", len(frame) - IP_START)
+        ip[10:12] = bytes(2)
+        ip[10:12] = struct.pack(">H", _checksum(ip))
+    else:
+        ip[4:6] = udp[4:6]
+        udp[6:] = struct.pack(
+            ">H", _checksum(ip[8:] + udp[4:6] + bytes([0, socket.IPPROTO_UDP]) + udp + payload) or 0xFFFF
+        )
+    return frame[:IP_START] + ip + udp + payload
+
+
+def _checksum(data: bytearray) -> int:
+    """RFC 1071."""
+    total: int = sum(struct.unpack(f">{(len(data) + 1) // 2}H", data + bytes(len(data) % 2)))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return total ^ 0xFFFF

@@ -12,6 +12,7 @@ import sys
 import time
 from collections import Counter
 from functools import partial
+from pathlib import Path
 
 from tests.udp_mesh.daemon.live.ether import PORT, Direction
 from tests.udp_mesh.daemon.live.programs import Broken
@@ -23,7 +24,7 @@ NETWORK_CHANGES = (
 )
 ROBOT_CHANGES = (
     *("kill", "leave", "suspend", "disk", "reader", "pause", "writer"),
-    *("move", "unplug", "reload", "stranger", "twin"),
+    *("move", "unplug", "reload", "stranger", "twin", "clock", "link-mtu"),
 )
 SMALL, LARGE = (60, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 SETTLE_S, LEAST_BYTES_PER_S = 120.0, 15_000
@@ -76,7 +77,8 @@ def change_network(team: LiveTeam, kind: str, name: str, other: str) -> None:
         case "replay":
             ether.replay(dice.choice((5, 100)))
         case "forge":
-            host = dice.choice([team.robots[name].address.split("/")[0], "10.7.200.9"])
+            stranger = "fe80::7:9" if team.ipv6 else "10.7.200.9"
+            host = dice.choice([team.robots[name].address.split("/")[0], stranger])
             ether.replay(dice.choice((5, 100)), source=(host, dice.choice((PORT, 9999))))
 
 
@@ -111,10 +113,16 @@ def change_robot(team: LiveTeam, kind: str, name: str) -> None:
             team.close_writer(name)
             team.open_writer(name)
         case "move":
-            robot.move(dice.randrange(1, 250) + 256 * (robot.place + 1))
+            robot.move(dice.randrange(1, 250) + 256 * (robot.place + 1), overlaps=dice.random() < 0.5)
         case "unplug":
             robot.ip("link set mesh0 down")
-            team.later(dice.choice((0.0, 0.5, 5.0)), partial(robot.ip, "link set mesh0 up"))
+            team.later(dice.choice((0.0, 0.5, 5.0)), robot.plug_in)
+        case "link-mtu":
+            # IPv6 needs 1280. Larger datagrams of others do not arrive.
+            team.ether.too_long |= {(one, name) for one in team.names}
+            robot.ip(f"link set mesh0 mtu {dice.choice((1500, 1400, 1280) if team.ipv6 else (1500, 1300, 700))}")
+        case "clock":
+            robot.set_clock(dice.choice((-1e9, -3600.0, -0.5, 0.0, 0.05, 1.0, 3600.0, 1e8)))
         case "reload":
             if robot.running:
                 robot.daemon.write(robot.configuration(team.folder, dice.choice((0, 5, 12))))
@@ -145,17 +153,20 @@ def repair(team: LiveTeam) -> None:
     for name, robot in team.robots.items():
         robot.free_disk()
         robot.resume()
-        robot.ip("link set mesh0 up")
+        robot.ip("link set mesh0 mtu 1500")
+        robot.plug_in()
         start(team, name)
+        # To readers of the log, also from where the disk was full.
+        team.publish(name, "artifact", None, 100)
         if robot.reader is not None:
             robot.reader.paused_until = 0.0
     for robot in team.others:
         robot.end(politely=True)
 
 
-def play(seed: int, seconds: float, size: int | None = None) -> LiveTeam:
+def play(seed: int, seconds: float, size: int | None = None, version: Path | None = None) -> LiveTeam:
     """Messages and changes for so long, then none. Raises Broken."""
-    with LiveTeam(seed, size) as team:
+    with LiveTeam(seed, size, version) as team:
         try:
             _play(team, seconds)
         except Exception:
@@ -257,14 +268,15 @@ def what_is_busy(team: LiveTeam) -> list[str]:
 
 
 def left_over(team: LiveTeam) -> dict[str, object]:
-    """By robot, bytes that it still has to send and files of messages."""
+    """By robot, bytes that it still has to send, files of messages, and why its log is not on disk."""
     found: dict[str, object] = {}
     for name, robot in team.robots.items():
         assert robot.writer is not None
         queued = robot.writer.program.request("status")["conditions"]["queued_bytes"]
         files = list((team.folder / f"{name}.disk").rglob("*.message"))
-        if queued or files:
-            found[name] = (queued, files[:3])
+        disk = robot.writer.program.request("logs")["disk"]
+        if queued or files or disk:
+            found[name] = (queued, files[:3], disk)
     return found
 
 
@@ -282,6 +294,9 @@ def main() -> None:
     parser.add_argument("last", type=int)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--robots", type=int)
+    parser.add_argument(
+        "--version", type=Path, metavar="FOLDER", help="a checkout of another version, for one robot of each team"
+    )
     arguments = parser.parse_args()
     if "LIVE_TEAM" not in os.environ:
         user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
@@ -292,11 +307,10 @@ def main() -> None:
     failed = 0
     for seed in range(arguments.first, arguments.last):
         try:
-            team = play(seed, arguments.seconds, arguments.robots)
+            team = play(seed, arguments.seconds, arguments.robots, arguments.version)
             worst = {topic: f"{sorted(found)[len(found) * 99 // 100]:.2f}" for topic, found in team.latencies.items()}
-            sys.stdout.write(
-                f"seed {seed}: {len(team.names)} robots, {len(team.sent)} sent, {dict(team.outcomes)}, p99 {worst}\n"
-            )
+            robots = f"{len(team.names)} robots over {'IPv6' if team.ipv6 else 'IPv4'}"
+            sys.stdout.write(f"seed {seed}: {robots}, {len(team.sent)} sent, {dict(team.outcomes)}, p99 {worst}\n")
         except Exception as error:  # noqa: BLE001
             failed += 1
             sys.stdout.write(f"seed {seed}: FAILED {type(error).__name__}: {str(error)[:1500]}\n")

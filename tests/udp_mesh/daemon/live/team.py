@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import random
-import signal
-import subprocess
 import tempfile
 import time
 from collections import Counter
@@ -18,163 +16,20 @@ from pathlib import Path
 
 from tests.udp_mesh.daemon.live.ether import Ether
 from tests.udp_mesh.daemon.live.programs import Broken, Reader, Sent, Writer
-from tests.udp_mesh.daemon.processes import KEY, OTHER_KEY, RunningDaemon
+from tests.udp_mesh.daemon.live.robot import BEST_EFFORT, LOG_READERS, NEVER_EXPIRE, OUTBOXES, PASSED_ON_S, Robot, run
+from tests.udp_mesh.daemon.processes import KEY, OTHER_KEY
 from udp_mesh.client import MeshError
-
-TOPICS = """
-stop = { priority = 0 }
-pose = { priority = 2, keep_last = 1, deadline_s = 0.5 }
-order = { priority = 3, deadline_s = 3.0 }
-status = { priority = 4, keep_last = 2 }
-view = { priority = 5, reliable = false }
-kept = { priority = 6, outbox = "all", outbox_bytes = 2000000 }
-newest = { priority = 6, outbox = "last" }
-stored = { priority = 7, outbox = "all", outbox_on_disk = true }
-limited = { priority = 7, rate_limit_bytes_per_s = 40000 }
-map = { priority = 9, compression = true }
-grid = { priority = 10, delta = true }
-alert = { priority = 1, repair = true, reliable = false }
-artifact = { priority = 4, log = { readers = ["a", "b"] } }
-"""
-LOG_READERS = ("a", "b")
-BEST_EFFORT = ("view", "alert")
-OUTBOXES = ("kept", "newest", "stored")
-NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
-"""Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
-peer lost."""
-DISK_BYTES = 40_000_000
-PASSED_ON_S = 10.0
-"""Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
-RATES = """
-[rates]
-heartbeat_s = 0.2
-heartbeat_sparse_s = 0.5
-offline_s = 3.0
-peer_lost_s = 8.0
-"""
-
-
-def run(command: str) -> None:
-    subprocess.run(command.split(), check=True)
-
-
-class Robot:
-    """One computer: a namespace, an interface, a disk and a daemon."""
-
-    def __init__(self, folder: Path, name: str, place: int, ether: Ether, *, key: str = KEY, called: str = "") -> None:
-        self.name, self.ether, self.place = name, ether, place
-        self.called = called or name
-        """What its daemon says it is called."""
-        self.host = place + 1
-        self.runs = 0
-        self.suspended = False
-        self.reader: Reader | None = None
-        self.writer: Writer | None = None
-        self._filler = folder / f"{name}.disk" / "filler"
-        # Ends with this process, whose end of the pipe is then closed.
-        self.holder = subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE)
-        disk = folder / f"{name}.disk"
-        disk.mkdir()
-        run(f"mount -t tmpfs -o size={DISK_BYTES} none {disk}")
-        (folder / f"{name}.key").write_text(key + "\n")
-        self.daemon = RunningDaemon(folder, name, self.configuration(folder))
-        self.daemon.prefix = ["nsenter", "-t", str(self.holder.pid), "-n", "--"]
-        # `unshare` has left this namespace once the interface can be moved.
-        while Path(f"/proc/{self.holder.pid}/ns/net").readlink() == Path("/proc/self/ns/net").readlink():
-            time.sleep(0.005)
-        # Segmentation by the kernel: the ether sees the datagrams that a radio would.
-        run(f"ip link add port{place} gso_max_segs 1 type veth peer name mesh0 gso_max_segs 1 netns {self.holder.pid}")
-        run(f"ip link set port{place} up")
-        self.ip("link set lo up")
-        self.ip("link set mesh0 up")
-        self.ip(f"addr add {self.address} broadcast + dev mesh0")
-        ether.plug_in(name, f"port{place}")
-
-    @property
-    def address(self) -> str:
-        return f"10.7.{self.host >> 8}.{self.host & 255}/16"
-
-    def configuration(self, folder: Path, stop_priority: int = 0, topics: str = TOPICS) -> str:
-        return f"""
-name = "{self.called}"
-key_file = "{folder}/{self.name}.key"
-[topics]
-{topics.replace("priority = 0", f"priority = {stop_priority}")}
-{RATES}
-[daemon]
-socket = "{folder}/{self.name}.sock"
-state_directory = "{folder}/{self.name}.disk"
-"""
-
-    def ip(self, words: str) -> None:
-        """`ip WORDS` in its namespace."""
-        run(f"nsenter -t {self.holder.pid} -n ip {words}")
-
-    def start(self) -> None:
-        if self.daemon.process is None:
-            self.runs += 1
-            self.daemon.start()
-
-    @property
-    def running(self) -> bool:
-        return self.daemon.process is not None and not self.suspended
-
-    def suspend(self) -> None:
-        self.daemon.signal(signal.SIGSTOP)
-        self.suspended = True
-
-    def resume(self) -> None:
-        if self.suspended:
-            self.daemon.signal(signal.SIGCONT)
-        self.suspended = False
-
-    def end(self, *, politely: bool) -> None:
-        """End the daemon; its programs lose their connection."""
-        self.resume()
-        for program in (self.reader, self.writer):
-            if program is not None:
-                program.close()
-        self.reader = self.writer = None
-        if politely:
-            if (code := self.daemon.stop()) != 0:
-                raise Broken(f"{self.name} ended with {code}: {self.daemon.log.read_text()[-2000:]}")
-        elif self.daemon.process is not None:
-            self.daemon.kill()
-
-    def move(self, host: int) -> None:
-        """Another address, as from another DHCP lease."""
-        old, self.host = self.address, host
-        self.ip(f"addr del {old} dev mesh0")
-        self.ip(f"addr add {self.address} broadcast + dev mesh0")
-
-    def fill_disk(self) -> None:
-        with contextlib.suppress(OSError), self._filler.open("wb") as file:
-            while True:
-                file.write(bytes(4096))
-                file.flush()
-
-    def free_disk(self) -> None:
-        self._filler.unlink(missing_ok=True)
-
-    def usage(self) -> tuple[float, int]:
-        """Seconds of processor used, and memory in bytes."""
-        assert self.daemon.process is not None
-        stat = Path(f"/proc/{self.daemon.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(stat[11]) + int(stat[12])) / 100, int(stat[21]) * 4096
-
-    def close(self) -> None:
-        with contextlib.suppress(Broken):
-            self.end(politely=True)
-        self.holder.kill()
-        self.holder.wait()
 
 
 class LiveTeam:
     """Robots a, b, c ..; what was sent and what came. Use as a context."""
 
-    def __init__(self, seed: int, size: int | None = None) -> None:
+    def __init__(self, seed: int, size: int | None = None, version: Path | None = None) -> None:
+        """`version` is a checkout of another version, which one of the robots runs."""
         self.dice = random.Random(seed)
-        self.size = size or self.dice.randint(2, 4)
+        self.size = size or self.dice.choice((2, 3, 3, 4, 4, 6))
+        self.ipv6 = self.dice.random() < 0.25
+        self._version = version
         self.names = [chr(ord("a") + place) if place < 26 else f"r{place}" for place in range(self.size)]
         self.robots: dict[str, Robot] = {}
         self.others: list[Robot] = []
@@ -213,21 +68,27 @@ class LiveTeam:
         self._stack.callback(run, f"umount -l {folder}")
         self.ether.start()
         self._stack.callback(self.ether.close)
+        other_version = self.dice.choice(self.names)
         for name in self.names:
-            self._add(name)
+            self._add(name, version=self._version if name == other_version else None)
         for name in self.names:
             self.open_reader(name)
             self.open_writer(name)
 
-    def _add(self, name: str, **more: str) -> Robot:
+    def _add(self, name: str, *, key: str = KEY, called: str = "", version: Path | None = None) -> Robot:
         place = len(self.robots) + len(self.others)
-        robot = Robot(self.folder, name, place, self.ether, **more)
+        robot = Robot(self.folder, name, place, self.ether, ipv6=self.ipv6, key=key, called=called, version=version)
         self._stack.callback(robot.close)
-        robot.start()
-        if more:
-            self.others.append(robot)
-        else:
+        robot.attach()
+        if name in self.names:
             self.robots[name] = robot
+            if self.dice.random() < 0.1:
+                self.disk_trouble.add(name)
+                robot.fill_disk()
+                self.later(self.dice.choice((1.0, 15.0)), robot.free_disk)
+        else:
+            self.others.append(robot)
+        robot.start()
         return robot
 
     def __exit__(self, *_: object) -> None:

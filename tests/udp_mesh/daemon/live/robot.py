@@ -1,0 +1,202 @@
+"""One computer of a live team: namespace, interface, disk, clock and daemon."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+from pathlib import Path
+
+from tests.udp_mesh.daemon.live.ether import Ether
+from tests.udp_mesh.daemon.live.programs import Broken, Reader, Writer
+from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, poll
+
+TOPICS = """
+stop = { priority = 0 }
+pose = { priority = 2, keep_last = 1, deadline_s = 0.5 }
+order = { priority = 3, deadline_s = 3.0 }
+status = { priority = 4, keep_last = 2 }
+view = { priority = 5, reliable = false }
+kept = { priority = 6, outbox = "all", outbox_bytes = 2000000 }
+newest = { priority = 6, outbox = "last" }
+stored = { priority = 7, outbox = "all", outbox_on_disk = true }
+limited = { priority = 7, rate_limit_bytes_per_s = 40000 }
+map = { priority = 9, compression = true }
+grid = { priority = 10, delta = true }
+alert = { priority = 1, repair = true, reliable = false }
+artifact = { priority = 4, log = { readers = ["a", "b"] } }
+"""
+LOG_READERS = ("a", "b")
+BEST_EFFORT = ("view", "alert")
+OUTBOXES = ("kept", "newest", "stored")
+NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
+"""Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
+peer lost."""
+DISK_BYTES = 40_000_000
+PASSED_ON_S = 10.0
+"""Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
+RATES = """
+[rates]
+heartbeat_s = 0.2
+heartbeat_sparse_s = 0.5
+offline_s = 3.0
+peer_lost_s = 8.0
+"""
+
+
+def run(command: str) -> None:
+    subprocess.run(command.split(), check=True)
+
+
+class Robot:
+    """One computer: a namespace, an interface, a disk and a daemon."""
+
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        place: int,
+        ether: Ether,
+        *,
+        ipv6: bool = False,
+        key: str = KEY,
+        called: str = "",
+        version: Path | None = None,
+    ) -> None:
+        """`version` is a checkout of another version, whose daemon runs here."""
+        self.name, self.ether, self.place, self.ipv6 = name, ether, place, ipv6
+        self.called = called or name
+        """What its daemon says it is called."""
+        self.host = place + 1
+        self.runs = 0
+        self.suspended = False
+        self.reader: Reader | None = None
+        self.writer: Writer | None = None
+        self._filler = folder / f"{name}.disk" / "filler"
+        self._clock = folder / f"{name}.clock"
+        self._clock.touch()
+        # Ends with this process, whose end of the pipe is then closed.
+        self.holder = subprocess.Popen(["unshare", "--net", "cat"], stdin=subprocess.PIPE)
+        disk = folder / f"{name}.disk"
+        disk.mkdir()
+        run(f"mount -t tmpfs -o size={DISK_BYTES} none {disk}")
+        (folder / f"{name}.key").write_text(key + "\n")
+        self.daemon = RunningDaemon(folder, name, self.configuration(folder))
+        self.daemon.prefix = ["nsenter", "-t", str(self.holder.pid), "-n", "--"]
+        if version is None:
+            self.daemon.module = ["tests.udp_mesh.daemon.live.stepped_clock", str(self._clock)]
+        else:
+            self.daemon.prefix += ["env", "--chdir", str(version)]
+
+    def attach(self) -> None:
+        """Make the interface, whose other end is a port of the ether."""
+        poll(self._has_namespace, f"a network namespace for {self.name}")
+        port, namespace = f"port{self.place}", self.holder.pid
+        # Segmentation by the kernel: the ether sees the datagrams that a radio would.
+        run(f"ip link add {port} gso_max_segs 1 type veth peer name mesh0 gso_max_segs 1 netns {namespace}")
+        run(f"ip link set {port} up")
+        self.ip("link set lo up")
+        self.ip("link set mesh0 addrgenmode none")
+        # As systemd sets it: a second address stays when the first one goes.
+        promote = "echo 1 > /proc/sys/net/ipv4/conf/all/promote_secondaries"
+        subprocess.run(["nsenter", "-t", str(namespace), "-n", "sh", "-c", promote], check=True)
+        self.plug_in()
+        self.ether.plug_in(self.name, port)
+
+    def _has_namespace(self) -> bool:
+        """`unshare` has left this namespace, so that the interface can be moved."""
+        return Path(f"/proc/{self.holder.pid}/ns/net").readlink() != Path("/proc/self/ns/net").readlink()
+
+    @property
+    def address(self) -> str:
+        return f"fe80::{self.host:x}/64" if self.ipv6 else f"10.7.{self.host >> 8}.{self.host & 255}/16"
+
+    def configuration(self, folder: Path, stop_priority: int = 0, topics: str = TOPICS) -> str:
+        return f"""
+name = "{self.called}"
+key_file = "{folder}/{self.name}.key"
+[topics]
+{topics.replace("priority = 0", f"priority = {stop_priority}")}
+{RATES}
+[daemon]
+socket = "{folder}/{self.name}.sock"
+state_directory = "{folder}/{self.name}.disk"
+"""
+
+    def ip(self, words: str) -> None:
+        """`ip WORDS` in its namespace."""
+        run(f"nsenter -t {self.holder.pid} -n ip {words}")
+
+    def plug_in(self) -> None:
+        """The interface is up, with its address."""
+        self.ip("link set mesh0 up")
+        # The kernel removes an IPv6 address when the interface goes down.
+        self.ip(f"addr replace {self.address} {'nodad' if self.ipv6 else 'broadcast +'} dev mesh0")
+
+    def start(self) -> None:
+        if self.daemon.process is None:
+            self.runs += 1
+            self.daemon.start()
+
+    @property
+    def running(self) -> bool:
+        return self.daemon.process is not None and not self.suspended
+
+    def suspend(self) -> None:
+        self.daemon.signal(signal.SIGSTOP)
+        self.suspended = True
+
+    def resume(self) -> None:
+        if self.suspended:
+            self.daemon.signal(signal.SIGCONT)
+        self.suspended = False
+
+    def end(self, *, politely: bool) -> None:
+        """End the daemon; its programs lose their connection."""
+        self.resume()
+        for program in (self.reader, self.writer):
+            if program is not None:
+                program.close()
+        self.reader = self.writer = None
+        if politely:
+            if (code := self.daemon.stop()) != 0:
+                raise Broken(f"{self.name} ended with {code}: {self.daemon.log.read_text()[-2000:]}")
+        elif self.daemon.process is not None:
+            self.daemon.kill()
+
+    def move(self, host: int, *, overlaps: bool) -> None:
+        """Another address, as from another DHCP lease: instead of the old one, or before that goes."""
+        old, self.host = self.address, host
+        if not overlaps:
+            self.ip(f"addr del {old} dev mesh0")
+        self.plug_in()
+        if overlaps:
+            self.ip(f"addr del {old} dev mesh0")
+
+    def set_clock(self, offset_s: float) -> None:
+        """Sets the daemon's wall clock to the host's and so much."""
+        with self._clock.open("a") as file:
+            file.write(f"{offset_s}\n")
+
+    def fill_disk(self) -> None:
+        with contextlib.suppress(OSError), self._filler.open("wb") as file:
+            while True:
+                file.write(bytes(4096))
+                file.flush()
+
+    def free_disk(self) -> None:
+        self._filler.unlink(missing_ok=True)
+
+    def usage(self) -> tuple[float, int]:
+        """Seconds of processor used, and memory in bytes."""
+        assert self.daemon.process is not None
+        stat = Path(f"/proc/{self.daemon.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(stat[11]) + int(stat[12])) / 100, int(stat[21]) * 4096
+
+    def close(self) -> None:
+        with contextlib.suppress(Broken):
+            self.end(politely=True)
+        # The kernel would remove it some time after the namespace, when the next team may need the name.
+        subprocess.run(["ip", "link", "del", f"port{self.place}"], check=False, stderr=subprocess.DEVNULL)
+        self.holder.kill()
+        self.holder.wait()

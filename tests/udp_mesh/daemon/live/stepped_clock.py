@@ -1,0 +1,58 @@
+"""A daemon whose wall clock is set while it runs: `python -m tests.udp_mesh.daemon.live.stepped_clock CLOCK run FILE`.
+
+The host's clock cannot be set for one process alone. Here `time.time` and the kernel's timestamps of datagrams are
+moved by the last line of the file CLOCK, in seconds. What arrived before that line was written has the offset before
+it, as after settimeofday(2).
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from udp_mesh.cli import main as command
+from udp_mesh.links import udp
+from udp_mesh.links.attachments import Address
+
+_real_time = time.time
+
+
+class SteppedClock:
+    """The offset now, and the one before it. Reads the file when that has changed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._size = 0
+        self._before_s = self._now_s = self._since_s = 0.0
+
+    def offset_s(self, at_s: float | None = None) -> float:
+        """What to add to a real time of recent arrival; by default, to the time now."""
+        size = self._path.stat().st_size
+        if size != self._size:
+            self._size = size
+            self._before_s, self._since_s = self._now_s, _real_time()
+            self._now_s = float(self._path.read_text().split()[-1])
+        return self._now_s if at_s is None or at_s >= self._since_s else self._before_s
+
+    def time(self) -> float:
+        return _real_time() + self.offset_s()
+
+
+def main() -> int:
+    clock = SteppedClock(Path(sys.argv.pop(1)))
+    receive = udp.UdpLink._receive
+
+    def received(self: udp.UdpLink, from_socket: object, deliver: udp.Deliver, limit: int, stop_after: float) -> int:
+        def moved(data: memoryview, source: Address, arrived: float) -> None:
+            deliver(data, source, arrived + clock.offset_s(arrived) if arrived else 0.0)
+
+        return receive(self, from_socket, moved, limit, stop_after - clock.offset_s())  # type: ignore[arg-type]
+
+    time.time = clock.time
+    udp.UdpLink._receive = received  # type: ignore[method-assign]
+    return command.main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
