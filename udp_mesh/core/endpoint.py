@@ -24,7 +24,7 @@ from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.relaying.relaying import Relaying
 from udp_mesh.core.relaying.snapshot import snapshot
 from udp_mesh.core.selective_sending import SelectiveSending
-from udp_mesh.core.settings import Address, LinkInfo, Settings
+from udp_mesh.core.settings import Address, LinkInfo, Settings, Topic
 from udp_mesh.core.shared_logs import SharedLogs
 from udp_mesh.core.state import State
 from udp_mesh.core.subscriptions.messages import TABLE_TOPIC, with_subscription_topics
@@ -79,6 +79,10 @@ class Endpoint:
     def settings(self) -> Settings:
         """The settings in force."""
         return self._state.settings
+
+    def topic(self, name: str) -> Topic | None:
+        """The settings of a topic; those of undeclared ones, if it is none of its own (None: it is refused)."""
+        return self._state.topic(name)
 
     def receive(self, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         """Process one datagram. Bad bytes are counted and dropped; received data never makes this raise."""

@@ -6,7 +6,6 @@
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from itertools import zip_longest
 
 from udp_mesh.core.compression import STEP_BYTES, Uncompressed, compress
@@ -65,11 +64,9 @@ def send(
     """See `Endpoint.send`. `thin_number` is that of the copies on thin links, if there are any."""
     if state.closed:
         return Rejected(RejectReason.CLOSED, "the node is closed")
-    topic = state.topics.get(topic_name)
+    topic = state.named_topic(topic_name)
     if topic is None:
-        if state.settings.undeclared is None:
-            return Rejected(RejectReason.UNKNOWN_TOPIC, f"topic {topic_name} is not declared")
-        topic = replace(state.settings.undeclared, name=topic_name)
+        return Rejected(RejectReason.UNKNOWN_TOPIC, f"topic {topic_name} is not declared")
     limits = state.settings.limits
     if len(payload) > limits.message_bytes:
         return Rejected(RejectReason.TOO_LARGE, f"expected at most {limits.message_bytes} bytes, found {len(payload)}")

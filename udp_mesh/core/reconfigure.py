@@ -23,9 +23,7 @@ from udp_mesh.wire.frames import Bye, MessageFlag
 def restore_outboxes(state: State, now: float) -> None:
     """Queue the messages that the last run left on disk."""
     for stored in state.outboxes.load():
-        topic = state.topics.get(stored.topic)
-        if topic is None and state.settings.undeclared is not None:
-            topic = replace(state.settings.undeclared, name=stored.topic)
+        topic = state.named_topic(stored.topic)
         channel = topic_channel(state, topic, stored.type_name) if topic is not None else None
         if channel is None:
             # Its topic is no longer declared: it stays on disk for a run that declares it.
@@ -161,9 +159,7 @@ def _shown(value: object) -> str:
 def _retopic(state: State, now: float) -> None:
     """Apply the new settings to every topic; waiting messages move to the new priority."""
     for channel in state.channels.values():
-        topic: Topic | None = state.topics.get(channel.name)
-        if topic is None and state.settings.undeclared is not None:
-            topic = replace(state.settings.undeclared, name=channel.name)
+        topic = state.named_topic(channel.name)
         if topic is not None:
             channel.topic = topic
     for name in list(state.rate_limits):

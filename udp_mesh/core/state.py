@@ -6,6 +6,7 @@ The parts, in the order that bytes and messages pass them: `receive` and `frame_
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from heapq import heappop, heappush
 
 from udp_mesh.core.broadcast import BroadcastQueue, NackRepair
@@ -111,6 +112,15 @@ class State:
         self.incompatible_reported: dict[bytes, float] = {}
         self.own_name_reported_at = float("-inf")
         self.closed = False
+
+    def topic(self, name: str) -> Topic | None:
+        """The settings of a topic; those of undeclared ones, if it is none of its own (None: it is refused)."""
+        return self.topics.get(name, self.settings.undeclared)
+
+    def named_topic(self, name: str) -> Topic | None:
+        """The same, under its name."""
+        topic = self.topic(name)
+        return topic if topic is None or topic.name == name else replace(topic, name=name)
 
     def set_timer(self, peer: Peer, at: float) -> None:
         """Set the peer's timer to `at`, unless it is due earlier."""

@@ -119,7 +119,7 @@ class Node:
     async def deliver(self, topic: str, payload: bytes, *, to: str, type_name: str = "") -> Outcome:
         """Sends a message of a reliable topic to one peer and waits for its outcome. Raises SendRefusedError,
         ValueError for a best-effort topic, and RuntimeError if the node is closed before the outcome is known."""
-        found = next((one for one in self._settings.topics if one.name == topic), self._settings.undeclared)
+        found = self.driver.node.topic(topic)
         if found is not None and not found.reliable:
             raise ValueError(f"topic {topic} is best effort and reports no outcomes: use `send`, or make it reliable")
         outcome = self.driver.send(topic, payload, destination=to, type_name=type_name)

@@ -210,8 +210,8 @@ class Service:
         return message
 
     def topic(self, name: str) -> Topic | None:
-        """The settings of a topic (None: it is refused)."""
-        return next((topic for topic in self.settings.topics if topic.name == name), self.settings.undeclared)
+        """See `Endpoint.topic`."""
+        return self.driver.node.topic(name)
 
     # Runtime changes
 
