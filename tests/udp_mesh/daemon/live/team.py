@@ -188,7 +188,9 @@ class LiveTeam:
         again = sent.topic == "stored" and (sent.abandoned or self.robots[sent.source].runs != sent.run)
         narrowed = (sent.source, name) in self.ether.too_long
         held = sent.to is None and sent.topic in OUTBOXES
-        known = (name, key) in self.excused or again or narrowed or held or name in self.disk_trouble
+        # What another robot of this name had not acknowledged was sent to this one again.
+        troubled = name in self.disk_trouble or name in self.contested
+        known = (name, key) in self.excused or again or narrowed or held or troubled
         if not known:
             raise Broken(f"{name} received {sent} twice, the second time with {header}")
 
