@@ -113,7 +113,13 @@ def bind(source: str, target: str, *, read_only: bool = False) -> None:
 
 def make_private() -> None:
     """Stop mounts of this mount namespace from propagating to others."""
-    mount("none", "/", "", MS_REC | MS_PRIVATE)
+    try:
+        mount("none", "/", "", MS_REC | MS_PRIVATE)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+        reason = "the root directory is not a mount point (a chroot?): run `mount --bind DIR DIR` before `chroot DIR`"
+        raise OSError(error.errno, reason) from error
 
 
 def pivot_root(new_root: str) -> None:

@@ -201,6 +201,7 @@ def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int])
         _close_all_except(descriptors)
         spaces = [(os.open(f"/proc/{node.pid}/ns/{kind}", os.O_RDONLY), flag) for kind, flag in _NAMESPACES]
         pid_space = os.open(f"/proc/{node.pid}/ns/pid", os.O_RDONLY)
+        root = os.open(f"/proc/{node.pid}/root", os.O_RDONLY | os.O_DIRECTORY)
         with contextlib.suppress(FileNotFoundError):
             time_space = os.open(f"/proc/{node.pid}/ns/time_for_children", os.O_RDONLY)
             ns.setns(time_space, ns.CLONE_NEWTIME)
@@ -215,7 +216,9 @@ def _enter_and_run(node: _RunningNode, command: str, descriptors: Sequence[int])
         if node.deny_setgroups:
             # the command may restart the SSH server
             ns.accept_setgroups()
-        os.chdir("/")
+        # Entering a mount namespace leads to its root, which is the host's where the fleet runs in a chroot.
+        os.fchdir(root)
+        os.chroot(".")
         os.setsid()
         for number, descriptor in enumerate(descriptors):
             os.dup2(descriptor, number)
