@@ -24,6 +24,7 @@ from meshlab.quality import tq_of
 from meshlab.spec import LinkSpec
 from meshlab.state import Power
 from tests.meshlab.conftest import answers, in_mesh
+from tests.processes import killed_on_failure
 from tests.waiting import until
 
 # a station that is heard sends several times a second
@@ -173,7 +174,10 @@ def test_an_interrupted_mission_prints_how_to_continue(grounded: VirtualFleet, t
         encoding="utf-8",
     )
     words = [sys.executable, "-m", "meshctl", "lab", "mission", str(file), "--dir", str(grounded.directory)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as playing:
+    with (
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as playing,
+        killed_on_failure(playing),
+    ):
         assert playing.stdout is not None
         assert playing.stdout.readline() == "     1.0 s  far arrives at 90, 0 m\n"
         playing.send_signal(signal.SIGINT)

@@ -19,6 +19,7 @@ from meshctl.monitor.alarm_log import Silence
 from meshctl.monitor.frame import Frame
 from meshctl.monitor.store import MIN_BYTES, FrameStore
 from tests.meshctl.monitor.documents import frame
+from tests.processes import killed_on_failure
 
 ROOT = Path(__file__).resolve().parents[3]
 DAY_S = 86400.0
@@ -126,7 +127,7 @@ def test_a_killed_process_loses_no_appended_frame(path: Path) -> None:
         with subprocess.Popen(
             [sys.executable, "-c", script.replace("range(100_000)", f"range({seen}, 100_000)"), str(path)],
             stdout=subprocess.PIPE, cwd=ROOT, text=True,
-        ) as writer:  # fmt: skip
+        ) as writer, killed_on_failure(writer):  # fmt: skip
             assert writer.stdout is not None
             for line in writer.stdout:
                 assert line.split() == [str(seen + 1)]

@@ -17,6 +17,7 @@ import pytest
 from meshctl import __version__
 from meshctl.archive import TarMember, tar_of
 from meshctl.sites.protocol import PROTOCOL
+from tests.processes import killed_on_failure
 
 _RUN = "0123456789abcdef"
 
@@ -43,7 +44,10 @@ class WorkerProcess:
 def _worker(directory: Path) -> Iterator[WorkerProcess]:
     environment = {**os.environ, "XDG_STATE_HOME": str(directory)}
     command = [sys.executable, "-m", "meshctl", "worker", "--stdio", "mines/north"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process,
+        killed_on_failure(process),
+    ):
         yield WorkerProcess(process)
         assert process.stdin is not None
         process.stdin.write(b'{"do": "finish"}\n')
@@ -107,7 +111,10 @@ def test_a_plan_is_deleted_when_the_operator_is_finished(tmp_path: Path) -> None
 def test_a_plan_waits_for_its_order_when_the_uplink_is_lost(tmp_path: Path) -> None:
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path)}
     command = [sys.executable, "-m", "meshctl", "worker", "--stdio", "mines/north"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process:
+    with (
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment) as process,
+        killed_on_failure(process),
+    ):
         assert "plan" in WorkerProcess(process).ask(**_PLAN)["reply"]
         assert process.stdin is not None
         assert process.stdout is not None

@@ -12,6 +12,7 @@ import pytest
 
 from tests.meshctl.status.line_fleet import NAMES, Bench, line_of_three
 from tests.meshctl.status.terminal import PATIENCE_S, Terminal
+from tests.processes import killed_on_failure
 from tests.waiting import until
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet")]
@@ -109,14 +110,17 @@ def test_topology_draws_a_line_mesh(bench: Bench) -> None:
 
 def test_an_interrupt_need_not_wait_for_unreachable_devices(bench: Bench) -> None:
     bench.fleet.inject_fault("b01", "ssh-hang")
-    with subprocess.Popen(
-        bench.command("status", "--timeout", "3600", "--watch", "1", "--json"),
-        env=bench.environ,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    with (
+        subprocess.Popen(
+            bench.command("status", "--timeout", "3600", "--watch", "1", "--json"),
+            env=bench.environ,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process,
+        killed_on_failure(process),
+    ):
         journal = bench.directory / "state/meshctl/journal.sqlite-wal"
         until(lambda: journal.exists() or process.poll() is not None, "the look to begin", wait_s=PATIENCE_S)
         process.send_signal(signal.SIGINT)

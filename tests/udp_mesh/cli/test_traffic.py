@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes import killed_on_failure
 from tests.udp_mesh.cli.conftest import Pair, Run
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, poll
 from tests.udp_mesh.links.sockets import WAIT_S
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.xdist_group("udp_mesh_traffic")
 def test_an_interrupted_measurement_prints_its_partial_result(pair: Pair, words: list[str]) -> None:
     before = messages_received(pair[1])
     command = [sys.executable, "-m", "udp_mesh.cli.main", *words, "--socket", str(pair[0].socket)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program, killed_on_failure(program):
         assert program.stdout is not None
         if words[0] == "ping":
             assert "bob: " in program.stdout.readline()
@@ -47,7 +48,7 @@ def messages_received(daemon: RunningDaemon) -> int:
 def test_an_interrupted_ping_exits_with_interrupted(pair: Pair) -> None:
     words = ["ping", "bob", "-c", "1000", "--json", "--socket", str(pair[0].socket)]
     program = subprocess.Popen([sys.executable, "-m", "udp_mesh.cli.main", *words], stdout=subprocess.PIPE)
-    with program:
+    with program, killed_on_failure(program):
         assert program.stdout is not None
         program.stdout.readline()
         program.send_signal(signal.SIGINT)

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 import udp_mesh
+from tests.processes import killed_on_failure
 from tests.udp_mesh.daemon.processes import RunningDaemon, collect, outcomes, poll, two_daemons
 from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.client import MeshClient, MeshError, mesh_client
@@ -129,7 +130,11 @@ def test_the_guides_commands_and_program_work(pair: Pair, tmp_path: Path) -> Non
     (echo,) = re.findall(r"^ {8}udp-mesh (echo .*)$", GUIDE, re.MULTILINE)
     command = [sys.executable, "-m", "udp_mesh.cli.main", *echo.split(), "--json", "--count", "2"]
     environment = {**os.environ, "UDP_MESH_SOCKET": str(bob.socket)}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as program, alice.client() as sender:
+    with (
+        subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as program,
+        killed_on_failure(program),
+        alice.client() as sender,
+    ):
         await_read(alice, "video")
         assert read_at_bob(alice) == [{"topics": "video", "rate_hz": 2.0, "max_age_s": 5.0}]
         shown = subprocess.run(
@@ -153,7 +158,10 @@ def test_the_guides_commands_and_program_work(pair: Pair, tmp_path: Path) -> Non
     )
     script = text.replace("len(message.payload))", "len(message.payload), flush=True)")
     assert "rate_hz=2" in script
-    with subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, env={}) as program:
+    with (
+        subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, stdout=subprocess.PIPE, env={}) as program,
+        killed_on_failure(program),
+    ):
         await_read(alice, "video", "map", "artifacts/*")
         with alice.client() as sender:
             sender.publish("map", b"four", to="bob")
