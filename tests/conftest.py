@@ -6,6 +6,7 @@ deadline depends on the clock. `deep` draws new cases and many more of them: `HY
 
 import gc
 import os
+import signal
 from importlib.metadata import version
 
 import pytest
@@ -27,6 +28,10 @@ settings.register_profile(
 settings.register_profile("deep", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fast"))
 
+
+# A shell's background job ignores SIGINT, and so would every program that a test interrupts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Eight thousand collected tests and their modules stay: the default thresholds search them again and again for cycles.
 gc.set_threshold(50_000, 20, 50)
