@@ -13,8 +13,8 @@ from meshctl.device.ssh import SshConnection
 class ChangeListener(Protocol):
     """Receives the events of one node's change. No event alters the outcome of the change.
 
-    `armed` comes first, in a simultaneous change after `restarting`; or never, if a whole mesh
-    changes its cell. Then `started`, again for each new attempt; `waiting`,
+    `armed` comes first, in a simultaneous change after `restarting`; if a whole mesh changes its
+    cell, `watch_own_entries` comes instead. Then `started`, again for each new attempt; `waiting`,
     `connecting`, `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
     """
 
@@ -26,6 +26,9 @@ class ChangeListener(Protocol):
 
         `connection` is None for a node that loses its processes in the change. Raises Unreachable.
         """
+
+    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+        """The node's neighbors change at the same moment, and all changes end within `for_s`. Raises Unreachable."""
 
     def started(self) -> None:
         """The change starts: from now on the node's radios may restart."""

@@ -126,6 +126,10 @@ def _arm(commit: _MeshCommit, participant: Participant) -> None:
             arm(participant.change, connection)
             if commit.is_together:
                 _watch_unchanged(commit, participant.change, connection)
+            else:
+                # it may be called off before its radio restarts, and then keeps its entries of those that did restart
+                listener = participant.change.listener
+                listener.watch_own_entries(connection, for_s=commit.window_s + GRACE_AFTER_WINDOW_S)
             participant.clock = measure_uptime(connection)
     except NodeError as error:
         participant.failure = Outcome(ctx.name, Result.FAILED, str(error), hint=error.hint)

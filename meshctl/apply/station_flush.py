@@ -123,7 +123,7 @@ class StationFlush:
         if not self.radios:
             return
         if connection is not None:
-            self._watch_own_entries(connection, for_s=for_s)
+            self.watch_own_entries(connection, for_s=for_s)
         self._watch_neighbors(for_s=for_s)
 
     def _watch_neighbors(self, *, for_s: float) -> None:
@@ -142,13 +142,11 @@ class StationFlush:
                 f"{_listed(unwatched)} did not answer and cannot watch their entries of its radio", self.node
             )
 
-    def _watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
-        """Start a watch on the node itself: if a neighbor removes its entry although the radio did not restart, the
-        node removes its own, and both count from 0."""
+    def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
+        """Start a watch on the node itself. If a neighbor removes its entry although the radio did not restart, the
+        node removes its own, and both count from 0. If the node's part of a simultaneous change is called off before
+        its radio restarts, it keeps its entries of those that do restart."""
         entries = own_entries(self.node, self.ctx.before, self.radios)
-        if self._restarting:
-            owners = self.ctx.run.mac_owners
-            entries = tuple(entry for entry in entries if owners.get(entry.mac.lower()) not in self._restarting)
         if entries:
             connection.run(watch_script(self.node, entries, for_s=for_s))
 
@@ -213,6 +211,9 @@ class StationFlush:
         """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
         `rebooted` has restarted all of its radios."""
         since_s = self._observed_s if went_back and self._observed_s is not None else self._started_s
+        if went_back:
+            # the others' radios restarted with the change, and may have an entry of this one from then
+            self._restarting = frozenset()
         if rebooted:
             self.radios = EVERY_RADIO
         if since_s is None or not self.radios:

@@ -115,6 +115,23 @@ def test_no_node_is_armed_while_another_one_is_in_its_first_boot(monkeypatch: py
     assert "b02 could not be armed: b02: its first boot has not ended" in ended["b01"].reason
 
 
+def test_a_node_that_is_armed_to_change_its_cell_watches_its_station_entries(monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def borrow(_: object) -> Iterator[SimpleNamespace]:
+        yield SimpleNamespace(endpoint=None)
+
+    watching: list[float] = []
+    listener = SimpleNamespace(watch_own_entries=lambda _, for_s: watching.append(for_s))
+    monkeypatch.setattr(mesh_commit, "new_change", lambda *ctx, **window: SimpleNamespace(listener=listener))
+    monkeypatch.setattr(mesh_commit, "arm", lambda *change: None)
+    monkeypatch.setattr(mesh_commit, "measure_uptime", lambda _: None)
+    run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow)))
+    member = Participant(cast("NodeContext", SimpleNamespace(node=None, name="b01")))
+    with ThreadPoolExecutor(1) as pool:
+        mesh_commit._arm(mesh_commit._MeshCommit(run, [member], 60, 1, (), is_together=False, pool=pool), member)
+    assert (watching[0] > 60, member.failure) == (True, None)
+
+
 def test_a_node_that_was_scheduled_names_the_one_for_which_it_is_called_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen on real OpenWrt: b03's power was cut, and the others said no more than that they had been aborted."""
 
