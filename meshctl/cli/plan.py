@@ -94,6 +94,8 @@ def plan(
 ) -> None:
     """Show what provisioning would change on each node, in which order, and why. Changes nothing.
 
+    Exit code: 1 if a node or the whole plan is refused, otherwise 0; `provision --check` tells if a node differs.
+
     Example: meshctl plan 'husky1-*' --out plan.json
     """
     choices = choices_of(no_firmware, leave_behind, accept_cut, together)

@@ -95,12 +95,17 @@ def show(plan: Plan, fleet: Fleet, *, brief: bool) -> None:
 
 
 def report_plan(opened: Session, prepared: Prepared, choices: PlanOptions, *, as_json: bool, brief: bool) -> ExitCode:
-    """Print the plan; with `as_json`, as a saved plan."""
+    """Print the plan; with `as_json`, as a saved plan. FINDINGS if it, or one of its nodes, is refused."""
     if as_json:
         echo_json(dump(saved_plan(opened, prepared, choices)), nl=False)
     else:
         show(prepared.plan, opened.fleet, brief=brief)
-    return ExitCode.FINDINGS if prepared.plan.refusal else ExitCode.OK
+    return plan_code(prepared.plan)
+
+
+def plan_code(plan: Plan) -> ExitCode:
+    """FINDINGS if the plan, or one of its nodes, is refused."""
+    return ExitCode.FINDINGS if plan.refusal or plan.of(Verdict.REFUSED) else ExitCode.OK
 
 
 def report_check(plan: Plan, fleet: Fleet, *, as_json: bool, brief: bool) -> ExitCode:
@@ -142,8 +147,7 @@ def confirm_and_execute(
     from meshctl.report.plan_text import question
 
     if dry_run:
-        ended = report_plan(opened, prepared, choices, as_json=as_json, brief=brief)
-        raise typer.Exit(ExitCode.FINDINGS if prepared.plan.of(Verdict.REFUSED) else ended)
+        raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
     if not as_json:
         show(prepared.plan, opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:

@@ -28,6 +28,7 @@ from meshctl.cli.plan_execution import (
     PlanRefused,
     check_code,
     execute_direct,
+    plan_code,
     prepare_agreed,
     prepare_plan,
     print_verdicts,
@@ -212,15 +213,15 @@ def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:
 def report_everywhere(
     opened: Session, plan: WholePlan, choices: PlanOptions, *, as_json: bool, brief: bool
 ) -> ExitCode:
-    """Print the plans; with `as_json`, as `meshctl plan --out` saves them."""
+    """Print the plans; with `as_json`, as `meshctl plan --out` saves them. FINDINGS as for `report_plan`, or if a site
+    could not plan."""
     if as_json:
         echo_json(dump_site_plans(plan.saved(opened, choices)), nl=False)
     else:
         show_everywhere(opened, plan, brief=brief)
-    failed = [site.error for site in plan.sites if site.error is not None]
-    if failed or any(each.refusal for each in plan.plans):
+    if any(site.error is not None for site in plan.sites):
         return ExitCode.FINDINGS
-    return ExitCode.OK
+    return max((plan_code(each) for each in plan.plans), default=ExitCode.OK)
 
 
 def check_everywhere(opened: Session, plan: WholePlan, *, as_json: bool, brief: bool) -> ExitCode:
