@@ -108,16 +108,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
 
     fleet = _with_parallel(load_fleet(inventory, environ=os.environ), os.environ.get("MESHCTL_PARALLEL", ""))
     trust = trust_of(fleet)
-    virtual, locate = _lab(lab)
-    # a lab's copy of the inventory also works without --lab
-    lab_directory = str(virtual.directory) if virtual is not None else lab_of(str(inventory.resolve()))
-    if virtual is None and lab_directory:
-        # in another terminal, one of two variables is easily forgotten
-        echo(
-            f"note: the inventory is that of the lab in {lab_directory}, but its addresses are used as those of real "
-            f"devices: set MESHCTL_LAB={lab_directory} to reach the lab",
-            err=True,
-        )
+    virtual, lab_directory = lab_at(lab, inventory)
     with (
         open_journal(
             os.environ,
@@ -125,7 +116,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
             lab=lab_directory,
             pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
         ) as journal,
-        ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate) as access,
+        ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate_in(virtual)) as access,
     ):
         journal.move_lab_runs(fleet.name, lab_of)
         access.former_addresses = cache(lambda: former_addresses(fleet, journal.last_known(fleet.name)))
@@ -160,19 +151,40 @@ def trust_of(fleet: Fleet) -> TrustStore:
     return TrustStore(known_hosts_path(fleet), inventory=pinned)
 
 
-def _lab(directory: Path | None) -> tuple[LabFleet | None, Locate]:
+def lab_at(given: Path | None, inventory: Path) -> tuple[LabFleet | None, str]:
+    """The running virtual fleet, if one is given, and the directory of the lab that it or the inventory belongs to.
+
+    Prints a note when the inventory is a lab's and no fleet is given. Raises MeshctlError if no fleet runs there.
+    """
+    from meshctl.fleet.lab_directory import lab_of
+
+    if given is not None:
+        virtual = attach_lab(given)
+        return virtual, str(virtual.directory)
+    # a lab's copy of the inventory also works without --lab
+    directory = lab_of(str(inventory.resolve()))
+    if directory:
+        # in another terminal, one of two variables is easily forgotten
+        echo(
+            f"note: the inventory is that of the lab in {directory}, but its addresses are used as those of real "
+            f"devices: set MESHCTL_LAB={directory} to reach the lab",
+            err=True,
+        )
+    return None, directory
+
+
+def locate_in(virtual: LabFleet | None) -> Locate:
+    """Where nodes are reached: at the virtual fleet's forwarded ports, or as the inventory says."""
     from meshctl.nodes.connections import as_written
 
-    if directory is None:
-        return None, as_written
-
-    virtual = attach_lab(directory)
+    if virtual is None:
+        return as_written
 
     def locate(node: Node, address: object) -> tuple[str, int]:
         endpoint = virtual.endpoint(str(address))
         return endpoint.host, endpoint.port
 
-    return virtual, locate
+    return locate
 
 
 def selected_nodes(

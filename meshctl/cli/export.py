@@ -12,7 +12,8 @@ from typing import Annotated
 
 import typer
 
-from meshctl.cli.context import InventoryPath, Limit, Nodes, selected_nodes, trust_of
+from meshctl.cli.context import InventoryPath, Lab, Limit, Nodes, lab_at, locate_in, selected_nodes, trust_of
+from meshctl.cli.extensions import LabFleet
 from meshctl.cli.output import echo, echo_bytes, write_file
 from meshctl.errors import InputError
 from meshctl.interchange.label_sheet import SHEETS, draw, labels
@@ -23,7 +24,7 @@ from meshctl.inventory.load import load_fleet
 from meshctl.lint.grouping import join_limited
 from meshctl.model import Fleet, Node
 from meshctl.render.compare import placeholder_secret
-from meshctl.render.host_lists import ansible_inventory, host_entries, ssh_config
+from meshctl.render.host_lists import ansible_inventory, host_entries, lab_host_entries, ssh_config
 
 
 class ExportFormat(Enum):
@@ -35,6 +36,7 @@ class ExportFormat(Enum):
     LABELS = "labels"
 
 
+_HOST_LISTS = (ExportFormat.SSH_CONFIG, ExportFormat.ANSIBLE)
 _SELECTABLE = (ExportFormat.CSV, ExportFormat.NETJSON_CONFIG, ExportFormat.LABELS)
 
 
@@ -51,12 +53,15 @@ def export(
     outlines: Annotated[
         bool, typer.Option("--outlines", help="Draw the labels' edges, to cut plain paper or to check the position.")
     ] = False,
+    lab: Lab = None,
 ) -> None:
     """Export the fleet for other tools: OpenSSH, Ansible, spreadsheets, NetJSON, label paper.
 
     ssh-config and ansible have all managed nodes and robot computers, csv is the table that `meshctl inventory import`
     reads, netjson the planned topology, netjson-config the nodes' configurations, labels a PDF with name, MAC and host
     key fingerprint for the lids.
+
+    With --lab, ssh-config and ansible name the virtual fleet's forwarded ports, and no computers: a lab has none.
 
     NetJSON is draft-capoano-kaplan-netjson-00; mesh keys are never in it. Labels need the extra `labels`.
 
@@ -71,7 +76,10 @@ def export(
     if format is ExportFormat.LABELS:
         _write_labels(fleet, selected_nodes(fleet, nodes, limit), out, sheet, skip=skip, outlines=outlines)
         return
-    text = _text(fleet, format, nodes, limit)
+    if format in _HOST_LISTS:
+        text = _hosts(fleet, format, lab_at(lab, inventory)[0])
+    else:
+        text = _text(fleet, format, nodes, limit)
     if out is None:
         echo(text, nl=False)
     else:
@@ -79,17 +87,14 @@ def export(
 
 
 def _text(fleet: Fleet, format: ExportFormat, nodes: list[str] | None, limit: list[str] | None) -> str:
-    match format:
-        case ExportFormat.CSV:
-            chosen = selected_nodes(fleet, nodes, limit) if nodes or limit else fleet.nodes.values()
-            return csv_table.write(chosen)
-        case ExportFormat.NETJSON:
-            return json.dumps(network_graph(fleet), indent=2) + "\n"
-        case ExportFormat.NETJSON_CONFIG:
-            # a key is needed to resolve an encrypted mesh, and is not exported
-            found = configurations(fleet, selected_nodes(fleet, nodes, limit), placeholder_secret)
-            return json.dumps(found, indent=2) + "\n"
-    return _hosts(fleet, format)
+    if format is ExportFormat.CSV:
+        chosen = selected_nodes(fleet, nodes, limit) if nodes or limit else fleet.nodes.values()
+        return csv_table.write(chosen)
+    if format is ExportFormat.NETJSON:
+        return json.dumps(network_graph(fleet), indent=2) + "\n"
+    # a key is needed to resolve an encrypted mesh, and is not exported
+    found = configurations(fleet, selected_nodes(fleet, nodes, limit), placeholder_secret)
+    return json.dumps(found, indent=2) + "\n"
 
 
 def _write_labels(
@@ -111,8 +116,12 @@ def _write_labels(
         echo(f"without a host key: {join_limited(unpinned)}; pin them with `meshctl trust`, then print again", err=True)
 
 
-def _hosts(fleet: Fleet, format: ExportFormat) -> str:
-    entries = host_entries(fleet, fleet.managed())
+def _hosts(fleet: Fleet, format: ExportFormat, virtual: LabFleet | None) -> str:
+    if virtual is None:
+        entries = host_entries(fleet, fleet.managed())
+    else:
+        locate = locate_in(virtual)
+        entries = lab_host_entries(fleet, fleet.managed(), lambda node: locate(node, node.address.ip))
     write = ssh_config if format is ExportFormat.SSH_CONFIG else ansible_inventory
     # ssh and Ansible may be started in another directory
     placed = replace(fleet, base=str(Path(fleet.base).resolve()))

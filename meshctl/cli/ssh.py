@@ -16,6 +16,7 @@ import typer
 
 from meshctl.cli.context import (
     AsJson,
+    DryRun,
     InventoryPath,
     KeyFiles,
     Lab,
@@ -44,11 +45,14 @@ def trust(
     inventory: InventoryPath = Path(),
     change: Annotated[bool, typer.Option("--replace", "--replace-key", help="Also accept changed keys.")] = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Pin without confirmation.")] = False,
+    dry_run: DryRun = False,
     as_json: AsJson = False,
     key: KeyFiles = None,
     lab: Lab = None,
 ) -> None:
     """Show the nodes' host key fingerprints and pin them in the fleet's known_hosts after confirmation.
+
+    Exit code: 0 if all keys are pinned (with --dry-run: or would be), 1 if not, 3 if no node answers.
 
     Example: meshctl trust b03
     """
@@ -63,7 +67,7 @@ def trust(
             echo_json(json.dumps([_key_object(item) for item in shown], indent=1))
         left = 0
         for item in shown:
-            left += not _pin_key(opened, item, may_replace=change, yes=yes, quiet=as_json)
+            left += not _pin_key(opened, item, may_replace=change, yes=yes, dry_run=dry_run, quiet=as_json)
         if left:
             none_answered = all(item.key is None for item in shown)
             raise typer.Exit(ExitCode.UNREACHABLE if none_answered else ExitCode.FINDINGS)
@@ -78,8 +82,8 @@ def _key_object(item: HostKeyState) -> dict[str, str]:
     }
 
 
-def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: bool, quiet: bool) -> bool:
-    """Show, confirm and pin the key; whether it is pinned in the end."""
+def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: bool, dry_run: bool, quiet: bool) -> bool:
+    """Show, confirm and pin the key; whether it is pinned in the end, or would be in a dry run."""
 
     def say(text: str) -> None:
         if not quiet:
@@ -100,6 +104,9 @@ def _pin_key(opened: Session, item: HostKeyState, *, may_replace: bool, yes: boo
             return False
     else:
         say(f"{line}: not pinned")
+    if dry_run:
+        say("  would be pinned after confirmation")
+        return True
     if not yes:
         if quiet or not sys.stdin.isatty():
             return False

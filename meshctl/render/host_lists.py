@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from meshctl.model import Fleet, Node, Release, Site, SshSettings
+from meshctl.model import Computer, Fleet, Node, Release, Robot, Site, SshSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,27 @@ class HostEntry:
     groups: tuple[str, ...]
     is_openwrt: bool
     has_sha1_rsa_only: bool = False
+
+
+def lab_host_entries(
+    fleet: Fleet, nodes: Iterable[Node], locate: Callable[[Node], tuple[str, int]]
+) -> tuple[HostEntry, ...]:
+    """The nodes of a virtual fleet at its forwarded ports, without jump hosts.
+
+    Only computers with an `ssh.host` of their own: a lab has none, and the inventory's addresses may be real robots'.
+    """
+
+    def placed(node: Node) -> Node:
+        host, port = locate(node)
+        return replace(node, ssh=replace(node.ssh, host=host, port=port))
+
+    test_machines = {name for name, _, computer in _computers(fleet) if computer.ssh.host}
+    entries = host_entries(fleet, (placed(node) for node in nodes))
+    return tuple(
+        replace(entry, ssh=replace(entry.ssh, jump=""))
+        for entry in entries
+        if entry.is_openwrt or entry.name in test_machines
+    )
 
 
 def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
@@ -44,15 +65,14 @@ def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
     ]
     computers = [
         HostEntry(
-            ".".join(("robot", name, *place[1:])),
-            ".".join(("robot", name, *place[1:])),
+            name,
+            name,
             computer.ssh.host or str(computer.address.ip),
             _through(computer.ssh, fleet.robot_site(robot)),
             ("robots",),
             is_openwrt=False,
         )
-        for name, robot in fleet.robots.items()
-        for place, _, computer in robot.all_computers()
+        for name, robot, computer in _computers(fleet)
     ]
     gateways = [
         HostEntry(_gateway(site), _gateway(site), site.ssh.host, site.ssh, ("gateways",), is_openwrt=False)
@@ -60,6 +80,13 @@ def host_entries(fleet: Fleet, nodes: Iterable[Node]) -> tuple[HostEntry, ...]:
         if site.has_gateway
     ]
     return (*radios, *computers, *gateways)
+
+
+def _computers(fleet: Fleet) -> Iterator[tuple[str, Robot, Computer]]:
+    """All computers of all robots, with the names of their host keys."""
+    for name, robot in fleet.robots.items():
+        for place, _, computer in robot.all_computers():
+            yield ".".join(("robot", name, *place[1:])), robot, computer
 
 
 def _gateway(site: Site) -> str:

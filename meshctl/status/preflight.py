@@ -86,43 +86,54 @@ def _skipped_reason(status: FleetStatus) -> str:
     return next((alarm.text for alarm in status.alarms if alarm.code == "robots-unasked"), "")
 
 
-def _check(name: str, bad: Iterable[str], good: str, asked: tuple[int, int] | None = None) -> Check:
-    """A go with the reason `good` unless something is `bad`. `asked` is (answered, expected): no answer at all is a
-    no-go."""
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    """How many devices can tell, of how many; `none` says what is missing if no device can."""
+
+    count: int
+    expected: int
+    none: str
+
+
+def _check(name: str, bad: Iterable[str], good: str, answers: _Answers | None = None) -> Check:
+    """A go with the reason `good` unless something is `bad`. No answer at all is a no-go."""
     reasons = list(bad)
-    if asked is not None and not reasons:
-        answered, count = asked
-        if not answered:
-            return Check(name, False, "cannot check: no device answers")
-        good += f" ({answered} of {count} answer)" if answered < count else ""
+    if answers is not None and not reasons:
+        if not answers.count:
+            return Check(name, False, f"cannot check: {answers.none}")
+        is_partial = answers.count < answers.expected
+        good += f" ({answers.count} of {answers.expected} answer)" if is_partial else ""
     more = f"; and {len(reasons) - MAX_REASONS} more" if len(reasons) > MAX_REASONS else ""
     return Check(name, not reasons, "; ".join(reasons[:MAX_REASONS]) + more if reasons else good)
 
 
-def _answered(devices: Sequence[NodeStatus | RobotStatus]) -> tuple[int, int]:
-    """(answered, expected) of the devices that are on or should be."""
+def _answered(devices: Sequence[NodeStatus | RobotStatus], none: str) -> _Answers:
+    """Of the devices that are on or should be."""
     expected = [one for one in devices if one.health is not Health.OFF]
-    return sum(not one.no_answer_reason for one in expected), len(expected)
+    return _Answers(sum(not one.no_answer_reason for one in expected), len(expected), none)
 
 
-def _answered_radios(status: FleetStatus) -> tuple[int, int]:
-    return _answered(status.nodes)
+def _answered_radios(status: FleetStatus) -> _Answers:
+    return _answered(status.nodes, "no radio answers")
 
 
-def _answered_computers(status: FleetStatus) -> tuple[int, int]:
-    return _answered(status.robots)
+def _answered_computers(status: FleetStatus) -> _Answers:
+    return _answered(status.robots, "no computer answers")
 
 
-def _installed(status: FleetStatus) -> tuple[int, int]:
-    """(answered and have udp_mesh, expected) of active robots."""
+def _installed(status: FleetStatus) -> _Answers:
+    """Of the computers of active robots, those that answer and have udp_mesh."""
     robots = _active_robots(status)
-    return sum(robot.facts is not None and robot.facts.is_installed for robot in robots), len(robots)
+    count = sum(robot.facts is not None and robot.facts.is_installed for robot in robots)
+    none = "no computer has udp_mesh" if _answered_computers(status).count else "no computer answers"
+    return _Answers(count, len(robots), none)
 
 
-def _answered_daemons(status: FleetStatus) -> tuple[int, int]:
-    """(answered, expected) of the daemons of active robots."""
+def _answered_daemons(status: FleetStatus) -> _Answers:
+    """Of the daemons of active robots."""
     robots = _active_robots(status)
-    return sum(robot.facts is not None and robot.facts.answers for robot in robots), len(robots)
+    count = sum(robot.facts is not None and robot.facts.answers for robot in robots)
+    return _Answers(count, len(robots), "no daemon answers")
 
 
 def _plural(count: int, what: str) -> str:
@@ -133,17 +144,16 @@ def _alarm_check(
     name: str,
     good: str,
     *codes: str,
-    answered: Callable[[FleetStatus], tuple[int, int]] = _answered_radios,
+    answered: Callable[[FleetStatus], _Answers] = _answered_radios,
     is_fleetwide: bool = False,
 ) -> Callable[[Fleet, FleetStatus], Check]:
     """A check that no device has one of these alarms; `answered` counts those that can report them."""
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
         devices: Sequence[NodeStatus | RobotStatus] = status.nodes if answered is _answered_radios else status.robots
-        asked = answered(status)
         bad = [_alarm_text(one.name, one.alarms, codes) for one in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
-        return _check(name, [*everywhere, *(text for text in bad if text)], good, asked)
+        return _check(name, [*everywhere, *(text for text in bad if text)], good, answered(status))
 
     return check
 
@@ -205,14 +215,14 @@ def _quality(fleet: Fleet, status: FleetStatus) -> Check:
     weak = [text for node in status.nodes if (text := _alarm_text(node.name, node.alarms, ("no-path", "weak")))]
     worst = min((node.quality for node in deployed if node.quality is not None), default=None)
     good = "no path to measure" if worst is None else f"all paths usable, the weakest has {worst:.0%}"
-    found = _check("links", weak, good, _answered(status.nodes))
+    found = _check("links", weak, good, _answered_radios(status))
     has_paths = any(node.node.role is not Role.BASE for node in status.nodes if node.health is not Health.OFF)
     return replace(found, is_checked=False) if found.is_go and worst is None and has_paths else found
 
 
 def _strangers(fleet: Fleet, status: FleetStatus) -> Check:
     found = [f"{join_limited(status.strangers)} in the mesh"] if status.strangers else []
-    return _check("strangers", found, "none heard", _answered(status.nodes))
+    return _check("strangers", found, "none heard", _answered_radios(status))
 
 
 _CHECKS: Sequence[Callable[[Fleet, FleetStatus], Check]] = (

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 import signal
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.meshctl.proof.rig import Ended, Rig
+from tests.meshctl.proof.rig import Ended, Rig, run
 
 pytestmark = [pytest.mark.lab, pytest.mark.xdist_group("fleet"), pytest.mark.timeout(600)]
 
@@ -28,6 +29,8 @@ def test_a_saved_plan_is_applied_and_a_node_changed_since_is_refused(rig: Rig) -
     expected = {name: "refused" if name == "n001" else "done" for name in ("base", *rig.names)}
     assert (applied.code, applied.results) == (1, expected), applied.err
     assert rig.state_of("n002", old, new) == "new"
+    again = rig.meshctl("apply", new, str(file), "--dry-run")
+    assert (again.code, "n001  refused" in again.out) == (1, True), again.out + again.err
     drifted = rig.meshctl("provision", new, "--check", "--json")
     assert (drifted.code, drifted.verdicts["n001"], drifted.verdicts["n002"]) == (1, "change", "same")
     assert rig.meshctl("provision", new, "n001", "--yes", "--json").results == {"n001": "done"}
@@ -145,6 +148,29 @@ def test_a_command_runs_on_all_nodes_and_a_failure_is_reported(rig: Rig) -> None
     assert (done.code, sorted(done.out.splitlines())) == (0, [f"{name}: node={name}" for name in rig.names])
     failed = rig.meshctl("run", rig.current, "n001", command=["false"])
     assert (failed.code, failed.err) == (1, "n001: exit status 1\n")
+
+
+def test_openssh_logs_in_with_the_configuration_exported_in_the_lab(rig: Rig, tmp_path: Path) -> None:
+    exported = run(["inventory", "export", "-i", str(rig.inventory(rig.current))], rig.environ)
+    file = tmp_path / "ssh_config"
+    # the rig's inventory names no key
+    file.write_text(f"Host *\n    IdentityFile {rig.directory / 'key'}\n{exported.out}", encoding="utf-8")
+    words = ["ssh", "-F", str(file), "-o", "BatchMode=yes", "n001", "grep ^node= /etc/meshctl/node"]
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "node=n001\n"), done.stderr
+
+
+def test_a_dry_run_of_trust_pins_nothing(rig: Rig) -> None:
+    pins = rig.directory / "known_hosts"
+    before = pins.read_text(encoding="utf-8")
+    others = [line for line in before.splitlines(keepends=True) if not line.startswith("n001 ")]
+    pins.write_text("".join(others), encoding="utf-8")
+    try:
+        shown = rig.meshctl("trust", rig.current, "n001", "n002", "--dry-run", "--yes")
+        assert (shown.code, shown.out.count("would be pinned")) == (0, 1), shown.out + shown.err
+        assert pins.read_text(encoding="utf-8") == "".join(others)
+    finally:
+        pins.write_text(before, encoding="utf-8")
 
 
 def test_the_journal_records_each_run_with_its_steps(rig: Rig) -> None:

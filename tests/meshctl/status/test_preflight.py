@@ -117,7 +117,9 @@ def test_a_check_without_any_answer_is_a_no_go(fleet: Fleet) -> None:
     status = status_of(fleet, {}, {}, known=KNOWN)
     found = {check.name: check for check in preflight(fleet, status, Pings())}
     assert not any(check.is_go for check in found.values() if check.name != "beacons")
-    assert found["radios"].reason == "cannot check: no device answers"
+    assert found["radios"].reason == "cannot check: no radio answers"
+    assert found["one release"].reason == found["computers"].reason == "cannot check: no computer answers"
+    assert found["queues"].reason == "cannot check: no daemon answers"
 
 
 def test_a_check_with_partial_answers_shows_their_number(fleet: Fleet) -> None:
@@ -232,6 +234,7 @@ def test_what_only_an_installed_daemon_shows_is_not_a_go_without_one(fleet: Flee
     found = checks(fleet, bare)
     for name in ("daemons", "one release", "keys", "ROS bridges", "peers", "topics"):
         assert not found[name].is_go, name
+    assert found["one release"].reason == "cannot check: no computer has udp_mesh"
 
 
 def test_an_emergency_stop_that_could_not_be_sent_is_a_no_go(fleet: Fleet) -> None:
