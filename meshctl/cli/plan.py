@@ -94,7 +94,7 @@ def plan(
 ) -> None:
     """Show what provisioning would change on each node, in which order, and why. Changes nothing.
 
-    Exit code: 1 if a node or the whole plan is refused, otherwise 0; `provision --check` tells if a node differs.
+    Exit code: 1 if a node or the whole plan is refused, otherwise 0; run `provision --check` to see if a node differs.
 
     Example: meshctl plan 'husky1-*' --out plan.json
     """

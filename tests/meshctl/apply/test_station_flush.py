@@ -15,32 +15,19 @@ import pytest
 
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
-from meshctl.apply.reconnect import HEARD_MS, Reconnected, entries_of_unreachable, last_relays, repaired
-from meshctl.apply.stale_stations import StationEntry
+from meshctl.apply.reconnect import HEARD_MS
 from meshctl.apply.station_flush import StationFlushes
-from meshctl.device.observation import Observation, Originator, Station, WirelessLink
+from meshctl.device.observation import Observation, Originator
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
 from meshctl.model import Release
-from meshctl.nodes.collect import FleetObservation
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, SLACK_S, Radios
 from meshlab.fleet import VirtualNode
 from tests import waiting
-from tests.meshctl.plan.support import fleet, running
+from tests.meshctl.apply.mesh_nodes import MAC, MACS, node
+from tests.meshctl.plan.support import fleet
 from tests.meshctl.proof.rig import Ended, Rig
-
-MAC = "02:00:00:00:01:02"
-OTHER = "02:00:00:00:01:99"
-MACS = {"b01": "02:00:00:00:01:01", "b02": MAC, "b03": "02:00:00:00:01:03", "b04": "02:00:00:00:01:04"}
-
-
-def node(name: str, *hears: str, connected_s: int = 500) -> Observation:
-    stations = tuple(Station("mesh0", MACS[other], connected_s=connected_s) for other in hears)
-    link = WirelessLink("mesh0", "IBSS", MACS[name])
-    return replace(
-        running(fleet(), name, neighbours=()), links=(link,), macs={}, ifindexes={"mesh0": 7}, stations=stations
-    )
 
 
 class Neighbours:
@@ -266,71 +253,6 @@ def test_entries_from_before_a_boot_are_flushed_later(
     booted = Neighbours({"b02": seen})
     booted.flushes.flush_later(booted.job, ago_s=500.0)
     assert re.search(r"flush_stale .* 43\n", booted.asked[0][1])
-
-
-def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_entries() -> None:
-    heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
-    silent, reachable = replace(heard, inactive_ms=30_000), replace(heard, mac=MACS["b03"])
-    around = {
-        "b01": replace(node("b01"), stations=(heard, reachable)),
-        "b03": replace(node("b03"), stations=(silent,)),
-        "b04": replace(node("b04"), stations=(reachable,)),
-    }
-    owners = {mac: name for name, mac in MACS.items()}
-    asked = entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), owners)
-    assert {holder: [(one.ifname, one.mac) for one in entries] for holder, entries in asked.items()} == {
-        "b01": [("mesh0", MAC)]
-    }
-    assert entries_of_unreachable(FleetObservation(around, {}), owners) == {}
-
-
-def test_an_unknown_radio_may_belong_to_a_node_without_a_known_mac() -> None:
-    """A node that was never seen, and whose MAC the inventory does not have, such as at a site with a new journal."""
-    heard = tuple(Station("mesh0", MACS[name], inactive_ms=30) for name in ("b02", "b03", "b04"))
-    around = {"b01": replace(node("b01"), stations=heard), "b03": node("b03")}
-    without = {MACS[name]: name for name in ("b01", "b04")}
-    asked = entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), without)
-    # b03 was observed, and b04 is known and reachable
-    assert [(one.holder, one.mac) for one in asked["b01"]] == [("b01", MAC)]
-    assert entries_of_unreachable(FleetObservation(around, {"b02": "no answer"}), {**without, OTHER: "b02"}) == {}
-
-
-def test_what_was_repaired_is_reported_once_for_each_radio() -> None:
-    owners = {MACS["b04"]: "b04"}
-    entries = [StationEntry("", "mesh0", mac) for mac in (MAC, MACS["b04"])]
-    asked = dict.fromkeys(("b01", "b03", "base"), entries)
-    answers = {
-        "b01": f"gone {MACS['b04'].upper()}\nanswers {MACS['b04']}\n",
-        "b03": f"gone {MACS['b04']}\n",
-        "base": "",
-    }
-    away = ("b02", "b04")
-    assert repaired(answers, asked, away, owners) == Reconnected(
-        frozenset({"b04"}), ("b04: b01, b03 removed a stale entry of its radio",)
-    )
-    unknown = repaired({"b01": f"silent {MAC}\ncaught-up {MAC}\n"}, asked, away, owners)
-    assert unknown.nodes == {"b02"}
-    assert unknown.notes[0].startswith(f"{MAC}, a radio of an unknown node: b01 sent echo requests until")
-    assert repaired({"b01": "gone \x1b[2J\n"}, asked, away, owners) == Reconnected()
-    assert repaired({"b01": f"kept {MAC}\nsilent {MAC}\n"}, asked, away, owners) == Reconnected()
-
-
-def test_a_neighbor_that_loses_its_own_link_meanwhile_has_its_nodes_tried_again() -> None:
-    asked = {"b01": [StationEntry("b01", "mesh0", MAC)]}
-    assert repaired({"b01": None}, asked, ("b02",), {MAC: "b02"}) == Reconnected(
-        frozenset({"b02"}), ("b02: b01 hears it, and did not answer when asked to repair the link",)
-    )
-
-
-def test_the_relays_to_an_unreachable_node_are_those_of_its_last_path() -> None:
-    """It may be a relay that is not heard. A path that leads in a circle was recorded at two times."""
-    known = {
-        name: LastKnown(name, 0.0, {"via": via} if via else {})
-        for name, via in {"b03": "b02", "b02": "b01", "b01": "base", "base": "", "b04": "b05", "b05": "b04"}.items()
-    }
-    assert list(last_relays(["b03"], known)) == ["b02", "b01", "base"]
-    assert list(last_relays(["b04"], known)) == ["b05"]
-    assert list(last_relays(["unknown"], known)) == []
 
 
 def test_current_and_recently_heard_neighbors_are_observed() -> None:
