@@ -13,11 +13,12 @@ $(VENV)/.ready: pyproject.toml scripts/setup
 demo: setup
 	PATH="$(CURDIR)/$(BIN):$$PATH" scripts/demo
 
-# The tests start the programs hundreds of times; with PYTHONDONTWRITEBYTECODE each start would compile them.
+# The tests start the programs hundreds of times, and each worker imports all tests: with PYTHONDONTWRITEBYTECODE each
+# would compile them.
 # Four workers on two cores: tests of virtual fleets and of real radios wait for most of their time.
 test: setup
 	$(BIN)/python -m compileall -q meshctl meshlab mesh_sweep udp_mesh
-	$(BIN)/pytest -n 4 --dist loadgroup --no-loadscope-reorder
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/pytest -n 4 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .

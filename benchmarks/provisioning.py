@@ -40,7 +40,6 @@ from benchmarks.model_node.counting import counted
 from benchmarks.model_node.fleet import ModelFleet
 from benchmarks.page import append_result, read_results
 from meshctl.errors import MeshctlError
-from meshctl.render import DeviceFacts
 from meshlab.fleet import VirtualFleet
 from tests.meshctl.proof.rig import Rig
 
@@ -166,7 +165,7 @@ def measure(count: int, forks: int, parallel: int | None) -> dict[str, Any]:
         ours = by_meshctl(rig.inventory("b"), rig.directory / "key", rig.environ, count)
         after = _node_count(rig.fleet, "n001")
         hosts = {
-            name: Host(endpoint.host, endpoint.port, rig.rendered("a", name, DeviceFacts("")))
+            name: Host(endpoint.host, endpoint.port, rig.rendered("a", name, ""))
             for name in names
             for endpoint in (rig.fleet.endpoint(_address(rig.fleet, name)),)
         }

@@ -27,7 +27,6 @@ from meshctl.device.openwrt import measure_uptime
 from meshctl.device.parse.sections import split_sections
 from meshctl.device.ssh import SshConnection, connect
 from meshctl.device.trust import AcceptAnyKey
-from meshctl.render import DeviceFacts
 from meshlab.fleet import VirtualNode
 from tests.meshctl.proof.rig import Rig
 
@@ -65,7 +64,7 @@ def connected(rig: Rig, name: str) -> SshConnection:
 
 def change_of(rig: Rig, name: str) -> Change:
     """The change that takes a node from configuration `a` to `b`."""
-    before, after = (rig.rendered(variant, name, DeviceFacts("1.0")) for variant in ("a", "b"))
+    before, after = (rig.rendered(variant, name, "1.0") for variant in ("a", "b"))
     files = {f"/{path}": NewFile(content) for path, content in after.items() if content != before[path]}
     return Change(new_change_id(), files, reload_script({path[1:] for path in files}, ()))
 
@@ -114,7 +113,7 @@ def ansible_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:
     """One change as the playbook of benchmarks.provisioning makes it."""
     node = rig.fleet.node(name)
     place = "/root/.ansible/tmp/ansible-tmp-1.5-1-1"
-    pushed = script(rig.rendered("a", name, DeviceFacts("1.0"))).encode()
+    pushed = script(rig.rendered("a", name, "1.0")).encode()
     with connected(rig, name) as opened:
         connection = CountingConnection(opened, node, costs)
         connection.run("cat /etc/openwrt_release")

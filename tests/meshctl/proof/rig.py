@@ -120,6 +120,8 @@ class Rig:
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
+    # (inventory, node, compat_version) -> files: most tests begin with a comparison of all nodes with both inventories
+    _rendered: dict[tuple[str, str, str], dict[str, bytes]] = field(default_factory=dict, repr=False)
 
     def __enter__(self) -> Self:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -223,10 +225,14 @@ class Rig:
         """Bootstrap every node with inventory `variant`."""
         return self.meshctl("bootstrap", variant, "--yes", "--json")
 
-    def rendered(self, variant: str, name: str, facts: DeviceFacts) -> dict[str, bytes]:
+    def rendered(self, variant: str, name: str, compat_version: str) -> dict[str, bytes]:
         """The files that inventory `variant` wants of a node, without the leading slash."""
-        found = render_node(load_fleet(self.inventory(variant)), name, _no_secret, device_facts=facts)
-        return {file.path: file.content for file in found.files}
+        inventory = self.inventory(variant)
+        key = (inventory.read_text(encoding="utf-8"), name, compat_version)
+        if key not in self._rendered:
+            found = render_node(load_fleet(inventory), name, _no_secret, device_facts=DeviceFacts(compat_version))
+            self._rendered[key] = {file.path: file.content for file in found.files}
+        return self._rendered[key]
 
     def state_of(self, name: str, old: str, new: str) -> str:
         """`old`, `new`, or `mixed` with the paths that are neither here nor there."""
@@ -258,7 +264,7 @@ class Rig:
         """What inventory `variant` wants of a node that has these files."""
         system = parse(there.get("etc/config/system", b"").decode(), "system")
         compat = next((text for section in system.sections if (text := section.get("compat_version"))), "")
-        return self.rendered(variant, name, DeviceFacts(compat))
+        return self.rendered(variant, name, compat)
 
     def _files(self, name: str) -> dict[str, bytes]:
         done = self.fleet.node(name).exec("cd / && tar -cf - etc/config etc/dropbear etc/meshctl/node")
