@@ -21,6 +21,8 @@ STAND_INS = Path(__file__).resolve().parent / "node_root"
 
 # applets that stand-ins replace: the fleet's busybox must not have these names
 _REPLACED = frozenset({"date", "sync", "fsync", "reboot", "poweroff", "halt", "logread", "logger", "sh", "ash"})
+# what the stand-ins' own shell looks for in PATH: the shell of scripts, and programs of a machine's own (lab/kernel)
+_NOT_QUICK = frozenset({"sh", "ip", "ping", "ping6"})
 _APPLETS = STAND_INS / "lab" / "applets"
 _SEARCH_PATHS = ("/usr/local/sbin", "/usr/local/bin", "/usr/sbin", "/usr/bin", "/sbin", "/bin")
 
@@ -92,21 +94,28 @@ def _install_busybox(busybox: Path, rom: Path) -> None:
     image = busybox.read_bytes()
     names = subprocess.run([str(busybox), "--list"], capture_output=True, text=True, check=True).stdout.split()
     # each is called busybox: only under that name does it take the applet from its first argument
-    shell, tools, genuine = (rom / "lab" / use / "busybox" for use in ("shell", "tools", "genuine"))
-    for program in (shell, tools, genuine):
+    uses = ("shell", "tools", "genuine", "quick")
+    shell, tools, genuine, quick = (rom / "lab" / use / "busybox" for use in uses)
+    for program in (shell, tools, genuine, quick):
         program.parent.mkdir()
     # used by the stand-ins
     shutil.copy2(busybox, genuine)
     applets = _applets()
+    folders = ("bin", "sbin", "usr/bin", "usr/sbin")
+    replaced = {name for name in applets if any((rom / folder / name).exists() for folder in folders)}
     if _is_standalone(busybox):
         shell.write_bytes(without_applets(image, names, set(names) - {"ash", "sh"}, keep=("ash", "sh")))
         keep = tuple(name for name in applets if name not in _REPLACED)
         tools.write_bytes(without_applets(image, names, _REPLACED, keep=keep))
+        # runs the stand-ins: with its own applets it need not start a program for each `mv`
+        keep = ("ash", *(name for name in applets if name not in _REPLACED | _NOT_QUICK | replaced))
+        quick.write_bytes(without_applets(image, names, set(names) - set(keep), keep=keep))
     else:
         shutil.copy2(busybox, shell)
         shutil.copy2(busybox, tools)
-    shell.chmod(0o755)
-    tools.chmod(0o755)
+        shutil.copy2(busybox, quick)
+    for program in (shell, tools, quick):
+        program.chmod(0o755)
     if _is_standalone(shell):
         raise LabError(
             f"the shell of {busybox} runs its own applets before it searches PATH",
