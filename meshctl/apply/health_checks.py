@@ -12,8 +12,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 
-from meshctl.device.observation import Observation
+from meshctl.device.observation import Observation, WirelessLink
 from meshctl.plan import DesiredState
+from meshctl.plan.abilities import IW_MODES
 from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
@@ -163,8 +164,8 @@ def _off(expected: Expectation, after: Observation) -> tuple[str, ...]:
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
-    name = iface.get("ifname")
-    link = next((found for found in after.links or () if found.ifname == name), None)
+    link = _link_of(iface, after)
+    name = iface.get("ifname") or (link.ifname if link is not None else _described(iface))
     if link is None:
         radio = next((found for found in after.radios or () if found.name == iface.get("device")), None)
         # netifd tries no more until the next change or `wifi up`
@@ -173,8 +174,10 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     # `up` in netifd does not mean that the cell was joined (openwrt-facts.md section 5)
     if link.joined is False:
         return [f"{name} has not joined its cell"]
-    # 23.05 and later join a mesh unencrypted where the supplicant cannot (wifi-scripts, mac80211.sh)
-    if iface.get("encryption", "none") != "none" and after.supplicants is not None and name not in after.supplicants:
+    # 23.05 and later join a mesh unencrypted where the supplicant cannot (wifi-scripts, mac80211.sh); access points are
+    # hostapd's
+    is_encrypted = iface.get("mode") != "ap" and iface.get("encryption", "none") != "none"
+    if is_encrypted and after.supplicants is not None and name not in after.supplicants:
         return [f"{name} is not encrypted: wpa_supplicant does not run it"]
     if link.channel is not None and channel.isdigit() and link.channel != int(channel):
         return [f"{name} is on channel {link.channel}, not {channel}"]
@@ -182,6 +185,21 @@ def _radio(iface: Section, channel: str, after: Observation) -> list[str]:
     if bssid and link.bssid is not None and link.bssid.lower() != bssid:
         return [f"{name} is in cell {link.bssid}, not {bssid}"]
     return []
+
+
+def _link_of(iface: Section, after: Observation) -> WirelessLink | None:
+    """The interface of a section. OpenWrt names it itself if `ifname` is missing, as in an access point that
+    `extra_uci` adds: then one of its mode, and of its SSID if iw shows one."""
+    name, mode, ssid = iface.get("ifname"), iface.get("mode"), iface.get("ssid")
+    links = after.links or ()
+    if name:
+        return next((found for found in links if found.ifname == name), None)
+    return next((found for found in links if found.mode == IW_MODES.get(mode) and found.ssid in (ssid, None)), None)
+
+
+def _described(iface: Section) -> str:
+    """An interface without a name, by its section or SSID."""
+    return f"the interface of {iface.name or iface.get('ssid') or iface.get('mode')}"
 
 
 def _batman(expected: Expectation, after: Observation) -> tuple[str, ...]:
@@ -193,7 +211,8 @@ def _batman(expected: Expectation, after: Observation) -> tuple[str, ...]:
         section = None if expected.network is None else expected.network.section(iface.get("network"))
         if section is None or section.get("proto") != "batadv_hardif":
             continue
-        name, master = iface.get("ifname"), section.get("master")
+        link, master = _link_of(iface, after), section.get("master")
+        name = iface.get("ifname") or (link.ifname if link is not None else _described(iface))
         state = states.get(iface.get("network"))
         if state is not None and _UNKNOWN_PROTOCOL in state.errors:
             problems.append("netifd does not know batman-adv: /lib/netifd/proto/batadv_hardif.sh is missing or fails")

@@ -15,7 +15,7 @@ from meshctl.regdb.channels import CHANNELS, center_mhz
 from meshctl.uci import Package, Section
 
 # UCI's modes as iw names them, and as messages do
-_IW_MODES = {"adhoc": "IBSS", "mesh": "mesh point", "ap": "AP", "sta": "managed"}
+IW_MODES = {"adhoc": "IBSS", "mesh": "mesh point", "ap": "AP", "sta": "managed"}
 _NAMES = {"adhoc": "ad-hoc mode", "mesh": "802.11s", "ap": "access point mode", "sta": "station mode"}
 
 
@@ -40,7 +40,7 @@ def lacking_abilities(
 def _lacking(chip: RadioChip, band: Band, iface: Section, device: Section) -> Iterator[str]:
     name = f"{device.name}{f' ({chip.driver})' if chip.driver else ''}"
     mode, channel = iface.get("mode"), device.get("channel")
-    if chip.modes and mode in _IW_MODES and _IW_MODES[mode] not in chip.modes:
+    if chip.modes and mode in IW_MODES and IW_MODES[mode] not in chip.modes:
         yield f"{name} has no {_NAMES[mode]}: its driver supports {', '.join(chip.modes)}"
     known = chip.frequencies_mhz
     if not known or not channel.isdigit() or int(channel) not in CHANNELS[band]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from meshctl.apply.health_checks import expectation, unmet
+from meshctl.apply.health_checks import Expectation, expectation, unmet
 from meshctl.device.observation import (
     Bridge,
     ChangeStatus,
@@ -236,3 +236,29 @@ def test_neighbors_that_only_an_interface_heard_that_is_turned_off_are_not_waite
 def test_an_interface_that_is_not_ours_may_stay() -> None:
     monitor = (*(good().links or ()), WirelessLink("mon0", "monitor"))
     assert gaps(replace(good(), links=monitor)) == ()
+
+
+GUEST_AP = WirelessLink("phy1-ap0", "AP", ssid="guests", channel=6)
+
+
+def with_an_access_point(**options: str) -> Expectation:
+    expected = expectation(wanted(fleet(), "b01"), good(), [BASE])
+    assert expected.wireless is not None
+    section = "".join(f"\toption {name} '{value}'\n" for name, value in {"device": "radio0", **options}.items())
+    text = f"{dump(expected.wireless)}\nconfig wifi-iface 'guest'\n{section}"
+    return replace(expected, wireless=parse(text, "wireless"))
+
+
+def test_an_interface_that_openwrt_names_itself_is_found_by_its_mode_and_ssid() -> None:
+    expected = with_an_access_point(mode="ap", ssid="guests")
+    assert unmet(expected, good()) == ("the interface of guest does not exist",)
+    for found in (GUEST_AP, replace(GUEST_AP, ssid=None)):
+        assert unmet(expected, replace(good(), links=(*(good().links or ()), found))) == ()
+    other = replace(GUEST_AP, ssid="others")
+    assert unmet(expected, replace(good(), links=(*(good().links or ()), other))) != ()
+
+
+def test_an_encrypted_access_point_is_not_one_of_wpa_supplicant() -> None:
+    expected = with_an_access_point(mode="ap", ssid="guests", encryption="owe", ifname="phy1-ap0")
+    after = replace(good(), links=(*(good().links or ()), GUEST_AP), supplicants=("mesh0",))
+    assert unmet(expected, after) == ()
