@@ -99,6 +99,7 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     """Open a session and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     from meshctl.fleet.journal_store import open_journal
     from meshctl.fleet.lab_directory import lab_of
+    from meshctl.fleet.lab_sites import without_real_gateways
     from meshctl.fleet.process import lock_owner
     from meshctl.inventory import load_fleet
     from meshctl.inventory.secrets import SecretStore
@@ -107,8 +108,10 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
     from meshctl.nodes.desired import Renderer
 
     fleet = _with_parallel(load_fleet(inventory, environ=os.environ), os.environ.get("MESHCTL_PARALLEL", ""))
-    trust = trust_of(fleet)
     virtual, lab_directory = lab_at(lab, inventory)
+    if virtual is not None:
+        fleet = without_real_gateways(fleet)
+    trust = trust_of(fleet)
     with (
         open_journal(
             os.environ,

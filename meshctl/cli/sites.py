@@ -43,16 +43,18 @@ def selected_sites(opened: Session, names: Iterable[str] | None, *, with_login: 
     """The named sites with a worker, or those whose gateway has a login; all without names. Raises InputError."""
     sites = opened.fleet.sites
     able = {name: site for name, site in sites.items() if (site.has_gateway if with_login else site.has_worker)}
-    setting = "sites.{}.ssh.host" if with_login else "sites.{0}.ssh.host or sites.{0}.nats"
+    setting = "set sites.{}.ssh.host" if with_login else "set sites.{0}.ssh.host or sites.{0}.nats"
+    if opened.lab is not None:
+        setting = "in a lab, only gateways on this machine are used: unset MESHCTL_LAB, and omit --lab"
     wanted = list(names or ())
     for name in wanted:
         if name not in opened.fleet.sites:
             hint = did_you_mean(name, opened.fleet.sites) or "the inventory's sites are in `sites`"
             raise InputError(f"no site of {opened.fleet.name} is named {name!r}", hint=hint)
         if name not in able:
-            raise InputError(f"site {name} has no gateway", hint=f"set {setting.format(name)}")
+            raise InputError(f"site {name} has no gateway", hint=setting.format(name))
     if not able:
-        raise InputError(f"no site of {opened.fleet.name} has a gateway", hint=f"set {setting.format('NAME')}")
+        raise InputError(f"no site of {opened.fleet.name} has a gateway", hint=setting.format("NAME"))
     return tuple(able[name] for name in dict.fromkeys(wanted or able))
 
 
