@@ -101,8 +101,8 @@ class NodeLayer(Document):
     """Packages in addition to the hardware profile's."""
     extra_uci: dict[Text, Text] = Field(default_factory=dict)
     """Additional UCI options by their full names: `wireless.radio0.rts: "500"`."""
-    gateway: Address = NOT_WRITTEN
-    """Default gateway."""
+    gateway: Address | None = NOT_WRITTEN
+    """Default gateway; null removes that of an outer layer."""
     position: PositionDocument = NOT_WRITTEN
     """Where it stands, if it does not move."""
 

@@ -89,3 +89,12 @@ def test_a_lan_filter_of_defaults_is_removed_or_replaced_by_a_nearer_layer(tmp_p
     """
     fleet = fleet_of(tmp_path, text)
     assert [node.lan_filter for node in fleet.nodes.values()] == [LanFilter((5353,)), None, LanFilter()]
+
+
+def test_a_gateway_of_defaults_is_removed_by_a_nearer_layer(tmp_path: Path) -> None:
+    text = """
+    defaults: {hardware: rocket, gateway: 10.42.0.1}
+    nodes: {b01: {address: 10.42.0.11}, b02: {address: 10.42.0.1, gateway: null}}
+    """
+    fleet = fleet_of(tmp_path, text)
+    assert [str(node.gateway) for node in fleet.nodes.values()] == ["10.42.0.1", "None"]
