@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
@@ -16,54 +17,66 @@ from meshctl.model import Backend, Fleet, Mesh, Node
 _LOOP_AVOIDANCE_S = 60
 # interfaces on the mesh side of the bridge
 _NOT_PORTS = ("bat", "mesh", "wlan", "phy", "br-")
-# UCI options set by inventory keys, by package
+# UCI options set by inventory keys, by package: the key, or empty if meshctl decides
 _CHECKED = {
-    "wireless": frozenset(
-        [
-            "channel",
-            "htmode",
-            "band",
-            "hwmode",
-            "country",
-            "txpower",
-            "distance",
-            "disabled",
-            "path",
-            "ssid",
-            "bssid",
-            "mode",
-            "encryption",
-            "key",
-            "mcast_rate",
-            "beacon_int",
-            "mesh_id",
-            "mesh_fwding",
-            "network",
-            "ifname",
-        ]
-    ),
-    "network": frozenset(
-        [
-            "ipaddr",
-            "netmask",
-            "gateway",
-            "ports",
-            "ifname",
-            "device",
-            "proto",
-            "mtu",
-            "master",
-            "routing_algo",
-            "bridge_loop_avoidance",
-            "orig_interval",
-            "hop_penalty",
-            "gw_mode",
-            "fragmentation",
-        ]
-    ),
-    "dropbear": frozenset(["Port", "PasswordAuth", "RootPasswordAuth", "RootLogin", "Interface", "enable"]),
-    "system": frozenset(["hostname", "log_ip", "log_port", "timezone", "zonename"]),
+    "wireless": {
+        "channel": "meshes.NAME.channel",
+        "htmode": "meshes.NAME.htmode",
+        "band": "hardware.NAME.radios",
+        "hwmode": "hardware.NAME.radios",
+        "country": "country",
+        "txpower": "radios.RADIO.tx_power_dbm",
+        "distance": "meshes.NAME.distance_m",
+        "disabled": "radios.RADIO.mesh",
+        "path": "hardware.NAME.radios",
+        "ssid": "meshes.NAME.ssid",
+        "bssid": "meshes.NAME.bssid",
+        "mode": "meshes.NAME.mode",
+        "encryption": "meshes.NAME.encryption",
+        "key": "meshes.NAME.key",
+        "mcast_rate": "meshes.NAME.mcast_rate_kbps",
+        "beacon_int": "meshes.NAME.beacon_interval_tu",
+        "mesh_id": "meshes.NAME.ssid",
+        "mesh_fwding": "",
+        "network": "",
+        "ifname": "",
+    },
+    "network": {
+        "ipaddr": "address",
+        "netmask": "meshes.NAME.network",
+        "gateway": "gateway",
+        "ports": "lan_ports",
+        "ifname": "lan_ports",
+        "device": "",
+        "proto": "",
+        "mtu": "meshes.NAME.mtu",
+        "master": "",
+        "routing_algo": "meshes.NAME.batman",
+        "bridge_loop_avoidance": "meshes.NAME.batman",
+        "orig_interval": "meshes.NAME.batman",
+        "hop_penalty": "meshes.NAME.batman",
+        "fragmentation": "meshes.NAME.batman",
+    },
+    "dropbear": {
+        "Port": "ssh.port",
+        "PasswordAuth": "operators.password_login",
+        "RootPasswordAuth": "operators.password_login",
+        "RootLogin": "",
+        "Interface": "",
+        "enable": "",
+    },
+    "system": {
+        "hostname": "hostname",
+        "log_ip": "system.log_host",
+        "log_port": "system.log_port",
+        "timezone": "system.timezone",
+        "zonename": "system.zonename",
+    },
 }
+# what a radio without a mesh needs to serve an access point; it has no mesh to take them from
+_ACCESS_POINT_OPTIONS = ("channel", "htmode", "disabled")
+# sections that meshctl renders, besides radios
+_RENDERED = re.compile(r"mesh[0-9]+|bat[0-9]+|lan|backbone|loopback|br_lan|main")
 _TWO_RADIOS = """
 nodes: {husky1-rear: {role: robot, address: 10.42.0.12, label: H1R}}
 robots: {husky1: {nodes: [husky1-front, husky1-rear]}}
@@ -247,18 +260,35 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     Severity.WARNING,
     "An extra UCI option overrides a checked setting",
     why="""`extra_uci` is applied after the templates and can change channel, power, addresses and bridges after every
-    check has passed: the cell may split, a limit may be exceeded, or a node lost, unnoticed.""",
-    fix="Use the inventory's own key, which is checked.",
+    check has passed: the cell may split, a limit may be exceeded, or a node lost, unnoticed. Sections that `extra_uci`
+    itself creates, such as an access point, are not checked.""",
+    fix="Use the inventory's own key, which is checked; without one, remove the option.",
     failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '13'}}}",
-    passing="nodes: {b01: {extra_uci: {wireless.radio0.rts: '500'}}}",
+    passing="""
+    nodes:
+      b01:
+        extra_uci: {wireless.radio0.rts: '500', wireless.guest: wifi-iface, wireless.guest.device: radio0,
+          wireless.guest.mode: ap, wireless.guest.ssid: guests, wireless.guest.network: lan,
+          network.bat0.gw_mode: server}
+    """,
 )
 def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for node in fleet.managed():
         for key in node.extra_uci:
             package, _, rest = key.partition(".")
-            if rest.rpartition(".")[2] in _CHECKED.get(package, ()):
+            section, _, option = rest.rpartition(".")
+            own = _CHECKED.get(package, {}).get(option)
+            if section and own is not None and not _is_unchecked(node, package, section, option):
                 path = ("nodes", node.name, "extra_uci", key)
-                yield Finding(path, "overrides a checked setting", "the inventory's own key", key)
+                yield Finding(path, "overrides a checked setting", own or "no such option in extra_uci", key)
+
+
+def _is_unchecked(node: Node, package: str, section: str, option: str) -> bool:
+    """Whether the option is one of a section that `extra_uci` creates, or of a radio that is in no mesh."""
+    radio = next((radio for radio in node.radios if package == "wireless" and radio.name == section), None)
+    if radio is not None:
+        return radio.mesh is None and option in _ACCESS_POINT_OPTIONS
+    return f"{package}.{section}" in node.extra_uci and _RENDERED.fullmatch(section) is None
 
 
 @fleet_rule(

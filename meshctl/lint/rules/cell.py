@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import duplicates, group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.access import RSA_KEY
-from meshctl.model import Band, Fleet, MeshMode, Release
+from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
 from meshctl.regdb import occupied_span
 
 # IEEE 802.11: the basic rates of 802.11b, and the OFDM rates of 802.11a and g
@@ -89,24 +89,37 @@ def bssid_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "Two meshes share a cell",
     why="""With the same BSSID, or the same SSID on one channel, the radios of both meshes join one cell with two sets
-    of routing messages.""",
-    fix="Give each mesh a unique SSID and BSSID.",
+    of routing messages. Meshes at different sites do not hear each other.""",
+    fix="Give each mesh a unique SSID and BSSID, or set the `site` of their nodes.",
     failing=_second("other", "02:ca:fe:00:00:01", 11),
     passing=_second("other", "02:ca:fe:00:00:02", 11),
 )
 def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    meshes = fleet.meshes.values()
     reported: set[str] = set()
-    for bssid, sharing in duplicates(((mesh.band, mesh.bssid), mesh) for mesh in meshes if mesh.bssid):
-        for mesh in sharing[1:]:
-            reported.add(mesh.name)
-            message = f"mesh {sharing[0].name} has the same BSSID"
-            yield Finding(("meshes", mesh.name, "bssid"), message, "a unique BSSID", bssid[1])
-    for ssid, sharing in duplicates(((mesh.band, mesh.channel, mesh.ssid), mesh) for mesh in meshes):
-        for mesh in sharing[1:]:
-            if mesh.name not in reported:
-                message = f"mesh {sharing[0].name} has the same SSID on the same channel"
-                yield Finding(("meshes", mesh.name, "ssid"), message, "a unique SSID", ssid[2])
+    for meshes in _in_earshot(fleet):
+        for bssid, sharing in duplicates(((mesh.band, mesh.bssid), mesh) for mesh in meshes if mesh.bssid):
+            for mesh in sharing[1:]:
+                if mesh.name not in reported:
+                    reported.add(mesh.name)
+                    message = f"mesh {sharing[0].name} has the same BSSID"
+                    yield Finding(("meshes", mesh.name, "bssid"), message, "a unique BSSID", bssid[1])
+        for ssid, sharing in duplicates(((mesh.band, mesh.channel, mesh.ssid), mesh) for mesh in meshes):
+            for mesh in sharing[1:]:
+                if mesh.name not in reported:
+                    reported.add(mesh.name)
+                    message = f"mesh {sharing[0].name} has the same SSID on the same channel"
+                    yield Finding(("meshes", mesh.name, "ssid"), message, "a unique SSID", ssid[2])
+
+
+def _in_earshot(fleet: Fleet) -> list[list[Mesh]]:
+    """The meshes that may hear each other: those of each site, with those that are not at one site alone."""
+    sites = {mesh.name: {node.site for node in fleet.members(mesh.name)} for mesh in fleet.meshes.values()}
+    places = sorted({site for found in sites.values() for site in found if site})
+    anywhere = {name for name, found in sites.items() if not found or "" in found}
+    return [
+        [mesh for mesh in fleet.meshes.values() if mesh.name in anywhere or place in sites[mesh.name]]
+        for place in places or [""]
+    ]
 
 
 @fleet_rule(
@@ -114,14 +127,23 @@ def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.WARNING,
     "Two meshes overlap in frequency",
     why="""Cells on overlapping channels cannot coordinate as they would on the same channel: each sees the other as
-    noise and loses airtime.""",
-    fix="Use non-overlapping channels (1, 6 and 11 at 2.4 GHz), or another band.",
+    noise and loses airtime. Meshes at different sites do not hear each other.""",
+    fix="Use non-overlapping channels (1, 6 and 11 at 2.4 GHz), or another band; or set the `site` of their nodes.",
     failing=_second("other", "02:ca:fe:00:00:02", 9),
     passing=_second("other", "02:ca:fe:00:00:02", 11),
 )
 def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    reported: set[str] = set()
+    for meshes in _in_earshot(fleet):
+        for mesh, finding in _overlaps(meshes):
+            if mesh not in reported:
+                reported.add(mesh)
+                yield finding
+
+
+def _overlaps(meshes: Iterable[Mesh]) -> Iterator[tuple[str, Finding]]:
     spans = []
-    for mesh in fleet.meshes.values():
+    for mesh in meshes:
         try:
             span = occupied_span(mesh.band, mesh.channel, mesh.htmode)
         except ValueError:
@@ -137,7 +159,7 @@ def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         if span.overlaps(reaching) and (mesh.ssid, mesh.channel) != (first.ssid, first.channel):
             message = f"overlaps mesh {first.name} on {reaching.low_mhz}-{reaching.high_mhz} MHz"
             found = f"{span.low_mhz}-{span.high_mhz} MHz"
-            yield Finding(("meshes", mesh.name, "channel"), message, "a non-overlapping channel", found)
+            yield mesh.name, Finding(("meshes", mesh.name, "channel"), message, "a non-overlapping channel", found)
         if span.high_mhz > reaching.high_mhz:
             reaching, first = span, mesh
 

@@ -24,6 +24,8 @@ _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
 # OpenWrt's 4/32 warning: 8 MiB flash and 64 MiB RAM are the minimum
 _MIN_MEMORY_MIB = 64
 _MIN_FLASH_MIB = 8
+# targets with one image for all boards, or profiles that are not named after the device tree (target/linux/*/image)
+_OTHER_PROFILE_NAMES = ("x86", "armsr", "armvirt", "malta", "bcm27xx", "octeon")
 
 
 @fleet_rule(
@@ -134,6 +136,8 @@ def package_contradiction(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 )
 def board_and_profile_differ(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
+        if profile.target.partition("/")[0] in _OTHER_PROFILE_NAMES:
+            continue
         if profile.board.replace(",", "_") != profile.profile:
             path = ("hardware", profile.name, "profile")
             expected = f"{profile.board.replace(',', '_')} for board {profile.board}"

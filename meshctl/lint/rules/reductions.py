@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
+from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Topic
 from meshctl.model.computers import ROS_1
@@ -111,8 +112,13 @@ def not_reduced(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for topic in fleet.topics:
         if topic.reduce is None:
             continue
-        for name in topic.sources or tuple(fleet.robots):
-            robot = fleet.robots.get(name)
-            if robot is not None and robot.computer is not None and robot.computer.ros != ROS_1:
-                found = robot.computer.ros or "no ros"
-                yield Finding(_path(topic), f"{name} has no deployed bridge", f"ros: {ROS_1} on its computer", found)
+        sources = (fleet.robots.get(name) for name in topic.sources or tuple(fleet.robots))
+        lacking = [
+            (robot.name, robot.computer.ros or "no ros")
+            for robot in sources
+            if robot is not None and robot.computer is not None and robot.computer.ros != ROS_1
+        ]
+        if lacking:
+            found = join_limited([f"{name}: {ros}" for name, ros in lacking])
+            expected = f"ros: {ROS_1} on their computers"
+            yield Finding(_path(topic), "some sources have no deployed bridge", expected, found)

@@ -179,7 +179,8 @@ def originators_not_aggregated(fleet: Fleet, _context: LintContext) -> Iterator[
     "Every node announces itself as a gateway",
     why="""`gw_mode: server` applies to all nodes of the mesh: each announces an uplink that it does not have, and DHCP
     requests go to the nearest one.""",
-    fix="Use `gw_mode: off`; set `gateway` on nodes that have one.",
+    fix="""Use `gw_mode: client`, or `off`, and `extra_uci: {network.bat0.gw_mode: server}` on the nodes with an
+    uplink.""",
     failing="meshes: {main: {batman: {gw_mode: server}}}",
     passing="meshes: {main: {batman: {gw_mode: 'off'}}}",
 )
@@ -187,7 +188,7 @@ def all_gateways(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for mesh in batman_meshes(fleet):
         if mesh.batman.gw_mode == "server":
             path = ("meshes", mesh.name, "batman", "gw_mode")
-            yield Finding(path, "applies to every node of the mesh", "off", mesh.batman.gw_mode)
+            yield Finding(path, "applies to every node of the mesh", "client or off", mesh.batman.gw_mode)
 
 
 @fleet_rule(

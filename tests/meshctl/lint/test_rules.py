@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.diagnostics import Diagnostic
 from meshctl.lint import RULES, Example, Rule, check_path
 from meshctl.lint.example import environment, write
 from meshctl.lint.rules.housekeeping import STALE_BASELINE
@@ -14,9 +15,12 @@ _REGDB = load(SHIPPED)
 _CHECKED = [rule for rule in RULES if rule is not STALE_BASELINE]
 
 
+def _found(example: Example, directory: Path) -> tuple[Diagnostic, ...]:
+    return tuple(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
+
+
 def _codes(example: Example, directory: Path) -> set[str]:
-    path = write(example, directory)
-    return {item.code for item in check_path(path, _REGDB, environment(example)).diagnostics}
+    return {item.code for item in _found(example, directory)}
 
 
 @pytest.mark.parametrize("rule", _CHECKED, ids=lambda rule: rule.code)
@@ -47,3 +51,40 @@ def test_weather_radar_needs_a_longer_window_in_europe(
     hardware: {{rocket: {{confirm_window_s: {window_s}}}}}
     """
     assert ("MC620" in _codes(Example(fragment), tmp_path)) == is_too_short
+
+
+@pytest.mark.parametrize(
+    ("cell", "code"), [("channel: 6, bssid: '02:ca:fe:00:00:01'", "MC304"), ("channel: 9", "MC305")]
+)
+@pytest.mark.parametrize(("site", "is_reported"), [("north", True), ("south", False)])
+def test_meshes_at_different_sites_do_not_hear_each_other(
+    tmp_path: Path, cell: str, code: str, site: str, *, is_reported: bool
+) -> None:
+    fragment = f"""
+    sites: {{north: {{}}, south: {{}}}}
+    meshes: {{other: {{ssid: other, mode: mesh, band: 2g, {cell}, network: 10.43.0.0/24}}}}
+    defaults: {{site: north, radios: {{radio0: {{mesh: main}}}}}}
+    nodes: {{s1: {{site: {site}, role: base, address: 10.43.0.1, radios: {{radio0: {{mesh: other}}}}}}}}
+    """
+    assert (code in _codes(Example(fragment), tmp_path)) == is_reported
+
+
+@pytest.mark.parametrize(
+    ("target", "is_reported"), [("x86/64", False), ("bcm27xx/bcm2711", False), ("ath79/generic", True)]
+)
+def test_profiles_of_some_targets_are_not_named_after_the_board(
+    tmp_path: Path, target: str, *, is_reported: bool
+) -> None:
+    fragment = f"hardware: {{rocket: {{board: pc-engines-apu2, profile: generic, target: {target}}}}}"
+    assert ("MC825" in _codes(Example(fragment), tmp_path)) == is_reported
+
+
+def test_a_radio_without_a_mesh_may_serve_an_access_point(tmp_path: Path) -> None:
+    fragment = """
+    nodes:
+      b01:
+        radios: {radio0: {mesh: main}, radio1: {mesh: null}}
+        extra_uci: {wireless.radio1.disabled: '0', wireless.radio1.channel: '36', wireless.radio0.channel: '1'}
+    """
+    found = [item for item in _found(Example(fragment), tmp_path) if item.code == "MC529"]
+    assert [item.path.rpartition("extra_uci.")[2] for item in found] == ["wireless.radio0.channel"]
