@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from meshctl.cli.output import ignore_broken_pipe
 from meshctl.errors import InputError
 
 
@@ -39,7 +40,9 @@ def worker(
         return
     if execute:
         raise typer.Exit(serving.execute(site, execute, os.environ))
-    serving.serve(site, os.environ, sys.stdin.buffer, sys.stdout.buffer)
+    # a lost uplink leaves a reply that no one reads
+    with ignore_broken_pipe():
+        serving.serve(site, os.environ, sys.stdin.buffer, sys.stdout.buffer)
 
 
 def _serve_nats(site: str, url: str, hub: str) -> None:

@@ -72,6 +72,9 @@ class Worker:
             except OSError as error:
                 self._send(error_message(MeshctlError(f"{error.filename or 'gateway'}: {error.strerror or error}")))
         self._forget_planned()
+        # whoever owns the stream may close it now
+        with self._lock:
+            self._is_lost = True
 
     def _forget_planned(self) -> None:
         """Delete what was planned over this uplink and is not ordered, since it has secrets. After an uplink that was
@@ -219,8 +222,9 @@ class Worker:
     def _send(self, message: Mapping[str, object]) -> None:
         try:
             with self._lock:
-                self._out.write(encode(message) + b"\n")
-                self._out.flush()
+                if not self._is_lost:
+                    self._out.write(encode(message) + b"\n")
+                    self._out.flush()
         except (OSError, ValueError):
             # the input ends, too; the runs are not this process's
             self._is_lost = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -179,3 +180,12 @@ def test_any_value_survives_set_commit_and_get(tmp_path_factory: pytest.TempPath
     uci.out("set", f"system.main.note={value}")
     uci.out("commit", "system")
     assert uci.out("get", "system.main.note") == f"{value}\n"
+
+
+def test_json_text_survives_being_read_and_written(tmp_path: Path) -> None:
+    text = 'it\'s "quoted", a\\b\\\\c & more\nof it'
+    program = tmp_path / "echo.awk"
+    program.write_text('{ json($0); print json_shown("") }', encoding="utf-8")
+    command = [str(BUSYBOX), "awk", "-f", f"{STAND_INS}/lab/json.awk", "-f", str(program)]
+    done = subprocess.run(command, input=json.dumps({"text": text}), capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"text": text}

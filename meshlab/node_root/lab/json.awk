@@ -54,9 +54,16 @@ function json_any(path,    c, key, n) {
 	else if (match(json_text, /^-?[0-9][0-9.eE+-]*/)) { sort[path] = "n"; value[path] = substr(json_text, 1, RLENGTH); json_take(RLENGTH) }
 	else json_bad = 1
 }
+# in the replacement of gsub, "\\\\&" is a backslash and what was found in every busybox; "\\" is not
+function json_quoted(text,    n, i, line) {
+	gsub(/["\\]/, "\\\\&", text)
+	n = split(text, line, "\n"); text = line[1]
+	for (i = 2; i <= n; i++) text = text "\\n" line[i]
+	return "\"" text "\""
+}
 # the same value as JSON text
 function json_shown(path,    n, i, list, text) {
-	if (sort[path] == "s") { text = value[path]; gsub(/\\/, "\\\\", text); gsub(/"/, "\\\"", text); gsub(/\n/, "\\n", text); return "\"" text "\"" }
+	if (sort[path] == "s") return json_quoted(value[path])
 	if (sort[path] == "b") return value[path] ? "true" : "false"
 	if (sort[path] == "n") return value[path]
 	n = split(substr(members[path], 2), list, "\t")

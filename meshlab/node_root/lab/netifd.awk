@@ -24,8 +24,9 @@
 
 function get(id, option, otherwise) { return (id, option) in opt ? opt[id, option] : otherwise }
 function yes(value) { return value ~ /^(1|on|true|yes|enabled)$/ }
-function json(text) { gsub(/\\/, "\\\\", text); gsub(/"/, "\\\"", text); return "\"" text "\"" }
-function shell(text) { gsub(/'/, "'\\''", text); return "'" text "'" }
+# in the replacement of gsub, "\\\\&" is a backslash and what was found in every busybox; "\\" is not
+function json(text) { gsub(/["\\]/, "\\\\&", text); return "\"" text "\"" }
+function shell(text) { gsub(/'/, "'\\\\&'", text); return "'" text "'" }
 
 # --- the current state, and what a change does to it --------------------------------------------------------------------
 

@@ -7,7 +7,8 @@ function lines(file,    n, line) {
 	close(file)
 	return n
 }
-function text(word) { gsub(/\\/, "\\\\", word); gsub(/"/, "\\\"", word); return "\"" word "\"" }
+# in the replacement of gsub, "\\\\&" is a backslash and what was found in every busybox; "\\" is not
+function text(word) { gsub(/["\\]/, "\\\\&", word); return "\"" word "\"" }
 BEGIN {
 	if (!first) print ","
 	printf "\t%s: {\n", text(name)

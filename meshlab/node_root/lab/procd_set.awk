@@ -10,7 +10,8 @@ function each(path, between,    n, i, list, text) {
 	for (i = 1; i <= n; i++) text = text (sort[path] == "o" ? list[i] between : "") value[path "/" list[i]] "\n"
 	return text
 }
-function quoted(text) { gsub(/'/, "'\\''", text); return "'" text "'" }
+# in the replacement of gsub, "\\\\&" is a backslash and what was found in every busybox; "\\" is not
+function quoted(text) { gsub(/'/, "'\\\\&'", text); return "'" text "'" }
 { text = text $0 "\n" }
 END {
 	if (!json(text) || !("/name" in value)) exit 1

@@ -49,7 +49,8 @@ function quick(line, out) {
 	return 3
 }
 
-function quoted(value) { gsub(/'/, "'\\''", value); return "'" value "'" }
+# in the replacement of gsub, "\\\\&" is a backslash and what was found in every busybox; "\\" is not
+function quoted(value) { gsub(/'/, "'\\\\&'", value); return "'" value "'" }
 
 function valid(name) { return name ~ /^[A-Za-z0-9_]+$/ }
 

@@ -118,8 +118,10 @@ def test_a_plan_waits_for_its_order_when_the_uplink_is_lost(tmp_path: Path) -> N
         assert "plan" in WorkerProcess(process).ask(**_PLAN)["reply"]
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.close()
         process.stdout.close()
+        # its reply has no reader
+        process.stdin.write(b'{"do": "hello"}\n')
+        process.stdin.close()
         (inventory,) = tmp_path.rglob("inventory")
         with pytest.raises(subprocess.TimeoutExpired):
             process.wait(2)
