@@ -72,7 +72,7 @@ class Worker:
             except OSError as error:
                 self._send(error_message(MeshctlError(f"{error.filename or 'gateway'}: {error.strerror or error}")))
         self._forget_planned()
-        # whoever owns the stream may close it now
+        # its owner may close the stream now
         with self._lock:
             self._is_lost = True
 

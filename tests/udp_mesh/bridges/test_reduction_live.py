@@ -23,7 +23,7 @@ from udp_mesh.bridges.message_codec import Numbers, decode, encode
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.receiving import EVERYTHING
-from udp_mesh.bridges.reduction import IMAGE, JPEG, JpegOptions, Reducer, Reduction
+from udp_mesh.bridges.reduction import IMAGE, JPEG, MAX_INCREASE, JpegOptions, Reducer, Reduction
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.types import TypeKey
@@ -103,6 +103,8 @@ def test_the_quality_of_a_camera_settles_at_what_the_link_carries() -> None:
         # without oscillating: a range of a few steps; how far down depends on the host, too, which delays images
         assert max(settled) < min(0.8, min(settled) + 0.3)
         # and rises again, in small steps, when the link carries more
-        assert details[-1] > max(settled)
-        assert min(later - sooner for sooner, later in pairwise(details[-IMAGES // 2 :])) >= 0
+        risen = details[IMAGES:]
+        assert max(risen) > max(settled)
+        # a busy host delays images, too, so detail may fall in between
+        assert max(later - sooner for sooner, later in pairwise(risen)) <= MAX_INCREASE + 1e-9
         assert len(sizes) > 1.4 * IMAGES

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import resource
 import sqlite3
 from collections.abc import Awaitable, Callable, Iterator
@@ -120,7 +121,7 @@ def test_reading_an_unknown_item_writes_nothing(tmp_path: Path) -> None:
         assert answers == [None]
 
     with_store(tmp_path / "items.db", use)
-    with sqlite3.connect(tmp_path / "items.db") as connection:
+    with contextlib.closing(sqlite3.connect(tmp_path / "items.db")) as connection:
         assert connection.execute("SELECT count(*) FROM logs").fetchone() == (0,)
 
 
