@@ -7,6 +7,7 @@ its runs are merged later. `notify` receives what the operator has to know about
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 
 from meshctl.errors import MeshctlError
 from meshctl.fleet.journal import Journal, default_path
@@ -36,9 +37,14 @@ def open_journal(
     try:
         store = SharedStore(Database(url, program=f"meshctl of {owner()}"), path)
     except DatabaseLost as error:
-        spool, target = Spool(path), label_of(url)
+        target = label_of(url)
+
+        def merge_later(run: int) -> None:
+            with closing(Spool(path)) as spool:
+                spool.note_unmerged(target, run)
+
         notify(f"{error}; the journal of this computer is used, and merged later")
-        return Journal(path, pinned=pinned, merge_later=lambda run: spool.note_unmerged(target, run))
+        return Journal(path, pinned=pinned, merge_later=merge_later)
     try:
         merged = store.merge(path)
     except MeshctlError as error:
