@@ -167,13 +167,25 @@ def download(resolved: ResolvedPackages, apt: Apt, cache: Path) -> None:
 
 
 def unpack(resolved: ResolvedPackages, cache: Path, root: Path) -> None:
-    """Unpack the packages into the new directory `root`, without documentation and other unused files."""
+    """Unpack the packages into the new directory `root`, without documentation and other unused files. No link leads
+    out of it."""
     root.mkdir(parents=True)
     for name in resolved.archives:
         _unpack_one(cache / name, root)
     for pattern in _EXCLUDED:
         for path in root.glob(pattern):
             shutil.rmtree(path)
+    keep_links_inside(root)
+
+
+def keep_links_inside(root: Path) -> None:
+    """Make absolute links relative: on the host they lead out of `root`, to the loader and programs of the host."""
+    for folder, folders, files in os.walk(root):
+        for link in (Path(folder, name) for name in (*folders, *files)):
+            target = os.readlink(link) if link.is_symlink() else ""
+            if target.startswith("/"):
+                link.unlink()
+                link.symlink_to(os.path.relpath(f"{root}{target}", folder))
 
 
 def unpack_kernel(resolved: ResolvedPackages, cache: Path, target: Path) -> None:

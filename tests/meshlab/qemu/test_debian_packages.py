@@ -54,6 +54,22 @@ def test_a_missing_keyring_is_rejected_with_a_hint(tmp_path: Path, monkeypatch: 
     assert "setup-lab" in caught.value.hint
 
 
+def test_no_link_of_an_unpacked_root_leads_to_the_host(tmp_path: Path) -> None:
+    for folder in ("bin", "sbin", "lib64", "lib/x86_64-linux-gnu", "etc"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "bin/ip").write_text("the root's")
+    (tmp_path / "lib/x86_64-linux-gnu/loader").write_text("the root's")
+    # as in the packages iproute2 and libc6
+    links = {"sbin/ip": "/bin/ip", "lib64/loader": "/lib/x86_64-linux-gnu/loader", "etc/sh": "../bin/ip"}
+    for link, target in {**links, "lib64/more": "/etc", "etc/missing": "/bin/missing"}.items():
+        (tmp_path / link).symlink_to(target)
+    apt.keep_links_inside(tmp_path)
+    assert {(tmp_path / link).read_text() for link in links} == {"the root's"}
+    assert (tmp_path / "lib64/more").resolve() == tmp_path / "etc"
+    assert (tmp_path / "etc/missing").resolve() == tmp_path / "bin/missing"
+    assert (tmp_path / "etc/sh").readlink() == Path("../bin/ip")
+
+
 def test_setup_lab_fails_with_an_error_without_apt(tmp_path: Path) -> None:
     script = Path(__file__).parents[3] / "scripts" / "setup-lab"
     shell = shutil.which("sh")
