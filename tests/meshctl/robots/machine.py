@@ -22,8 +22,11 @@ from meshctl.device.trust import HostKey, TrustStore, parse_key
 from tests.meshctl.device.servers import PATIENCE_S, eventually
 from tests.meshctl.robots.lan import Lan
 
-PYTHON = "python3" if sys.version_info[:2] == (3, 11) else f"/opt/python/bin/python3.{sys.version_info.minor}"
-"""Tests deploy wheels made of their own packages: Debian's Python runs them where it is as old as ours, ours else."""
+_DEBIAN_PYTHONS = {(3, 11): "bookworm", (3, 13): "trixie"}
+_SUITE = _DEBIAN_PYTHONS.get(sys.version_info[:2], "trixie")
+PYTHON = "python3" if sys.version_info[:2] in _DEBIAN_PYTHONS else f"/opt/python/bin/python3.{sys.version_info.minor}"
+"""Tests deploy wheels made of their own packages: the Python of the Debian that has our version runs them; ours where
+no Debian has it, on the newest, as a Python needs a C library no older than the one that it was built for."""
 PATIENT = Deadlines(connect_s=60, handshake_s=120, auth_s=120, channel_s=120, run_s=120)
 BUILD_TIMEOUT_S = 280
 _SETUP = Path(__file__).parents[3] / "scripts/setup-robot-machine"
@@ -32,7 +35,7 @@ _BOOT = Path(__file__).with_name("boot_machine.sh")
 
 def debian() -> Path:
     """The root that all machines stand on. Fails, and says why, where it can neither be found nor built."""
-    done = subprocess.run([_SETUP], capture_output=True, text=True, timeout=BUILD_TIMEOUT_S, check=False)
+    done = subprocess.run([_SETUP, _SUITE], capture_output=True, text=True, timeout=BUILD_TIMEOUT_S, check=False)
     assert done.returncode == 0, f"no Debian machine to test on:\n{done.stderr}"
     return Path(done.stdout.strip())
 
