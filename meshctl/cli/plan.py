@@ -231,13 +231,13 @@ def resume(
                     hint="run `meshctl robots diff` to see what a deploy would change",
                 )
             raise resume_run(opened, inventory, record, as_json=as_json)
-        if record.command == "restore":
+        if record.command == "restore" and left:
             hint = f"run `meshctl restore {' '.join(left)} FILE` again, or `meshctl provision` to apply the inventory"
             raise InputError(f"run {record.id} restored a backup, which cannot be resumed", hint=hint)
         unknown = meet(opened, record, as_json=as_json)
         if unknown is not None:
             left = opened.journal.unfinished(record.id)
-        if record.command == "rollback" and (left or unknown is None):
+        if record.command == "rollback" and left:
             hint = "run `meshctl rollback` again with the number of the run to undo, or `meshctl provision`"
             raise InputError(f"run {record.id} was a rollback, which cannot be resumed", hint=hint)
         names = _still_managed(opened, [name for name in left if name not in (unknown or ())])

@@ -6,9 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.cli.main import main
 from meshctl.cli.run_record import run_of
 from meshctl.errors import InputError
+from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal
+from tests.meshctl.inventory.inventories import HEAD
 
 
 @pytest.mark.parametrize(
@@ -43,3 +46,19 @@ def test_a_run_in_progress_is_not_resumed(tmp_path: Path) -> None:
         run = journal.begin("provision", fleet="f", inventory="inv", nodes=("a",))
         with pytest.raises(InputError, match="is still in progress"):
             run_of(journal, "f", run.id)
+
+
+@pytest.mark.parametrize("command", ["restore", "rollback"])
+def test_a_finished_run_of_any_kind_has_nothing_to_resume(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    inventory = tmp_path / "fleet.yaml"
+    inventory.write_text(HEAD, encoding="utf-8")
+    with Journal(tmp_path / "meshctl/journal.sqlite") as journal:
+        run = journal.begin(command, fleet="trial", inventory="inv", nodes=("a",))
+        run.finish_node(Outcome("a", Result.DONE))
+        run.end("1 done")
+    with pytest.raises(SystemExit) as ended:
+        main(["resume", "-i", str(inventory)])
+    assert (ended.value.code, capsys.readouterr().out) == (0, "run 1 is finished: nothing to resume\n")
