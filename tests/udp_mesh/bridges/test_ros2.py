@@ -131,12 +131,19 @@ def test_messages_cross_in_both_directions(team: tuple[Side, Side]) -> None:
 def test_the_first_message_of_a_topic_reaches_an_existing_subscriber(team: tuple[Side, Side]) -> None:
     alice, bob = team
     names = [f"/alice/mesh_comm/bob/once{number}" for number in range(5)]
-    for name in [*names, TO_BOB]:
+    last = "/alice/mesh_comm/bob/last"
+    for name in [*names, last]:
         bob.node.subscribe(name)
-    # the last of them is known to the bridge, and so are those before
-    alice.node.publish_until_received(TO_BOB, "known", bob.node)
     kind = kind_text(MessageKind(TypeKey("std_msgs/msg/String", "reliable:volatile:10:")))
     with alice.daemon.client() as client:
+        client.request("set-topic", topic="last", values={"priority": 0})
+
+        def is_last_known() -> bool:
+            client.publish("last", b"\0\1\0\0\5\0\0\0stop\0", to="bob", type=kind)
+            return any(line.get("name") == last for line in bob.node.received())
+
+        # the last of them is known to the bridge, and so are those before
+        poll(is_last_known, "the last subscription to be known")
         for number in range(5):
             topic = f"once{number}"
             client.request("set-topic", topic=topic, values={"priority": 0})
