@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from meshctl.cli.context import InventoryPath, KeyFiles, Lab, Options, Session, session, with_options
-from meshctl.cli.output import is_dumb, is_plain
+from meshctl.cli.output import has_transient_line, is_plain, transient_line
 from meshctl.cli.robots_context import AskSudo, sudo_password
 from meshctl.device.connection import Deadlines
 from meshctl.model import Fleet, Node, Site
@@ -165,13 +165,11 @@ def collect(
 
 def _progress(*, show_progress: bool) -> Progress:
     """A counter on the terminal that is erased at the end."""
-    if not (show_progress and sys.stderr.isatty()) or is_dumb():
+    if not (show_progress and has_transient_line()):
         return lambda done, count: None
 
     def show(done: int, count: int) -> None:
-        text = "" if done == count else f"queried {done} of {count}"
-        sys.stderr.write(f"\r\x1b[K{text}")
-        sys.stderr.flush()
+        transient_line("" if done == count else f"queried {done} of {count}")
 
     return show
 

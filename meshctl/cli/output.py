@@ -7,16 +7,17 @@ screen (`live_screen`) sanitize what they draw themselves.
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from meshctl.errors import InputError
-from meshctl.report.terminal_escapes import clean, clean_styled, json_safe
+from meshctl.report.terminal_escapes import clean, clean_styled, json_safe, one_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,6 +60,20 @@ def is_plain() -> bool:
 def is_dumb() -> bool:
     """Whether the terminal understands no escapes, such as an editor's shell."""
     return os.environ.get("TERM") == "dumb"
+
+
+def has_transient_line() -> bool:
+    """Whether standard error is a terminal on which a line can be replaced."""
+    return sys.stderr.isatty() and not is_dumb()
+
+
+def transient_line(text: str) -> None:
+    """Replace the current line of the terminal, cut to its width; an empty text erases it."""
+    shown = one_line(text)[: shutil.get_terminal_size().columns - 1]
+    # the terminal may be closed
+    with suppress(OSError):
+        sys.stderr.write(f"\r\x1b[K{shown}")
+        sys.stderr.flush()
 
 
 def console() -> Console:

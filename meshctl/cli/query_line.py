@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
-from meshctl.cli.output import echo_error, is_dumb
+from meshctl.cli.output import echo_error, has_transient_line, transient_line
 from meshctl.fleet import Event, EventKind
-from meshctl.report.terminal_escapes import one_line
 
 _MAX_NAMES = 4
 
@@ -23,7 +20,7 @@ class QueryLine:
         self._queried = 0
         # node -> what is being done with it
         self._active: dict[str, str] = {}
-        self._is_shown = sys.stderr.isatty() and not is_dumb()
+        self._is_shown = has_transient_line()
 
     def __call__(self, event: Event) -> None:
         with self._lock:
@@ -61,11 +58,7 @@ class QueryLine:
 
     def _write(self, text: str) -> None:
         if self._is_shown:
-            shown = one_line(text)[: shutil.get_terminal_size().columns - 1]
-            # the terminal may be closed
-            with suppress(OSError):
-                sys.stderr.write(f"\r\x1b[K{shown}")
-                sys.stderr.flush()
+            transient_line(text)
 
 
 @contextmanager
