@@ -122,8 +122,8 @@ def test_reload_config_reloads_only_what_changed(node: VirtualNode) -> None:
     assert node.exec("cat /proc/sys/kernel/hostname").stdout == "OpenWrt\n"
     node.exec("reload_config").check("reload")
     until(lambda: node.exec("cat /proc/sys/kernel/hostname").stdout == "renamed\n", "the new name")
+    until(lambda: "dnsmasq: reloaded" in node.exec("logread").stdout.removeprefix(before), "dnsmasq")
     assert "firewall" not in node.exec("logread").stdout.removeprefix(before)
-    assert "dnsmasq: reloaded" in node.exec("logread").stdout.removeprefix(before)
     node.exec("uci set dhcp.lan.ignore=1; uci commit dhcp; reload_config").check("reload")
     until(lambda: node.exec("logread").stdout.count("dnsmasq: reloaded") == 2, "dnsmasq")
 
