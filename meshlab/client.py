@@ -13,6 +13,7 @@ from typing import Any
 from meshctl.errors import InputError
 from meshlab.control import address_of
 from meshlab.errors import LabError
+from meshlab.kernel_log import CONSOLE, blocked_tasks
 from meshlab.node_runner import MESSAGE_BYTES
 
 
@@ -42,7 +43,8 @@ def request(
             socket.send_fds(connection, [json.dumps(message).encode()], list(descriptors))
             answer = connection.recv(MESSAGE_BYTES * 4)
     except TimeoutError as error:
-        raise LabError(f"the fleet in {directory} did not answer {message['op']} within {timeout_s:g} s") from error
+        silent = f"the fleet in {directory} did not answer {message['op']} within {timeout_s:g} s"
+        raise LabError(silent + _reason(directory)) from error
     except OSError as error:
         raise LabError(f"no virtual fleet runs in {directory}", hint="run `meshctl lab up` to start one") from error
     if not answer:
@@ -51,6 +53,13 @@ def request(
     if "error" in result:
         raise InputError(result["error"], hint=result.get("hint", ""))
     return result
+
+
+def _reason(directory: Path) -> str:
+    """The blocked tasks of the machine's kernel, for an error message; empty for none and without a machine."""
+    console = directory / CONSOLE
+    stuck = blocked_tasks(console.read_text(encoding="utf-8", errors="replace")) if console.exists() else ()
+    return f"; its kernel reports blocked tasks: {'; '.join(stuck)}" if stuck else ""
 
 
 def is_running(directory: Path) -> bool:

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from meshlab import namespaces as ns
 from meshlab.errors import LabError
+from meshlab.kernel_log import CONSOLE
 from meshlab.qemu.guest_protocol import ADDRESS, GATEWAY, NETWORK, PORT, READY
 from meshlab.qemu.time_stamp_counter import counter_khz
 
@@ -38,6 +39,8 @@ _KERNEL_OPTIONS = "init_on_alloc=0 apparmor=0 audit=0 cgroup_disable=memory tran
 # A CPU that has not scheduled for twice watchdog_thresh seconds never will: the kernel writes every CPU's stack to the
 # console and panics, so that the machine ends with a reason instead of leaving each request to its timeout
 _LOCKUP_OPTIONS = "loglevel=5 watchdog_thresh=30 softlockup_all_cpu_backtrace=1 softlockup_panic=1"
+# a task that waits for longer is on the console before the request that waits for it ends (60 s, `client.request`)
+_BLOCKED_OPTIONS = "sysctl.kernel.hung_task_timeout_secs=20"
 _STOP_S = 10.0
 
 
@@ -108,7 +111,7 @@ class Machine:
     """A machine with its console and QEMU's log in `directory`."""
 
     def __init__(self, directory: Path, kernel: Path, initrd: Path, *, radios: int, nodes: int) -> None:
-        self.console = directory / "console"
+        self.console = directory / CONSOLE
         self._directory = directory
         self._kernel = kernel
         self._initrd = initrd
@@ -148,7 +151,7 @@ class Machine:
         clock = "tsc=reliable" if khz is None else f"tsc=reliable tsc_early_khz={khz}"
         line = (
             f"console=ttyS0 panic=-1 mitigations=off nokaslr random.trust_cpu=on no_timer_check {clock} "
-            f"{_KERNEL_OPTIONS} {_LOCKUP_OPTIONS} lab.radios={self._radios}"
+            f"{_KERNEL_OPTIONS} {_LOCKUP_OPTIONS} {_BLOCKED_OPTIONS} lab.radios={self._radios}"
         )
         network = f"user,id=host,restrict=on,net={NETWORK},host={GATEWAY},hostfwd=tcp:127.0.0.1:0-{ADDRESS}:{PORT}"
         return (
