@@ -2,7 +2,14 @@
 
 from meshctl.resolve.airtime import originator_airtime
 from meshctl.resolve.intent import Backbone, BatmanInterface, Intent, Lan, Login, MeshInterface, RadioIntent
-from meshctl.resolve.intervals import MEASURED_HEAL_S, Intervals, UnreachableTarget, batman_intervals, heal_s
+from meshctl.resolve.intervals import (
+    LONGEST_MEASURED_MS,
+    MEASURED_HEAL_S,
+    Intervals,
+    UnreachableTarget,
+    batman_intervals,
+    heal_s,
+)
 from meshctl.resolve.node import resolve
 from meshctl.resolve.packages import (
     FULL_SUPPLICANTS,
@@ -18,6 +25,7 @@ from meshctl.resolve.routes import StaticRoute, computer_gateway, has_routed_lan
 
 __all__ = [
     "FULL_SUPPLICANTS",
+    "LONGEST_MEASURED_MS",
     "MEASURED_HEAL_S",
     "Backbone",
     "BatmanInterface",

@@ -13,6 +13,7 @@ from meshctl.model import Mesh
 
 # Originator interval in ms -> the longest measured time to heal, in s.
 MEASURED_HEAL_S: dict[int, float] = {1000: 5.0, 500: 2.9, 250: 1.35, 100: 0.6}
+LONGEST_MEASURED_MS = max(MEASURED_HEAL_S)
 
 # batman-adv's default ELP interval, used by BATMAN_V (bat_v_elp.c).
 DEFAULT_ELP_INTERVAL_MS = 500

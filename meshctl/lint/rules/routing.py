@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,12 +11,20 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key, join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, NodeState
-from meshctl.resolve import MEASURED_HEAL_S, UnreachableTarget, batman_intervals, heal_s, originator_airtime
+from meshctl.resolve import (
+    LONGEST_MEASURED_MS,
+    MEASURED_HEAL_S,
+    UnreachableTarget,
+    batman_intervals,
+    heal_s,
+    originator_airtime,
+)
 
 # airtime shares from which MC516, MC502 and MC501 report
 _AIRTIME_NOTE = 0.03
 _AIRTIME_WARNING = 0.10
 _AIRTIME_ERROR = 0.30
+_MAX_INTERVAL_MS = 60_000  # of `orig_interval_ms`
 
 
 MESHMERIZE = """
@@ -91,8 +100,26 @@ def _airtime_findings(fleet: Fleet, least: float, most: float) -> Iterator[Findi
             written = options.orig_interval_ms is not None
             key = ("batman", "orig_interval_ms") if written else ("reconnect_s",)
             path = ("meshes", mesh.name, *key)
-            expected = "" if least == _AIRTIME_NOTE else f"less than {least:.0%}"
-            yield Finding(path, message, expected, found)
+            if least == _AIRTIME_NOTE:
+                yield Finding(path, message, found=found)
+                continue
+            # `reconnect_s` has no effect beside `orig_interval_ms`; alone it selects at most the longest measured
+            hint = _longer_interval(nodes, interval_ms, mesh) if written or interval_ms == LONGEST_MEASURED_MS else ""
+            yield Finding(path, message, f"less than {least:.0%}", found, hint)
+
+
+def _longer_interval(nodes: int, interval_ms: int, mesh: Mesh) -> str:
+    """The advice to set the shortest interval, in steps of 100 ms, with which MC502 does not warn."""
+    others = "raise `mcast_rate_kbps`, keep `aggregated_ogms` on, or split the mesh."
+    for longer_ms in range(interval_ms // 100 * 100 + 100, _MAX_INTERVAL_MS + 1, 100):
+        share = originator_airtime(nodes, longer_ms, mesh.mcast_rate_kbps, is_aggregated=mesh.batman.aggregated_ogms)
+        if share < _AIRTIME_WARNING:
+            target_s = math.ceil(heal_s(longer_ms) * 10) / 10
+            return (
+                f"Set `batman: {{orig_interval_ms: {longer_ms}}}` and `reconnect_s: {target_s:g}` or more "
+                f"(`reconnect_s` alone selects at most {LONGEST_MEASURED_MS} ms), {others}"
+            )
+    return others[0].upper() + others[1:]
 
 
 @fleet_rule(
