@@ -129,6 +129,19 @@ def test_an_interface_that_was_left_on_the_air_is_found_and_a_later_reload_remov
     until(lambda: left_over(observed(latest)) == (), "mesh0 to go")
 
 
+def test_an_access_point_is_a_port_of_its_networks_bridge(latest: VirtualNode) -> None:
+    access_point = """\
+set wireless.guest=wifi-iface
+set wireless.guest.device=radio0
+set wireless.guest.mode=ap
+set wireless.guest.ssid=guests
+set wireless.guest.ifname=ap0
+set wireless.guest.network=lan"""
+    configure(latest, access_point)
+    bridges = {bridge.name: bridge.ports for bridge in observed(latest).bridges or ()}
+    assert sorted(bridges["br-lan"]) == ["ap0", "bat0", "eth0"]
+
+
 def observed(node: VirtualNode) -> Observation:
     output = node.exec(observation_script("NONCE")).stdout_bytes
     return interpret(split_sections(output, "NONCE"), asked_at_s=0.0, answered_at_s=0.0)

@@ -278,13 +278,23 @@ function all_devices(    i, n, id, list, name) {
 	}
 	for (i = 1; i <= sections; i++) {
 		id = order[i]
-		if (kind[id] == "network.device" && get(id, "type", "") == "bridge") make_bridge(get(id, "name", ""), get(id, "ports", get(id, "ifname", "")))
+		if (kind[id] == "network.device" && get(id, "type", "") == "bridge") make_bridge(get(id, "name", ""), get(id, "ports", get(id, "ifname", "")) attached_to(get(id, "name", "")))
 		if (kind[id] == "network.interface" && get(id, "type", "") == "bridge") {
 			name = "br-" label[id]
 			make_bridge(name, get(id, "ifname", "") attached[label[id]])
 			device_of[id] = name
 		}
 	}
+}
+
+# the radio interfaces of the networks on a bridge (21.02 on), such as an access point's
+function attached_to(bridge,    i, id, members) {
+	members = ""
+	for (i = 1; i <= sections; i++) {
+		id = order[i]
+		if (kind[id] == "network.interface" && get(id, "device", "") == bridge) members = members attached[label[id]]
+	}
+	return members
 }
 
 # as set in the configuration, else a new address, as the kernel chooses a random one at each creation
