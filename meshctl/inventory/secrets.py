@@ -50,9 +50,10 @@ class SecretStore:
     def _value(self, ref: SecretRef) -> str:
         match ref.kind:
             case SecretKind.ENV:
-                value = self.environ.get(ref.where, "")
+                value = self.environ.get(ref.where)
                 if not value:
-                    raise _NoSecret("the environment variable is not set", f"export {ref.where}=...")
+                    reason = "is not set" if value is None else "is empty"
+                    raise _NoSecret(f"the environment variable {reason}", f"export {ref.where}=...")
                 return value
             case SecretKind.FILE:
                 path = self._path(ref, ref.where)

@@ -187,7 +187,8 @@ def mesh_open(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     Severity.ERROR,
     "The mesh's passphrase is invalid",
     why="""WPA accepts 8 to 63 printable ASCII characters, or 64 hexadecimal digits; with anything else the supplicant
-    rejects its configuration on every node at once.""",
+    rejects its configuration on every node at once. SAE takes 1 to 128 characters; up to OpenWrt 22.03, one of 64, as
+    `openssl rand -hex 32` prints, is taken for a raw key, and the supplicant does not join: it has no password.""",
     fix="Generate one: `openssl rand -base64 24`.",
     failing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "short"}),
     passing=Example("meshes: {main: {distance_m: 1000}}", environment={"MESH_KEY": "cedar-lantern-93-quarry"}),
@@ -200,9 +201,18 @@ def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Findi
             yield Finding(path, "invalid passphrase", expected, f"{len(value)} characters")
         elif mesh.encryption is Encryption.SAE and not (1 <= len(value) <= 128 and value.isprintable()):
             yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", f"{len(value)} characters")
+        elif mesh.encryption is Encryption.SAE and len(value.encode()) == 64 and _before_23_05(fleet, mesh):
+            message = "up to OpenWrt 22.03, a key of 64 characters joins no SAE mesh"
+            found = f"64 characters, and an older release than 23.05 on {join_limited(_before_23_05(fleet, mesh))}"
+            yield Finding(path, message, "fewer or more than 64 characters", found)
         elif "'" in value and any(node.release >= Release.V25_12 for node in fleet.members(mesh.name)):
             # same as for an SSID (MC310)
             yield Finding(path, "breaks on OpenWrt 25.12", "no apostrophe", "one")
+
+
+def _before_23_05(fleet: Fleet, mesh: Mesh) -> list[str]:
+    """The members whose hostapd.sh writes a key of 64 characters as `psk=`, without `sae_password`."""
+    return [node.name for node in fleet.members(mesh.name) if node.release < Release.V23_05]
 
 
 def _passphrases(fleet: Fleet, context: LintContext) -> Iterator[tuple[Mesh, str]]:

@@ -33,11 +33,11 @@ _MEETING_S = 90
 )
 def max_down_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     sizes = group_by_key((mesh, node.name) for node in fleet.managed() for mesh in node.meshes)
-    smallest = min((len(names) for names in sizes.values()), default=0)
-    if smallest > 1 and fleet.apply.max_down > max(smallest // 2, 1):
-        expected = f"at most {max(smallest // 2, 1)}"
-        found = f"{fleet.apply.max_down} of {smallest} nodes"
-        yield Finding(("apply", "max_down"), "a bad change takes down most of a mesh", expected, found)
+    mesh, names = min(sizes.items(), key=lambda item: len(item[1]), default=("", []))
+    limit = max(len(names) // 2, 1)
+    if len(names) > 1 and fleet.apply.max_down > limit:
+        message = f"a bad change takes down most of mesh {mesh}, which has {len(names)} nodes"
+        yield Finding(("apply", "max_down"), message, f"at most {limit}", str(fleet.apply.max_down))
 
 
 @fleet_rule(

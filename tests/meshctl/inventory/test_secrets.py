@@ -29,6 +29,12 @@ def test_a_secret_comes_from_the_environment(tmp_path: Path) -> None:
     assert store.get(_ref(SecretKind.ENV, "MESH_KEY")).reveal() == _VALUE
 
 
+@pytest.mark.parametrize(("environ", "reason"), [({}, "is not set"), ({"MESH_KEY": ""}, "is empty")])
+def test_an_empty_variable_is_not_called_unset(environ: dict[str, str], reason: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"the environment variable {reason}"):
+        SecretStore(environ, tmp_path).get(_ref(SecretKind.ENV, "MESH_KEY"))
+
+
 def test_a_secret_is_a_whole_file_or_one_entry_of_it(tmp_path: Path) -> None:
     (tmp_path / "whole").write_text(f"{_VALUE}\n")
     (tmp_path / "many.yaml").write_text(f'mesh: "{_VALUE}"\nother: 0123\n')

@@ -1,6 +1,5 @@
 """What a newcomer's trial reported: findings that were false, missing, or at the wrong place."""
 
-import re
 from pathlib import Path
 
 import pytest
@@ -481,17 +480,3 @@ def test_the_one_topic_at_a_wrong_level_is_reported_and_not_those_around_it(tmp_
 def test_the_range_of_host_addresses_has_none_that_is_refused(tmp_path: Path) -> None:
     (finding,) = [item for item in _found("nodes: {b01: {address: 10.42.0.255}}", tmp_path) if item.code == "MC203"]
     assert finding.expected == "one of 10.42.0.1 to 10.42.0.254"
-
-
-def test_a_mesh_at_the_longest_interval_gets_advice_that_helps(tmp_path: Path) -> None:
-    nodes = 'nodes: {"c[01-40]": {state: carried, address: {from: 10.42.0.121}}}'
-    robots = 'robots: {husky1: {carries: ["c[01-40]", b01]}}'
-
-    def fragment(mesh: str) -> str:
-        return f"{{meshes: {{main: {{{mesh}}}}}, {nodes}, {robots}}}"
-
-    found = _found(fragment("reconnect_s: 20"), tmp_path)
-    hint = next(item.hint for item in found if item.code == "MC502")
-    interval, target = re.findall(r"`(?:batman: {(orig_interval_ms: \d+)}|(reconnect_s: [\d.]+))`", hint)
-    followed = _codes(fragment(f"{target[1]}, batman: {{{interval[0]}}}"), tmp_path)
-    assert not {"MC502", "MC504"} & set(followed)
