@@ -2,7 +2,7 @@
 
 A word is one term or several separated by commas:
 
-    b03  'husky*'           a node by name or pattern
+    b03  'husky*'  b[01-12] a node by name, pattern or range
     beacons                 a group by name, where no node has that name
     B3  02:00:5e:00:00:03   a node by label, serial number or MAC, where no node or group has that name
     role:beacon  state:carried  mesh:main  group:spares  robot:spot1  site:north  hardware:box  release:24.10  label:B3
@@ -23,6 +23,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from meshctl.errors import InputError
+from meshctl.inventory.ranges import BadRange, expand
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet, Node, NodeState, Robot
 
@@ -30,6 +31,9 @@ LIST_HINT = "run `meshctl inventory list` to list all nodes"
 COMPUTER = "computer"
 """The role of a robot's computer, beside the roles of radios."""
 
+# brackets that a pattern would read as a set of single characters: b[01-12] as b0, b1 and b2
+_RANGE = re.compile(r"\[[^\]]*(?:,|\d\d+-|-\d\d)[^\]]*\]")
+_COMMA = re.compile(r",(?![^\[]*\])")  # none inside brackets
 _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
 # what is printed on a device; compared regardless of case
 _PRINTED = ("label", "serial", "mac")
@@ -181,7 +185,7 @@ def _select(
 
 
 def _terms(words: Iterable[str], read_file: Callable[[str], str], source: str = "") -> Iterator[Term]:
-    for text in (part.strip() for word in words for part in word.split(",")):
+    for text in (part.strip() for word in words for part in _COMMA.split(word)):
         if not text:
             continue
         if text.startswith("@") and not source:
@@ -210,7 +214,8 @@ def _terms_of_file(path: str, read_file: Callable[[str], str]) -> Iterator[Term]
 def _matching(term: Term, candidates: _Named[K], subject: _Subject) -> list[K]:
     if term.attribute:
         return _matching_attribute(term, candidates, subject.what)
-    found = [key for key, (name, _) in candidates.items() if fnmatchcase(name, term.pattern)]
+    named = _matcher(term.pattern)
+    found = [key for key, (name, _) in candidates.items() if named(name)]
     for attribute in ("group", *_PRINTED):
         found = found or _having(attribute, term.pattern, candidates, exactly=True)
     found = found or [key for key, (name, _) in candidates.items() if name.lower() == term.pattern.lower()]
@@ -224,7 +229,10 @@ def _matching(term: Term, candidates: _Named[K], subject: _Subject) -> list[K]:
         known = [*(name for name, _ in candidates.values()), *_values("group", candidates)]
         raise InputError(
             f"no {subject.what} matches {term.pattern!r}",
-            hint=_pattern_hint(term.pattern, candidates) or did_you_mean(term.pattern, known) or subject.hint,
+            hint=_pattern_hint(term.pattern, candidates)
+            or _other_language(term.pattern)
+            or did_you_mean(term.pattern, known)
+            or subject.hint,
         )
     return found
 
@@ -233,6 +241,18 @@ def _pattern_hint(text: str, candidates: _Named[K]) -> str:
     """For the beginning of several names, such as a name whose end is not typed yet: one of them would be a guess."""
     count = sum(name.startswith(text) for name, _ in candidates.values())
     return f"{count} names begin with it: '{text}*' selects them" if count > 1 else ""
+
+
+def _other_language(text: str) -> str:
+    """For what is meant as a selection elsewhere: a path, Ansible's `all`, `role=beacon`."""
+    if text in (".", "..") or "/" in text or text.endswith((".yaml", ".yml")):
+        return f"to name another inventory, write `-i {text}`"
+    if text == "all":
+        return "leave the name out, or write '*', for all nodes"
+    attribute, equals, value = text.partition("=")
+    if equals and value:
+        return f"write {attribute}:{value}"
+    return ""
 
 
 def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]:
@@ -256,11 +276,23 @@ def _matching_attribute(term: Term, candidates: _Named[K], what: str) -> list[K]
 def _having(attribute: str, pattern: str, candidates: _Named[K], *, exactly: bool = False) -> list[K]:
     fold = str.lower if attribute in _PRINTED else str
     wanted = fold(pattern)
+    matches = wanted.__eq__ if exactly and not _RANGE.search(wanted) else _matcher(wanted)
+    return [
+        key for key, (_, each) in candidates.items() if any(matches(fold(value)) for value in each.get(attribute, ()))
+    ]
 
-    def matches(value: str) -> bool:
-        return fold(value) == wanted if exactly else fnmatchcase(fold(value), wanted)
 
-    return [key for key, (_, each) in candidates.items() if any(matches(value) for value in each.get(attribute, ()))]
+def _matcher(pattern: str) -> Callable[[str], bool]:
+    """Whether a name matches a pattern, or is one of a range. Raises InputError for an invalid range."""
+    if not _RANGE.search(pattern):
+        return lambda name: fnmatchcase(name, pattern)
+    try:
+        patterns = expand(pattern)
+    except BadRange as error:
+        raise InputError(f"{pattern!r}: invalid range: {error}", hint="for example: 'b[01-12]'") from None
+    if not any(mark in pattern for mark in "*?"):
+        return frozenset(patterns).__contains__
+    return lambda name: any(fnmatchcase(name, each) for each in patterns)
 
 
 def _values(attribute: str, candidates: _Named[K]) -> list[str]:

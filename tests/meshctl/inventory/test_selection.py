@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -53,8 +53,37 @@ def test_terms_select_nodes(words: tuple[str, ...], names: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "numbers"),
+    [
+        (("h[1-20]",), range(1, 21)),
+        (("h[8-11]", "!h9"), [8, 10, 11]),
+        (("h[1,3,11-12],h20",), [1, 3, 11, 12, 20]),
+        (("!h[2-20]",), [1]),
+        (("label:H[08-10]",), [8, 9, 10]),
+        (("H[08-10]",), [8, 9, 10]),
+        (("h[1-3]",), [1, 2, 3]),
+        (("[g-h]1[5-9]",), range(15, 20)),
+        (("?[12-14]",), [12, 13, 14]),
+        (("h[19-25]",), [19, 20]),
+    ],
+)
+def test_ranges_select_all_their_names(words: tuple[str, ...], numbers: Iterable[int]) -> None:
+    """As a pattern, h[1-20] is a set of characters: it would select h1 and h2 alone."""
+    houses = {f"h{number}": {"label": (f"H{number:02}",)} for number in range(1, 21)}
+    assert list(select(words, houses, read, what="node")) == [f"h{number}" for number in numbers]
+
+
+def test_an_invalid_range_is_an_error() -> None:
+    with pytest.raises(InputError, match=r"'b\[12-01\]': invalid range: descending span 12-01"):
+        chosen("b[12-01]")
+
+
+@pytest.mark.parametrize(
     ("words", "message", "hint"),
     [
+        (("all",), "no managed node of lab matches 'all'", "for all nodes"),
+        (("./valley",), "no managed node of lab matches './valley'", "-i ./valley"),
+        (("role=beacon",), "no managed node of lab matches 'role=beacon'", "write role:beacon"),
         (("b1",), "no managed node of lab matches 'b1'", "did you mean 'b01'?"),
         (("wset",), "no managed node of lab matches 'wset'", "did you mean 'west'?"),
         (("rol:beacon",), "'rol:beacon': unknown attribute 'rol'", "did you mean 'role'?"),
