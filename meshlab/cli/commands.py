@@ -14,7 +14,7 @@ from meshctl.cli.context import AsJson, LabDirectory, lab_directory
 from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.device.framing import command_line
 from meshctl.errors import InputError
-from meshctl.model import Release
+from meshctl.model import Backend, Fleet, Release
 from meshctl.resources import shipped
 from meshlab.cli import links, sweep
 from meshlab.console import run_shell
@@ -70,7 +70,20 @@ def up(
     lab, inventory_path = shlex.quote(str(place)), shlex.quote(str(copy.inventory))
     echo(f"use it:    export MESHCTL_LAB={lab} MESHCTL_INVENTORY={inventory_path}")
     echo(f"console:   meshctl lab shell {fleet.spec.names[0]}")
-    echo("next:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology")
+    for line in next_steps(copy.fleet):
+        echo(line)
+
+
+def next_steps(fleet: Fleet) -> list[str]:
+    """What to run after `lab up`. The nodes of a mesh that the lab cannot route stay on the bench."""
+    unrouted = [mesh.name for mesh in fleet.meshes.values() if mesh.backend is Backend.MESHMERIZE]
+    if not unrouted:
+        return ["next:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology"]
+    meshes = f"mesh{'es' if len(unrouted) > 1 else ''} {', '.join(unrouted)}"
+    return [
+        f"note:      the lab does not route meshmerize: without its cable, no node of {meshes} is reached",
+        "next:      meshctl bootstrap --yes; meshctl topology",
+    ]
 
 
 @app.command("down")

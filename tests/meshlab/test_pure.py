@@ -11,7 +11,9 @@ from typer.testing import CliRunner
 
 from meshctl.errors import InputError
 from meshctl.firmware.metadata import read_metadata
+from meshctl.inventory import load_fleet
 from meshctl.model import Release
+from meshctl.resources import shipped
 from meshlab import addresses, faults, from_inventory, releases, rootfs
 from meshlab.cli import commands
 from meshlab.errors import LabError
@@ -131,3 +133,10 @@ def test_the_console_quotes_a_command_as_run_does(
     monkeypatch.setattr("meshlab.cli.commands.VirtualFleet", mock.MagicMock())
     done = CliRunner().invoke(commands.app, ["shell", "b01", *(("--", *words) if words else ())])
     assert (done.exit_code, run_shell.call_args.args[2]) == (0, sent)
+
+
+@pytest.mark.parametrize(("name", "is_routed"), [("lab", True), ("mine", False)])
+def test_nobody_is_advised_to_unplug_nodes_that_the_lab_cannot_route(name: str, *, is_routed: bool) -> None:
+    text = "\n".join(commands.next_steps(load_fleet(shipped("inventory") / name, environ={})))
+    assert ("meshctl lab unplug" in text) == is_routed
+    assert ("no node of mesh drift is reached" in text) != is_routed
