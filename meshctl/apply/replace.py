@@ -87,7 +87,13 @@ def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConne
     """A connection to a spare: through the gateway of its site, or else on the bench."""
     site = connections.fleet.gateway_site(spare)
     if site is None:
-        return connections.open(spare)
+        try:
+            return connections.open(spare)
+        except Unreachable as error:
+            if not error.hint:
+                # a spare is often as it came out of its box
+                error.hint = f"if {spare.name} has its factory settings, say where it is: --interface IF or --at HOST"
+            raise
     try:
         connection = connections.open(spare)
     except Unreachable:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import socket
 from dataclasses import replace
+from ipaddress import ip_address
 from typing import Annotated
 
 import typer
 
 from meshctl.apply.bootstrap import BenchTarget
+from meshctl.cli.extensions import LabFleet
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
@@ -18,7 +20,8 @@ At = Annotated[
     typer.Option(
         "--at",
         metavar="HOST",
-        help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2; one per NODE, in the same order.",
+        help="Address of a device, HOST or HOST:PORT, e.g. fe80::1%eth2 (in a lab a virtual node); one per NODE, in "
+        "the same order.",
     ),
 ]
 
@@ -64,6 +67,32 @@ def named_places(at: list[str], interfaces: list[str], site: str) -> list[BenchT
         if name not in known:
             raise InputError(f"--interface {name}: no such interface, found {', '.join(sorted(known))}")
     return [_parse_place(text) for text in at] + [BenchTarget(interface=name) for name in interfaces]
+
+
+def places_in_lab(places: list[BenchTarget], lab: LabFleet) -> list[BenchTarget]:
+    """The ports of virtual nodes. Who practices must not reach the devices on a real bench. Raises InputError."""
+    return [_place_in_lab(place, lab) for place in places]
+
+
+def _place_in_lab(place: BenchTarget, lab: LabFleet) -> BenchTarget:
+    names = lab.node_names
+    if place.host in names and not place.interface:
+        end = lab.bench_endpoint(place.host)
+        return replace(place, host=end.host, port=end.port)
+    if place.interface or not _is_loopback(place.host):
+        given = f"--interface {place.interface}" if place.interface else f"--at {place.host}"
+        raise InputError(
+            f"{given} is not in the lab: expected a virtual node that is plugged in",
+            hint=did_you_mean(place.host, names) or f"for example: --at {names[-1]}",
+        )
+    return place
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _parse_place(text: str) -> BenchTarget:

@@ -22,7 +22,7 @@ from meshctl.apply.bootstrap import (
     restore_pins,
 )
 from meshctl.apply.replace import adopt, identity_edits, require_off, still_on, with_identity
-from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, with_site
+from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, places_in_lab, with_site
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -86,7 +86,8 @@ def bootstrap(
     """
     choices = choices_of(no_firmware, "", "")
     with session(inventory, key_files=key or (), lab=lab) as opened:
-        places = _expected_places(opened, nodes or [], limit or [], named_places(at or [], interface or [], at_site))
+        given = _given_places(opened, at or [], interface or [], at_site)
+        places = _expected_places(opened, nodes or [], limit or [], given)
         places = [with_site(opened.fleet, place, at_site) for place in places]
         with opened.interrupt.on_signals(echo_error):
             arrivals = discover(
@@ -144,6 +145,12 @@ def _print_failure(outcome: Outcome) -> None:
         echo(f"  hint: {hint}", err=True)
 
 
+def _given_places(opened: Session, at: list[str], interfaces: list[str], site: str) -> list[BenchTarget]:
+    """The places of --at or --interface; in a lab those of its nodes."""
+    places = named_places(at, interfaces, site)
+    return places if opened.lab is None else places_in_lab(places, opened.lab)
+
+
 def _expected_places(opened: Session, words: list[str], limits: list[str], at: list[BenchTarget]) -> list[BenchTarget]:
     """Which node is expected at which place."""
     selected = selected_nodes(opened.fleet, words, limits, in_word_order=True) if words or limits else ()
@@ -170,7 +177,12 @@ def replace(
     old: Annotated[str, typer.Argument(help="Node whose device failed or is lost.")],
     new: Annotated[str, typer.Argument(help="Spare node, or `bench` for a device that is not in the inventory.")],
     at: Annotated[
-        str, typer.Option("--at", metavar="HOST", help="Address of the new device if not its own: HOST or HOST:PORT.")
+        str,
+        typer.Option(
+            "--at",
+            metavar="HOST",
+            help="Address of the new device if not its own: HOST or HOST:PORT; in a lab a virtual node.",
+        ),
     ] = "",
     interface: Annotated[
         str, typer.Option("--interface", metavar="IF", help="Interface with the factory-default device, e.g. eth1.")
@@ -197,7 +209,12 @@ def replace(
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
         has_taken_over = not old_is_off and _require_off(opened, inventory, old_node, spare)
-        given = named_places([at] if at else [], [interface] if interface else [], at_site)
+        given = _given_places(opened, [at] if at else [], [interface] if interface else [], at_site)
+        if spare is None and not given and opened.lab is not None:
+            raise InputError(
+                "every virtual node has a bench port of its own: expected --at NODE",
+                hint=f"for example: --at {opened.lab.node_names[-1]}",
+            )
         spots = given or [BenchTarget()][: spare is None or at_site != ""]
         place = with_site(opened.fleet, with_changes(spots[0], node=old_node.name), at_site) if spots else None
         if has_taken_over:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from unittest.mock import Mock
 
 import pytest
 
 from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, identify, require_site, restore_pins
-from meshctl.apply.replace import identity_edits
+from meshctl.apply.replace import adopt, identity_edits
 from meshctl.device.observation import BoardInfo, Observation
 from meshctl.device.trust import HostKey, TrustStore
-from meshctl.errors import NodeError
+from meshctl.errors import NodeError, Unreachable
 from meshctl.model import Fleet, NodeState
+from meshctl.nodes.connections import ConnectionPool
 from tests.meshctl.plan.support import factory, fleet
 
 MAC = "02:4d:00:00:00:01"
@@ -71,6 +73,24 @@ def test_a_spare_hands_over_its_mac_label_and_serial_and_retires() -> None:
     mine, theirs = identity_edits(team.nodes["b01"], spare, device("02:4d:00:00:00:02"))
     assert mine == {"mac": "02:4d:00:00:00:02", "label": "S1"}
     assert theirs == {"state": "retired"}
+
+
+def test_the_way_to_a_spare_that_is_still_in_its_factory_state_is_named(tmp_path: Path) -> None:
+    team = fleet()
+    pool = Mock(spec=ConnectionPool, fleet=team)
+    pool.open.side_effect = Unreachable("b02 (10.42.0.102): cannot connect: Connection refused")
+    with pytest.raises(Unreachable, match="cannot connect") as caught:
+        adopt(
+            Mock(),
+            pool,
+            TrustStore(tmp_path / "known_hosts"),
+            team.nodes["b01"],
+            spare=team.nodes["b02"],
+            target=None,
+            has_taken_over=False,
+            interrupt=Mock(),
+        )
+    assert caught.value.hint == "if b02 has its factory settings, say where it is: --interface IF or --at HOST"
 
 
 def test_rejected_devices_have_their_previous_host_key_pins_restored(tmp_path: Path) -> None:

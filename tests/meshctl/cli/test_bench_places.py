@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import cast
 
 import pytest
 
 from meshctl.apply.bootstrap import BenchTarget
-from meshctl.cli.bench_places import named_places, with_site
+from meshctl.cli.bench_places import named_places, places_in_lab, with_site
+from meshctl.cli.extensions import LabFleet
+from meshctl.device.connection import Endpoint
 from meshctl.errors import InputError
 from tests.meshctl.inventory.inventories import fleet_of
 
@@ -34,3 +38,36 @@ def test_an_interface_of_this_computer_leads_to_no_other_bench() -> None:
     assert named_places(["192.168.1.1:2222"], [], "north") == [BenchTarget("192.168.1.1", 2222)]
     with pytest.raises(InputError, match="--interface is one of this computer"):
         named_places([], ["lo"], "north")
+
+
+class _Lab:
+    node_names = ("base", "b01")
+
+    def bench_endpoint(self, name: str) -> Endpoint:
+        return Endpoint(f"127.255.0.{self.node_names.index(name) + 1}", 20022)
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (BenchTarget("b01"), BenchTarget("127.255.0.2", 20022)),
+        (BenchTarget("127.255.0.2", 20022), BenchTarget("127.255.0.2", 20022)),
+        (BenchTarget("::1", 20022), BenchTarget("::1", 20022)),
+    ],
+)
+def test_a_place_in_a_lab_is_a_virtual_node(given: BenchTarget, found: BenchTarget) -> None:
+    assert places_in_lab([given], cast(LabFleet, _Lab())) == [found]
+
+
+@pytest.mark.parametrize(
+    ("given", "message", "hint"),
+    [
+        (BenchTarget("192.168.1.1"), "--at 192.168.1.1 is not in the lab", "for example: --at b01"),
+        (BenchTarget("b02"), "--at b02 is not in the lab", "did you mean 'b01'?"),
+        (BenchTarget(interface="eth1"), "--interface eth1 is not in the lab", "for example: --at b01"),
+    ],
+)
+def test_a_lab_reaches_no_real_device(given: BenchTarget, message: str, hint: str) -> None:
+    with pytest.raises(InputError, match=re.escape(message)) as caught:
+        places_in_lab([given], cast(LabFleet, _Lab()))
+    assert caught.value.hint == hint
