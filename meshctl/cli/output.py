@@ -45,11 +45,34 @@ def echo_bytes(raw: bytes, *, err: bool = False) -> None:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails."""
+    """Write the file that an option names, such as `--out`. Raises InputError with the reason if that fails; an earlier
+    file then stays as it was."""
+    data = content.encode() if isinstance(content, str) else content
     try:
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        if path.exists() and not path.is_file():
+            path.write_bytes(data)  # a pipe, /dev/stdout
+        else:
+            _replace(Path(os.path.realpath(path)), data)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _replace(target: Path, data: bytes) -> None:
+    temporary = target.with_name(f".{target.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    except PermissionError:
+        target.write_bytes(data)  # a file that is writable in a directory that is not
+        return
+    try:
+        with open(descriptor, "wb") as stream:
+            stream.write(data)
+        with suppress(FileNotFoundError):
+            os.chmod(temporary, target.stat().st_mode & 0o7777)
+        os.replace(temporary, target)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def is_plain() -> bool:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.cli.context import AsJson
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_json, write_file
 from meshctl.errors import ExitCode, InputError
 from meshctl.placement.margin import UNMEASURED_FADE_DB
 from meshctl.placement.path_loss import PathLossModel, Point, RadioModel, Wall
@@ -61,9 +61,9 @@ def plan_placement(
     terrain, air, stops, view = _read(map_file, route, wall_loss, exponent)
     found = plan(terrain, air, stops, margin_db=margin, beacons=beacons, tx_power_dbm=tx_power)
     if svg_file is not None:
-        _write(svg_file, svg(view, found).encode())
+        write_file(svg_file, svg(view, found))
     if png_file is not None:
-        _write(png_file, png(view, found))
+        write_file(png_file, png(view, found))
     if as_json:
         echo_json(json.dumps(_json(found), indent=2))
     elif as_csv:
@@ -110,13 +110,6 @@ def _point(word: str, nodes: dict[str, Point]) -> Point:
     if not (abs(x) < 1e7 and abs(y) < 1e7):
         raise InputError(f"route: expected X,Y within 10,000 km, found {word!r}")
     return (x, y)
-
-
-def _write(file: Path, content: bytes) -> None:
-    try:
-        file.write_bytes(content)
-    except OSError as error:
-        raise InputError(f"cannot write {file}: {error.strerror}") from error
 
 
 def _json(found: PlacementPlan) -> dict[str, Any]:

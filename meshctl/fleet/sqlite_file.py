@@ -63,7 +63,8 @@ class SqliteFile:
                 path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
             )
         except (OSError, sqlite3.Error) as error:
-            raise MeshctlError(f"{path}: cannot open the {schema.name}: {error}", hint=self._hint(error)) from error
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+            raise MeshctlError(f"{path}: cannot open the {schema.name}: {reason}", hint=self._hint(error)) from error
         try:
             # a foreign file stays as it is
             self._retried(self._check_owner)

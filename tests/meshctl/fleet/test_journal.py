@@ -238,6 +238,12 @@ def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> N
     assert "XDG_STATE_HOME" in caught.value.hint
 
 
+def test_the_reason_why_a_journal_cannot_be_made_is_in_words(tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("a file in place of the directory", encoding="utf-8")
+    with pytest.raises(MeshctlError, match=r"cannot open the journal: (Not a directory|File exists)$"):
+        Journal(tmp_path / "state" / "journal.sqlite")
+
+
 def test_a_lab_and_a_real_fleet_of_the_same_name_are_kept_separate(path: Path) -> None:
     with Journal(path) as field, Journal(path, lab="/lab") as lab:
         practice = lab.begin("provision", fleet="f", inventory="/lab/inventory", nodes=("a",))

@@ -1,0 +1,56 @@
+"""Files that options such as `--out` name."""
+
+from __future__ import annotations
+
+import os
+import resource
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from meshctl.cli.output import write_file
+from meshctl.errors import InputError
+
+
+@pytest.fixture
+def _full_disk() -> Iterator[None]:
+    """A limit on files' sizes fails a write in its middle, as a full disk does."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.usefixtures("_full_disk")
+def test_a_full_disk_leaves_the_earlier_file(tmp_path: Path) -> None:
+    file = tmp_path / "baseline.json"
+    file.write_text("accepted findings", encoding="utf-8")
+    for target in (file, tmp_path / "new.json"):
+        with pytest.raises(InputError, match=f"cannot write {target}: File too large"):
+            write_file(target, "x" * 8192)
+    assert [path.name for path in tmp_path.iterdir()] == ["baseline.json"]
+    assert file.read_text(encoding="utf-8") == "accepted findings"
+
+
+def test_a_file_keeps_its_mode_and_its_link(tmp_path: Path) -> None:
+    file, link = tmp_path / "plan.json", tmp_path / "link"
+    link.symlink_to(file)
+    file.write_text("old", encoding="utf-8")
+    file.chmod(0o640)
+    write_file(link, "new")
+    assert (file.read_text(encoding="utf-8"), file.stat().st_mode & 0o777) == ("new", 0o640)
+    assert link.is_symlink()
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    heard: list[str] = []
+    reader = threading.Thread(target=lambda: heard.append(pipe.read_text(encoding="utf-8")))
+    reader.start()
+    write_file(pipe, "for another program")
+    reader.join()
+    assert heard == ["for another program"]
+    assert pipe.is_fifo()
