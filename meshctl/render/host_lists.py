@@ -13,6 +13,9 @@ from pathlib import Path
 
 from meshctl.model import Computer, Fleet, Node, Release, Robot, Site, SshSettings
 
+# OpenSSH's options for dropbear 2019.78, which signs and accepts RSA with SHA-1 only
+_SHA1_RSA = ("HostKeyAlgorithms", "PubkeyAcceptedAlgorithms")
+
 
 @dataclass(frozen=True, slots=True)
 class HostEntry:
@@ -117,9 +120,7 @@ def _block(entry: HostEntry, known_hosts: Path, key_path: Callable[[str], Path])
     if entry.ssh.jump:
         yield f"    ProxyJump {entry.ssh.jump}"
     if entry.has_sha1_rsa_only:
-        # dropbear 2019.78 signs and accepts RSA with SHA-1 only
-        yield "    HostKeyAlgorithms +ssh-rsa"
-        yield "    PubkeyAcceptedAlgorithms +ssh-rsa"
+        yield from (f"    {name} +ssh-rsa" for name in _SHA1_RSA)
 
 
 def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callable[[str], Path]) -> str:
@@ -127,7 +128,10 @@ def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path:
     groups: dict[str, dict[str, dict[str, object]]] = {}
     for entry in entries:
         options = [f"-o HostKeyAlias={entry.alias}", f"-o UserKnownHostsFile={_quoted(known_hosts)}"]
+        # one private key has a variable of its own
+        options += [f"-o IdentityFile={_quoted(key_path(text))}" for text in entry.ssh.key_files[1:]]
         options += [f"-o ProxyJump={entry.ssh.jump}"] if entry.ssh.jump else []
+        options += [f"-o {name}=+ssh-rsa" for name in _SHA1_RSA] if entry.has_sha1_rsa_only else []
         variables: dict[str, object] = {
             "ansible_host": entry.address,
             "ansible_port": entry.ssh.port,

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from meshctl.model import SshSettings
+from meshctl.render.host_lists import HostEntry, ansible_inventory
+
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "inventory" / "subt-final"
 
@@ -54,6 +57,19 @@ def test_the_ansible_inventory_lists_every_host_with_its_address_once() -> None:
         assert host["ansible_host"]
         assert f"HostKeyAlias={name}" in host["ansible_ssh_common_args"]
     assert all(host == {} for host in children["role_beacon"]["hosts"].values())
+
+
+def test_ansible_logs_in_like_openssh() -> None:
+    """With every private key, and on 19.07 with its only signature algorithm."""
+    ssh = SshSettings(key_files=("ed25519", "rsa"))
+    entry = HostEntry("u01", "u01", "10.60.0.1", ssh, (), is_openwrt=True, has_sha1_rsa_only=True)
+    text = ansible_inventory([entry], Path("known_hosts"), Path)
+    host = json.loads(text)["all"]["children"]["openwrt"]["hosts"]["u01"]
+    assert host["ansible_ssh_private_key_file"] == "ed25519"
+    options = ("IdentityFile=rsa", "HostKeyAlgorithms=+ssh-rsa", "PubkeyAcceptedAlgorithms=+ssh-rsa")
+    assert {f"-o {option}" for option in options} <= set(
+        host["ansible_ssh_common_args"].replace(" -o", "\n-o").split("\n")
+    )
 
 
 @pytest.mark.parametrize("kind", ["ssh-config", "ansible"])
