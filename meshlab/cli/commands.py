@@ -204,13 +204,16 @@ def image(
     out: Annotated[Path, typer.Argument(help="The file to write.")],
     package: Annotated[list[str] | None, typer.Option("--package", help="Package to add to the mesh packages.")] = None,
     revision: Annotated[str, typer.Option("--revision", help="Build revision; default: that of new nodes.")] = "",
+    target: Annotated[
+        str, typer.Option("--target", help="The hardware profile's target, such as ath79/nand.")
+    ] = "ath79/generic",
 ) -> None:
     """Write a firmware image for virtual nodes and print its line for the inventory.
 
     Example: meshctl lab image 23.05 compex,wpj344-16m wpj344.bin --revision r24107-0123456789
     """
     named = revision or facts(release).revision
-    content = firmware_image(release, board=board, extra=tuple(package or ()), revision=named)
+    content = firmware_image(release, board=board, extra=tuple(package or ()), target=target, revision=named)
     write_file(out, content)
     echo(f"firmware: {{image: {out.name}, sha256: {hashlib.sha256(content).hexdigest()}, revision: {named}}}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -88,6 +89,16 @@ def test_a_generated_image_has_readable_sysupgrade_metadata(release: Release) ->
     assert metadata is not None
     assert metadata.boards == ("ubnt,rocket-m",)
     assert releases.facts(release).revision == metadata.revision
+
+
+@pytest.mark.parametrize(("options", "target"), [((), "ath79/generic"), (("--target", "ath79/nand"), "ath79/nand")])
+def test_an_image_is_for_the_target_of_its_profile(options: tuple[str, ...], target: str, tmp_path: Path) -> None:
+    file = tmp_path / "new.bin"
+    done = CliRunner().invoke(commands.app, ["image", "23.05", "glinet,gl-ar750s-nor-nand", str(file), *options])
+    assert done.exit_code == 0, done.output
+    metadata = read_metadata(file.read_bytes())
+    assert metadata is not None
+    assert metadata.target == target
 
 
 def test_an_image_contains_exactly_one_wpad_package() -> None:
