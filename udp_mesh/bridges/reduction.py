@@ -31,10 +31,11 @@ GAIN = 0.3
 from one side: for a range of sizes of 1 : 20."""
 MAX_INCREASE = 0.05
 """Of detail, per message."""
-LATE_DECREASE = 0.25
-"""Of detail, for a message that did not arrive before the next one."""
-LATENCIES = 3
-"""Of which the median counts: one message that lost packets changes nothing."""
+LATE_DECREASES = (0.0, 0.1, 0.3, 0.6)
+"""Of detail, for the first, second, third and each further message in a row that did not leave before the next one:
+a pause of a second costs little, a link that carries nothing takes the detail down within ten messages or so."""
+LATENCIES = 5
+"""Of which the median counts: two messages that lost packets change nothing."""
 
 
 class ReductionError(ValueError):
@@ -90,17 +91,28 @@ class DetailController:
     that go first, and repetitions. It grows with the message's size, which grows about exponentially with the detail;
     so detail is moved in proportion to the logarithm of latency / target: an integral controller that settles. Slowly
     upwards, fast downwards, not at all near the target.
+
+    An outcome counts only if its message was published after the previous outcome that counted. So messages that one
+    pause of the link or of a host delayed together count once, and after a change of detail nothing counts that was
+    made before it.
     """
 
     def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
         self._target_s = TARGET_SHARE * period_s
         self._latencies: Deque[float] = deque(maxlen=LATENCIES)
+        self._counted_s = -math.inf
+        self._late_in_a_row = 0
         self.detail = 1.0
 
-    def on_delivered(self, latency_s: float, detail_in_use: float = 1.0) -> None:
+    def on_delivered(self, now: float, latency_s: float, detail_in_use: float = 1.0) -> None:
         """A message arrived, so long after it was published. `detail_in_use` may be less than ours, for the sake of
-        another destination: then the latency says nothing about ours."""
+        another destination: then the latency says nothing about ours. `now` in monotonic seconds."""
         self.detail = min(self.detail, detail_in_use + MAX_INCREASE)
+        if now - latency_s < self._counted_s:
+            return
+        self._counted_s = now
+        self._late_in_a_row = 0
         self._latencies.append(max(latency_s, 1e-6))
         if len(self._latencies) < LATENCIES:
             return
@@ -108,9 +120,14 @@ class DetailController:
         if abs(error) > DEADBAND:
             self._move(min(-GAIN * error, MAX_INCREASE))
 
-    def on_late(self) -> None:
-        """A message was superseded by the next one, or its deadline passed, before it arrived."""
-        self._move(-LATE_DECREASE)
+    def on_late(self, now: float) -> None:
+        """A message was superseded by the next one, or its deadline passed, before it left."""
+        # it is a period old; half a period of tolerance for uneven ones
+        if now - self._counted_s < 1.5 * self._period_s:
+            return
+        self._counted_s = now
+        self._move(-LATE_DECREASES[min(self._late_in_a_row, len(LATE_DECREASES) - 1)])
+        self._late_in_a_row += 1
 
     def _move(self, change: float) -> None:
         moved = min(1.0, max(0.0, self.detail + change))
@@ -169,8 +186,8 @@ class Reducer:
     def _detail(self, topic: str) -> float:
         return min((each.detail for each in self._controllers.get(topic, {}).values()), default=1.0)
 
-    def on_outcome(self, topic: str, peer: str, outcome: str, latency_s: Optional[float]) -> None:
-        """The outcome of a message at one destination, as the daemon's event names it."""
+    def on_outcome(self, topic: str, peer: str, outcome: str, latency_s: Optional[float], now: float) -> None:
+        """The outcome of a message at one destination, as the daemon's event names it; `now` in monotonic seconds."""
         with self._lock:
             if topic not in self._periods_s:
                 return
@@ -181,9 +198,9 @@ class Reducer:
             if peer not in controllers:
                 controllers[peer] = DetailController(self._periods_s[topic])
             if outcome == "expired":
-                controllers[peer].on_late()
+                controllers[peer].on_late(now)
             elif latency_s is not None:
-                controllers[peer].on_delivered(latency_s, in_use)
+                controllers[peer].on_delivered(now, latency_s, in_use)
 
     def reduce(
         self, route: Route, key: TypeKey, definition: str, payload: bytes, now: float, *, latched: bool = False

@@ -56,7 +56,7 @@ class BridgeRuntime:
         message, header = as_message(frame), frame[0]
         if header.get("event") == "outcome":
             topic, peer, outcome = (str(header[name]) for name in ("topic", "peer", "outcome"))
-            self._reducer.on_outcome(topic, peer, outcome, header.get("latency_s"))
+            self._reducer.on_outcome(topic, peer, outcome, header.get("latency_s"), time.monotonic())
             return
         effects: list[Effect] = []
         with self._lock:

@@ -22,11 +22,8 @@ from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.reduction import (
     CLOUD,
-    DEADBAND,
     IMAGE,
     JPEG,
-    TARGET_SHARE,
-    DetailController,
     JpegOptions,
     Reduced,
     Reducer,
@@ -265,53 +262,6 @@ def test_quality_and_voxels_stay_within_their_bounds() -> None:
     cloud_options = Reduction(voxel_m=0.1, max_voxel_m=0.4)
     assert [round(voxel_edge_m(cloud_options, detail) or 0, 6) for detail in (0.0, 0.5, 1.0)] == [0.4, 0.2, 0.1]
     assert voxel_edge_m(Reduction(voxel_m=0.1), 0.0) == 0.1
-
-
-@given(st.floats(2, 20), st.floats(0.05, 3.0), st.floats(0.05, 3.0))
-def test_the_detail_settles_for_every_link_and_does_not_oscillate(
-    ratio: float, first_s: float, second_s: float
-) -> None:
-    """Latency at detail 1 is `first_s`, then `second_s`, at a period of 1 s; at detail 0, `ratio` times less."""
-    controller = DetailController(1.0)
-    for full_s in (first_s, second_s):
-        details = []
-        for _ in range(120):
-            latency_s = full_s * ratio ** (controller.detail - 1)
-            if latency_s > 1.0:
-                controller.on_late()
-            else:
-                controller.on_delivered(latency_s)
-            details.append(controller.detail)
-        assert len(set(details[-40:])) == 1, "settled"
-        changes = [later - sooner for sooner, later in itertools.pairwise(details) if later != sooner]
-        turns = sum((sooner > 0) != (later > 0) for sooner, later in itertools.pairwise(changes))
-        assert turns <= 1
-        settled_s = full_s * ratio ** (details[-1] - 1)
-        if 0 < details[-1] < 1:
-            assert abs(math.log(settled_s / TARGET_SHARE)) <= DEADBAND + 1e-6
-
-
-def test_one_slow_message_changes_nothing() -> None:
-    controller = DetailController(1.0)
-    for latency_s in (0.4, 0.5, 0.9, 0.5, 0.4, 0.9, 0.4):
-        controller.on_delivered(latency_s)
-    assert controller.detail == 1.0
-
-
-def test_the_slowest_destination_decides_until_it_is_lost() -> None:
-    reducer = Reducer({"camera": Reduction(rate_hz=1.0, encode=JpegOptions(), adapt=True)}, 1)
-    assert reducer.adapts("camera")
-    assert not reducer.adapts("other")
-    for _ in range(20):
-        reducer.on_outcome("camera", "near", "delivered", 0.01)
-        reducer.on_outcome("camera", "far", "expired", None)
-    assert reducer.detail("camera") == 0.0
-    reducer.on_outcome("camera", "far", "peer-lost", None)
-    # from where it was: nothing is known yet about larger messages
-    assert 0.0 < reducer.detail("camera") <= 0.1
-    for _ in range(100):
-        reducer.on_outcome("camera", "near", "delivered", 0.01)
-    assert reducer.detail("camera") == 1.0
 
 
 # The bridge's file

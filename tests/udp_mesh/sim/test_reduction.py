@@ -71,9 +71,9 @@ def drive(*, adapt: bool, seed: int) -> Run:
             return
         if isinstance(event, MessageDelivered):
             run.latencies.append((started, event.latency_s))
-            reducer.on_outcome("camera", event.peer, "delivered", event.latency_s)
+            reducer.on_outcome("camera", event.peer, "delivered", event.latency_s, now)
         else:
-            reducer.on_outcome("camera", event.peer, "expired", None)
+            reducer.on_outcome("camera", event.peer, "expired", None, now)
 
     settings = {name: Settings(name, unkeyed=True, topics=TOPICS) for name in ("rover", "base")}
     team = Team(settings, channel=RadioChannel(rate=LINK_BIT_S), loss=lambda a, b, now: 0.02, seed=seed, on_event=note)
