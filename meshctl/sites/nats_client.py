@@ -179,38 +179,64 @@ class NatsClient:
     def _jetstream(self, domain: str) -> JetStreamContext:
         return self._client.jetstream(domain=domain or None, timeout=ANSWER_S)
 
-    def ensure_stream(self, domain: str = "", **config: Any) -> None:
-        """Make a stream, unless there is one of this name."""
+    def ensure_stream(self, domain: str = "", **config: Any) -> bool:
+        """Make a stream, unless there is one of this name; whether it was made."""
         from nats.js.errors import NotFoundError
 
-        async def ensure() -> None:
+        async def ensure() -> bool:
             js = self._jetstream(domain)
             try:
                 await js.stream_info(config["name"])
             except NotFoundError:
                 await js.add_stream(**config)
+                return True
+            return False
 
         self._check_connected()
-        self._run(ensure())
+        return self._run(ensure())
+
+    def last_sequence(self, stream: str, domain: str = "") -> int:
+        """The number of the last message that was stored in a stream."""
+        self._check_connected()
+        return int(self._run(self._jetstream(domain).stream_info(stream)).state.last_seq)
+
+    def start_above(self, stream: str, sequence: int) -> None:
+        """Number the messages of an empty stream from `sequence` + 1 on."""
+        self._check_connected()
+        self._run(self._jetstream("").purge_stream(stream, seq=sequence + 1))
 
     def ensure_mirror(self, stream: str, domain: str, **limits: Any) -> None:
-        """Copy a stream of another JetStream domain, under its name, unless that is done already."""
+        """Copy a stream of another JetStream domain, under its name, unless that is done already. A copy of a stream
+        that was lost, and made anew with lower numbers, would wait for them: it is made anew, too."""
         from nats.js.api import ExternalStream, StreamSource
 
         external = ExternalStream(api=f"$JS.{domain}.API", deliver="")
-        self.ensure_stream(name=stream, mirror=StreamSource(name=stream, external=external), **limits)
+        config = {"name": stream, "mirror": StreamSource(name=stream, external=external), **limits}
+        if self.ensure_stream(**config):
+            return
+        copied = self.last_sequence(stream)
+        try:
+            is_lost = self.last_sequence(stream, domain) < copied
+        except NatsLost:
+            # its site is offline, or has no stream yet
+            return
+        if is_lost:
+            self._run(self._jetstream("").delete_stream(stream))
+            self.ensure_stream(**config)
 
-    def store(self, subject: str, message: str, data: bytes, domain: str = "") -> None:
-        """Store a message in the stream of its subject; the same `message` again changes nothing."""
+    def store(self, subject: str, message: str, data: bytes, domain: str = "") -> int:
+        """Store a message in the stream of its subject; returns its number there. The same `message` again changes
+        nothing."""
 
-        async def store() -> None:
-            js = self._jetstream(domain)
+        async def store() -> int:
+            js, sequence = self._jetstream(domain), 0
             for chunk in chunks_of(message, data):
                 headers = {HEADER: chunk.header, "Nats-Msg-Id": f"{message}-{chunk.number}"}
-                await js.publish(subject, chunk.data, headers=headers)
+                sequence = (await js.publish(subject, chunk.data, headers=headers)).seq
+            return sequence
 
         self._check_connected()
-        self._run(store(), None)
+        return self._run(store(), None)
 
     def queued(self, stream: str, subject: str) -> int:
         """How many messages of a subject a stream has."""

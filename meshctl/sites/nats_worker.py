@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import sys
 import threading
 import time
@@ -59,6 +60,10 @@ CONSUMER = "worker"
 KEPT_DAYS = 90
 MAX_STREAM_BYTES = 64 << 20
 _PUBLISH_S = 0.25
+# How often the stream is checked for a loss.
+_CHECK_S = 30.0
+# More messages than a worker stores before it records their numbers.
+_UNRECORDED = 1000
 _CLOCK_RETRY_S = 30.0
 _RETRY_S = 1.0
 # Requests that change what the worker is, or that NATS has another way for.
@@ -236,12 +241,35 @@ class NatsWorker:
         self.client.ensure_stream(
             name=subjects.run_stream, subjects=[subjects.runs], **stream_settings(KEPT_DAYS, MAX_STREAM_BYTES)
         )
+        checked_s = -math.inf
         while True:
+            if time.monotonic() - checked_s >= _CHECK_S:
+                self._publish_what_was_lost()
+                checked_s = time.monotonic()
             self._runners = [each for each in self._runners if each.poll() is None]
-            for path in (self.directory.root / "runs").glob("*"):
-                if path.name not in self._published:
-                    self._publish(RunDirectory(path))
+            for run in self._runs():
+                if run.path.name not in self._published:
+                    self._publish(run)
             time.sleep(_PUBLISH_S)
+
+    def _runs(self) -> Iterator[RunDirectory]:
+        return map(RunDirectory, (self.directory.root / "runs").glob("*"))
+
+    def _publish_what_was_lost(self) -> None:
+        """After the leaf node has lost its stream, publish all runs again, since the hub may not have copied them. Its
+        copy goes on after the last number that it has, so ours continue above it."""
+        runs = list(self._runs())
+        last = max((int(read_json(run.published).get("sequence", 0)) for run in runs), default=0)
+        stream = self._subjects.run_stream
+        if self.client.last_sequence(stream) >= last:
+            return
+        _log("the leaf node has lost its stream: the events of all runs are published again")
+        self._published.clear()
+        for run in runs:
+            if run.published.exists():
+                # the hub's copy would refuse a message whose name it has
+                write_json(run.published, {"sequence": last, "lost": last})
+        self.client.start_above(stream, last + _UNRECORDED)
 
     def _publish(self, run: RunDirectory) -> None:
         """Publish what is new of a run."""
@@ -250,27 +278,30 @@ class NatsWorker:
         if not is_ordered:
             return
         state = read_json(run.published)
-        offset = int(state.get("offset", 0))
-        if not state and run.replaced.exists():
+        offset, lost = int(state.get("offset", 0)), int(state.get("lost", 0))
+        suffix = f"-{lost}" if lost else ""
+        if not offset and run.replaced.exists():
             replaced = base64.b64encode(run.replaced.read_bytes()).decode()
-            self._store(run, "replaced", {"end": 0, "replaced": replaced})
+            self._store(run, f"replaced{suffix}", {"end": 0, "replaced": replaced})
         while not state.get("is_over"):
             with self._starting:
                 reply = run.next_reply(offset, MAX_EVENTS_BYTES)
             if reply is None:
                 return
             value = {"end": reply["offset"], **{key: each for key, each in reply.items() if key != "offset"}}
-            self._store(run, "over" if "over" in reply else str(offset), value)
+            mark = "over" if "over" in reply else str(offset)
+            sequence = self._store(run, f"{mark}{suffix}", value)
             offset = int(reply["offset"])
-            state = {"offset": offset, "is_over": "over" in reply}
+            state = {"offset": offset, "is_over": "over" in reply, "sequence": sequence, "lost": lost}
             write_json(run.published, state)
         self._published.add(run.path.name)
 
-    def _store(self, run: RunDirectory, mark: str, value: Mapping[str, object]) -> None:
-        """Store a message of a run; the same `mark` again, of a worker that was killed, is dropped by the server."""
+    def _store(self, run: RunDirectory, mark: str, value: Mapping[str, object]) -> int:
+        """Store a message of a run; the same `mark` again, of a worker that was killed, is dropped by the server.
+        Returns its number in the stream."""
         name = run.path.name
         whole = {"fleet": self.directory.fleet, "site": self.directory.site, "run": name, **value}
-        self.client.store(self._subjects.run(name), f"{name}-{mark}", signed(EVENTS, whole, self.sign))
+        return self.client.store(self._subjects.run(name), f"{name}-{mark}", signed(EVENTS, whole, self.sign))
 
 
 class _Replies:

@@ -32,7 +32,8 @@ class NatsServerProcess:
         directory.mkdir(parents=True, exist_ok=True)
         self.port = free_tcp_port()
         self.url = f"nats://127.0.0.1:{self.port}"
-        jetstream = {"store_dir": str(directory / f"{name}-store"), "domain": domain}
+        self.store = directory / f"{name}-store"
+        jetstream = {"store_dir": str(self.store), "domain": domain}
         config = {"listen": f"127.0.0.1:{self.port}", "server_name": name, "jetstream": jetstream, **more}
         self._config = directory / f"{name}.conf"
         # JSON is a configuration of nats-server
