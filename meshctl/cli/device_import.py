@@ -315,6 +315,7 @@ def _show(
     for fate, heading in _HEADINGS.items():
         _list(heading, [difference.line for difference in made.of(fate)])
     _list("not written by meshctl, stays on the device", [", ".join(made.untouched)] if made.untouched else [])
+    _list("not UCI, not mapped, stays on the device", list(made.unreadable))
     _list("assumed, to be checked", list(made.assumed))
     if target.dry_run:
         return
@@ -351,6 +352,7 @@ def _as_json(target: ImportTarget, made: DeviceImport, files: Mapping[Path, Secr
             for each in made.differences
         ],
         "untouched": list(made.untouched),
+        "unreadable": list(made.unreadable),
         "assumed": list(made.assumed),
         "secret_files": [str(path) for path in files],
     }

@@ -4,7 +4,7 @@ text of `uci export`. Pure."""
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -18,11 +18,14 @@ from meshctl.uci import Package, Section, parse, parse_export
 
 MARKER = f"/{MARKER_PATH}"
 EMPTY_EXPORT = "IMP001"
+# without which there is nothing to import
+_ESSENTIAL = frozenset({"network", "system", "wireless"})
 
 
 @dataclass(frozen=True, slots=True)
 class ExistingDevice:
-    """One device. Empty text and None mean that it was not reported; `marker` is meshctl's own file on the node."""
+    """One device. Empty text and None mean that it was not reported; `marker` is meshctl's own file on the node.
+    `unreadable` are the files in /etc/config that are not UCI, with what is wrong."""
 
     packages: Mapping[str, Package] = field(repr=False)
     release: Release
@@ -35,6 +38,13 @@ class ExistingDevice:
     authorized_keys: tuple[str, ...] = ()
     links: tuple[WirelessLink, ...] = ()
     marker: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    unreadable: Mapping[str, tuple[Diagnostic, ...]] = field(default_factory=lambda: MappingProxyType({}))
+
+    def require(self, packages: Iterable[str]) -> None:
+        """Raises InvalidInput if one of these is unreadable."""
+        problems = [item for name in packages for item in self.unreadable.get(name, ())]
+        if problems:
+            raise InvalidInput(problems)
 
     def package(self, name: str) -> Package:
         """The package, empty if the device has none."""
@@ -62,7 +72,8 @@ class ExistingDevice:
 def observed_device(seen: Observation) -> ExistingDevice:
     """The device of an observation that includes the file MARKER.
 
-    Raises InputError if it reported no release, board or configuration, InvalidInput for a package that is not UCI.
+    Raises InputError if it reported no release, board or configuration, InvalidInput if its network, its
+    radios or its system are not UCI.
     """
     if seen.release is None or seen.board is None or seen.uci is None:
         missing = [
@@ -74,16 +85,14 @@ def observed_device(seen: Observation) -> ExistingDevice:
             f"the device reports no {' and no '.join(missing)}", hint="it must run OpenWrt 19.07 or later, as root"
         )
     packages = {}
-    problems: list[Diagnostic] = []
+    unreadable: dict[str, tuple[Diagnostic, ...]] = {}
     for name, text in seen.uci.items():
         try:
             packages[name] = parse(text, f"/etc/config/{name}", name=name)
         except InvalidInput as reason:
-            problems += reason.diagnostics
-    if problems:
-        raise InvalidInput(problems)
+            unreadable[name] = reason.diagnostics
     marker = seen.files.get(MARKER)
-    return ExistingDevice(
+    device = ExistingDevice(
         packages=packages,
         release=release_of(seen.release.version),
         board=seen.board.board_name,
@@ -95,7 +104,10 @@ def observed_device(seen: Observation) -> ExistingDevice:
         authorized_keys=seen.authorized_keys or (),
         links=seen.links or (),
         marker=MappingProxyType(parse_marker("" if marker is None else marker.text or "")),
+        unreadable=MappingProxyType(unreadable),
     )
+    device.require(_ESSENTIAL)
+    return device
 
 
 def exported_device(text: str, file: str, *, release: Release, board: str, target: str) -> ExistingDevice:

@@ -32,6 +32,8 @@ class DeviceImport:
     kept: Mapping[str, str]
     differences: tuple[Difference, ...]
     untouched: tuple[str, ...]
+    unreadable: tuple[str, ...]
+    """What is wrong with a file that is not UCI and that meshctl does not write."""
     assumed: tuple[str, ...]
 
     def of(self, fate: Fate) -> tuple[Difference, ...]:
@@ -49,7 +51,8 @@ def import_device(
 ) -> DeviceImport:
     """Import `device` into the inventory of `fleet`, or into a new one (None). `secrets` reads those of `fleet`.
 
-    Raises InputError, and InvalidInput for values that an inventory cannot have.
+    Raises InputError, and InvalidInput for values that an inventory cannot have, and for a file that meshctl writes and
+    that is not UCI on the device.
     """
     entries = entries_of(device, fleet, options)
     patterns = tuple(keep)
@@ -73,6 +76,7 @@ def import_device(
         kept=first.extra_uci,
         differences=final.differences,
         untouched=final.untouched,
+        unreadable=tuple(str(item) for items in device.unreadable.values() for item in items),
         assumed=entries.assumed,
     )
 
@@ -88,6 +92,7 @@ def _compare(
     packages: dict[str, Package] = {
         file.package.name: file.package for file in rendered.files if file.package is not None
     }
+    device.require(packages)
     return compare(device.packages, packages, entries.sections, keep=keep)
 
 

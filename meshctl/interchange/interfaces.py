@@ -37,14 +37,24 @@ def interfaces(device: ExistingDevice, radios: Iterable[ExistingRadio]) -> tuple
 
 
 def bridge_ports(network: Package, interface: Section) -> tuple[str, ...]:
-    """The ports of the interface's bridge, or its own device."""
+    """The ports of the interface's bridge, or of its VLAN there (`br-lan.1`), or its own device."""
     device = interface.get("device") or interface.get("ifname")
     if interface.get("type") == "bridge":
         return tuple(interface.get("ifname").split())
+    bridge, _, vlan = device.rpartition(".")
+    for section in network.of_type("bridge-vlan"):
+        if (section.get("device"), section.get("vlan")) == (bridge, vlan):
+            return tuple(_vlan_port(word, vlan) for item in section.items("ports") for word in item.split())
     for section in network.of_type("device"):
         if section.get("name") == device and section.get("type") == "bridge":
             return tuple(word for item in (section.items("ports") or section.items("ifname")) for word in item.split())
     return tuple(device.split())
+
+
+def _vlan_port(member: str, vlan: str) -> str:
+    """A member of a bridge's VLAN (`lan1:u*`, `lan3:t`) as a port of a bridge without VLANs."""
+    port, _, flags = member.partition(":")
+    return f"{port}.{vlan}" if "t" in flags else port
 
 
 def static_address(interface: Section) -> IpInterface:

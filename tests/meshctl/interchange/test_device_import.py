@@ -12,9 +12,11 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from meshctl.cli.main import build
+from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
-from meshctl.interchange.device import observed_device, release_of
+from meshctl.interchange.device import ExistingDevice, observed_device, release_of
 from meshctl.interchange.device_differences import Fate, compare
+from meshctl.interchange.interfaces import bridge_ports
 from meshctl.interchange.new_inventory import load_text, new_text
 from meshctl.inventory import load_fleet
 from meshctl.model import MASK, Encryption, Fleet, MeshMode, Release
@@ -72,7 +74,7 @@ def test_a_foreign_mesh_becomes_an_entry_with_its_options_in_extra_uci(tmp_path:
 
 
 def test_every_option_of_a_device_is_in_the_entry_or_named(tmp_path: Path) -> None:
-    for name in ("foreign", "stock-24.10", "stock-19.07"):
+    for name in ("foreign", "stock-24.10", "stock-19.07", "switch-19.07", "vlans-24.10"):
         device = exported(name, release=Release.V19_07 if "19.07" in name else Release.V24_10)
         made = new_inventory(device, tmp_path, name="node", country="US")
         lines = "\n".join(
@@ -85,12 +87,12 @@ def test_every_option_of_a_device_is_in_the_entry_or_named(tmp_path: Path) -> No
                     text = value if isinstance(value, str) else " ".join(value)
                     shown = MASK if option == "key" else text
                     is_named = f".{option}: {shown}" in lines or f"{option}={shown}" in lines
-                    is_same = text in keys or is_rendered(made.fleet, made.name, package.name, option, text)
+                    is_same = text in keys or is_rendered(made.fleet, made.name, device, package.name, option, text)
                     assert is_named or is_same, (package.name, option)
 
 
-def is_rendered(fleet: Fleet, node: str, package: str, option: str, text: str) -> bool:
-    tree = render_node(fleet, node, placeholder_secret).package(package)
+def is_rendered(fleet: Fleet, node: str, device: ExistingDevice, package: str, option: str, text: str) -> bool:
+    tree = render_node(fleet, node, placeholder_secret, device_facts=device.facts).package(package)
     assert tree is not None
     return any(section.get(option) == text for section in tree.sections)
 
@@ -118,6 +120,41 @@ def test_a_stock_device_gives_a_usable_entry(release: str, tmp_path: Path) -> No
     assert node.hardware.switch_vlans == ((("1", "3 0t"),) if release == "19.07" else ())
     assert "wireless.default_radio0" in {each.key for each in made.of(Fate.REMOVED)}
     assert "operators.password_login: true" in made.assumed[0]
+
+
+def test_a_board_with_a_switch_and_two_radios_keeps_its_vlans_and_meshes(tmp_path: Path) -> None:
+    made = new_inventory(exported("switch-19.07", release=Release.V19_07), tmp_path)
+    (node,) = made.fleet.nodes.values()
+    assert node.lan_ports == ("eth1.1",)
+    assert node.hardware.switch_vlans == (("1", "2 3 4 5 0t"), ("2", "1 6t"))
+    assert [(radio.name, radio.mesh) for radio in node.radios] == [("radio0", "attic5"), ("radio1", "attic24")]
+    meshes = made.fleet.meshes
+    assert (meshes["attic5"].mode, meshes["attic24"].mode) == (MeshMode.MESH, MeshMode.ADHOC)
+    assert (meshes["attic5"].channel, meshes["attic24"].bssid) == (48, "02:ca:ff:ee:ba:be")
+    removed = {each.key for each in made.of(Fate.REMOVED)}
+    assert {"network.wan", "network.wan6", "wireless.ap24", "firewall.@include[0]"} <= removed
+
+
+def test_the_ports_of_a_bridges_vlan_are_those_of_the_node(tmp_path: Path) -> None:
+    made = new_inventory(exported("vlans-24.10"), tmp_path)
+    (node,) = made.fleet.nodes.values()
+    # not `br-lan.1`, the VLAN's interface
+    assert node.lan_ports == ("lan1", "lan2")
+    assert [(radio.name, radio.mesh) for radio in node.radios] == [("radio0", "hall"), ("radio1", "hall-2")]
+    assert len(made.secrets) == 2
+    assert [each.line for each in made.of(Fate.CHANGED) if each.key.startswith("network.")] == [
+        "network.br_lan.ports: lan1 lan2 lan3 bat0 -> lan1 lan2 bat0",
+        "network.lan.device: br-lan.1 -> br-lan",
+    ]
+    assert {"network.@bridge-vlan[0]", "network.@bridge-vlan[1]", "network.cameras"} <= {
+        each.key for each in made.of(Fate.REMOVED)
+    }
+
+
+def test_a_tagged_port_of_a_bridges_vlan_is_an_interface_of_that_vlan() -> None:
+    bridge = Section("bridge-vlan", None, {"device": "br-lan", "vlan": "20", "ports": ("lan1:u*", "lan2", "lan3:t")})
+    lan = Section("interface", "lan", {"device": "br-lan.20"})
+    assert bridge_ports(Package("network", (bridge, lan)), lan) == ("lan1", "lan2", "lan3.20")
 
 
 def test_a_stock_device_joins_the_mesh_of_an_inventory(fleet: Path) -> None:
@@ -225,6 +262,24 @@ def test_a_recorded_observation_of_every_release_is_imported(release: str, tmp_p
     assert node.hardware.board == device.board
     assert made.fleet.operators.ssh_keys == device.authorized_keys
     assert str(node.address.ip).startswith("10.42.0.")
+
+
+def test_a_file_that_is_not_uci_is_listed_and_the_rest_imported(tmp_path: Path) -> None:
+    seen = observed(RECORDED / "24.10" / "mesh")
+    broken = {"broken": "config thing 'x'\n\toption bad 'un'closed'\n", "notes": "bought in May\n"}
+    device = observed_device(replace(seen, uci={**(seen.uci or {}), **broken}))
+    made = new_inventory(device, tmp_path, country="US")
+    assert [line.partition(":")[0] for line in made.unreadable] == ["/etc/config/broken", "/etc/config/notes"]
+    assert made.differences == new_inventory(observed_device(seen), tmp_path, country="US").differences
+
+
+@pytest.mark.parametrize("package", ["network", "firewall"])
+def test_a_file_that_meshctl_writes_must_be_uci(package: str, tmp_path: Path) -> None:
+    seen = observed(RECORDED / "24.10" / "mesh")
+    with pytest.raises(InvalidInput, match=f"/etc/config/{package}:1:1: .*expected"):
+        new_inventory(
+            observed_device(replace(seen, uci={**(seen.uci or {}), package: "no section\n"})), tmp_path, country="US"
+        )
 
 
 def test_the_key_of_a_collector_is_no_operators(tmp_path: Path) -> None:
