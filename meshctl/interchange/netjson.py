@@ -19,6 +19,7 @@ from meshctl.resolve.intent import MeshInterface, RadioIntent
 # The least cost: nothing is measured yet.
 PLANNED_COST = 1.0
 _ENCRYPTIONS: Mapping[Encryption, str] = {Encryption.PSK2: "wpa2_personal", Encryption.SAE: "wpa3_personal"}
+_PROTOCOLS = {"VHT": "802.11ac", "HE": "802.11ax", "EHT": "802.11be"}
 _MODES: Mapping[MeshMode, str] = {MeshMode.ADHOC: "adhoc", MeshMode.MESH: "802.11s"}
 
 
@@ -27,8 +28,9 @@ def network_graph(fleet: Fleet) -> dict[str, Any]:
     return {
         "type": "NetworkGraph",
         "protocol": "static",
-        "version": None,
-        "metric": None,
+        # the text of the draft allows null, its schema does not
+        "version": "",
+        "metric": "",
         "label": fleet.name,
         "nodes": [
             {
@@ -75,7 +77,8 @@ def _may_hear(fleet: Fleet, mesh: str, a: Node, b: Node) -> bool:
 
 
 def configurations(fleet: Fleet, nodes: Iterable[Node], secrets: Callable[[SecretRef], Secret]) -> dict[str, Any]:
-    """One node's DeviceConfiguration, or a NetworkCollection of several. Mesh keys are never in it.
+    """One node's DeviceConfiguration, or a NetworkCollection of several. Mesh keys are never in it: they
+    are empty.
 
     NetJSON has no keys for batman-adv, firewall and SSH, which are left out. Raises InvalidInput for nodes that cannot
     be rendered.
@@ -136,7 +139,7 @@ def _radio(radio: RadioIntent) -> dict[str, Any]:
     """`channel` is 0, which NetJSON reads as automatic, for a radio that is off."""
     return {
         "name": radio.name,
-        "protocol": "802.11ac" if radio.htmode.startswith("VHT") else "802.11n",
+        "protocol": _PROTOCOLS.get(radio.htmode.rstrip("0123456789+-"), "802.11n"),
         "channel": radio.channel or 0,
         "channel_width": _width_mhz(radio.htmode),
         "tx_power": radio.tx_power_dbm,
@@ -152,13 +155,15 @@ def _width_mhz(htmode: str) -> int:
 
 
 def _wireless(radio: RadioIntent, interface: MeshInterface) -> dict[str, Any]:
-    wireless: dict[str, Any] = {"radio": radio.name, "mode": _MODES[interface.mode]}
+    # the draft requires an SSID of every mode
+    wireless: dict[str, Any] = {"radio": radio.name, "mode": _MODES[interface.mode], "ssid": interface.ssid}
     if interface.mode is MeshMode.ADHOC:
-        wireless |= {"ssid": interface.ssid, "bssid": interface.bssid}
+        wireless["bssid"] = interface.bssid
     else:
         wireless["mesh_id"] = interface.ssid
     if interface.encryption in _ENCRYPTIONS:
-        wireless["encryption"] = {"protocol": _ENCRYPTIONS[interface.encryption]}
+        # the draft requires a key
+        wireless["encryption"] = {"protocol": _ENCRYPTIONS[interface.encryption], "key": ""}
     return {"name": interface.name, "type": "wireless", "mtu": interface.mtu, "wireless": wireless}
 
 

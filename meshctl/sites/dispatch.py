@@ -279,6 +279,8 @@ class SiteExecution:
     def _read(self, run: SiteRun, reply: Mapping[str, object]) -> None:
         objects = reply.get("events", [])
         assert isinstance(objects, list)
+        if "note" in reply:
+            self._note(f"site {run.site.name}: {reply['note']}")
         for event in events_of(objects):
             if event.node and event.node not in run.nodes:
                 continue

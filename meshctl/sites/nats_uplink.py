@@ -38,7 +38,7 @@ from meshctl.sites.envelope import (
     verified,
 )
 from meshctl.sites.nats_client import NatsLost, NatsServer, shared, stream_settings
-from meshctl.sites.protocol import SILENCE_S, raise_error
+from meshctl.sites.protocol import SILENCE_S, WorkerError, raise_error
 from meshctl.sites.service import unit_name
 from meshctl.sites.subjects import SiteSubjects
 from meshctl.sites.uplink import Greeting, Parcel, SiteOffline, Uplink, greeting_of
@@ -48,6 +48,9 @@ KEPT_DAYS = 90
 MAX_ORDERS_BYTES = MAX_EVENTS_BYTES = 256 << 20
 _SLICE_BYTES = 256 << 10
 _POLL_S = 0.5
+# After so long without events, a worker that is heard is asked for them.
+_QUIET_S = 20.0
+_NOT_STORED = "events do not come through the NATS servers, so the worker was asked: look at their disks and logs"
 
 
 def hub_server(fleet: Fleet, hub: NatsHub) -> NatsServer:
@@ -218,18 +221,29 @@ class NatsUplink(Uplink):
         stream = self._subjects.run_stream
         limits = stream_settings(KEPT_DAYS, MAX_EVENTS_BYTES)
         self._client.ensure_mirror(stream, self._nats.domain, **limits)
-        heard_s = time.monotonic()
+        heard_s = quiet_s = time.monotonic()
         messages = self._client.read(stream, self._subjects.run(run), lambda: self._is_closed)
         with self._client.listening(self._subjects.beat) as beats, closing(messages):
+            asked: dict[str, Any] = {}
             for data in messages:
-                if data is None and beats.empty():
+                if data is None and beats.empty() and not asked:
                     self._check_heard(heard_s)
                     continue
                 heard_s, self._has_contact = time.monotonic(), True
                 while not beats.empty():
                     beats.get()
                 if data is None:
+                    if asked:
+                        # nor did they come meanwhile
+                        offset = int(asked["offset"])
+                        yield {**asked, "note": _NOT_STORED}
+                        if "over" in asked:
+                            return
+                        asked = {}
+                    elif heard_s - quiet_s >= _QUIET_S:
+                        asked, quiet_s = self._events_there(run, offset), heard_s
                     continue
+                quiet_s, asked = heard_s, {}
                 try:
                     value = verified(EVENTS, data, (self._worker,), "the worker")
                 except EnvelopeRefused:
@@ -243,6 +257,14 @@ class NatsUplink(Uplink):
                 if "over" in value:
                     return
         self._check_heard(heard_s)
+
+    def _events_there(self, run: str, offset: int) -> dict[str, Any]:
+        """What the worker has of a run beyond `offset`; empty if there is nothing."""
+        try:
+            return self.ask({"do": "events", "run": run, "offset": offset})
+        except WorkerError:
+            # of an earlier version
+            return {}
 
     def stop(self, run: str) -> bool:
         return bool(self.ask({"do": "stop", "run": run})["stopping"])

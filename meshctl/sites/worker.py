@@ -100,6 +100,9 @@ class Worker:
                 self._reply(self._start(request))
             case "follow":
                 self._follow(self._directory.run(str(request["run"])), int(request["offset"]))
+            case "events":
+                run = self._directory.run(str(request["run"]))
+                self._reply(run.next_reply(int(request["offset"]), MAX_EVENTS_BYTES) or {})
             case "stop":
                 self._reply({"stopping": runner.stop(self._directory.run(str(request["run"])))})
             case "status":

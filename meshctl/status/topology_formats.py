@@ -170,7 +170,8 @@ def netjson(view: TopologyView) -> str:
         {
             "type": "NetworkGraph",
             "protocol": view.routing,
-            "version": None,
+            # the draft's schema allows no null
+            "version": "",
             "metric": "ETX",
             "label": view.mesh,
             "nodes": [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,12 +33,7 @@ def example(name: str) -> Fleet:
 def test_the_graph_has_every_pair_of_a_cell_once_and_the_wires_of_a_robot() -> None:
     fleet = load_fleet(shipped("inventory") / "subt-final")
     graph = network_graph(fleet)
-    assert (graph["type"], graph["protocol"], graph["version"], graph["metric"]) == (
-        "NetworkGraph",
-        "static",
-        None,
-        None,
-    )
+    assert (graph["type"], graph["protocol"]) == ("NetworkGraph", "static")
     names = {node["id"]: node["label"] for node in graph["nodes"]}
     assert list(names.values()) == [node.name for node in fleet.managed()]
     pairs = [frozenset((names[link["source"]], names[link["target"]])) for link in graph["links"]]
@@ -58,6 +54,44 @@ def test_radios_farther_apart_than_the_longest_link_are_not_linked() -> None:
         ("base", "rover1-b01"),
         ("rover1-b01", "rover1-b02"),
     }
+
+
+def lacking(value: object, members: Mapping[str, type]) -> dict[str, object]:
+    """The members that the draft requires and `value` has not, or with another type."""
+    assert isinstance(value, Mapping)
+    return {name: value.get(name) for name, kind in members.items() if not isinstance(value.get(name), kind)}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_every_object_has_the_members_that_the_draft_requires(name: str) -> None:
+    """As the draft's schemas have them: no null, also where its text allows one."""
+    fleet = example(name)
+    graph = network_graph(fleet)
+    assert not lacking(graph, dict.fromkeys(("type", "protocol", "version", "metric", "label"), str))
+    ids = [node["id"] for node in graph["nodes"]]
+    assert len(ids) == len(set(ids))
+    for link in graph["links"]:
+        assert not lacking(link, {"source": str, "target": str, "cost": float})
+        assert {link["source"], link["target"]} <= set(ids)
+    nodes = list({node.hardware.name + node.role.value: node for node in fleet.managed()}.values())
+    found = configurations(fleet, nodes, placeholder_secret)
+    for device in found["collection"] if found["type"] == "NetworkCollection" else [found]:
+        radios = {radio["name"] for radio in device["radios"]}
+        for radio in device["radios"]:
+            assert not lacking(radio, {"protocol": str, "channel": int, "channel_width": int})
+        for route in device["routes"]:
+            assert not lacking(route, {"device": str, "destination": str, "next": str})
+        for interface in device["interfaces"]:
+            assert len(interface["name"]) <= 15
+            assert interface["type"] != "bridge" or interface["bridge_members"]
+            for address in interface.get("addresses", []):
+                assert not lacking(address, {"proto": str, "family": str, "address": str, "mask": int})
+            if wireless := interface.get("wireless"):
+                assert not lacking(wireless, {"mode": str, "ssid": str})
+                assert wireless["radio"] in radios
+                assert not lacking(
+                    wireless.get("encryption", {"protocol": "", "key": ""}), {"protocol": str, "key": str}
+                )
 
 
 @pytest.mark.parametrize("name", EXAMPLES)

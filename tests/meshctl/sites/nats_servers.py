@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Self
 
 from tests.meshctl.monitor.prometheus_program import free_tcp_port
@@ -26,14 +26,22 @@ def expects_nats() -> bool:
 
 
 class NatsServerProcess:
-    """A server with JetStream on loopback; `more` is added to its configuration."""
+    """A server with JetStream on loopback; `more` is added to its configuration, `limits` to that of
+    JetStream."""
 
-    def __init__(self, directory: Path, name: str, domain: str, more: Mapping[str, object]) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        name: str,
+        domain: str,
+        more: Mapping[str, object],
+        limits: Mapping[str, object] = MappingProxyType({}),
+    ) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         self.port = free_tcp_port()
         self.url = f"nats://127.0.0.1:{self.port}"
         self.store = directory / f"{name}-store"
-        jetstream = {"store_dir": str(self.store), "domain": domain}
+        jetstream = {"store_dir": str(self.store), "domain": domain, **limits}
         config = {"listen": f"127.0.0.1:{self.port}", "server_name": name, "jetstream": jetstream, **more}
         self._config = directory / f"{name}.conf"
         # JSON is a configuration of nats-server
@@ -55,7 +63,9 @@ class NatsServerProcess:
 class NatsSites:
     """A hub, and a leaf node of each site behind an uplink that can be cut."""
 
-    def __init__(self, directory: Path, sites: Iterable[str]) -> None:
+    def __init__(self, directory: Path, sites: Iterable[str], leaf_store_bytes: int | None = None) -> None:
+        """`leaf_store_bytes` is how much of its disk a leaf node may use."""
+        limits = {} if leaf_store_bytes is None else {"max_file_store": leaf_store_bytes}
         leaf_port = free_tcp_port()
         # the hub advertises its address to leaf nodes, which would pass by the uplink: one where nothing listens
         leafnodes = {"listen": f"127.0.0.1:{leaf_port}", "advertise": "127.0.0.1:1"}
@@ -65,7 +75,7 @@ class NatsSites:
         for site in sites:
             uplink = self.uplinks[site] = CuttableUplink(leaf_port)
             remote = {"reconnect": 1, "remotes": [{"url": f"nats://127.0.0.1:{uplink.port}"}]}
-            self.leaves[site] = NatsServerProcess(directory, f"leaf-{site}", site, {"leafnodes": remote})
+            self.leaves[site] = NatsServerProcess(directory, f"leaf-{site}", site, {"leafnodes": remote}, limits)
 
     def close(self) -> None:
         for server in (*self.leaves.values(), self.hub):

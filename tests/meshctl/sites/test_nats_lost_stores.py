@@ -5,18 +5,24 @@ from __future__ import annotations
 import json
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import closing
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
+from meshctl.device.trust import TrustStore
 from meshctl.errors import MeshctlError
+from meshctl.inventory import load_fleet
+from meshctl.model import Fleet
+from meshctl.nodes.connections import ConnectionPool
 from meshctl.sites.nats_client import NatsClient, NatsServer, stream_settings
+from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.nats_worker import NatsWorker
 from meshctl.sites.runs import RunDirectory, SiteDirectory, write_json
 from meshctl.sites.subjects import SiteSubjects
+from meshctl.sites.uplink import SiteOffline
 from tests.meshctl.device.servers import keypair, public
 from tests.meshctl.sites.nats_servers import NatsServerProcess, NatsSites
 from tests.waiting import until
@@ -38,31 +44,38 @@ def hub(servers: NatsSites) -> Iterator[NatsClient]:
         yield client
 
 
-@pytest.fixture
-def site(servers: NatsSites, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SiteDirectory]:
-    """A site whose worker publishes, in a thread that ends with its connection."""
-    monkeypatch.setattr("meshctl.sites.nats_worker._CHECK_S", 0.5)
-    directory = SiteDirectory.of("mines/north", {"XDG_STATE_HOME": str(tmp_path)})
-    directory.install([public(keypair(tmp_path / "operator")).read_text().strip()])
-    client = NatsClient(NatsServer(servers.leaves["north"].url), waits_at_start=True)
-    worker = NatsWorker(directory, {}, client, "hub")
+@contextmanager
+def serving(directory: Path, url: str, loops: Iterable[str]) -> Iterator[SiteDirectory]:
+    """A site whose worker runs these of its loops, in threads that end with its connection."""
+    site = SiteDirectory.of("mines/north", {"XDG_STATE_HOME": str(directory)})
+    site.install([public(keypair(directory / "operator")).read_text().strip()])
+    client = NatsClient(NatsServer(url), waits_at_start=True)
+    worker = NatsWorker(site, {}, client, "hub")
     is_over = threading.Event()
 
-    def publish() -> None:
+    def repeat(loop: Callable[[], None]) -> None:
         while not is_over.is_set():
-            try:
-                worker._events()
-            except (MeshctlError, CancelledError):
-                is_over.wait(0.2)
+            with suppress(MeshctlError, CancelledError):
+                loop()
+            is_over.wait(0.2)
 
-    thread = threading.Thread(target=publish)
-    thread.start()
+    threads = [threading.Thread(target=repeat, args=(getattr(worker, name),), daemon=True) for name in loops]
+    for thread in threads:
+        thread.start()
     try:
-        yield directory
+        yield site
     finally:
         is_over.set()
         client.close()
-        thread.join()
+        # the others wait for requests
+        threads[0].join()
+
+
+@pytest.fixture
+def site(servers: NatsSites, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[SiteDirectory]:
+    monkeypatch.setattr("meshctl.sites.nats_worker._CHECK_S", 0.5)
+    with serving(tmp_path, servers.leaves["north"].url, ["_events"]) as made:
+        yield made
 
 
 def finished_run(site: SiteDirectory, number: int) -> str:
@@ -125,3 +138,43 @@ def test_a_hub_that_loses_its_store_copies_again(servers: NatsSites, hub: NatsCl
     lose_store(servers.hub)
     until(lambda: hub.is_connected, "the connection", wait_s=60)
     until(lambda: ends(hub, run), "the run at the hub again", wait_s=120)
+
+
+INVENTORY = """\
+meshctl: 1
+fleet: mines
+country: US
+operators: {{ssh_keys: ["{key}"]}}
+nats: {{url: {hub}}}
+sites: {{north: {{nats: {{}}, ssh: {{key_files: ["{private}"]}}, worker_key: {worker}}}}}
+nodes: {{}}
+"""
+
+
+def test_a_worker_that_cannot_store_events_is_asked_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The leaf node has less room than its stream may use, as with a full disk."""
+    monkeypatch.setattr("meshctl.sites.nats_uplink._QUIET_S", 1.0)
+    with (
+        NatsSites(tmp_path / "nats", ["north"], leaf_store_bytes=1 << 20) as servers,
+        serving(tmp_path, servers.leaves["north"].url, ["_events", "_asks", "_beats"]) as site,
+    ):
+        run = finished_run(site, 1)
+        private = tmp_path / "operator"
+        key, worker = (path.read_text().strip() for path in (public(private), public(site.key)))
+        path = tmp_path / "fleet.yaml"
+        path.write_text(INVENTORY.format(key=key, hub=servers.hub.url, private=private, worker=worker))
+        fleet = load_fleet(path)
+        access = ConnectionPool(fleet, TrustStore(tmp_path / "known_hosts"), use_agent=False)
+        uplink = until(lambda: connected(fleet, access), "the worker to answer", wait_s=60)
+        with uplink:
+            replies = list(uplink.follow(run, 0))
+    assert [event["text"] for reply in replies for event in reply.get("events", [])] == ["run 1"]
+    assert replies[-1]["over"] == {"error": ""}
+    assert all("do not come through the NATS servers" in reply["note"] for reply in replies)
+
+
+def connected(fleet: Fleet, access: ConnectionPool) -> NatsUplink | None:
+    try:
+        return NatsUplink(fleet, fleet.sites["north"], access)
+    except SiteOffline:
+        return None
