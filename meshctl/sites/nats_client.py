@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import queue
-import re
-import ssl
 import threading
 from collections.abc import Callable, Coroutine, Generator, Iterator
 from contextlib import contextmanager, suppress
@@ -19,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from meshctl.errors import InputError, MeshctlError, Unreachable
 from meshctl.sites.chunks import HEADER, Chunk, chunks_of, parse_chunk
+from meshctl.sites.nats_login import login_options, tls_context
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -100,10 +99,10 @@ class NatsClient:
             "pending_size": -1,
             "error_cb": _ignore,
             "inbox_prefix": b"_INBOX",
-            **_login(self._server.credentials),
+            **login_options(self._server.credentials),
         }
         if self._server.ca is not None:
-            options["tls"] = _tls(self._server.ca)
+            options["tls"] = tls_context(self._server.ca)
         while True:
             client = Client()
             try:
@@ -207,7 +206,7 @@ class NatsClient:
 
     def ensure_mirror(self, stream: str, domain: str, **limits: Any) -> None:
         """Copy a stream of another JetStream domain, under its name, unless that is done already. A copy of a stream
-        that was lost, and made anew with lower numbers, would wait for them: it is made anew, too."""
+        that was lost, and whose numbers began again, would wait for the next one: it is replaced."""
         from nats.js.api import ExternalStream, StreamSource
 
         external = ExternalStream(api=f"$JS.{domain}.API", deliver="")
@@ -346,7 +345,6 @@ class NatsClient:
         self._end_loop()
 
 
-_SEED = re.compile(r"SU[A-Z2-7]{56}")
 _HINT = "check the address, the credentials and the network; `nats.url` in the inventory"
 
 
@@ -364,27 +362,6 @@ async def _ignore(error: Exception) -> None:
 
 def _not_installed(error: ImportError) -> InputError:
     return InputError(f"sites over NATS need nats-py: {error}", hint="pip install 'meshctl-fleet[nats]'")
-
-
-def _login(credentials: Path | None) -> dict[str, Any]:
-    if credentials is None:
-        return {}
-    try:
-        text = credentials.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{credentials}: cannot be read: {error.strerror}") from error
-    if "BEGIN NATS USER JWT" in text:
-        return {"user_credentials": str(credentials)}
-    if not _SEED.fullmatch(text.strip()):
-        raise InputError(f"{credentials}: expected a .creds file or the seed of a user's nkey (SU...)")
-    return {"nkeys_seed_str": text.strip()}
-
-
-def _tls(ca: Path) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=str(ca))
-    except (OSError, ssl.SSLError) as error:
-        raise InputError(f"{ca}: not a certificate authority: {error}") from error
 
 
 def _translated(error: BaseException, url: str) -> Unreachable | None:

@@ -257,7 +257,7 @@ class NatsWorker:
 
     def _publish_what_was_lost(self) -> None:
         """After the leaf node has lost its stream, publish all runs again, since the hub may not have copied them. Its
-        copy goes on after the last number that it has, so ours continue above it."""
+        copy continues after the last number that it has, so ours continue above it."""
         runs = list(self._runs())
         last = max((int(read_json(run.published).get("sequence", 0)) for run in runs), default=0)
         stream = self._subjects.run_stream

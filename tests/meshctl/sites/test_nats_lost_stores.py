@@ -117,7 +117,7 @@ def test_what_a_leaf_node_loses_is_published_again_above_what_the_hub_has_copied
     assert hub.last_sequence(_STREAM) > copied
 
 
-def test_the_copy_of_a_gateway_that_was_replaced_is_made_anew(
+def test_the_copy_of_a_gateway_that_was_replaced_is_made_again(
     servers: NatsSites, hub: NatsClient, site: SiteDirectory
 ) -> None:
     """Its worker knows no earlier runs, and the new leaf node numbers from 1."""
