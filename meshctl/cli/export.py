@@ -16,7 +16,7 @@ from meshctl.cli.context import InventoryPath, Lab, Limit, Nodes, lab_at, locate
 from meshctl.cli.extensions import LabFleet
 from meshctl.cli.output import echo, echo_bytes, write_file
 from meshctl.errors import InputError
-from meshctl.interchange.label_sheet import SHEETS, draw, labels
+from meshctl.interchange.label_sheet import SHEETS, draw, is_printable, labels
 from meshctl.interchange.netjson import configurations, network_graph
 from meshctl.inventory import csv_table
 from meshctl.inventory.file_paths import file_path, known_hosts_path
@@ -111,6 +111,10 @@ def _write_labels(
         echo_bytes(content)
     else:
         write_file(out, content)
+    unprintable = [each.name for each in found if not is_printable(each)]
+    if unprintable:
+        hint = "the sheet's fonts have Western European characters only; the code has name, MAC and key"
+        echo(f"printed with '?' in label or serial number: {join_limited(unprintable)}; {hint}", err=True)
     unpinned = [each.name for each in found if not each.fingerprints]
     if unpinned:
         echo(f"without a host key: {join_limited(unpinned)}; pin them with `meshctl trust`, then print again", err=True)

@@ -23,6 +23,7 @@ INSTALL_HINT = "install it with: pip install 'meshctl-fleet[labels]' (reportlab 
 NO_KEY = "no host key pinned"
 # ISO/IEC 18004: four modules of white around the code
 QUIET_ZONE_MODULES = 4
+TITLE_FONT, MIN_TITLE_POINTS = "Helvetica-Bold", 5.0
 MAX_CODE_SHARE = 0.42
 """Of a label's width: with more, the fingerprint beside the code becomes too small to read."""
 
@@ -158,12 +159,11 @@ def _draw_label(
 
 def _draw_text(canvas: Any, label: DeviceLabel, left: float, bottom: float, width: float, height: float) -> None:
     """The label's lines, each as large as fits."""
-    title = f"{label.label}  {label.name}" if label.label else label.name
     key = label.fingerprints[0] if label.fingerprints else NO_KEY
     half = (len(key) + 1) // 2
     halves = (key[:half], key[half:]) if label.fingerprints else (key, "")
     lines = [
-        (title, "Helvetica-Bold", height * 0.2),
+        *_title(canvas, label, width, height),
         (label.mac, "Courier", height * 0.13),
         (label.serial, "Helvetica", height * 0.11),
         (halves[0], "Courier", height * 0.1),
@@ -173,8 +173,29 @@ def _draw_text(canvas: Any, label: DeviceLabel, left: float, bottom: float, widt
     for text, font, size in lines:
         if not text:
             continue
-        shown = text.encode("latin-1", "replace").decode("latin-1")
+        shown = _printable(text)
         fitting = min(size, size * width / max(canvas.stringWidth(shown, font, size), 1))
         y -= size * 1.15
         canvas.setFont(font, fitting)
         canvas.drawString(left, y, shown)
+
+
+def _title(canvas: Any, label: DeviceLabel, width: float, height: float) -> list[tuple[str, str, float]]:
+    """Label and name on one line, or, where that would be too small to read, the label above the name in two parts."""
+    size = height * 0.2
+    one = f"{label.label}  {label.name}" if label.label else label.name
+    if size * width / max(canvas.stringWidth(_printable(one), TITLE_FONT, size), 1) >= MIN_TITLE_POINTS:
+        return [(one, TITLE_FONT, size)]
+    half = (len(label.name) + 1) // 2
+    parts = [(label.name[:half], TITLE_FONT, height * 0.1), (label.name[half:], TITLE_FONT, height * 0.1)]
+    return [(label.label, TITLE_FONT, height * 0.12), *parts]
+
+
+def _printable(text: str) -> str:
+    """The text with '?' for characters that the PDF's own fonts lack."""
+    return text.encode("latin-1", "replace").decode("latin-1")
+
+
+def is_printable(label: DeviceLabel) -> bool:
+    """Whether a sheet shows all characters of the label's texts."""
+    return all(_printable(text) == text for text in (label.name, label.label, label.serial))

@@ -18,7 +18,17 @@ from typer.testing import CliRunner, Result
 from meshctl.cli.main import build
 from meshctl.device.trust import HostKey
 from meshctl.errors import InputError
-from meshctl.interchange.label_sheet import POINTS_PER_MM, SHEETS, DeviceLabel, Sheet, draw, labels, sheet_positions
+from meshctl.interchange.label_sheet import (
+    MIN_TITLE_POINTS,
+    POINTS_PER_MM,
+    SHEETS,
+    DeviceLabel,
+    Sheet,
+    draw,
+    is_printable,
+    labels,
+    sheet_positions,
+)
 from meshctl.inventory import load_fleet
 from meshctl.resources import shipped
 from tests.meshctl.interchange.devices import SSH_KEY
@@ -79,6 +89,28 @@ def test_the_text_has_name_label_mac_and_fingerprint() -> None:
     for word in ("B7", "b07", "02:00:5e:00:00:07", "SN-7"):
         assert word in text
     assert FINGERPRINT in text.replace("\n", "")
+
+
+@pytest.mark.parametrize("paper", SHEETS)
+def test_a_name_of_63_characters_can_be_read_and_leaves_room_for_the_rest(paper: str) -> None:
+    name = "a-beacon-in-the-northern-adit-of-level-7-" + "x" * 22
+    found = DeviceLabel(name, "B7", "02:00:5e:00:00:07", "SN-7", (FINGERPRINT,))
+    (page,) = PdfReader(io.BytesIO(draw((found,), SHEETS[paper]))).pages
+    assert name in page.extract_text().replace("\n", "")
+    operations = page.get_contents()
+    assert operations is not None
+    text = operations.get_data().decode("latin-1")
+    sizes = [float(size) for size, line in re.findall(r"/F\d+ ([\d.]+) Tf [^/]*?\((.*?)\) Tj", text) if line in name]
+    assert len(sizes) == 2
+    assert min(sizes) >= MIN_TITLE_POINTS
+    lowest = min(float(y) for y in re.findall(r"1 0 0 1 [\d.]+ ([\d.]+) Tm", text))
+    sheet = SHEETS[paper]
+    assert lowest > (sheet.page_mm[1] - sheet.margin_mm[1] - sheet.label_mm[1]) * POINTS_PER_MM
+
+
+@pytest.mark.parametrize(("text", "is_shown"), [("Höhle 3", True), ("Łódź 1", False), ("坑道 4", False)])
+def test_labels_that_the_fonts_lack_characters_for_are_known(text: str, is_shown: bool) -> None:
+    assert is_printable(DeviceLabel("b07", text, "", "", ())) == is_shown
 
 
 @pytest.mark.parametrize("paper", SHEETS)
