@@ -74,7 +74,12 @@ CREATE INDEX alarm_actions_of_fleet ON alarm_actions(fleet, id);
 
 
 class DatabaseLost(MeshctlError):
-    """The database does not answer: its server or the network is down."""
+    """The database does not answer, since its server or the network is down, or it takes nothing for now."""
+
+
+# SQLSTATE: a read-only server, no room or memory, a statement that took too long, an error of the disk
+_UNUSABLE = ("25006", "53", "57", "58")
+UNUSABLE_HINT = "with MESHCTL_STORE= (empty), meshctl uses the journal of this computer"
 
 
 def check_url(url: str) -> None:
@@ -207,6 +212,10 @@ class Database:
         except psycopg.Error as error:
             if self._connection.broken or self._connection.closed or isinstance(error, psycopg.errors.AdminShutdown):
                 raise DatabaseLost(f"{self.label}: the connection was lost: {_one_line(error)}") from error
+            if (error.sqlstate or "").startswith(_UNUSABLE):
+                raise DatabaseLost(
+                    f"{self.label}: cannot {verb} the journal: {_one_line(error)}", hint=UNUSABLE_HINT
+                ) from error
             raise MeshctlError(f"{self.label}: cannot {verb} the journal: {_one_line(error)}") from error
 
     def lock_run(self, run: int) -> None:

@@ -17,7 +17,7 @@ from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet import Outcome, Result, postgresql, shared_store
 from meshctl.fleet.journal import Journal, default_path
 from meshctl.fleet.journal_store import open_journal
-from meshctl.fleet.postgresql import MIGRATIONS, Database, DatabaseLost
+from meshctl.fleet.postgresql import MIGRATIONS, UNUSABLE_HINT, Database, DatabaseLost
 from meshctl.fleet.run_files import CHANGES, RunFiles
 from meshctl.fleet.shared_store import SharedStore
 from meshctl.monitor.alarm_log import Silence
@@ -189,6 +189,58 @@ def test_a_server_that_hangs_costs_a_run_one_bounded_wait(
             run.finish_node(Outcome("a", Result.DONE))
             assert "the connection was lost" in hers.notice
             assert run.error == ""
+
+
+_READ_ONLY = ("ALTER SYSTEM SET default_transaction_read_only = on", "SELECT pg_reload_conf()")
+_WRITABLE = ("ALTER SYSTEM RESET default_transaction_read_only", "SELECT pg_reload_conf()")
+_FULL = (
+    "CREATE FUNCTION meshctl.refuse() RETURNS trigger LANGUAGE plpgsql AS"
+    " $$ BEGIN RAISE 'No space left on device' USING ERRCODE = 'disk_full'; END $$",
+    "CREATE TRIGGER full_disk BEFORE INSERT OR UPDATE ON meshctl.outcomes EXECUTE FUNCTION meshctl.refuse()",
+    "CREATE TRIGGER full_disk BEFORE INSERT OR UPDATE ON meshctl.runs EXECUTE FUNCTION meshctl.refuse()",
+)
+_ROOM = ("DROP FUNCTION meshctl.refuse CASCADE",)
+
+
+@pytest.mark.parametrize(
+    ("refuse", "accept", "reason"),
+    [(_READ_ONLY, _WRITABLE, "read-only transaction"), (_FULL, _ROOM, "No space left on device")],
+)
+def test_a_database_that_takes_nothing_stops_no_run(
+    alice: Laptop, bob: Laptop, url: str, refuse: tuple[str, ...], accept: tuple[str, ...], reason: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    import psycopg
+
+    monkeypatch.setattr(shared_store, "RETRY_S", 0.05)
+    with alice.open() as hers, psycopg.connect(url, autocommit=True) as administrator:
+        administrator.execute("SET default_transaction_read_only = off")
+        run = hers.begin("provision", fleet="f", inventory="i", nodes=("a",))
+        try:
+            for statement in refuse:
+                administrator.execute(statement)
+            until(lambda: is_refused(bob, reason), "the database to refuse a new run", wait_s=60)
+            run.finish_node(Outcome("a", Result.DONE))
+            assert run.error == ""
+            assert reason in hers.notice
+            assert "journal entries are kept on this computer" in hers.notice
+        finally:
+            for statement in accept:
+                administrator.execute(statement)
+        with bob.open() as his:
+            until(lambda: his.unfinished(run.id) == (), "the outcome to arrive", wait_s=60)
+
+
+def is_refused(laptop: Laptop, reason: str) -> bool:
+    """Whether a new run is refused for this reason, with the way around it."""
+    try:
+        with laptop.open() as journal:
+            journal.begin("provision", fleet="f", inventory="i", nodes=("b",)).end("ok")
+    except DatabaseLost as error:
+        assert reason in str(error)
+        assert error.hint == UNUSABLE_HINT
+        return True
+    return False
 
 
 def test_runs_without_the_database_are_merged_once_it_is_back(carol: Laptop, bob: Laptop, uplink: Uplink) -> None:
