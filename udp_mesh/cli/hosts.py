@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import errno
+import fcntl
 import os
 import shutil
 import signal
@@ -65,6 +66,11 @@ def _follow(socket: str, path: Path) -> int:
     notifier = Notifier()
     block = HostsBlock(path)
     try:
+        lock = _lock(path)
+    except OSError as error:
+        print_error(f"{path}: {_reason(error)}")
+        return Exit.FAILED
+    try:
         block.write(())
         notifier.ready("waiting for the daemon")
         answered_s = time.monotonic()
@@ -91,6 +97,21 @@ def _follow(socket: str, path: Path) -> int:
     except (OSError, ValueError) as error:
         print_error(f"{path}: {_reason(error)}")
         return Exit.FAILED
+    finally:
+        os.close(lock)
+
+
+def _lock(path: Path) -> int:
+    """A descriptor that keeps others from writing there, until it is closed: two would replace each other's names.
+    The lock is on the directory, since each change replaces the file. Raises OSError."""
+    folder = os.open(os.path.dirname(os.path.realpath(path)), os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(folder)
+        text = "another `udp-mesh hosts --write` keeps its names there: stop it, or write to another directory"
+        raise OSError(errno.EBUSY, text) from None
+    return folder
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:

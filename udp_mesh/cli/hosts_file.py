@@ -36,11 +36,16 @@ def hosts_of(peers: Iterable[Mapping[str, object]]) -> tuple[HostEntry, ...]:
     """The peers, as in the daemon's reply to `peers`, that a hosts file can name, in the order of their names.
 
     Left out are peers without an address, addresses that reach only this computer or one link, legacy peers, whose
-    names are not authenticated, and names that are not a host name of one label (RFC 1123, section 2.1).
+    names are not authenticated, names that are not a host name of one label (RFC 1123, section 2.1), and offline peers
+    whose address another peer has now, such as a robot that was renamed.
     """
+    everyone = tuple(peers)
+    in_use = {_ip(peer.get("address")) for peer in everyone if peer.get("online")}
     found = {}
-    for peer in peers:
+    for peer in everyone:
         name, address = str(peer.get("name", "")), _ip(peer.get("address"))
+        if address in in_use and not peer.get("online"):
+            continue
         is_host_name = _LABEL.fullmatch(name) is not None and not name.isdigit() and name.lower() not in _RESERVED
         if address and is_host_name and not peer.get("legacy"):
             found[name.lower()] = HostEntry(name, address)

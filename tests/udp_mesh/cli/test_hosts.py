@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.udp_mesh.cli.conftest import Run
-from udp_mesh.cli.hosts import MAX_FILE_BYTES, HostsBlock
+from udp_mesh.cli.hosts import MAX_FILE_BYTES, HostsBlock, _lock
 from udp_mesh.cli.hosts_file import BEGIN, HostEntry, MergedHosts, merge
 from udp_mesh.cli.main import main
 
@@ -84,6 +84,18 @@ def test_a_conflict_is_reported_once(file: Path, capsys: pytest.CaptureFixture[s
     error = capsys.readouterr().err
     assert error.count("another line defines localhost; 10.42.0.9 is left out") == 1
     assert block.hosts == (SPOT,)
+
+
+def test_a_second_writer_is_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = file.read_bytes()
+    first = _lock(file)
+    try:
+        assert main(["hosts", "--write", str(file)]) == 1
+    finally:
+        os.close(first)
+    assert f"{file}: another `udp-mesh hosts --write` keeps its names there" in capsys.readouterr().err
+    assert file.read_bytes() == before
+    os.close(_lock(file))
 
 
 def test_a_missing_or_oversized_file_is_refused_with_its_name(

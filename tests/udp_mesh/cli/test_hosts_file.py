@@ -47,6 +47,15 @@ def test_a_peer_with_an_unusable_or_unsafe_name_or_address_is_omitted(peer: Mapp
     assert hosts_of([peer]) == ()
 
 
+def test_the_former_name_of_a_renamed_peer_is_omitted() -> None:
+    peers = [
+        {"name": "spot1", "address": "10.42.0.12:8700", "online": False},
+        {"name": "rover9", "address": "10.42.0.12:8700", "online": True},
+        {"name": "spot2", "address": "10.42.0.13:8700", "online": False},
+    ]
+    assert hosts_of(peers) == (HostEntry("rover9", "10.42.0.12"), HostEntry("spot2", "10.42.0.13"))
+
+
 def test_a_block_is_appended_replaced_and_removed_and_the_rest_stays() -> None:
     first = merge(DEBIAN, [BASE, SPOT]).text
     assert first == f"{DEBIAN}{BEGIN}\n10.42.0.1  base\n10.42.0.12 spot1\n{END}\n"
