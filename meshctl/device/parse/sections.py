@@ -31,17 +31,19 @@ def split_sections(output: bytes, nonce: str) -> dict[str, OutputSection]:
     _, is_compressed, packed = output.partition(f"{nonce} gzip\n".encode())
     if is_compressed:
         output = _inflated(packed)
-    begin, end = f"{nonce} begin ".encode(), f"{nonce} end ".encode()
     name: str | None = None
     body: list[bytes] = []
-    for line in output.split(b"\n"):
-        if line.startswith(begin):
-            name, body = line[len(begin) :].decode("utf-8", "replace"), []
-        elif name is not None and line.startswith(end):
-            found.setdefault(name, OutputSection(b"\n".join(body), _status(line[len(end) :])))
+    # at the nonce instead of line by line: most of an answer is one long table
+    mark = f"{nonce} ".encode()
+    for piece in (b"\n" + output).split(b"\n" + mark)[1:]:
+        line, line_break, rest = piece.partition(b"\n")
+        if line.startswith(b"begin "):
+            name, body = line[len(b"begin ") :].decode("utf-8", "replace"), [rest] if line_break else []
+        elif name is not None and line.startswith(b"end "):
+            found.setdefault(name, OutputSection(b"\n".join(body), _status(line[len(b"end ") :])))
             name = None
         elif name is not None:
-            body.append(line)
+            body.append(mark + piece)
     if name is not None:
         found.setdefault(name, OutputSection(b"\n".join(body), -1))
     return found
