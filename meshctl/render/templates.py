@@ -32,6 +32,7 @@ class Templates:
 
     def __init__(self, folders: tuple[Path, ...], boundary: Boundary | None = None) -> None:
         self._folders = folders
+        self._only_shipped_folders = folders == (shipped("templates"),)
         self._boundary = boundary or Boundary(tuple(os.path.realpath(folder) for folder in folders))
         self._sets: dict[tuple[Backend, OperatorParts], TemplateSet] = {}
         # for templates that are not shipped
@@ -75,7 +76,7 @@ class Templates:
 
     def are_shipped(self, parts: OperatorParts) -> bool:
         """Whether all templates are those shipped with meshctl, none the operator's."""
-        return self._folders == (shipped("templates"),) and not parts.templates
+        return self._only_shipped_folders and not parts.templates
 
     def _set(self, backend: Backend, parts: OperatorParts) -> TemplateSet:
         from meshctl.render.template_set import TemplateSet
