@@ -54,8 +54,9 @@ def parsed(text: str | None, package: str) -> Package | None:
     return None if text is None else _parsed(text, package)
 
 
-# A plan reads the same file several times, and many nodes have the same dhcp or firewall file.
-@lru_cache(maxsize=64)
+# A plan reads the same file several times, many nodes have the same dhcp or firewall file, and the next round of
+# `status --watch` finds most files unchanged: enough for those of 200 nodes.
+@lru_cache(maxsize=2048)
 def _parsed(text: str, package: str) -> Package | None:
     try:
         return parse(text, package)

@@ -121,29 +121,25 @@ def parse_originators_json(text: str, names: Mapping[int, str]) -> tuple[Origina
 _COLUMNS: tuple[set[type], ...] = ({str}, {str}, {str}, {int}, {bool}, {int, NoneType}, {int, NoneType})
 
 
-def _usual_originators(data: Iterable[Any]) -> tuple[Originator, ...] | None:
-    """None if a row lacks a key, or a value has an unusual type or is empty; both are checked for whole columns."""
+def _usual_originators(data: list[Any]) -> tuple[Originator, ...] | None:
+    """None if a row lacks a key, or a value has an unusual type or is empty; read and checked column by column."""
     try:
-        rows = [
-            (
-                item["orig_address"],
-                item["neigh_address"],
-                item["hard_ifname"],
-                item["last_seen_msecs"],
-                item.get("best", False),
-                item.get("tq"),
-                item.get("throughput"),
-            )
-            for item in data
-        ]
+        columns: tuple[list[Any], ...] = (
+            [item["orig_address"] for item in data],
+            [item["neigh_address"] for item in data],
+            [item["hard_ifname"] for item in data],
+            [item["last_seen_msecs"] for item in data],
+            [item.get("best", False) for item in data],
+            [item.get("tq") for item in data],
+            [item.get("throughput") for item in data],
+        )
     except (KeyError, TypeError, AttributeError):
         return None
-    columns = tuple(zip(*rows, strict=True))
-    if not all(set(map(type, column)) <= types for column, types in zip(columns, _COLUMNS, strict=False)):
+    if not all(set(map(type, column)) <= types for column, types in zip(columns, _COLUMNS, strict=True)):
         return None
     if any("" in column for column in columns[:3]):
         return None
-    return tuple(map(_ORIGINATOR_OF, rows))
+    return tuple(map(_ORIGINATOR_OF, zip(*columns, strict=True)))
 
 
 _ORIGINATOR_OF = partial(tuple.__new__, Originator)
