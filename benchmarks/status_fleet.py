@@ -1,19 +1,23 @@
-"""Many cheap devices to measure their client with: one real OpenSSH server, with prepared answers.
+"""Many cheap devices to measure their client with: a real dropbear for each radio, one OpenSSH server for all robots,
+and prepared answers.
 
-In its own network namespace, the server has the addresses of all radios and robots. A radio's answer to the observation
-is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbors, a path to every other
-radio in its originator table, and its files from the inventory. A robot runs meshctl's own script in a real shell, with
-stand-ins for `systemctl` and the daemon that answer as in a team of that size.
+In their own network namespace, the servers have the addresses of all radios and robots. A radio's answer to the
+observation is that of a recorded node (`tests/meshctl/device/recorded`), with its own MACs, four neighbors, a path to
+every other radio in its originator table, and its files from the inventory. A robot runs meshctl's own script in a real
+shell, with stand-ins for `systemctl` and the daemon that answer as in a team of that size.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,17 +59,11 @@ nodes:
 {robots}topics:
 {topics}"""
 _RADIO = """#!/bin/sh
-# Stand-in for a radio: the first line of the input has the nonce; the answer is prepared, and compressed if the script
-# that is sent does so.
+# Stand-in for a radio: the first line of the input has the nonce; the answer is prepared, and compressed as a radio's.
 IFS= read -r first
 set -- $SSH_CONNECTION
-answer() {{ sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$1"; }}
-if grep -q 'gzip -c'; then
-	echo "${{first#N=}} gzip"
-	answer $3 | gzip -c
-else
-	answer $3
-fi
+echo "${{first#N=}} gzip"
+sed "s/^NONCE /${{first#N=}} /" "{root}/answers/$3" | gzip -1c
 """
 _DAEMON = """#!/bin/sh
 # Stand-in for the release's Python that queries the daemon: its answer, by the address of the connection.
@@ -87,10 +85,18 @@ mount --make-rprivate /
 mount --bind "$1/opt" /opt
 mount -t tmpfs tmpfs /run
 # without the start-up files of this machine's shells
-mount -t tmpfs tmpfs /root
-mkdir -p /run/sshd
-exec /usr/sbin/sshd -D -e -f "$1/sshd_config"
+mount -t tmpfs -o mode=700 tmpfs /root
+mkdir -p /run/sshd -m 700 /root/.ssh
+cp "$1/key.pub" /root/.ssh/authorized_keys
+root=$1
+shift
+# one for each radio: a dropbear refuses more than 30 logins at once
+for address; do
+	dropbear -F -r "$root/dropbear_key" -p "$address:22" -P "" -s -j -k -c "$root/bin/radio" </dev/null &
+done
+exec /usr/sbin/sshd -D -e -f "$root/sshd_config"
 """
+SSHD_PORT = 2222
 
 
 @dataclass(slots=True)
@@ -132,13 +138,17 @@ class Devices:
             subprocess.run(
                 ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", self.directory / name], check=True, timeout=60
             )
+        dropbear_key = ["dropbearkey", "-t", "ed25519", "-f", str(self.directory / "dropbear_key")]
+        described = subprocess.run(dropbear_key, check=True, timeout=60, capture_output=True, text=True).stdout
+        radio_key = next(line for line in described.splitlines() if line.startswith("ssh-ed25519 "))
         self._write_inventory()
         self._write_radios()
         self._write_computers()
         trust = TrustStore(self.directory / "known_hosts")
-        host_key = parse_key((self.directory / "host_key.pub").read_text())
-        for name in (*self.names, *(f"robot.{robot}" for robot in self.team)):
-            trust.replace(name, host_key)
+        for name in self.names:
+            trust.replace(name, parse_key(radio_key))
+        for robot in self.team:
+            trust.replace(f"robot.{robot}", parse_key((self.directory / "host_key.pub").read_text()))
         self._listen()
 
     def stop(self) -> None:
@@ -146,6 +156,18 @@ class Devices:
             # the server and its namespace end with unshare
             self._server.kill()
             self._server.wait(60)
+
+    def cpu_s(self) -> float:
+        """The processor time of all devices so far: of all processes in their namespace, and of those that ended."""
+        assert self._server is not None
+        space = Path(f"/proc/{self._server.pid}/ns/pid_for_children").readlink()
+        total_s = 0.0
+        for process in Path("/proc").glob("[0-9]*"):
+            # a process may end meanwhile: then its parent has its time
+            with suppress(OSError):
+                if (process / "ns/pid").readlink() == space:
+                    total_s += process_cpu_s(int(process.name))
+        return total_s
 
     def switch_off_half(self) -> int:
         """Silence the second half of the radios; returns their number."""
@@ -158,8 +180,9 @@ class Devices:
             f"  {name}: {{role: {'base' if number == 0 else 'beacon'}, address: {self.address(number)}}}\n"
             for number, name in enumerate(self.names)
         )
+        login = f"{{user: root, port: {SSHD_PORT}, key_files: [key]}}"
         robots = "".join(
-            f"  {robot}: {{computer: {{address: {COMPUTERS}.{number}/16, ssh: {{user: root, key_files: [key]}}}}}}\n"
+            f"  {robot}: {{computer: {{address: {COMPUTERS}.{number}/16, ssh: {login}}}}}\n"
             for number, robot in enumerate(self.team, 1)
         )
         topics = "".join(f"  {name}: {text}\n" for name, text in TOPICS.items())
@@ -232,6 +255,7 @@ class Devices:
             f"HostKey {root}/host_key",
             f"AuthorizedKeysFile {root}/key.pub",
             "ListenAddress 0.0.0.0",
+            f"Port {SSHD_PORT}",
             "StrictModes no",
             "UsePAM no",
             "UseDNS no",
@@ -239,24 +263,38 @@ class Devices:
             "PermitRootLogin yes",
             "MaxStartups 1000",
             f"SetEnv PATH={root}/bin:/usr/sbin:/usr/bin:/sbin:/bin",
-            f"Match LocalAddress {FIRST_HALF}.0/24,{SECOND_HALF}.0/24",
-            f"ForceCommand {root}/bin/radio",
         )
         (root / "sshd_config").write_text("".join(f"{line}\n" for line in settings))
         command = ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc", "sh", "-ec", _ENTER, "sshd"]
         log = root / "log"
+        addresses = [self.address(number) for number in range(self.radios)]
         with log.open("wb") as output:
-            self._server = subprocess.Popen([*command, str(root)], stdout=output, stderr=output)
-        deadline = time.monotonic() + 60
-        while b"listening on" not in log.read_bytes():
+            self._server = subprocess.Popen([*command, str(root), *addresses], stdout=output, stderr=output)
+        deadline = time.monotonic() + 120
+        while b"listening on" not in log.read_bytes() or not all(map(_listens, addresses)):
             if self._server.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError(f"the SSH server did not start: {log.read_text()}")
             time.sleep(0.05)
 
 
+def _listens(address: str) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((address, 22)) == 0
+
+
+def process_cpu_s(process: int) -> float:
+    """The processor time of a process and of its children that ended: proc(5), fields 14 to 17. Raises OSError."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+
+
 def programs_missing() -> tuple[str, ...]:
     """The programs that must be installed."""
-    return tuple(name for name in ("sshd", "ssh-keygen", "unshare", "ip") if not shutil.which(name, path=_PATH))
+    return tuple(
+        name
+        for name in ("sshd", "ssh-keygen", "dropbear", "dropbearkey", "unshare", "ip")
+        if not shutil.which(name, path=_PATH)
+    )
 
 
 _PATH = "/usr/sbin:/usr/bin:/sbin:/bin"

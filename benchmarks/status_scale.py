@@ -10,8 +10,8 @@ command runs in a separate process, over real connections:
 
 `--against` runs the same, in turns, with the meshctl of another checkout that has its own `.venv`.
 
-Devices and meshctl share this machine's CPUs, so the wall time includes the server's work; the CPU time is meshctl's
-own.
+Devices and meshctl share this machine's CPUs, so the wall time includes the devices' work. The CPU time of each is
+measured: on a fleet of real devices only meshctl's is spent here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.page import fill, this_machine
-from benchmarks.status_fleet import Devices, programs_missing
+from benchmarks.status_fleet import Devices, process_cpu_s, programs_missing
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
@@ -54,23 +54,38 @@ def run(command: Sequence[str], environ: Mapping[str, str]) -> tuple[float, floa
     return took_s, used.ru_utime + used.ru_stime, json.loads(text)
 
 
-def repeated(command: Sequence[str], environ: Mapping[str, str], answering: int) -> dict[str, float]:
-    """The median of several runs. Raises RuntimeError unless exactly `answering` devices answered in each."""
-    walls, processors = [], []
+def repeated(
+    devices: Devices, commands: Mapping[str, Sequence[str]], environ: Mapping[str, str], answering: int
+) -> dict[str, dict[str, float]]:
+    """The median of several runs of each command, in turns. Raises RuntimeError unless exactly `answering` devices
+    answered in each."""
+    found: dict[str, list[tuple[float, float, float]]] = {label: [] for label in commands}
     for _ in range(RUNS):
-        wall_s, cpu_s, document = run(command, environ)
-        devices = [*document["nodes"], *document["robots"]]
-        answered = sum(one["answers"] for one in devices)
-        if answered != answering:
-            why = {one["silent_because"] for one in devices if not one["answers"]}
-            raise RuntimeError(f"{answered} of {len(devices)} answered, expected {answering}: {why}")
-        walls.append(wall_s)
-        processors.append(cpu_s)
-    return {"seconds": statistics.median(walls), "cpu_s": statistics.median(processors), "answering": answering}
+        for label, command in commands.items():
+            before_s = devices.cpu_s()
+            wall_s, cpu_s = answered(command, environ, answering)
+            found[label].append((wall_s, cpu_s, devices.cpu_s() - before_s))
+    return {label: {**_medians(runs), "answering": answering} for label, runs in found.items()}
 
 
-def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
-    """The rounds of `--watch` after the first, as timed by the command itself."""
+def _medians(runs: Sequence[tuple[float, float, float]]) -> dict[str, float]:
+    seconds, cpu_s, devices_cpu_s = map(statistics.median, zip(*runs, strict=True))
+    return {"seconds": seconds, "cpu_s": cpu_s, "devices_cpu_s": devices_cpu_s}
+
+
+def answered(command: Sequence[str], environ: Mapping[str, str], answering: int) -> tuple[float, float]:
+    """Wall and CPU seconds of a status. Raises RuntimeError unless exactly `answering` devices answered."""
+    wall_s, cpu_s, document = run(command, environ)
+    devices = [*document["nodes"], *document["robots"]]
+    count = sum(one["answers"] for one in devices)
+    if count != answering:
+        why = {one["silent_because"] for one in devices if not one["answers"]}
+        raise RuntimeError(f"{count} of {len(devices)} answered, expected {answering}: {why}")
+    return wall_s, cpu_s
+
+
+def watched(devices: Devices, command: Sequence[str], environ: Mapping[str, str]) -> dict[str, float]:
+    """The rounds of `--watch` after the first: their duration by the command itself, and the CPU time of both sides."""
     with subprocess.Popen(
         [*command, "--watch", "1"],
         env=dict(environ),
@@ -80,10 +95,19 @@ def watched(command: Sequence[str], environ: Mapping[str, str]) -> dict[str, flo
         text=True,
     ) as process:
         assert process.stdout is not None
+        first = json.loads(process.stdout.readline())
+        before = process_cpu_s(process.pid), devices.cpu_s()
         looks = [json.loads(process.stdout.readline()) for _ in range(WATCH_ROUNDS)]
+        after = process_cpu_s(process.pid), devices.cpu_s()
         process.send_signal(signal.SIGINT)
         process.wait(60)
-    return {"seconds": statistics.median(look["took_s"] for look in looks[1:])}
+    asked = len(first["nodes"]) + len(first["robots"])
+    silent = [one["name"] for look in looks for one in (*look["nodes"], *look["robots"]) if not one["answers"]]
+    if silent or not asked:
+        raise RuntimeError(f"without an answer: {silent}")
+    cpu_s, devices_cpu_s = ((late - early) / WATCH_ROUNDS for early, late in zip(before, after, strict=True))
+    seconds = statistics.median(look["took_s"] for look in looks)
+    return {"seconds": seconds, "cpu_s": cpu_s, "devices_cpu_s": devices_cpu_s}
 
 
 def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -97,21 +121,21 @@ def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict
             label: [f"{checkout}/.venv/bin/meshctl", "status", "--json", "-i", str(devices.inventory)]
             for label, checkout in checkouts.items()
         }
-        results = [{"radios": radios, "robots": robots, "checkout": label} for label in commands]
         devices.start()
         try:
-            for result, command in zip(results, commands.values(), strict=True):
-                result["alone"] = repeated([*command, "--no-robots"], environ, radios)
-            for result, command in zip(results, commands.values(), strict=True):
-                result["both"] = repeated(command, environ, radios + robots)
-            for result, command in zip(results, commands.values(), strict=True):
-                result["again"] = watched(command, environ)
+            without_robots = {label: [*command, "--no-robots"] for label, command in commands.items()}
+            alone = repeated(devices, without_robots, environ, radios)
+            both = repeated(devices, commands, environ, radios + robots)
+            again = {label: watched(devices, command, environ) for label, command in commands.items()}
             off = devices.switch_off_half()
-            for result, command in zip(results, commands.values(), strict=True):
-                result["half"] = repeated(command, environ, radios + robots - off)
+            half = repeated(devices, commands, environ, radios + robots - off)
         finally:
             devices.stop()
-    return results
+    phases = {"alone": alone, "both": both, "again": again, "half": half}
+    return [
+        {"radios": radios, "robots": robots, "checkout": label, **{name: one[label] for name, one in phases.items()}}
+        for label in commands
+    ]
 
 
 _ROWS = {
@@ -125,16 +149,16 @@ _ROWS = {
 def table(results: Sequence[Mapping[str, Any]]) -> str:
     """Markdown."""
     lines = [
-        "| radios | robots | query | revision | seconds | processor seconds of meshctl |",
-        "| ---: | ---: | --- | --- | ---: | ---: |",
+        "| radios | robots | query | revision | seconds | processor seconds of meshctl | of the devices |",
+        "| ---: | ---: | --- | --- | ---: | ---: | ---: |",
     ]
     for radios, robots in dict.fromkeys((result["radios"], result["robots"]) for result in results):
         for key, what in _ROWS.items():
             for result in results:
                 if (result["radios"], result["robots"]) == (radios, robots):
                     took = result[key]
-                    processor = f"{took['cpu_s']:.1f}" if "cpu_s" in took else ""
-                    cells = (radios, robots, what, result["checkout"], f"{took['seconds']:.1f}", processor)
+                    measured = (f"{took[name]:.2f}" for name in ("seconds", "cpu_s", "devices_cpu_s"))
+                    cells = (radios, robots, what, result["checkout"], *measured)
                     lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
 
