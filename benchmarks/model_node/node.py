@@ -94,7 +94,7 @@ _KINDS = (
     ("watch", r"^mkdir -p /tmp/meshctl; \[ ! -f \S*/tmp/meshctl/forget\."),
     ("flush", r"(?m)^flush_(stale|restarted) "),
     ("uptime", r"^cat /proc/uptime /proc/sys/kernel/random/boot_id$"),
-    ("observe", r"(?m)^\tsection done true$"),
+    ("observe", r"(?m)^\t?section done true$"),
     ("survey", r"(?m)^have=0; "),
     ("chunk", r"(?m)^cat >>\"\$p\""),
     ("place", r"echo damaged; exit 0"),

@@ -34,7 +34,7 @@ from meshctl.device.observation import (
 from meshctl.device.parse import batctl, iw, keys, nft, packages, system, ubus
 from meshctl.device.parse.deadman import parse_status
 from meshctl.device.parse.sections import OutputSection, split_sections
-from meshctl.device.scripts import script
+from meshctl.device.scripts import code
 
 T = TypeVar("T")
 
@@ -92,7 +92,7 @@ def observation_script(nonce: str, extra_paths: Iterable[str] = (), *, brief: bo
         if not path.startswith("/") or quoted(path) != path:
             raise ValueError(f"{path!r}: expected an absolute path of letters, digits and ._+@%:,-")
     values = {"N": nonce, "EXTRA": " ".join(paths), "BRIEF": "yes" if brief else ""}
-    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), script("observe.sh")])
+    return "\n".join([*(f"{name}={quoted(value)}" for name, value in values.items()), code("observe.sh")])
 
 
 class _OutputReader:

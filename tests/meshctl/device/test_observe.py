@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from meshctl.device.framing import framed
 from meshctl.device.observation import Observation, Originator
 from meshctl.device.observe import interpret, observation_script, observe
 from meshctl.device.parse import batctl, iw, keys, packages, system, ubus
@@ -24,7 +25,7 @@ from meshctl.device.parse.deadman import parse_answer, parse_status
 from meshctl.device.parse.sections import MAX_INFLATED_BYTES, OutputSection, split_sections
 from meshctl.device.scripts import script
 from meshctl.device.ssh import SshConnection
-from meshctl.device.ssh_channel import MAX_OUTPUT_BYTES
+from meshctl.device.ssh_channel import MAX_INLINE_STDIN_BYTES, MAX_OUTPUT_BYTES
 from meshctl.model import RELEASES
 from tests.meshctl.device.sandbox import Sandbox
 from tests.meshctl.device.servers import host_key
@@ -467,3 +468,15 @@ def test_a_node_without_a_package_manager_has_one_note_that_says_so() -> None:
     seen = interpret(without, asked_at_s=1785311990.0, answered_at_s=1785311994.0)
     assert seen.notes == ("no package manager: neither apk nor opkg was found",)
     assert (seen.package_tool, seen.packages) == (None, None)
+
+
+def test_the_script_fits_in_the_window_of_its_channel() -> None:
+    """So it is sent at once, by no thread of its own, to each node of a fleet."""
+    paths = [
+        "/etc/meshctl/node",
+        "/etc/meshctl/lan-filter.sh",
+        "/etc/meshctl/links.sh",
+        "/etc/dropbear/authorized_keys",
+    ]
+    sent = framed(observation_script("meshctl-" + 32 * "0", paths))
+    assert len(sent.preamble) <= MAX_INLINE_STDIN_BYTES
