@@ -1,4 +1,4 @@
-"""Find and render templates: folders searched in order, one sandbox, undefined names are errors.
+"""Find and render templates: folders searched in order, undefined names are errors, a sandbox unless all are shipped.
 
 A folder has `common/`, for all back ends, and one folder per back end (`batman-adv/`, `meshmerize/`). Below them, a
 template has the path of its file on the device plus `.j2`. Templates that start with `_` are only included by others.
