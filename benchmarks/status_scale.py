@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import statistics
 import subprocess
 import sys
@@ -34,7 +33,7 @@ from benchmarks.status_fleet import Devices, process_cpu_s, programs_missing
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results") / "status_scale.jsonl"
-RUNS = 3
+RUNS = 2
 WATCH_ROUNDS = 4
 
 
@@ -99,7 +98,7 @@ def watched(devices: Devices, command: Sequence[str], environ: Mapping[str, str]
         before = process_cpu_s(process.pid), devices.cpu_s()
         looks = [json.loads(process.stdout.readline()) for _ in range(WATCH_ROUNDS)]
         after = process_cpu_s(process.pid), devices.cpu_s()
-        process.send_signal(signal.SIGINT)
+        process.terminate()
         process.wait(60)
     asked = len(first["nodes"]) + len(first["robots"])
     silent = [one["name"] for look in looks for one in (*look["nodes"], *look["robots"]) if not one["answers"]]

@@ -163,8 +163,8 @@ class Watchdog:
 
 
 class _Patrol:
-    """Checks every watchdog when it is due, in one daemon thread that starts with the first: a thread for each phase of
-    each connection costs a look at a large fleet a tenth of its processor time. Thread-safe."""
+    """Checks every watchdog when it is due, in one daemon thread that starts with the first: a look at 200 nodes would
+    start 800, with one for each phase of each connection. Thread-safe."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
