@@ -271,6 +271,11 @@ class Endpoint:
         """Datagrams so far without proof that a peer sent them: dropped ones, and those in the legacy format."""
         return self._state.event_queue.counters.dropped_unverified + self._legacy.accepted
 
+    @property
+    def late_acknowledgements(self) -> int:
+        """Acknowledgements so far that their receivers wanted sooner, because the driver reads too seldom for them."""
+        return self._state.late_acknowledgements
+
     def legacy_positions(self) -> dict[str, ReceivePosition]:
         """What was received from each legacy peer. Save it: the next run needs it to keep their senders going."""
         return self._legacy.positions()

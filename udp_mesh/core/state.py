@@ -83,6 +83,8 @@ class State:
         self.inflating: dict[Session, None] = {}
         """Sessions with a message being inflated."""
         self.broadcast_channel = SendChannel(self.keys[0], boot_id)
+        self.late_acknowledgements = 0
+        """Acknowledgements sent so far of which `AckState.is_late` was true."""
         self.priority_backoff = PriorityBackoff(settings.rates, now)
         self.repairs: dict[bytes, NackRepair] = {}
         """By the sender's boot id."""

@@ -91,6 +91,7 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
         return
     frames: list[Frame] = []
     if session.receiver.acks.pending or session.receiver.acks.send_now:
+        state.late_acknowledgements += session.receiver.acks.is_late
         waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
         ack = session.build_ack(now, waiting[:1])
         if ack is not None:

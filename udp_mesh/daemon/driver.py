@@ -1,7 +1,7 @@
 """Moves datagrams, timers and events between the sockets and the core, on an asyncio loop, in batches.
 
-1. A socket becomes readable: all waiting datagrams go to the core (`_drain`). Known peers have a socket of their own;
-   during a flood the other one is read for a fifth of the time at most (`stranger_throttle`).
+1. A socket becomes readable: all waiting datagrams go to the core (`_drain`). Of three sockets, that of bulk is read in
+   ticks (`bulk_ticks`), and that of strangers for a fifth of the time at most during a flood (`stranger_throttle`).
 2. `_pump`: due timers, datagrams that may leave now (in runs, through segmentation offload), events to the listener,
    and one timer for the core's next deadline.
 3. The kernel reports an interface change: sockets are opened and closed, and the core learns its new links.
@@ -23,6 +23,7 @@ from udp_mesh.core.legacy.acks import ReceivePosition
 from udp_mesh.core.logs.store import LogStore
 from udp_mesh.core.settings import Settings
 from udp_mesh.daemon.background import BackgroundThread
+from udp_mesh.daemon.bulk_ticks import BulkTicks
 from udp_mesh.daemon.link_output import LinkOutput, link_info
 from udp_mesh.daemon.stranger_throttle import StrangerThrottle
 from udp_mesh.links.attachments import Address, LinkConfig
@@ -44,10 +45,8 @@ MAX_PUMP_BYTES = 1 << 18
 """Bytes sent before the sockets get their turn again."""
 INTERFACE_DEBOUNCE_S = 0.05
 """One kernel notice is followed by others (link, then addresses): one refresh handles them all."""
-RECOVERY_S = 0.1
-"""Delay before the next attempt after an unexpected exception."""
-RETRY_LINK_S = 2.0
-"""Delay before a socket that could not be opened is retried."""
+RECOVERY_S, RETRY_LINK_S = 0.1, 2.0
+"""Delay before the next attempt after an unexpected exception, or to open a socket."""
 
 _PATH_EVENTS = (PeerOnline, PeerOffline, PeerAddressChanged, PeerRestarted)
 """Events after which the addresses of known peers may have changed."""
@@ -102,6 +101,7 @@ class Driver:
         self._link_name = ""
         self._unsorted: set[str] = set()
         """Links whose kernel does not separate peers from strangers, already logged."""
+        self._bulk = BulkTicks(self._loop, self.node, self._read_bulk, self._after_drain)
         self.strangers = StrangerThrottle(
             self._loop, self._read_strangers, lambda: self.node.unauthenticated, batch=MAX_DRAIN_DATAGRAMS
         )
@@ -214,6 +214,7 @@ class Driver:
         for link in self.hub.links.values():
             self.output.watch(link)
             self._loop.add_reader(link.fileno(), self._readable, link)
+            self._bulk.watch(link)
             self.strangers.watch(link)
 
     def _update_known_senders(self) -> None:
@@ -254,15 +255,22 @@ class Driver:
     def _unwatch(self, link: UdpLink) -> None:
         self._loop.remove_reader(link.fileno())
         self._loop.remove_writer(link.fileno())
+        self._bulk.unwatch(link)
         self.strangers.unwatch(link)
 
     # Receive
 
     def _readable(self, link: UdpLink) -> None:
+        self._bulk.read_ticking()
         self._drain(link, link.receive, MAX_DRAIN_DATAGRAMS)
+        self._bulk.marked_arrived(link, self._now)
         self._after_drain()
 
+    def _read_bulk(self, link: UdpLink) -> int:
+        return self._drain(link, link.receive_unmarked, MAX_DRAIN_DATAGRAMS)
+
     def _read_strangers(self, link: UdpLink, limit: int) -> int:
+        self._bulk.read_ticking()
         count = self._drain(link, link.receive_from_strangers, limit)
         self._after_drain()
         return count
@@ -367,6 +375,7 @@ class Driver:
 
     def _timer_due(self) -> None:
         self._timer = None
+        self._bulk.read_ticking()
         self._pump()
 
     def _transmit_all(self) -> bool:
@@ -376,14 +385,7 @@ class Driver:
             batch = self.node.datagrams_to_send(self._advance_clock())
             if not batch:
                 return False
-            start = 0
-            while start < len(batch):
-                name = batch[start].link
-                end = start + 1
-                while end < len(batch) and batch[end].link == name:
-                    end += 1
-                self.output.transmit(name, batch[start:end] if end - start < len(batch) else batch)
-                start = end
+            self.output.transmit_all(batch)
             sent += sum(len(datagram.data) for datagram in batch)
             if not self.node.has_datagrams:
                 return False

@@ -54,6 +54,17 @@ class LinkOutput:
         """How many datagrams wait for the link's socket."""
         return len(self._blocked.get(name, ()))
 
+    def transmit_all(self, datagrams: list[Datagram]) -> None:
+        """Send each over its link; consecutive ones of one link together."""
+        start = 0
+        while start < len(datagrams):
+            name = datagrams[start].link
+            end = start + 1
+            while end < len(datagrams) and datagrams[end].link == name:
+                end += 1
+            self.transmit(name, datagrams[start:end] if end - start < len(datagrams) else datagrams)
+            start = end
+
     def transmit(self, name: str, datagrams: list[Datagram]) -> None:
         """Send over the link, if it is open."""
         if name in self.others:

@@ -1,7 +1,8 @@
-"""Classic BPF programs that tell known senders from strangers in the kernel, by source address and port.
+"""Classic BPF programs that tell known senders from strangers in the kernel, by source address and port, and what the
+former mark as urgent from what they do not, by DSCP.
 
-A flood then fills the strangers' socket only. The programs are attached to sockets (SO_ATTACH_FILTER) and to their
-group (SO_ATTACH_REUSEPORT_CBPF); neither needs a privilege.
+A flood then fills the strangers' socket only, and bulk can be read less often than what is urgent. The programs are
+attached to sockets (SO_ATTACH_FILTER) and to their group (SO_ATTACH_REUSEPORT_CBPF); neither needs a privilege.
 """
 
 from __future__ import annotations
@@ -17,28 +18,38 @@ from udp_mesh.links.attachments import Address
 SO_ATTACH_FILTER, SO_ATTACH_REUSEPORT_CBPF = 26, 51
 
 MAX_INSTRUCTIONS = 1500
-"""The kernel charges programs to net.core.optmem_max, 20 KiB on older kernels. About 300 IPv4 senders fit; further ones
+"""The kernel charges programs to net.core.optmem_max, 20 KiB on older kernels. About 250 IPv4 senders fit; further ones
 are treated as strangers."""
 
 ACCEPT, DROP = 0xFFFFFFFF, 0
-STRANGERS, PEERS = 0, 1
+STRANGERS, MARKED, UNMARKED = 0, 1, 2
 """Positions in the group: the order in which the sockets were bound."""
 
 _LOAD_WORD, _LOAD_HALF, _JUMP_EQUAL, _RETURN = 0x20, 0x28, 0x15, 0x06
+_AND, _LOAD_X, _X_TO_A, _RETURN_A = 0x54, 0x01, 0x87, 0x16
 _NETWORK_HEADER = 0xFFF00000
 """SKF_NET_OFF: offsets from here are relative to the IP header."""
 _SOURCE_OFFSET: dict[int, int] = {socket.AF_INET: 12, socket.AF_INET6: 8}
+_DSCP_MASK: dict[int, int] = {socket.AF_INET: 0x00FC, socket.AF_INET6: 0x0FC0}
+"""In the first two bytes of the IP header."""
 _PORT_OFFSET: dict[int, int] = {socket.AF_INET: 20, socket.AF_INET6: 40}
 """Without IP options, which no node sends."""
 _INSTRUCTION = struct.Struct("=HBBI")
 _PROGRAM = struct.Struct("@HP")
 
 
-def source_program(sources: Iterable[Address], family: int, known: int, unknown: int) -> bytes:
-    """The instructions that return `known` for datagrams of these senders and `unknown` for all others."""
-    instructions: list[tuple[int, int, int, int]] = []
+def source_program(sources: Iterable[Address], family: int, marked: int, unmarked: int, unknown: int) -> bytes:
+    """The instructions that return `marked` or `unmarked` for datagrams of these senders, with and without a DSCP, and
+    `unknown` for all others."""
+    instructions: list[tuple[int, int, int, int]] = [
+        (_LOAD_HALF, 0, 0, _NETWORK_HEADER),
+        (_AND, 0, 0, _DSCP_MASK[family]),
+        (_LOAD_X, 0, 0, unmarked),
+        (_JUMP_EQUAL, 1, 0, 0),
+        (_LOAD_X, 0, 0, marked),
+    ]
     for host, port in sorted(sources):
-        block = _match(host, port, family, known)
+        block = _match(host, port, family)
         if len(instructions) + len(block) >= MAX_INSTRUCTIONS:
             break
         instructions += block
@@ -46,8 +57,8 @@ def source_program(sources: Iterable[Address], family: int, known: int, unknown:
     return b"".join([_INSTRUCTION.pack(*instruction) for instruction in instructions])
 
 
-def _match(host: str, port: int, family: int, result: int) -> list[tuple[int, int, int, int]]:
-    """Compare the address word by word, then the port; continue after this block if one differs."""
+def _match(host: str, port: int, family: int) -> list[tuple[int, int, int, int]]:
+    """Compare the address word by word, then the port, and return X; continue after this block if one differs."""
     address = ipaddress.ip_address(host.partition("%")[0])
     if address.version != (4 if family == socket.AF_INET else 6):
         return []
@@ -56,9 +67,9 @@ def _match(host: str, port: int, family: int, result: int) -> list[tuple[int, in
     loads.append((_LOAD_HALF, _PORT_OFFSET[family], port))
     block: list[tuple[int, int, int, int]] = []
     for place, (code, offset, value) in enumerate(loads):
-        rest = 2 * (len(loads) - place - 1) + 1
+        rest = 2 * (len(loads) - place)
         block += [(code, 0, 0, _NETWORK_HEADER + offset), (_JUMP_EQUAL, 0, rest, value)]
-    return [*block, (_RETURN, 0, 0, result)]
+    return [*block, (_X_TO_A, 0, 0, 0), (_RETURN_A, 0, 0, 0)]
 
 
 def attach(own: socket.socket, option: int, program: bytes) -> None:

@@ -4,8 +4,8 @@ Send: consecutive datagrams of one size to one destination become one system cal
 kernel or a device refuses that, the socket falls back to one call per datagram for good. Receive: one call may return
 up to 64 datagrams of one sender, split by the size in UDP_GRO. Measurements are in the transport's fact sheet.
 
-Two sockets share the port (SO_REUSEPORT): one receives from known peers, the other from strangers (`source_filter`).
-What strangers send waits in a queue of its own, and can be read less often.
+Three sockets share the port (SO_REUSEPORT, `source_filter`): one receives what known peers mark as urgent, one what
+else they send, one what strangers send. Each has a queue of its own, so that the others can be read less often.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from udp_mesh.links.attachments import Address, Attachment
 from udp_mesh.links.source_filter import (
     ACCEPT,
     DROP,
-    PEERS,
+    MARKED,
     SO_ATTACH_FILTER,
     SO_ATTACH_REUSEPORT_CBPF,
     STRANGERS,
+    UNMARKED,
     attach,
     source_program,
 )
@@ -86,13 +87,18 @@ class UdpLink:
         )
         self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
         self.peers: frozenset[Address] = frozenset()
-        """The senders whose datagrams arrive at the first socket."""
+        """The senders whose datagrams arrive at the first two sockets."""
         # In use by another process? The sockets that share the port would not fail.
         self._open(family, RECEIVE_BUFFER_BYTES, share=False).close()
-        # Bound in the order of `STRANGERS` and `PEERS`.
+        # Bound in the order of `STRANGERS`, `MARKED` and `UNMARKED`.
         self._strangers = self._open(family, STRANGERS_BUFFER_BYTES)
         try:
             self._socket = self._open(family, RECEIVE_BUFFER_BYTES)
+            try:
+                self._unmarked = self._open(family, RECEIVE_BUFFER_BYTES)
+            except OSError:
+                self._socket.close()
+                raise
         except OSError:
             self._strangers.close()
             raise
@@ -103,7 +109,8 @@ class UdpLink:
             # A kernel before Linux 4.5, or a sandbox: one socket receives everything.
             self._sorts = False
             self._socket.close()
-            self._socket = self._strangers
+            self._unmarked.close()
+            self._socket = self._unmarked = self._strangers
 
     def _open(self, family: int, buffer_bytes: int, *, share: bool = True) -> socket.socket:
         """A configured and bound socket."""
@@ -118,7 +125,7 @@ class UdpLink:
         return own
 
     def set_peers(self, peers: frozenset[Address]) -> bool:
-        """Receive from these senders at the first socket, from all others at the strangers'. False if the kernel
+        """Receive from these senders at the first two sockets, from all others at the strangers'. False if the kernel
         refused the programs: then everything arrives as from strangers."""
         if not self._sorts or peers == self.peers:
             return self._sorts
@@ -133,14 +140,18 @@ class UdpLink:
         return True
 
     def _attach(self, peers: frozenset[Address]) -> None:
-        """Attach the programs in an order in which no datagram is refused by both sockets."""
+        """Attach the programs in an order in which no datagram is refused by all sockets."""
+        self._attach_filters(self.peers | peers, not_strangers=self.peers & peers)
+        to_group = source_program(peers, self._socket.family, MARKED, UNMARKED, STRANGERS)
+        attach(self._socket, SO_ATTACH_REUSEPORT_CBPF, to_group)
+        self._attach_filters(peers, not_strangers=peers)
+
+    def _attach_filters(self, peers: frozenset[Address], *, not_strangers: frozenset[Address]) -> None:
+        """The sockets for peers accept these senders; the one for strangers refuses `not_strangers`."""
         family = self._socket.family
-        own, strangers = self._socket, self._strangers
-        attach(own, SO_ATTACH_FILTER, source_program(self.peers | peers, family, ACCEPT, DROP))
-        attach(strangers, SO_ATTACH_FILTER, source_program(self.peers & peers, family, DROP, ACCEPT))
-        attach(own, SO_ATTACH_REUSEPORT_CBPF, source_program(peers, family, PEERS, STRANGERS))
-        attach(strangers, SO_ATTACH_FILTER, source_program(peers, family, DROP, ACCEPT))
-        attach(own, SO_ATTACH_FILTER, source_program(peers, family, ACCEPT, DROP))
+        attach(self._socket, SO_ATTACH_FILTER, source_program(peers, family, ACCEPT, DROP, DROP))
+        attach(self._unmarked, SO_ATTACH_FILTER, source_program(peers, family, DROP, ACCEPT, DROP))
+        attach(self._strangers, SO_ATTACH_FILTER, source_program(not_strangers, family, DROP, DROP, ACCEPT))
 
     def _configure(self, own: socket.socket, buffer_bytes: int) -> None:
         attachment = self.attachment
@@ -167,15 +178,22 @@ class UdpLink:
             own.bind(attachment.address)
 
     def fileno(self) -> int:
-        """The socket of the known peers; also used to send."""
+        """The socket of what known peers mark as urgent; also used to send."""
         return self._socket.fileno()
+
+    def unmarked_fileno(self) -> int:
+        return self._unmarked.fileno()
 
     def strangers_fileno(self) -> int:
         return self._strangers.fileno()
 
     def receive(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
-        """`_receive` from known peers."""
+        """`_receive` what known peers mark as urgent."""
         return self._receive(self._socket, deliver, limit, stop_after)
+
+    def receive_unmarked(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
+        """`_receive` what else known peers send."""
+        return self._receive(self._unmarked, deliver, limit, stop_after)
 
     def receive_from_strangers(self, deliver: Deliver, limit: int, stop_after: float = float("inf")) -> int:
         """`_receive` from all others."""
@@ -290,4 +308,5 @@ class UdpLink:
 
     def close(self) -> None:
         self._socket.close()
+        self._unmarked.close()
         self._strangers.close()

@@ -1,6 +1,7 @@
 """Edge cases of the driver: full sockets, clock steps, removed links, shutdown."""
 
 import asyncio
+import socket
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -86,15 +87,15 @@ def test_a_step_of_the_wall_clock_does_not_disturb_the_transport(
     monkeypatch: pytest.MonkeyPatch, step_s: float
 ) -> None:
     async def body(alice: Node, bob: Node) -> None:
-        real = UdpLink.receive
+        real = UdpLink._receive
 
-        def receive(self: UdpLink, deliver: Deliver, limit: int, stop_after: float) -> int:
+        def receive(self: UdpLink, from_socket: socket.socket, deliver: Deliver, limit: int, stop_after: float) -> int:
             def step(data: memoryview, source: Address, arrived: float) -> None:
                 deliver(data, source, arrived + step_s)
 
-            return real(self, step, limit, stop_after - step_s)
+            return real(self, from_socket, step, limit, stop_after - step_s)
 
-        monkeypatch.setattr(UdpLink, "receive", receive)
+        monkeypatch.setattr(UdpLink, "_receive", receive)
         assert isinstance(await alice.deliver("map", PAYLOAD, to="bob"), MessageDelivered)
         (peer,) = alice.conditions().peers
         assert peer.online

@@ -53,7 +53,8 @@ def receive(link: UdpLink, count: int) -> list[tuple[bytes, Address]]:
 
     deadline = time.monotonic() + WAIT_S
     while len(found) < count and time.monotonic() < deadline:
-        select.select([link.fileno(), link.strangers_fileno()], [], [], 1.0)
+        select.select([link.fileno(), link.unmarked_fileno(), link.strangers_fileno()], [], [], 1.0)
         link.receive(deliver, 1000)
+        link.receive_unmarked(deliver, 1000)
         link.receive_from_strangers(deliver, 1000)
     return found

@@ -108,16 +108,17 @@ while not heard and time.monotonic() < deadline:
     hub.links["mesh0"].receive_from_strangers(lambda data, source, arrived: echoed.append(bytes(data)), 10)
 assert heard[0] == (b"to all", ("10.7.20.6", 8700)), heard
 
-# A known peer's broadcast arrives at the socket of the peers, and only there.
+# A known peer's broadcast arrives at the socket for what peers do not mark, and only there.
 far.links["far0"].set_peers(frozenset({("10.7.20.6", 8700)}))
-at_peers, at_strangers = [], []
-while not at_peers and time.monotonic() < deadline:
+found = {"marked": [], "unmarked": [], "strangers": []}
+while not found["unmarked"] and time.monotonic() < deadline:
     hub.links["mesh0"].send([Out()])
-    select.select([far.links["far0"]], [], [], 0.2)
-    far.links["far0"].receive(lambda data, source, arrived: at_peers.append(bytes(data)), 10)
-    far.links["far0"].receive_from_strangers(lambda data, source, arrived: at_strangers.append(bytes(data)), 10)
-assert at_peers
-assert at_strangers == []
+    select.select([far.links["far0"].unmarked_fileno()], [], [], 0.2)
+    far.links["far0"].receive(lambda data, source, arrived: found["marked"].append(bytes(data)), 10)
+    far.links["far0"].receive_unmarked(lambda data, source, arrived: found["unmarked"].append(bytes(data)), 10)
+    far.links["far0"].receive_from_strangers(lambda data, source, arrived: found["strangers"].append(bytes(data)), 10)
+assert found["unmarked"]
+assert found["marked"] == found["strangers"] == []
 assert not echoed
 far.close(); hub.close(); monitor.close()
 """

@@ -1,4 +1,4 @@
-"""Datagrams of known peers and of strangers arrive at sockets of their own."""
+"""Marked and other datagrams of known peers and those of strangers arrive at sockets of their own."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ def arrivals(link: UdpLink, count: int) -> tuple[list[bytes], list[bytes]]:
     """What arrived from (peers, strangers), `count` datagrams in all."""
     found: tuple[list[bytes], list[bytes]] = ([], [])
     while len(found[0]) + len(found[1]) < count:
-        assert select.select([link.fileno(), link.strangers_fileno()], [], [], 60.0)[0]
+        assert select.select([link.fileno(), link.unmarked_fileno(), link.strangers_fileno()], [], [], 60.0)[0]
         link.receive(lambda data, _source, _at: found[0].append(bytes(data)), 100)
+        link.receive_unmarked(lambda data, _source, _at: found[0].append(bytes(data)), 100)
         link.receive_from_strangers(lambda data, _source, _at: found[1].append(bytes(data)), 100)
     return found
 
@@ -54,6 +55,44 @@ def test_a_peer_and_a_stranger_arrive_at_different_sockets() -> None:
         assert from_each() == ([], [b"bob", b"eve", b"other port"])
 
 
+def by_mark(link: UdpLink, count: int) -> tuple[list[bytes], list[bytes], list[bytes]]:
+    """What arrived (marked, unmarked, from strangers), `count` datagrams in all."""
+    found: tuple[list[bytes], list[bytes], list[bytes]] = ([], [], [])
+    while sum(map(len, found)) < count:
+        assert select.select([link.fileno(), link.unmarked_fileno(), link.strangers_fileno()], [], [], 60.0)[0]
+        link.receive(lambda data, _source, _at: found[0].append(bytes(data)), 100)
+        link.receive_unmarked(lambda data, _source, _at: found[1].append(bytes(data)), 100)
+        link.receive_from_strangers(lambda data, _source, _at: found[2].append(bytes(data)), 100)
+    return found
+
+
+def test_what_a_peer_marks_as_urgent_arrives_at_a_socket_of_its_own() -> None:
+    port = free_port()
+    with (
+        closing(open_link(ALICE, port)) as alice,
+        closing(open_link(BOB, port, urgent_dscp=46)) as bob,
+        closing(open_link(EVE, port, urgent_dscp=46)) as eve,
+    ):
+        alice.set_peers(frozenset({(BOB, port)}))
+        to_alice = (ALICE, port)
+        bob.send([Out(b"stop", to_alice, urgent=True), Out(b"map", to_alice)])
+        eve.send([Out(b"forged", to_alice, urgent=True)])
+        assert by_mark(alice, 3) == ([b"stop"], [b"map"], [b"forged"])
+
+
+@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
+def test_marks_of_ipv6_datagrams_are_seen() -> None:
+    port = free_port()
+    attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
+    with closing(UdpLink(attachment)) as link, socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as far:
+        far.bind(("::1", 0))
+        link.set_peers(frozenset({("::1", far.getsockname()[1])}))
+        for dscp, data in ((46, b"stop"), (0, b"map")):
+            far.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, dscp << 2)
+            far.sendto(data, ("::1", port))
+        assert by_mark(link, 2) == ([b"stop"], [b"map"], [])
+
+
 @pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
 def test_ipv6_addresses_are_compared_in_full() -> None:
     port = free_port()
@@ -70,7 +109,7 @@ def test_ipv6_addresses_are_compared_in_full() -> None:
 def test_the_filter_for_a_large_team_stays_within_the_kernel_limit() -> None:
     port = free_port()
     team = frozenset((f"10.0.{number // 250}.{number % 250 + 1}", 8700) for number in range(1000))
-    program = source_program(team, socket.AF_INET, ACCEPT, DROP)
+    program = source_program(team, socket.AF_INET, ACCEPT, DROP, DROP)
     assert len(program) <= MAX_INSTRUCTIONS * INSTRUCTION_BYTES
     with closing(open_link(ALICE, port)) as alice:
         assert alice.set_peers(team)
@@ -81,7 +120,7 @@ def test_every_datagram_still_arrives_if_the_kernel_rejects_the_filter(monkeypat
     with closing(open_link(ALICE, port)) as alice, closing(open_link(BOB, port)) as bob:
 
         def attach(own: socket.socket, option: int, program: bytes) -> None:
-            if len(program) > INSTRUCTION_BYTES and own is alice._strangers:
+            if len(program) > len(source_program((), socket.AF_INET, ACCEPT, DROP, DROP)) and own is alice._strangers:
                 raise OSError(12, "Cannot allocate memory")
             source_filter.attach(own, option, program)
 

@@ -12,16 +12,22 @@ MAX_PENDING = ACK_BITMAP_BITS // 4
 """An acknowledgement is due after this many packets in any case, so that each packet appears in four of them."""
 
 
+LARGE_WINDOW_SPACING = 8
+"""Packets between two requests of a sender whose window is so large that a millisecond is a small part of it."""
+
+
 class AckState:
     """`received` has bit 0 for `largest` itself and bit i for `largest - i`."""
 
-    __slots__ = ("arrived_at", "due_at", "largest", "pending", "received", "send_now")
+    __slots__ = ("arrived_at", "due_at", "largest", "pending", "received", "requested", "send_now")
 
     def __init__(self) -> None:
         self.largest = -1
         self.received = 0
         self.pending = 0
         """Packets that request an acknowledgement, since the last one was sent."""
+        self.requested = 0
+        """Those of them that request one at once."""
         self.arrived_at = 0.0
         """When `largest` arrived."""
         self.due_at: float | None = None
@@ -41,8 +47,15 @@ class AckState:
         elif -ahead <= ACK_BITMAP_BITS:
             self.received |= 1 << -ahead
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the sender has requested another acknowledgement before this one was sent, which it does every fifth
+        of its window."""
+        return self.requested > 1 and self.pending < LARGE_WINDOW_SPACING * self.requested
+
     def on_ack_sent(self) -> None:
         """Record that an acknowledgement was sent."""
         self.pending = 0
+        self.requested = 0
         self.due_at = None
         self.send_now = False

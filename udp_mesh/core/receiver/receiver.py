@@ -266,6 +266,7 @@ class Receiver:
     def on_accepted(self, number: int, now: float, *, ack_now: bool) -> None:
         """Record that a datagram that requests an acknowledgement was accepted."""
         acks = self.acks
+        acks.requested += ack_now
         if number > acks.largest + 1:
             # A gap: the sender can declare a loss once three later packets arrived, so acknowledge then.
             if self._gap_ack_at is None:
