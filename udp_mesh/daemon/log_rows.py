@@ -111,14 +111,14 @@ def _read_logs(connection: sqlite3.Connection, rows: _Reader) -> None:
             rows.keys.pop(log, None)
             continue
         rows.keys[log] = LogKey(topic, source, log_id)
-        ranges = _ranges(dropped)
+        ranges = parse_ranges(dropped)
         if ranges is None:
             rows.report(f"logs row {log}: dropped: expected ascending ranges, found {_shown(dropped)}")
             rows.doubtful.add(log)
         else:
             rows.received[log] = ranges
     for log, text in connection.execute("SELECT log, ranges FROM carried"):
-        ranges = _ranges(text)
+        ranges = parse_ranges(text)
         if ranges is None:
             rows.report(f"carried row {log}: expected ascending ranges, found {_shown(text)}")
         else:
@@ -152,7 +152,7 @@ def _read_items(
     return tuple(items), orphans
 
 
-def _ranges(text: object) -> Ranges | None:
+def parse_ranges(text: object) -> Ranges | None:
     """The ranges in a JSON list. None if it is none."""
     try:
         pairs = json.loads(text) if isinstance(text, str) else None

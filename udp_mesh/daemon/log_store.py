@@ -5,15 +5,14 @@ what is reported as stored survives a power cut), then reports the results on th
 loop never waits for it. A damaged database is renamed and a new one begun, with a new identity: the secret of this
 node's logs is in the database, so that no number is ever used twice. Rows that make no sense are left out (`log_rows`).
 
-A full disk takes no new database, but an old one is opened and read. Without a database on disk, one in memory is used,
-and copied to the disk as soon as that takes it (`_move_to_disk`).
+A full disk takes no new database, but an old one is opened and read. Without a database on disk, or while another
+process has locked it, one in memory is used, and copied to the disk as soon as that takes it (`_move_to_disk`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import os
 import queue
@@ -25,9 +24,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from udp_mesh.core.logs.item import ItemId, LogKey
-from udp_mesh.core.logs.messages import Ranges
+from udp_mesh.core.logs.item import ItemId
 from udp_mesh.core.logs.store import ItemUse, LogContents, RememberedLog
+from udp_mesh.daemon.log_join import join_logs, log_number, remember, with_earlier
 from udp_mesh.daemon.log_rows import SCHEMA, load_rows
 
 log = logging.getLogger(__name__)
@@ -73,6 +72,8 @@ class SqliteLogStore:
         """The latest call of `put`."""
         self._memory_only: str | None = None
         """Why items are kept in memory only."""
+        self._joined = False
+        """The database has what it held before this run could use it, and of which the core does not know."""
         self._move_at = 0.0
         self._wall_clock = wall_clock
         self._jobs: queue.SimpleQueue[_QueuedJob | None] = queue.SimpleQueue()
@@ -177,7 +178,7 @@ class SqliteLogStore:
         def insert(connection: sqlite3.Connection) -> Callable[[], None]:
             connection.execute(
                 "INSERT OR REPLACE INTO items (log, number, data, stored_s, taken) VALUES (?, ?, ?, ?, ?)",
-                (_log_number(connection, item.log), item.number, data, stored_s, int(use)),
+                (log_number(connection, item.log), item.number, data, stored_s, int(use)),
             )
             return stored
 
@@ -210,7 +211,7 @@ class SqliteLogStore:
 
         def update(connection: sqlite3.Connection) -> None:
             for item in marked:
-                where = (int(use), _log_number(connection, item.log), item.number)
+                where = (int(use), log_number(connection, item.log), item.number)
                 connection.execute("UPDATE items SET taken = ? WHERE log = ? AND number = ?", where)
 
         self._jobs.put((update, lambda: None))
@@ -220,16 +221,11 @@ class SqliteLogStore:
 
         def delete(connection: sqlite3.Connection) -> None:
             for item in gone:
-                where = (_log_number(connection, item.log), item.number)
+                where = (log_number(connection, item.log), item.number)
                 connection.execute("DELETE FROM items WHERE log = ? AND number = ?", where)
             for entry in kept:
-                log_number = _log_number(connection, entry.log)
-                connection.execute("UPDATE logs SET dropped = ? WHERE id = ?", (_json(entry.received), log_number))
-                if entry.carried:
-                    values = (log_number, _json(entry.carried))
-                    connection.execute("INSERT OR REPLACE INTO carried (log, ranges) VALUES (?, ?)", values)
-                else:
-                    connection.execute("DELETE FROM carried WHERE log = ?", (log_number,))
+                row = log_number(connection, entry.log)
+                remember(connection, row, with_earlier(connection, row, entry) if self._joined else entry)
 
         self._jobs.put((delete, lambda: None))
 
@@ -266,28 +262,35 @@ class SqliteLogStore:
         return batch, False
 
     def _move_to_disk(self, connection: sqlite3.Connection) -> sqlite3.Connection:
-        """Copies the database in memory to the disk, if that takes it now; returns the one to use.
-
-        Not over a database that another daemon uses, or that has items and numbers of its own.
-        """
+        """Copies the database in memory to the disk, if that takes it now; returns the one to use. A database that is
+        there and no longer locked keeps its items and its identity, and gets the items in memory as well."""
         self._move_at = time.monotonic() + MOVE_AGAIN_S
         try:
             on_disk = self._connect(str(self.path))
         except (sqlite3.Error, OSError):
             return connection
         try:
-            if on_disk.execute("SELECT count(*) FROM sqlite_master").fetchone() != (0,):
-                on_disk.close()
-                return connection
-            connection.backup(on_disk)
-        except sqlite3.Error:
+            earlier = self._copy(connection, on_disk)
+            (items,) = on_disk.execute("SELECT count(*) FROM items").fetchone()
+        except (sqlite3.Error, OSError):
             on_disk.close()
             return connection
         connection.close()
-        (items,) = on_disk.execute("SELECT count(*) FROM items").fetchone()
-        log.warning("log-moved-to-disk path=%s items=%d", self.path, items)
+        log.warning("log-moved-to-disk path=%s items=%d earlier=%d", self.path, items, earlier)
         self._memory_only = self.problem = None
         return on_disk
+
+    def _copy(self, connection: sqlite3.Connection, on_disk: sqlite3.Connection) -> int:
+        """The number of items that were there. Raises OSError if the database is of a later version."""
+        if on_disk.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
+            connection.backup(on_disk)
+            return 0
+        (version,) = on_disk.execute("PRAGMA user_version").fetchone()
+        if version != _VERSION:
+            raise OSError(f"expected a log of version {_VERSION}, found {version}")
+        earlier = join_logs(connection, on_disk)
+        self._joined = True
+        return earlier
 
     def _commit(self, connection: sqlite3.Connection, batch: list[_QueuedJob]) -> list[Callable[[], None]]:
         """Does a batch in one transaction; returns what to call on the loop."""
@@ -328,22 +331,6 @@ class SqliteLogStore:
         with contextlib.suppress(RuntimeError):
             # The loop is closed: no caller waits for the results.
             self._loop.call_soon_threadsafe(report)
-
-
-def _log_number(connection: sqlite3.Connection, key: LogKey) -> int:
-    row = connection.execute(
-        "SELECT id FROM logs WHERE topic = ? AND source = ? AND log_id = ?", (key.topic, key.source, key.log_id)
-    ).fetchone()
-    if row is None:
-        row = connection.execute(
-            "INSERT INTO logs (topic, source, log_id) VALUES (?, ?, ?) RETURNING id",
-            (key.topic, key.source, key.log_id),
-        ).fetchone()
-    return int(row[0])
-
-
-def _json(ranges: Ranges) -> str:
-    return json.dumps(ranges, separators=(",", ":"))
 
 
 def _is_damaged(error: sqlite3.DatabaseError) -> bool:

@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import resource
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -362,20 +364,96 @@ def test_a_log_begun_in_memory_moves_to_the_disk_once_there_is_space(
     with_store(path, look)
 
 
-def test_a_log_in_memory_replaces_no_log_that_is_on_the_disk(tmp_path: Path) -> None:
+HOLD = """
+import sqlite3, sys
+held = sqlite3.connect(sys.argv[1], isolation_level=None)
+held.execute("BEGIN EXCLUSIVE")
+print("locked", flush=True)
+sys.stdin.readline()
+"""
+"""Another process that has locked the database until it is told to end."""
+
+
+@pytest.mark.parametrize("moves_while_running", [True, False])
+def test_a_database_that_was_locked_at_the_start_gets_the_items_once_the_lock_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves_while_running: bool
+) -> None:
+    monkeypatch.setattr(log_store, "MOVE_AGAIN_S", 0.02 if moves_while_running else 3600.0)
+    monkeypatch.setattr(log_store, "LOCK_WAIT_S", 0.02)
+    path, seeds = tmp_path / "items.db", list[bytes]()
+    shared, only_carried = LogKey("artifact", "husky", bytes(32)), ((5, 6),)
+
+    async def write(store: Store, contents: LogContents) -> None:
+        seeds.append(contents.seed)
+        assert await put_and_wait(store, 1) is None
+        put(store, ItemId(shared, 9), b"before")
+        store.drop([], [RememberedLog(shared, ((1, 4), (5, 6)), only_carried)])
+
+    async def run(holder: subprocess.Popen[str]) -> None:
+        store = Store(path)
+        assert store.load().items == ()
+        assert await put_and_wait(store, 2) == "database is locked"
+        put(store, ItemId(shared, 8), b"during")
+        put(store, ItemId(shared, 9), b"again")
+        store.mark([ItemId(shared, 9)], ItemUse.TAKEN)
+        store.drop([], [RememberedLog(shared, ((7, 7),))])
+        holder.communicate("end\n")
+        if moves_while_running:
+            async with asyncio.timeout(60):
+                while store.problem is not None:  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+            assert await put_and_wait(store, 3) is None
+            # The core does not know what the disk remembers.
+            store.drop([ItemId(shared, 8)], [RememberedLog(shared, ((7, 8),))])
+        await asyncio.to_thread(store.close)
+
+    async def look(_: Store, contents: LogContents) -> None:
+        assert contents.seed == seeds[0]
+        own = {item.id.number for item in contents.items if item.id.log == ITEM.log}
+        assert own == ({1, 2, 3} if moves_while_running else {1, 2})
+        others = {item.id.number: item.use for item in contents.items if item.id.log == shared}
+        last = {} if moves_while_running else {8: ItemUse.WAITING}
+        assert others == {9: ItemUse.TAKEN, **last}
+        (remembered,) = contents.remembered
+        assert remembered == RememberedLog(shared, ((1, 8 if moves_while_running else 7),), only_carried)
+
+    with_store(path, write)
+    command = [sys.executable, "-c", HOLD, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "locked\n"
+        asyncio.run(run(holder))
+    with_store(path, look)
+
+
+def test_items_in_memory_do_not_go_to_a_database_of_a_later_version(tmp_path: Path) -> None:
+    path = tmp_path / "items.db"
+    with contextlib.closing(sqlite3.connect(path)) as later:
+        later.execute("CREATE TABLE items (of_its_own)")
+        later.execute("PRAGMA user_version = 9")
+
+    async def use(store: Store, _: LogContents) -> None:
+        assert "found 9" in str(await put_and_wait(store, 1))
+
+    with_store(path, use)
+    with contextlib.closing(sqlite3.connect(path)) as later:
+        assert later.execute("SELECT count(*) FROM items").fetchone() == (0,)
+
+
+def test_a_second_daemon_keeps_its_items_beside_those_of_the_first_once_that_ends(tmp_path: Path) -> None:
     path, seeds = tmp_path / "items.db", list[bytes]()
 
     async def use(store: Store, contents: LogContents) -> None:
         seeds.append(contents.seed)
         other = Store(path)
-        other.load()
+        assert other.load().seed != contents.seed
         assert await put_and_wait(other, 7) == "database is locked"
         store.close()
         other.close()
 
     async def look(_: Store, contents: LogContents) -> None:
         assert contents.seed == seeds[0]
-        assert contents.items == ()
+        assert [item.id.number for item in contents.items] == [7]
 
     with_store(path, use)
     with_store(path, look)
