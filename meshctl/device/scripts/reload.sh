@@ -3,8 +3,8 @@
 # if every effect was observed, with 75 if the confirm window was too short for that, with 1 if something failed.
 #
 #   reload_config -> procd has run the triggered scripts (`barrier`) -> netifd has set up interfaces and radios
-#   (`settle_radios`) -> procd has run the scripts triggered by interfaces -> the firewall is loaded (`load_firewall`) ->
-#   dropbear runs with its new options (`dropbear_is_new`)
+#   (`settle_radios`), which are part of batman-adv again (`settle_mesh`) -> procd has run the scripts triggered by
+#   interfaces -> the firewall is loaded (`load_firewall`) -> dropbear runs with its new options (`dropbear_is_new`)
 #
 # reload_config only sends events and always exits with 0. procd waits 1 s, then runs the init scripts in sequence and
 # discards their exit status (procd: service/trigger.c, the same from 19.07 to 25.12).
@@ -12,6 +12,7 @@
 # named by process id, because a rollback may start while the reload of its change is still running
 BARRIER=meshctl-barrier-$$
 PASSED=/tmp/meshctl/$BARRIER
+MEMBERS=/tmp/meshctl/members
 #
 # The limits are for what hangs, not for what is slow: a change's waits end with its window (is_late), and a reload after a
 # rollback that fails reboots the node, which takes a slow one longer than to wait. deadman.sh ends that after 300 s.
@@ -20,6 +21,7 @@ BLIND_S=10           # if procd rejects our trigger: about the time its reloads 
 SETUP_LIMIT_S=60     # netifd kills a setup that takes more than 30 s, and tries again
 NETIFD_LIMIT_S=20    # a WAN without a server takes longer; the health checks cover what matters
 RADIO_LIMIT_S=15     # netifd may not have started, or the radio is between down and up
+MESH_LIMIT_S=30      # a process of netifd per interface
 DROPBEAR_LIMIT_S=30  # procd waits 5 s for the old process before it kills it
 STATUS=0
 NEWLINE='
@@ -111,10 +113,11 @@ await_netifd() {
 }
 
 # radio_interfaces: prints `+NAME` for each enabled radio interface and `-NAME` for each disabled one; `+` for an enabled
-# one without an ifname; `:NAME` for each disabled radio.
+# one without an ifname; `:NAME` for each disabled radio; `=NAME` for each enabled one whose network is batman-adv's.
 radio_interfaces() {
-	uci -q show wireless | awk -F"[.=]" '
+	{ uci -q show network; uci -q show wireless; } | awk -F"[.=]" '
 		{ value = $0; sub(/^[^=]*=/, "", value); gsub(/\047/, "", value) }
+		$1 == "network" { if ($3 == "proto" && value == "batadv_hardif") hard[$2]; next }
 		NF == 3 && value == "wifi-iface" { sections[++count] = $2 }
 		NF == 3 && value == "wifi-device" { radios[$2] }
 		NF > 3 { options[$2, $3] = value }
@@ -123,6 +126,7 @@ radio_interfaces() {
 				section = sections[i]
 				off = options[section, "disabled"] == "1" || options[options[section, "device"], "disabled"] == "1"
 				if (!off || options[section, "ifname"] != "") print (off ? "-" : "+") options[section, "ifname"]
+				if (!off && options[section, "ifname"] != "" && options[section, "network"] in hard) print "=" options[section, "ifname"]
 			}
 			for (radio in radios) if (options[radio, "disabled"] == "1") print ":" radio
 		}'
@@ -185,6 +189,51 @@ settle_radios() {
 	/sbin/wifi down
 	/sbin/wifi up
 	await_netifd
+}
+
+# no_member_is_lost: each radio interface that has joined its cell is part of batman-adv, and so is each that was before the
+# change, unless it is still joining
+no_member_is_lost() {
+	for interface in $configured_interfaces; do
+		name=${interface#=}
+		[ "$name" != "$interface" ] && [ ! -e "/sys/class/net/$name/master" ] || continue
+		# it has none before it has joined, and cannot be read while the interface is down or gone
+		carrier=''
+		read -r carrier 2>/dev/null <"/sys/class/net/$name/carrier"
+		case $carrier in
+		0) ;;
+		1) return 1 ;;
+		*) case $members in *" $name "*) return 1 ;; esac ;;
+		esac
+	done
+}
+
+# settle_mesh: waits until the radio interfaces are part of batman-adv. If a radio is set up again while its last setup is
+# still being torn down, as after a change whose reload the rollback has stopped, netifd may lose the interface (seen on
+# 25.12.5): it is in its cell, `available`, neither `up` nor `pending`, and no reload, `ifup` or `wifi` brings it back to
+# bat0, only another netifd.
+settle_mesh() {
+	until_s $MESH_LIMIT_S no_member_is_lost && return
+	! is_late || return
+	/etc/init.d/network restart || fail "restart of network"
+	await_netifd
+	until_s $MESH_LIMIT_S no_member_is_lost || fail "a radio is not part of batman-adv"
+}
+
+# remember_members: sets `members`, the interfaces that were part of something before the change. Its reload writes them down
+# for that of the rollback, before which they may be gone.
+remember_members() {
+	members=' '
+	for interface in /sys/class/net/*/master; do
+		interface=${interface%/master}
+		members="$members${interface##*/} "
+	done
+	if [ -n "$UNTIL_S" ]; then
+		echo "$members" >"$MEMBERS"
+	elif [ -e "$MEMBERS" ]; then
+		read -r members <"$MEMBERS"
+		members=" $members "
+	fi 2>/dev/null
 }
 
 is_firewall_running() { [ -e /var/run/fw4.state ] || [ -e /var/run/fw3.state ]; }
@@ -258,11 +307,13 @@ split_service "$(ubus call service list '{"name":"dropbear"}' 2>/dev/null)"
 before_options=$WITHOUT_PIDS before_pids=$PIDS
 before_interfaces=' '
 for interface in /sys/class/net/*; do before_interfaces="$before_interfaces${interface##*/} "; done
+remember_members
 [ -z "$PACKAGES" ] || take_up
 ! changed dhcp || resolve_without_dnsmasq
 if changed network wireless; then
 	learn_batman_adv
 	settle_radios
+	settle_mesh
 fi
 if changed network; then
 	# A recreated bat0 announces the node's own address only once the node has sent a frame through it. If br-lan has

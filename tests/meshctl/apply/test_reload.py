@@ -7,6 +7,7 @@ event, `fw4 reload` ends with 0 whether or not nft took the ruleset, dropbear's 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import threading
 import time
@@ -46,7 +47,7 @@ class Node:
         passing = 'read -r up _ <"$HERE/uptime"; echo "$((up + $1)) 0" >"$HERE/uptime"'
         self.tool("sleep", f'echo "sleep $1" >>"$HERE/log"; {passing}')
         (place / "uptime").write_text("1000 0\n")
-        self.tool("uci", 'cat "$HERE/wireless" 2>/dev/null')
+        self.tool("uci", 'case $3 in network) cat "$HERE/network.uci" ;; *) cat "$HERE/wireless" ;; esac 2>/dev/null')
         self.tool("iw", 'cat "$HERE/iw" 2>/dev/null')
         self.tool("fw4", ":")
         self.tool("nft", 'cat "$HERE/rules"')
@@ -301,6 +302,52 @@ def test_lost_radios_and_disabled_radios_still_up_are_reset_once(
         node.tool("reload_config", 'rmdir "$HERE/net/mesh0"')
     assert node.reload("wireless") == (0, "")
     assert [line for line in node.log if line.startswith("wifi")] == resets
+
+
+@pytest.fixture
+def member(node: Node) -> Node:
+    """A node whose radio interface has joined its cell and is part of batman-adv."""
+    (node.place / "wireless").write_text(f"{WIRELESS % 0}wireless.mesh0.network='mesh0'\n")
+    (node.place / "network.uci").write_text("network.mesh0=interface\nnetwork.mesh0.proto='batadv_hardif'\n")
+    (node.place / "net" / "bat0").mkdir()
+    (node.place / "net" / "mesh0").mkdir()
+    (node.place / "net" / "mesh0" / "carrier").write_text("1\n")
+    (node.place / "net" / "mesh0" / "master").symlink_to("../bat0")
+    node.tool("wifi", 'echo wifi "$@" >>"$HERE/log"')
+    return node
+
+
+LOSES_MASTER = 'rm -f "$HERE/net/mesh0/master"'
+
+
+def test_a_radio_that_netifd_left_out_of_batman_adv_is_brought_back_by_a_restart_of_netifd(member: Node) -> None:
+    """Recorded on 25.12.5: netifd says `available`, neither `up` nor `pending`, whatever is called but its restart."""
+    member.tool("reload_config", LOSES_MASTER)
+    member.service("network", 'ln -s ../bat0 "$HERE/net/mesh0/master"')
+    assert member.reload("wireless") == (0, "")
+    assert [line for line in member.log if line.startswith(("wifi", "network"))] == ["network restart"]
+    assert (member.place / "net" / "mesh0" / "master").is_symlink()
+
+
+def test_a_radio_that_stays_out_of_batman_adv_is_a_failure(member: Node) -> None:
+    member.tool("reload_config", LOSES_MASTER)
+    assert member.reload("wireless") == (1, "failed: a radio is not part of batman-adv")
+
+
+def test_a_radio_that_is_still_joining_its_cell_is_no_failure(member: Node) -> None:
+    member.tool("reload_config", f'{LOSES_MASTER}; echo 0 >"$HERE/net/mesh0/carrier"')
+    assert member.reload("wireless") == (0, "")
+    assert "network restart" not in member.log
+
+
+@pytest.mark.parametrize("was_member", [True, False])
+def test_a_rollback_fails_if_the_change_lost_a_radio_that_does_not_return(member: Node, was_member: bool) -> None:
+    """A failed reload of a rollback reboots the node. A radio that was missing before the change is no reason to."""
+    if not was_member:
+        shutil.rmtree(member.place / "net" / "mesh0")
+    member.tool("reload_config", 'rm -rf "$HERE/net/mesh0"')
+    member.reload("wireless", environ={"UNTIL_S": "1001"})
+    assert member.reload("wireless")[0] == int(was_member)
 
 
 TWO_RADIOS = """wireless.radio0=wifi-device
