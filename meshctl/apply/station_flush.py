@@ -88,8 +88,6 @@ class StationFlush:
     radios: Radios
     unfinished: list[StationFlush] = field(repr=False)
     _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
-    # of all radios of the node
-    _every_holder: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
@@ -106,9 +104,7 @@ class StationFlush:
     _since_s: float = 0.0
 
     def __post_init__(self) -> None:
-        observations = self.ctx.run.observations
-        self._holders = by_holder(entries_of(self.ctx.name, observations, self.radios))
-        self._every_holder = by_holder(entries_of(self.ctx.name, observations))
+        self._holders = by_holder(entries_of(self.ctx.name, self.ctx.run.observations, self.radios))
 
     @property
     def node(self) -> str:
@@ -186,14 +182,12 @@ class StationFlush:
                     self.unreachable()
 
         thread = threading.Thread(target=watch, daemon=True)
-        if self._every_holder:
-            thread.start()
+        thread.start()
         try:
             yield
         finally:
             ended.set()
-            if self._every_holder:
-                thread.join()
+            thread.join()
 
     def unreachable(self, among: Container[str] | None = None) -> None:
         """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable."""
@@ -201,7 +195,8 @@ class StationFlush:
         if self._started_s is None or now_s < next_query_s(self._queried_s):
             return
         answered_s = max(self._started_s, self._observed_s or 0.0)
-        holders = self._holders if now_s < answered_s + BOOT_S else self._every_holder
+        # a plan for this node alone may have observed none of its neighbors
+        holders = self._holders if now_s < answered_s + BOOT_S else self._possible_holders(None, EVERY_RADIO)
         names = [name for name in holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._queried_s.append(now_s)
@@ -219,7 +214,9 @@ class StationFlush:
         if since_s is None or not self.radios:
             return
         self._since_s = since_s
-        asked = self._possible_holders(now)
+        silent = self._watching | self._restarting
+        possible = self._possible_holders(now, self.radios)
+        asked = {name: entries for name, entries in possible.items() if name not in silent}
         answers = self._flush(asked, since_s)
         unsure = [name for name, said in answers.items() if UNKNOWN in said.split()]
         if unsure and now is not None:
@@ -239,11 +236,11 @@ class StationFlush:
         entries = {name: tuple(e for e in asked[name] if e.mac.lower() in macs) for name in unsure}
         self._flush({name: some for name, some in entries.items() if some}, since_s, has_restarted=True)
 
-    def _possible_holders(self, now: Observation | None) -> dict[str, tuple[StationEntry, ...]]:
-        """Nodes known to hold a station entry, then nodes that may hold one on any interface: those not observed, and
-        new neighbors."""
+    def _possible_holders(self, now: Observation | None, radios: Radios) -> dict[str, tuple[StationEntry, ...]]:
+        """Nodes known to hold a station entry of these radios, then nodes that may hold one on any interface: those not
+        observed, and new neighbors."""
         run_context, ctx = self.ctx.run, self.ctx
-        asked = by_holder(entries_of(self.node, run_context.observations, self.radios))
+        asked = by_holder(entries_of(self.node, run_context.observations, radios))
         observed_macs = {
             mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
         }
@@ -254,15 +251,12 @@ class StationFlush:
             *(current_neighbors(now, names) if now else ()),
         )
         # the radio's MAC may have changed: use all that are known
-        own = [
-            radio_macs(seen, self.radios) for seen in (run_context.observations.get(self.node), now) if seen is not None
-        ]
+        own = [radio_macs(seen, radios) for seen in (run_context.observations.get(self.node), now) if seen is not None]
         macs = tuple(dict.fromkeys(mac for some in own for mac in some))
         for name in others:
             if name != self.node and name in run_context.fleet.nodes:
                 asked.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
-        silent = self._watching | self._restarting
-        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if name not in silent and asked[name]}
+        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if asked[name]}
 
     def _flush(
         self, asked: Mapping[str, Sequence[StationEntry]], since_s: float, *, has_restarted: bool = False

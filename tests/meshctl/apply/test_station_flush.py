@@ -118,6 +118,26 @@ def test_a_node_that_stays_unreachable_may_have_lost_its_power_whatever_its_chan
     assert near.notes == ["b02: b01 removed a stale entry of its radio"]
 
 
+def test_neighbors_that_the_plan_did_not_observe_are_queried_for_a_node_that_may_have_lost_its_power(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Seen on real OpenWrt: a change of one node's host name, whose plan observed that node alone, and a power cut."""
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    near = Neighbours({"b02": node("b02", "b01")})
+    flush = near.flushes.listener(near.job, NO_RADIOS)
+    flush.started()
+    now_s[0] += 15
+    flush.unreachable()
+    assert near.asked == []
+    now_s[0] += 10
+    flush.unreachable()
+    ((name, script),) = near.asked
+    assert name == "b01"
+    assert "iw dev 2>/dev/null" in script.splitlines()[-1]
+    assert script.endswith(f"{MAC} 25\n")
+
+
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
