@@ -50,6 +50,12 @@ class Boundary:
         return special_file(path)
 
 
+def located(base: str | Path, written: str) -> Path:
+    """The path that a file in the directory `base` writes as `written`: `~` is a home directory."""
+    # Path.expanduser raises for an unknown user
+    return Path(base or ".", os.path.expanduser(written))
+
+
 def special_file(path: Path) -> str:
     """A description of a pipe, device or socket, which may never end; empty for regular files and directories."""
     try:

@@ -69,7 +69,9 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     for place, path in _secrets_outside(fleet, folder):
         editor.set(place, path)
     if fleet.operators.known_hosts != _KNOWN_HOSTS:
-        editor.set(("operators", "known_hosts"), _KNOWN_HOSTS)
+        place = ("operators", "known_hosts")
+        is_beside = Path(fleet.where(*place).position.file).parent == folder
+        editor.set(place, _KNOWN_HOSTS if is_beside else str(target / _KNOWN_HOSTS))
     save(editor.changes())
     fleet_directory.record_digests(directory)
     links = target / LINKS_FILE

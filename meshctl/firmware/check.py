@@ -11,7 +11,7 @@ import hashlib
 from pathlib import Path
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
-from meshctl.file_access import special_file
+from meshctl.file_access import located, special_file
 from meshctl.firmware.metadata import Metadata, read_metadata
 from meshctl.firmware.trailer import DamagedImage
 from meshctl.firmware.usign import BadSignature, PublicKey, parse_public_key, verify
@@ -49,7 +49,7 @@ def check(image: Path, profile: HardwareProfile) -> tuple[Diagnostic, ...]:
 def image_path(profile: HardwareProfile) -> Path | None:
     """The path of the profile's image, None if it names none."""
     firmware = profile.firmware
-    return Path(firmware.base) / firmware.image if firmware.image else None
+    return located(firmware.base, firmware.image) if firmware.image else None
 
 
 def image_version(image: Path) -> str:
@@ -129,7 +129,7 @@ def _check_signature(image: Path, content: bytes, profile: HardwareProfile) -> t
     """Verify `IMAGE.sig`, or `sha256sums` and `sha256sums.sig` beside the image, as OpenWrt publishes them."""
     if not profile.firmware.usign_key:
         return ()
-    key_path = Path(profile.firmware.base) / profile.firmware.usign_key
+    key_path = located(profile.firmware.base, profile.firmware.usign_key)
     try:
         key = parse_public_key(_text(key_path))
     except (BadSignature, OSError, UnicodeDecodeError) as error:

@@ -28,8 +28,9 @@ from meshctl.inventory.documents import (
     SshLayer,
     SystemDocument,
 )
+from meshctl.inventory.file_paths import from_inventory
 from meshctl.inventory.layers import NodeSpec
-from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings
+from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings, ssh_values
 from meshctl.inventory.provenance import Provenance
 from meshctl.inventory.ranges import MAX_NAMES, BadRange, expand
 from meshctl.inventory.suggest import did_you_mean
@@ -83,7 +84,7 @@ def build(
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
     lan_addresses = _lan_addresses(document, robots, root, diagnostics)
-    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses)
+    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses, _base(root))
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -99,7 +100,7 @@ def build(
         operators=Operators(
             ssh_keys=tuple(document.operators.ssh_keys),
             password_login=document.operators.password_login,
-            known_hosts=document.operators.known_hosts,
+            known_hosts=_path(root, document.operators.known_hosts, "operators", "known_hosts"),
         ),
         system=SystemSettings(
             timezone=document.system.timezone,
@@ -118,9 +119,9 @@ def build(
         ),
         provenance=Provenance(root, specs, robot_of),
         files=tuple(str(path) for path in files),
-        base=str(files[0].parent),
-        sites=MappingProxyType({name: _site(name, item) for name, item in document.sites.items()}),
-        nats=_nats_hub(document.nats),
+        base=_base(root),
+        sites=MappingProxyType({name: _site(name, item, root) for name, item in document.sites.items()}),
+        nats=_nats_hub(document.nats, root),
     )
     return Built(fleet, ())
 
@@ -136,6 +137,15 @@ def _base(root: MappingNode, *path: str | int) -> str:
     """The directory of the file that sets `path`; of the first file if none does."""
     tree = descend(root, path)
     return str(Path((root if tree is None else tree).file).parent)
+
+
+def _path(root: MappingNode, written: str, *path: str | int) -> str:
+    """The path that the file with `path` writes, relative to the inventory's directory."""
+    return from_inventory(written, _base(root, *path), _base(root))
+
+
+def _paths(root: MappingNode, written: tuple[str, ...], *path: str) -> tuple[str, ...]:
+    return tuple(_path(root, text, *path, number) for number, text in enumerate(written))
 
 
 def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> HardwareProfile:
@@ -173,7 +183,7 @@ def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> Hardw
             base=_base(root, "hardware", name, "firmware"),
         ),
         packages=tuple(document.packages),
-        package_files=tuple(document.package_files),
+        package_files=_paths(root, document.package_files, "hardware", name, "package_files"),
         confirm_window_s=document.confirm_window_s,
         flash_timeout_s=document.flash_timeout_s,
         recovery=document.recovery,
@@ -216,7 +226,7 @@ def _mesh(name: str, document: MeshDocument, root: MappingNode) -> Mesh:
         ),
         operator_parts=OperatorParts(
             templates=parts.templates,
-            package_files=tuple(parts.package_files),
+            package_files=_paths(root, parts.package_files, "meshes", name, "operator_parts", "package_files"),
             packages=tuple(parts.packages),
             service=parts.service,
             status_command=parts.status_command,
@@ -254,12 +264,19 @@ def _robot(name: str, document: RobotDocument, root: MappingNode, diagnostics: l
     return Robot(
         name=name,
         nodes=_names(("robots", name, "nodes"), document.nodes, root, diagnostics),
-        computer=_computer(document.computer) if document.computer is not None else None,
+        computer=_computer(document.computer, root, "robots", name, "computer")
+        if document.computer is not None
+        else None,
         is_base=document.is_base,
         carries=_names(("robots", name, "carries"), document.carries, root, diagnostics),
         fielded=document.fielded,
         lan=document.lan.network if document.lan is not None else None,
-        computers=MappingProxyType({name: _other_computer(item) for name, item in document.computers.items()}),
+        computers=MappingProxyType(
+            {
+                computer: _other_computer(item, root, "robots", name, "computers", computer)
+                for computer, item in document.computers.items()
+            }
+        ),
         position=fixed_position(document.position),
         relay=document.relay,
         thin=thin_ports(document.thin),
@@ -321,31 +338,37 @@ def _names(
     return tuple(made)
 
 
-def _other_computer(document: OtherComputerDocument) -> Computer:
-    return Computer(document.address, _computer_ssh(document.ssh))
+def _other_computer(document: OtherComputerDocument, root: MappingNode, *path: str) -> Computer:
+    return Computer(document.address, _computer_ssh(document.ssh, root, *path))
 
 
-def _site(name: str, document: SiteDocument) -> Site:
+def _site(name: str, document: SiteDocument, root: MappingNode) -> Site:
     nats = None
     if document.nats is not None:
         nats = SiteNats(document.nats.domain or name, document.nats.url)
-    return Site(name, _computer_ssh(document.ssh), document.worker_key, nats)
+    return Site(name, _computer_ssh(document.ssh, root, "sites", name), document.worker_key, nats)
 
 
-def _nats_hub(document: NatsHubDocument | None) -> NatsHub | None:
+def _nats_hub(document: NatsHubDocument | None, root: MappingNode) -> NatsHub | None:
     if document is None:
         return None
-    return NatsHub(document.url, document.credentials, document.ca, document.domain, document.order_hours)
+    return NatsHub(
+        document.url,
+        _path(root, document.credentials, "nats", "credentials") if document.credentials else "",
+        _path(root, document.ca, "nats", "ca") if document.ca else "",
+        document.domain,
+        document.order_hours,
+    )
 
 
-def _computer_ssh(document: SshLayer) -> SshSettings:
-    return ssh_settings({key: getattr(document, key) for key in document.model_fields_set}, user="")
+def _computer_ssh(document: SshLayer, root: MappingNode, *path: str) -> SshSettings:
+    return ssh_settings(ssh_values(document, descend(root, (*path, "ssh")), _base(root)), user="")
 
 
-def _computer(document: ComputerDocument) -> Computer:
+def _computer(document: ComputerDocument, root: MappingNode, *path: str) -> Computer:
     return Computer(
         address=document.address,
-        ssh=_computer_ssh(document.ssh),
+        ssh=_computer_ssh(document.ssh, root, *path),
         python=document.python,
         arch=document.arch,
         ros=document.ros,

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-import os.path
 from pathlib import Path
 
+from meshctl.file_access import located
 from meshctl.model import Fleet
 
 
 def file_path(fleet: Fleet, written: str, base: str = "") -> Path:
     """The path that the inventory writes as `written`: `~` is a home directory, a relative path starts at `base`, by
     default the inventory's directory."""
-    # Path.expanduser raises for an unknown user
-    return Path(base or fleet.base or ".", os.path.expanduser(written))
+    return located(base or fleet.base, written)
+
+
+def from_inventory(written: str, base: str, inventory: str) -> str:
+    """The path that a file in the directory `base` writes, relative to the inventory's directory instead."""
+    if base == inventory or written.startswith(("/", "~")):
+        return written
+    try:
+        # not os.path.relpath: the directory above a symbolic link is another one
+        return str(Path(base).relative_to(inventory) / written)
+    except ValueError:
+        return str(Path(base).absolute() / written)
 
 
 def known_hosts_path(fleet: Fleet) -> Path:

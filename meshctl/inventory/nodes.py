@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from ipaddress import IPv4Interface, ip_interface
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -16,8 +17,10 @@ from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import codes
 from meshctl.inventory.addresses import AddressRule, AddressValue, BadAddress
 from meshctl.inventory.documents import LanFilterLayer, PositionDocument, RadioLayer, SshLayer
+from meshctl.inventory.file_paths import from_inventory
 from meshctl.inventory.layers import Layer, NodeSpec
 from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.tree import Tree, child
 from meshctl.model import (
     Band,
     FixedPosition,
@@ -59,13 +62,14 @@ def build_nodes(
     meshes: Mapping[str, Mesh],
     robot_of: Mapping[str, str],
     lan_addresses: Mapping[str, IpInterface],
+    base: str,
 ) -> BuiltNodes:
     """Build all nodes; errors of a range are reported once.
 
     `robot_of` maps nodes to the robots that list them, for nodes without `robot`; `lan_addresses` maps the radios of
-    robots with a LAN of their own to their addresses in it.
+    robots with a LAN of their own to their addresses in it; `base` is the inventory's directory.
     """
-    building = _Building(hardware, meshes, _only_meshes(meshes))
+    building = _Building(hardware, meshes, _only_meshes(meshes), base)
     nodes: dict[str, Node] = {}
     for spec in specs.values():
         node = building.node(spec, robot_of.get(spec.name, ""))
@@ -75,8 +79,10 @@ def build_nodes(
     return BuiltNodes(nodes, tuple(building.diagnostics))
 
 
-def merge_layers(layers: tuple[Layer, ...]) -> dict[str, Any]:
-    """The values of all layers by precedence; mappings (`radios`, `ssh`, `extra_uci`) merge key by key."""
+def merge_layers(layers: tuple[Layer, ...], base: str) -> dict[str, Any]:
+    """The values of all layers by precedence; mappings (`radios`, `ssh`, `extra_uci`) merge key by key.
+
+    Paths become relative to `base`, the inventory's directory."""
     values: dict[str, Any] = {}
     for layer in reversed(layers):
         document = layer.document
@@ -84,7 +90,7 @@ def merge_layers(layers: tuple[Layer, ...]) -> dict[str, Any]:
             value = getattr(document, name)
             match value:
                 case SshLayer():
-                    values[name] = {**values.get(name, {}), **_written(value)}
+                    values[name] = {**values.get(name, {}), **ssh_values(value, child(layer.tree, name), base)}
                 case dict() if name == "radios":
                     radios = dict(values.get(name, {}))
                     for radio, settings in value.items():
@@ -97,6 +103,15 @@ def merge_layers(layers: tuple[Layer, ...]) -> dict[str, Any]:
     return values
 
 
+def ssh_values(document: SshLayer, tree: Tree | None, base: str) -> dict[str, Any]:
+    """The values of an `ssh` mapping, `tree`, with paths relative to `base`, the inventory's directory."""
+    values = _written(document)
+    if tree is not None and "key_files" in values:
+        folder = str(Path(tree.file).parent)
+        values["key_files"] = tuple(from_inventory(file, folder, base) for file in values["key_files"])
+    return values
+
+
 def _written(document: SshLayer | RadioLayer) -> dict[str, Any]:
     return {name: getattr(document, name) for name in document.model_fields_set}
 
@@ -106,6 +121,7 @@ class _Building:
     hardware: Mapping[str, HardwareProfile]
     meshes: Mapping[str, Mesh]
     only_mesh: Mapping[Band, str]
+    base: str
     diagnostics: list[Diagnostic] = field(default_factory=list)
     _templates: dict[tuple[Layer, ...], _Template | None] = field(default_factory=dict)
     _counts: Counter[Layer] = field(default_factory=Counter)
@@ -141,7 +157,7 @@ class _Building:
         return index_of
 
     def _template(self, spec: NodeSpec) -> _Template | None:
-        values = merge_layers(spec.layers)
+        values = merge_layers(spec.layers, self.base)
         profile = self._profile(spec, values)
         address_layer = next((layer for layer in spec.layers if "address" in layer.document.model_fields_set), None)
         if address_layer is None:

@@ -11,7 +11,7 @@ from meshctl.plan import DesiredState
 from meshctl.plan.packages import Needs
 from meshctl.plan.seen import packages_seen
 from meshctl.render import DeviceFacts, Rendered, Templates, render, with_switch
-from meshctl.resolve import Intent, package_needs, resolve
+from meshctl.resolve import Intent, package_files, package_needs, resolve
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,7 @@ class Renderer:
             rendered.files,
             tuple(secret.reveal() for secret in intent.secrets),
             Needs(_groups(self.fleet, node, rendered.packages), rendered.removed_packages),
+            package_files=package_files(self.fleet, node),
         )
 
     def _rendered(self, node: Node) -> tuple[Intent, Rendered]:

@@ -33,13 +33,14 @@ PUBLIC_FILES = (LAN_FILTER_PATH, LINKS_PATH, MARKER_PATH, "etc/dropbear/authoriz
 
 @dataclass(frozen=True, slots=True)
 class DesiredState:
-    """The desired state of one node: its rendered files, the secrets in them, its packages. `departs`: the meshes whose
-    cell in the inventory it leaves, as an earlier state may."""
+    """The desired state of one node: its rendered files, the secrets in them, its packages and the files that may bring
+    them. `departs`: the meshes whose cell in the inventory it leaves, as an earlier state may."""
 
     node: Node
     files: Sequence[RenderedFile] = field(repr=False)
     secrets: tuple[str, ...] = field(repr=False, default=())
     needs: Needs = NO_NEEDS
+    package_files: tuple[str, ...] = ()
     departs: tuple[str, ...] = ()
 
     @property
@@ -85,7 +86,7 @@ def node_plan(
         wanted=target,
     )
     firmware = firmware_step(node, seen) if with_firmware else None
-    packages = package_step(desired.needs, seen, node.hardware.package_files)
+    packages = package_step(desired.needs, seen, desired.package_files)
     lacking = lacking_abilities(node, seen, before.get("wireless"), after.get("wireless"))
     problem = failed_precondition(
         node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages, lacking=lacking

@@ -12,8 +12,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from meshctl.inventory.file_paths import file_path
 from meshctl.model import Fleet, HardwareProfile, Node, Release
 from meshctl.render.rendered import Rendered, RenderedFile
+from meshctl.resolve import package_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,17 +92,8 @@ def image_folders(fleet: Fleet, rendered: Iterable[Rendered]) -> tuple[ImageFold
 
 def _package_files(fleet: Fleet, nodes: list[Node]) -> tuple[Path, ...]:
     """Package files of the hardware and of the nodes' back ends, as absolute paths, each once."""
-    found: dict[Path, None] = {}
-    for node in nodes:
-        found.update(dict.fromkeys(_absolute(fleet.base, path) for path in node.hardware.package_files))
-        for name in node.meshes:
-            parts = fleet.meshes[name].operator_parts
-            found.update(dict.fromkeys(_absolute(parts.base or fleet.base, path) for path in parts.package_files))
-    return tuple(found)
-
-
-def _absolute(base: str, path: str) -> Path:
-    return (Path(base) / path).resolve()
+    files = dict.fromkeys(file for node in nodes for file in package_files(fleet, node))
+    return tuple(dict.fromkeys(file_path(fleet, file).resolve() for file in files))
 
 
 def folder_files(folder: ImageFolder) -> tuple[RenderedFile, ...]:

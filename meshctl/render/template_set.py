@@ -22,7 +22,7 @@ from jinja2 import (
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.file_access import Boundary
+from meshctl.file_access import Boundary, located
 from meshctl.model import Backend, MeshMode, OperatorParts, Release
 from meshctl.render.quoting import quoted, require_quoted, revealed
 from meshctl.render.template_files import (
@@ -45,7 +45,7 @@ class TemplateSet:
         loaders: list[BaseLoader] = []
         shipped_loaders: list[BaseLoader] = []
         if parts.templates:
-            own = Path(parts.base) / parts.templates
+            own = located(parts.base, parts.templates)
             if not own.is_dir():
                 found = Diagnostic(
                     NO_TEMPLATE, Severity.ERROR, Position(str(own)), "", "", "a folder of templates", "none"

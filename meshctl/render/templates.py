@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from meshctl.diagnostics import Diagnostic, InvalidInput, Position, Severity
-from meshctl.file_access import Boundary
+from meshctl.file_access import Boundary, located
 from meshctl.model import Backend, Fleet, OperatorParts
 from meshctl.render.sandbox import LimitExceeded, SandboxRenderer
 from meshctl.render.template_files import COMMON, NO_TEMPLATE, TEMPLATE, TemplateFile, refuse_outside
@@ -90,7 +90,7 @@ class Templates:
 def _refuse_unknown_folders(own: Path, fleet: Fleet) -> None:
     known = {COMMON, *(backend.value for backend in Backend)}
     parts = [mesh.operator_parts for mesh in fleet.meshes.values()]
-    elsewhere = {(Path(item.base) / item.templates).resolve() for item in parts if item.templates}
+    elsewhere = {located(item.base, item.templates).resolve() for item in parts if item.templates}
     expected = ", ".join(sorted(known))
     strays = [
         Diagnostic(NO_TEMPLATE, Severity.ERROR, Position(str(folder)), "", "", f"one of {expected}", folder.name)

@@ -36,6 +36,12 @@ def package_plan(fleet: Fleet, node: Node) -> PackagePlan:
     return PackagePlan(tuple(sorted(named)), tuple(sorted(dropped - named)))
 
 
+def package_files(fleet: Fleet, node: Node) -> tuple[str, ...]:
+    """The package files of the node's hardware and of its meshes' back ends, each once."""
+    parts = [file for name in node.meshes for file in fleet.meshes[name].operator_parts.package_files]
+    return tuple(dict.fromkeys((*node.hardware.package_files, *parts)))
+
+
 def package_needs(fleet: Fleet, node: Node) -> tuple[PackageNeed, ...]:
     """The needs of the node's meshes, without duplicates, in the meshes' order."""
     needs: dict[PackageNeed, None] = {}

@@ -14,6 +14,7 @@ from meshctl.archive import TarMember, tar_of
 from meshctl.device.trust import Pin, TrustStore, dump_pins
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError, MeshctlError
+from meshctl.file_access import located
 from meshctl.inventory.include import read_files
 from meshctl.inventory.load import load
 from meshctl.inventory.source import Reader
@@ -80,7 +81,7 @@ def site_bundle(
     images: dict[str, str] = {}
     image_files: dict[str, Path] = {}
     for file in part.files:
-        source = Path(file.base or fleet.base or ".", os.path.expanduser(file.written))
+        source = located(file.base or fleet.base, file.written)
         if file.is_image:
             digest = _sha256(source)
             images[file.path], image_files[digest] = digest, source

@@ -171,7 +171,7 @@ def _mesh_files(data: dict[str, Any], fleet: Fleet, meshes: Mapping[str, None]) 
         if parts.templates:
             path = written["templates"] = f"operator-parts/{name}"
             yield PartFile(path, parts.templates, parts.base, is_folder=True)
-        yield from _package_files(written, f"packages/mesh-{name}", parts.package_files, parts.base)
+        yield from _package_files(written, f"packages/mesh-{name}", parts.package_files, fleet.base)
 
 
 def _package_files(entry: dict[str, Any], folder: str, files: tuple[str, ...], base: str) -> Iterator[PartFile]:

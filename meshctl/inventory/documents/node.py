@@ -33,7 +33,7 @@ class SshLayer(Document):
     user: Text = NOT_WRITTEN
     """User. Default: root on radios, the operator's user name on computers."""
     key_files: tuple[Text, ...] = ()
-    """Private key files to try. Default: the SSH agent and the usual files."""
+    """Private key files to try; relative to this file. Default: the SSH agent and the usual files."""
     jump: Text = ""
     """Node to use as a jump host."""
 

@@ -75,7 +75,7 @@ class HardwareDocument(Document):
     packages: tuple[Text, ...] = ()
     """Packages in addition to those that the mesh needs."""
     package_files: tuple[Text, ...] = ()
-    """Package files to install without internet; relative to the inventory."""
+    """Package files to install without internet; relative to this file."""
     confirm_window_s: Whole = Field(default=120, ge=10, le=3600)
     """Seconds that a node waits for confirmation of a change before it rolls back."""
     flash_timeout_s: Whole = Field(default=900, ge=300, le=14_400)

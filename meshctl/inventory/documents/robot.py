@@ -101,7 +101,7 @@ class OperatorsDocument(Document):
     password_login: Flag = False
     """Whether SSH accepts passwords; leave it off."""
     known_hosts: Text = "known_hosts"
-    """File of pinned host keys; relative to the inventory."""
+    """File of pinned host keys; relative to this file. Default: beside the inventory's first file."""
 
 
 class SystemDocument(Document):

@@ -17,7 +17,7 @@ class NatsHubDocument(Document):
     credentials: Line = ""
     """File with the operator's credentials: a `.creds` file or an nkey seed; relative to this file."""
     ca: Line = ""
-    """Certificate authority of the server, PEM; default: the system's."""
+    """Certificate authority of the server, PEM; relative to this file. Default: the system's."""
     domain: Name = "hub"
     """JetStream domain of the server."""
     order_hours: Whole = Field(default=24, ge=1, le=24 * 90)

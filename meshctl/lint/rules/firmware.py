@@ -17,6 +17,7 @@ from meshctl.firmware.check import (
     WRONG_RELEASE,
     WRONG_REVISION,
 )
+from meshctl.inventory.file_paths import file_path
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, HardwareProfile, PackageTool
@@ -209,30 +210,31 @@ def image_too_large(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     "A package file is missing or of the wrong type",
     why="""opkg (up to 24.10) installs .ipk files, apk (from 25.12) .apk files; with a wrong or missing file, the back
     end is not installed and the node comes up without a mesh.""",
-    fix="Add the package file built for this release.",
+    fix="""Add the package file built for this release, or correct the path, which is relative to the file that names
+    it.""",
     failing=Example("hardware: {rocket: {package_files: [tool.apk]}}", files={"tool.apk": "a package"}),
     passing=Example("hardware: {rocket: {package_files: [tool.ipk]}}", files={"tool.ipk": "a package"}),
 )
 def package_file_wrong(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for place, base, names, profile in _package_files(fleet):
+    for place, names, profile in _package_files(fleet):
         suffix = ".apk" if profile.release.package_tool is PackageTool.APK else ".ipk"
         for index, name in enumerate(names):
             if not name.endswith(suffix):
                 message = f"OpenWrt {profile.release} does not install this type"
                 yield Finding((*place, str(index)), message, f"a file with {suffix}", name)
-            elif context.files.size_bytes(Path(base, name)) is None:
+            elif context.files.size_bytes(file_path(fleet, name)) is None:
                 yield Finding((*place, str(index)), "no such file", "a package file", name)
 
 
-def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], str, tuple[str, ...], HardwareProfile]]:
+def _package_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], tuple[str, ...], HardwareProfile]]:
     for profile in fleet.hardware.values():
-        yield ("hardware", profile.name, "package_files"), fleet.base, profile.package_files, profile
+        yield ("hardware", profile.name, "package_files"), profile.package_files, profile
     for mesh in fleet.meshes.values():
         parts = mesh.operator_parts
         member = next((node for node in fleet.members(mesh.name)), None) if parts.package_files else None
         if member is not None:
             place = ("meshes", mesh.name, "operator_parts", "package_files")
-            yield place, parts.base or fleet.base, parts.package_files, member.hardware
+            yield place, parts.package_files, member.hardware
 
 
 @fleet_rule(

@@ -17,7 +17,7 @@ from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
-from meshctl.resolve import package_needs
+from meshctl.resolve import package_files, package_needs
 
 # no security fixes (openwrt.org/docs/guide-developer/security)
 _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
@@ -84,7 +84,7 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if not profile.firmware.image or not all(name in fleet.meshes for name in node.meshes):
             continue
         named = {*profile.packages, *node.packages}
-        brought = [PurePath(file).name for file in profile.package_files]
+        brought = [PurePath(file).name for file in package_files(fleet, node)]
         for need in package_needs(fleet, node):
             if not named.intersection(need.any_of) and not any(file.startswith(need.any_of) for file in brought):
                 path = ("hardware", profile.name, "packages")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
+from meshctl.file_access import located
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.trial_rendering import kinds, placeholder
@@ -57,7 +57,7 @@ def _named_folder(fleet: Fleet, node: Node, item: Diagnostic) -> Finding | None:
     """The finding about a folder of operator parts, at the line of the inventory that names it."""
     for name in node.meshes:
         parts = fleet.meshes[name].operator_parts
-        if parts.templates and item.position.file == str(Path(parts.base) / parts.templates):
+        if parts.templates and item.position.file == str(located(parts.base, parts.templates)):
             path = ("meshes", name, "operator_parts", "templates")
             found = item.found and f"{item.found} at {parts.templates}"[:_MAX_SHOWN_CHARACTERS]
             hint = item.hint or "Add what is missing, or correct the path: it is relative to this file."

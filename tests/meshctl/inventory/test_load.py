@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from meshctl.diagnostics import InvalidInput
+from meshctl.firmware import image_path
 from meshctl.inventory import load, load_fleet
+from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.model import Band, NodeState, Release, Role, SecretKind
 from tests.meshctl.inventory.inventories import HEAD, fleet_of, load_text
 
@@ -252,3 +254,58 @@ def test_a_radio_of_an_unknown_mesh_is_refused_where_it_is_named_and_left_to_lin
     line = (tmp_path / "fleet.yaml").read_text().splitlines()[found.position.line - 1]
     assert (found.code, found.message, found.hint) == ("INV037", "unknown mesh 'mian'", "did you mean 'main'?")
     assert "mesh: mian" in line
+
+
+def test_every_path_is_relative_to_the_file_that_names_it(tmp_path: Path) -> None:
+    """Profiles and logins in included files named files beside the first one, against the documentation."""
+    (tmp_path / "inventory").mkdir()
+    (tmp_path / "common").mkdir()
+    head, _, hardware = HEAD.partition("hardware:")
+    (tmp_path / "inventory" / "fleet.yaml").write_text(
+        f"{head}include: [../common/shared.yaml, {tmp_path}/common/absolute.yaml]\n"
+        "nodes: {n: {groups: [own], address: 10.42.0.1}, m: {address: 10.42.0.2, ssh: {key_files: [id_m]}}}\n"
+    )
+    (tmp_path / "common" / "shared.yaml").write_text(
+        f"hardware:{hardware}    package_files: [tool.ipk, /srv/other.ipk, ~/home.ipk]\n"
+        "    firmware: {image: rocket.bin}\n"
+        "operators: {known_hosts: pins}\n"
+        "defaults: {hardware: rocket, ssh: {key_files: [id]}}\n"
+        "groups: {own: {ssh: {key_files: [keys/own]}}}\n"
+        "sites: {north: {ssh: {host: gw.example, key_files: [id_site]}}}\n"
+        "robots: {r: {computer: {address: 10.42.0.9/24, ssh: {key_files: [id_robot]}}}}\n"
+    )
+    (tmp_path / "common" / "absolute.yaml").write_text(
+        "nats: {url: 'tls://nats.example:4222', credentials: operator.creds, ca: ca.pem}\n"
+    )
+    environ = {"MESHCTL_INCLUDE_PATH": str(tmp_path)}
+    fleet = load_fleet(tmp_path / "inventory", environ=environ)
+    computer, nats = fleet.robots["r"].computer, fleet.nats
+    assert computer is not None
+    assert nats is not None
+    common = tmp_path / "inventory" / ".." / "common"
+    profile = fleet.hardware["rocket"]
+    assert [file_path(fleet, file) for file in profile.package_files] == [
+        common / "tool.ipk",
+        Path("/srv/other.ipk"),
+        Path("~/home.ipk").expanduser(),
+    ]
+    assert image_path(profile) == common / "rocket.bin"
+    assert known_hosts_path(fleet) == common / "pins"
+    logins = [fleet.nodes["n"].ssh, fleet.nodes["m"].ssh, fleet.sites["north"].ssh, computer.ssh]
+    assert [file_path(fleet, *ssh.key_files) for ssh in logins] == [
+        common / "keys" / "own",
+        tmp_path / "inventory" / "id_m",
+        common / "id_site",
+        common / "id_robot",
+    ]
+    assert [file_path(fleet, text) for text in (nats.credentials, nats.ca)] == [
+        tmp_path / "common" / "operator.creds",
+        tmp_path / "common" / "ca.pem",
+    ]
+
+
+def test_known_hosts_are_beside_the_first_file_unless_set(tmp_path: Path) -> None:
+    (tmp_path / "common").mkdir()
+    (tmp_path / "common" / "operators.yaml").write_text("operators: {password_login: true}\n")
+    fleet = fleet_of(tmp_path, "include: [common/operators.yaml]\n")
+    assert known_hosts_path(fleet) == tmp_path / "known_hosts"

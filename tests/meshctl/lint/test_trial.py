@@ -6,10 +6,12 @@ import pytest
 
 from meshctl.diagnostics import Diagnostic
 from meshctl.inventory import load_fleet
+from meshctl.inventory.secrets import SecretStore
 from meshctl.lint import Example, check_path, trial_rendering
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
 from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_package
 from meshctl.lint.zones import is_posix, zones
+from meshctl.nodes.desired import Renderer
 from meshctl.regdb import SHIPPED, load
 from meshctl.render import Rendered, Templates, render
 from meshctl.resolve import Intent
@@ -480,3 +482,25 @@ def test_the_one_topic_at_a_wrong_level_is_reported_and_not_those_around_it(tmp_
 def test_the_range_of_host_addresses_has_none_that_is_refused(tmp_path: Path) -> None:
     (finding,) = [item for item in _found("nodes: {b01: {address: 10.42.0.255}}", tmp_path) if item.code == "MC203"]
     assert finding.expected == "one of 10.42.0.1 to 10.42.0.254"
+
+
+def test_a_package_file_is_found_beside_the_included_file_that_names_it(tmp_path: Path) -> None:
+    """It was looked for beside the inventory's first file: a false finding, and `provision` failed."""
+    shared = (
+        "hardware: {other: {board: a, profile: a, target: ath79/generic, release: '24.10', lan_ports: [], radios: {}, "
+    )
+    files = {
+        "common/hardware.yaml": f"{shared}package_files: [../packages/tool.ipk]}}}}\n",
+        "packages/tool.ipk": "package",
+    }
+    assert "MC811" not in _codes(Example("include: [common/hardware.yaml]", files=files), tmp_path)
+
+
+def test_package_files_of_operator_parts_are_offered_to_the_nodes_of_the_mesh(tmp_path: Path) -> None:
+    """They were part of images only: `plan` refused a node that lacked a package whose file was there."""
+    text = _SECOND_CELL.replace("packages: [mm]", "packages: [mm], package_files: [mm_1_all.ipk]")
+    files = {"parts/etc/config/mm.j2": "config mm\n", "mm_1_all.ipk": "package"}
+    example = Example(text, files=files)
+    fleet = load_fleet(write(example, tmp_path))
+    renderer = Renderer.of(fleet, SecretStore(environment(example), tmp_path).get)
+    assert renderer.desired(fleet.nodes["base"]).package_files == ("mm_1_all.ipk",)
