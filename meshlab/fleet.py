@@ -23,6 +23,7 @@ from typing import Any, Self
 
 from meshctl.device.connection import Completed, Endpoint
 from meshctl.errors import InputError
+from meshctl.wording import counted
 from meshlab import fleet_directory, propagation_file, rootfs
 from meshlab.addresses import bench_of, loopback_of
 from meshlab.client import is_running, request
@@ -235,7 +236,7 @@ class VirtualFleet:
                     )
             return all(node["power"] in (Power.UP.value, Power.DEAD.value) for node in nodes)
 
-        wait_for(booted, f"{len(self.spec.nodes)} nodes to boot; see {self.directory / 'log'}", wait_s)
+        wait_for(booted, f"{counted(len(self.spec.nodes), 'node')} to boot; see {self.directory / 'log'}", wait_s)
 
     def _log_tail(self) -> str:
         lines = (self.directory / "log").read_text(encoding="utf-8", errors="replace").splitlines()

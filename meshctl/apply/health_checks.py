@@ -21,6 +21,7 @@ from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
 from meshctl.plan.seen import WIRELESS, address_options, packages_seen
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
+from meshctl.wording import counted
 
 # The share of its former neighbors a node must hear again; not all, because robots move.
 MIN_NEIGHBOR_SHARE = 0.5
@@ -229,7 +230,7 @@ def _neighbors(expected: Expectation, after: Observation, fresh_ms: float) -> tu
     found = len(heard_neighbors(after, fresh_ms))
     if found >= needed:
         return ()
-    return (f"it hears {found} mesh neighbor{'s' if found != 1 else ''} of the {len(expected.neighbors)} it had",)
+    return (f"it hears {counted(found, 'mesh neighbor')} of the {len(expected.neighbors)} it had",)
 
 
 def _base(expected: Expectation, after: Observation, fresh_ms: float) -> tuple[str, ...]:

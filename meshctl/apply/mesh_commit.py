@@ -38,6 +38,7 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
+from meshctl.wording import counted
 
 # The scheduled moment is this many round trips of the slowest node ahead, for each batch of parallel commands, and at
 # least LEAD_S: the slowest board needs that to start a start-stop-daemon and two shells.
@@ -103,7 +104,8 @@ def commit_mesh(
             f"{count} of mesh {mesh}" if len(needed) > 1 else f"{count}" for mesh, count in needed.items()
         )
         must = "pass their checks" if together else "rejoin"
-        run_context.note(f"{len(participants)} nodes change simultaneously; {quorum_text} must {must}")
+        verb = "changes" if len(participants) == 1 else "change"
+        run_context.note(f"{counted(len(participants), 'node')} {verb} simultaneously; {quorum_text} must {must}")
         return _decide(commit, needed)
 
 

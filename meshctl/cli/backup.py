@@ -53,6 +53,7 @@ from meshctl.model import Node
 from meshctl.nodes.collect import facts_of, observe_cleared
 from meshctl.nodes.slots import transfers_at_once
 from meshctl.plan import Cut, Effect, NodePlan, Verdict
+from meshctl.wording import counted
 
 _TO_ANOTHER_CELL = (
     "restore the rest with `--keep-radios`; a whole mesh changes its cell by the inventory and `meshctl provision`"
@@ -164,7 +165,7 @@ def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) 
         report = {"node": node.name, "files": paths, "uninstalled_packages": missing, "disabled": saved.disabled}
         echo_json(json.dumps(report, indent=1))
         return
-    echo(f"{node.name}: {len(paths)} files would change" if paths else f"{node.name}: matches the backup")
+    echo(f"{node.name}: {counted(len(paths), 'file')} would change" if paths else f"{node.name}: matches the backup")
     for path in paths:
         echo(f"  {path}")
     for package in missing:

@@ -21,6 +21,7 @@ from meshctl.apply.bootstrap import (
     plan_discovered,
     restore_pins,
 )
+from meshctl.apply.prepare import PlanOptions
 from meshctl.apply.replace import adopt, identity_edits, require_off, still_on, with_identity
 from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, places_in_lab, with_site
 from meshctl.cli.context import (
@@ -39,7 +40,7 @@ from meshctl.cli.context import (
 from meshctl.cli.fleet_view import site_observer
 from meshctl.cli.output import echo, echo_error
 from meshctl.cli.plan import Brief, NoFirmware, Rate, Yes
-from meshctl.cli.plan_execution import SALT_BYTES, choices_of, confirm_and_execute
+from meshctl.cli.plan_execution import SALT_BYTES, confirm_and_execute
 from meshctl.device.observation import Observation
 from meshctl.errors import ExitCode, InputError, MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
@@ -84,7 +85,7 @@ def bootstrap(
 
     Example: meshctl bootstrap b03 --at-site north
     """
-    choices = choices_of(no_firmware, "", "")
+    choices = PlanOptions(with_firmware=not no_firmware)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         given = _given_places(opened, at or [], interface or [], at_site)
         places = _expected_places(opened, nodes or [], limit or [], given)
@@ -204,7 +205,7 @@ def replace(
 
     Example: meshctl replace husky1-b03 spare2
     """
-    choices = choices_of(no_firmware, "", "")
+    choices = PlanOptions(with_firmware=not no_firmware)
     with session(inventory, key_files=key or (), lab=lab) as opened:
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)

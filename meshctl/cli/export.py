@@ -21,10 +21,10 @@ from meshctl.interchange.netjson import configurations, network_graph
 from meshctl.inventory import csv_table
 from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.inventory.load import load_fleet
-from meshctl.lint.grouping import join_limited
 from meshctl.model import Fleet, Node
 from meshctl.render.compare import placeholder_secret
 from meshctl.render.host_lists import ansible_inventory, host_entries, lab_host_entries, ssh_config
+from meshctl.wording import join_limited
 
 
 class ExportFormat(Enum):

@@ -21,6 +21,7 @@ from meshctl.inventory.edit import Editor, FileEdit, save, set_node
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
+from meshctl.wording import counted
 
 app = typer.Typer(help="Import nodes from a CSV table (the default), an existing device, its `uci export`, or NetBox.")
 
@@ -110,7 +111,7 @@ def _take_over(
         for change in changes:
             echo(change.diff(), nl=False)
         new = sum(each.is_new for each in found)
-        echo(f"{len(rows)} rows: {len(found) - new} nodes to change, {new} to add", err=True)
+        echo(f"{counted(len(rows), 'row')}: {counted(len(found) - new, 'node')} to change, {new} to add", err=True)
     if not dry_run:
         save(changes)
 

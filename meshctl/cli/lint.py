@@ -20,6 +20,7 @@ from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
 from meshctl.regdb import SHIPPED, load, shipped_version
 from meshctl.report.findings import Findings, formatted
+from meshctl.wording import counted
 
 
 class LintFormat(StrEnum):
@@ -97,7 +98,7 @@ def lint(
         findings = _selected(findings, _prefixes(select, (*BY_CODE, *MEANINGS)))
     if write_baseline and baseline is not None:
         write_file(baseline, baselines.dump(item for item in findings.diagnostics if item.code in BY_CODE))
-        echo(f"wrote {len(findings.diagnostics)} findings to {baseline}", err=True)
+        echo(f"wrote {counted(len(findings.diagnostics), 'finding')} to {baseline}", err=True)
         return
     if baseline is not None:
         findings = _without_known(findings, baseline, rules)

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Generic, TextIO, TypeVar
 
 from meshctl.report.terminal_escapes import clean_styled
+from meshctl.wording import counted
 
 T = TypeVar("T")
 
@@ -113,7 +114,7 @@ def page(lines: list[str], height: int) -> str:
     room = max(1, height)
     if len(lines) > room:
         hidden = len(lines) - room + 1
-        lines = [*lines[: room - 1], f"... {hidden} more lines: enlarge the window or filter (--alarm any)"]
+        lines = [*lines[: room - 1], f"... {counted(hidden, 'more line')}: enlarge the window or filter (--alarm any)"]
     lines = [clean_styled(line) for line in lines]
     return _HOME + f"{_END_OF_LINE}\r\n".join(lines) + _END_OF_LINE + _END_OF_PAGE
 

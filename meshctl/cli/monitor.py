@@ -48,6 +48,7 @@ from meshctl.monitor.shared_alarms import SharedAlarms
 from meshctl.monitor.store import FrameStore
 from meshctl.report.duration import duration
 from meshctl.robots.local_daemon import socket_path
+from meshctl.wording import counted
 
 DEFAULT_PORT = 8765
 # Alarms that wait for a slow hook when the monitor ends.
@@ -267,7 +268,8 @@ def _print_frame(frame: Frame, began: Iterable[LoggedAlarm]) -> None:
     answering = totals.get("ok", 0) + totals.get("degraded", 0)
     expected = answering + totals.get("unreachable", 0)
     verdict = frame.document.get("verdict") or {}
-    echo(f"{_clock(frame.time_s)} {verdict.get('text', 'not assessed')}: {answering} of {expected} radios answer")
+    radios = f"{answering} of {counted(expected, 'radio')} answer"
+    echo(f"{_clock(frame.time_s)} {verdict.get('text', 'not assessed')}: {radios}")
     for alarm in began:
         if alarm.level != "note":
             echo(f"{_clock(alarm.first_s)} {alarm.level}: {alarm.device or 'fleet'}: {alarm.text}")

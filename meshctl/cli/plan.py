@@ -48,11 +48,16 @@ NoFirmware = Annotated[bool, typer.Option("--no-firmware", help="Do not upgrade 
 LeaveBehind = Annotated[
     str,
     typer.Option(
-        "--leave-behind", metavar="NODES", help="Nodes (a,b,... or all) that may be left in the old cell of their mesh."
+        "--leave-behind",
+        metavar="NODES",
+        help="Nodes ('b07,role:beacon', @FILE, or all) that may be left in the old cell of their mesh.",
     ),
 ]
 AcceptCut = Annotated[
-    str, typer.Option("--accept-cut", metavar="NODES", help="Cut vertices (a,b,... or all) that may be flashed anyway.")
+    str,
+    typer.Option(
+        "--accept-cut", metavar="NODES", help="Cut vertices ('b07,group:relays', @FILE, all) to flash anyway."
+    ),
 ]
 Together = Annotated[
     bool,
@@ -98,8 +103,8 @@ def plan(
 
     Example: meshctl plan 'husky1-*' --out plan.json
     """
-    choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
+        choices = choices_of(opened.fleet, no_firmware, leave_behind, accept_cut, together)
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
             with closing(prepare_everywhere(opened, inventory, own, sites, choices)) as made:
@@ -182,8 +187,8 @@ def provision(
 
     Example: meshctl provision 'b*' --together
     """
-    choices = choices_of(no_firmware, leave_behind, accept_cut, together)
     with session(inventory, key_files=key or (), lab=lab) as opened:
+        choices = choices_of(opened.fleet, no_firmware, leave_behind, accept_cut, together)
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
             options = RunOptions("provision", choices, as_json, rate)
@@ -253,7 +258,7 @@ def resume(
         if not as_json:
             echo(f"resuming run {record.id} ({record.command}): {', '.join(names)}")
         recorded = json.loads(record.plan).get("choices", {}) if record.plan else {}
-        added = choices_of(False, leave_behind, accept_cut)
+        added = choices_of(opened.fleet, False, leave_behind, accept_cut)
         choices = PlanOptions(
             bool(recorded.get("with_firmware", True)),
             (*recorded.get("leave_behind", ()), *added.leave_behind),

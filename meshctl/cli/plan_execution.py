@@ -24,6 +24,7 @@ from meshctl.fleet.run_files import BEFORE, CHANGES, RunFiles
 from meshctl.model import Fleet
 from meshctl.plan import NodePlan, Plan, Verdict
 from meshctl.plan.saved import SavedPlan, as_agreed, dump
+from meshctl.plan.switch import ALL
 
 # Bytes of salt for a plan's fingerprints, as in RFC 7914.
 SALT_BYTES = 16
@@ -37,12 +38,21 @@ class PlanRefused(MeshctlError):
     exit_code = ExitCode.FINDINGS
 
 
-def choices_of(no_firmware: bool, leave_behind: str, accept_cut: str, together: bool = False) -> PlanOptions:
-    return PlanOptions(not no_firmware, _names(leave_behind), _names(accept_cut), together=together)
+def choices_of(
+    fleet: Fleet, no_firmware: bool, leave_behind: str, accept_cut: str, together: bool = False
+) -> PlanOptions:
+    """Raises InputError for a word that selects no node."""
+    left, cut = (_acknowledged(fleet, text) for text in (leave_behind, accept_cut))
+    return PlanOptions(not no_firmware, left, cut, together=together)
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(part.strip() for part in text.split(",") if part.strip())
+def _acknowledged(fleet: Fleet, text: str) -> tuple[str, ...]:
+    """The nodes that an option selects, or `all`."""
+    words = tuple(part.strip() for part in text.split(",") if part.strip())
+    if not words or ALL in words or at_site():
+        # a site gets names, also those of other sites, which its part of the inventory may lack
+        return (ALL,) if ALL in words else words
+    return tuple(node.name for node in selected_nodes(fleet, words, with_unmanaged=True))
 
 
 def prepare_plan(
@@ -149,7 +159,8 @@ def confirm_and_execute(
     if dry_run:
         raise typer.Exit(report_plan(opened, prepared, choices, as_json=as_json, brief=brief))
     if not as_json:
-        show(prepared.plan, opened.fleet, brief=brief)
+        # the refusal is the error below
+        show(replace(prepared.plan, refusal="", refusal_hint=""), opened.fleet, brief=brief)
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
         confirm(question(prepared.plan))
     execute_plan(

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from meshctl.cli.output import echo_error, has_transient_line, transient_line
 from meshctl.fleet import Event, EventKind
+from meshctl.wording import counted
 
 _MAX_NAMES = 4
 
@@ -39,7 +40,7 @@ class QueryLine:
 
     def text(self) -> str:
         """`queried 12 nodes; waiting for b02, b03`."""
-        parts = [f"queried {self._queried} node{'' if self._queried == 1 else 's'}"]
+        parts = [f"queried {counted(self._queried, 'node')}"]
         waiting = [name for name, step in self._active.items() if not step]
         if waiting:
             more = f" and {len(waiting) - _MAX_NAMES} more" if len(waiting) > _MAX_NAMES else ""

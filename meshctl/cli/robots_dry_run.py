@@ -24,6 +24,7 @@ from meshctl.robots.expected_release import ExpectedRelease
 from meshctl.robots.facts import RobotFacts, collect_facts
 from meshctl.robots.host import Host
 from meshctl.robots.status_table import difference
+from meshctl.wording import counted
 
 
 def print_differences(context: RobotsContext, work: RobotTask) -> dict[str, Outcome]:
@@ -126,4 +127,4 @@ def _removal_changes(facts: RobotFacts, *, purge: bool) -> tuple[str, ...]:
 
 
 def _messages(count: int) -> str:
-    return f"{count} message" if count == 1 else f"{count} messages"
+    return counted(count, "message")

@@ -75,7 +75,7 @@ def rollback(
         meet(opened, record, as_json=as_json)
         states = _states(opened, record, selected, as_json=as_json)
         opened = with_states(opened, states)
-        choices = choices_of(True, leave_behind, accept_cut, together)
+        choices = choices_of(opened.fleet, True, leave_behind, accept_cut, together)
         own, sites = sites_of(opened, list(states), None, direct=direct)
         try:
             if sites:

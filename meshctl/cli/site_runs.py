@@ -47,6 +47,7 @@ from meshctl.plan.saved import dump
 from meshctl.sites.bundle import SiteBundle, site_bundle
 from meshctl.sites.dispatch import SiteExecution, SitePlan, SiteRun, by_site, prepare_sites
 from meshctl.sites.envelope import ReplyKey
+from meshctl.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +249,7 @@ def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
     count = len(plan.changing)
     if count and not yes:
         there = sum(1 for site in plan.sites if site.saved is not None and not site.saved.plan.is_empty)
-        confirm(f"Change {count} node{'s' if count != 1 else ''}, at {there} site{'s' if there != 1 else ''}?")
+        confirm(f"Change {counted(count, 'node')}, at {counted(there, 'site')}?")
 
 
 def execute_everywhere(opened: Session, plan: WholePlan, options: RunOptions) -> typer.Exit:

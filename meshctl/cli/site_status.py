@@ -25,6 +25,7 @@ from meshctl.sites.connect import open_uplink, waiting_orders
 from meshctl.sites.dispatch import MAX_SITES_AT_ONCE, new_run_id
 from meshctl.sites.protocol import WorkerError
 from meshctl.sites.uplink import Greeting, Uplink
+from meshctl.wording import counted
 
 _MAX_ALARMS = 20
 _SHOWN_LEVELS = ("error", "warning")
@@ -133,7 +134,7 @@ def _alarm_lines(nodes: dict[str, Any]) -> Iterator[str]:
     for name, alarm in alarms[:_MAX_ALARMS]:
         yield f"{alarm['level']}: {f'{name}: ' if name else ''}{alarm['text']}"
     if len(alarms) > _MAX_ALARMS:
-        yield f"... and {len(alarms) - _MAX_ALARMS} more alarms (--json has them all)"
+        yield f"... and {counted(len(alarms) - _MAX_ALARMS, 'more alarm')} (--json has them all)"
 
 
 def as_object(status: SiteStatus) -> dict[str, object]:

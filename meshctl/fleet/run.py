@@ -16,6 +16,7 @@ from meshctl.errors import MeshctlError, NodeError, Unreachable
 from meshctl.fleet.events import Event, EventKind, Observer, silent
 from meshctl.fleet.interrupt import Interrupt
 from meshctl.fleet.outcome import Outcome, Result
+from meshctl.wording import counted
 
 
 class FailureBudget:
@@ -39,7 +40,7 @@ class FailureBudget:
 
     @property
     def reason(self) -> str:
-        return f"stopped after {self._failures} failed node{'s' if self._failures != 1 else ''}"
+        return f"stopped after {counted(self._failures, 'failed node')}"
 
 
 def outcome_of_error(node: str, error: MeshctlError) -> Outcome:

@@ -25,6 +25,8 @@ _REAL = re.compile(r"[-+]?(?:[0-9]{1,15}(?:\.[0-9]{0,15})?|\.[0-9]{1,15})(?:[eE]
 _FLAGS = {"true": True, "false": False, "yes": True, "no": False, "on": True, "off": False}
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
 _SWITCH_PORTS = "[0-9]{1,2}t?( [0-9]{1,2}t?)*"
+# dev_valid_name() of the kernel: below IFNAMSIZ, and none of these
+_PORT = re.compile(r"[^\s/:,]{1,15}")
 _MAC = re.compile(r"[0-9A-Fa-f]{2}(?:[:-][0-9A-Fa-f]{2}){5}")
 # of any text on one line, as rendering requires
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -106,6 +108,12 @@ def _switch_ports(value: str) -> str:
     if re.fullmatch(_SWITCH_PORTS, value):
         return value
     raise expected_error("port numbers, with 't' after a tagged one, such as 3 0t")
+
+
+def _port(value: str) -> str:
+    if _PORT.fullmatch(value):
+        return value
+    raise expected_error("the name of one port such as eth0.1, without blanks; commas separate ports")
 
 
 def _address(value: object) -> IpAddress:
@@ -198,6 +206,12 @@ SwitchPorts = Annotated[
     BeforeValidator(_text),
     AfterValidator(_switch_ports),
     WithJsonSchema({"type": "string", "pattern": f"^{_SWITCH_PORTS}$"}),
+]
+Port = Annotated[
+    str,
+    BeforeValidator(_text),
+    AfterValidator(_port),
+    WithJsonSchema({"type": "string", "pattern": f"^{_PORT.pattern}$"}),
 ]
 Version = Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
 Window = Annotated[

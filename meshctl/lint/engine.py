@@ -8,9 +8,9 @@ from dataclasses import replace
 from meshctl.diagnostics import Diagnostic, Position, sorted_diagnostics
 from meshctl.lint.catalog import RULES
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, Rule
 from meshctl.model import Fleet, MissingOrigin
+from meshctl.wording import join_limited
 
 
 def lint(fleet: Fleet, context: LintContext, rules: Iterable[Rule] = RULES) -> tuple[Diagnostic, ...]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator
 from typing import TypeVar
 
 from meshctl.model.ip import IpNetwork
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
-
-_MAX_SHOWN = 4
 
 
 def group_by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
@@ -45,9 +43,3 @@ def _first(network: IpNetwork) -> tuple[int, int]:
 
 def _last(network: IpNetwork) -> tuple[int, int]:
     return network.version, int(network.broadcast_address)
-
-
-def join_limited(names: Sequence[str]) -> str:
-    """`a, b, c, d and 3 more`."""
-    shown = ", ".join(names[:_MAX_SHOWN])
-    return shown if len(names) <= _MAX_SHOWN else f"{shown} and {len(names) - _MAX_SHOWN} more"

@@ -61,9 +61,13 @@ def chip_target(radio_path: str) -> str | None:
 
 
 def suggest_package(name: str) -> str | None:
-    """The known package one edit or upper case away from `name`; None if `name` is known, or similar to none."""
+    """The known package one edit, upper case or underscores away from `name`; None if `name` is known, or like none."""
     if name.lower() in PACKAGES:
         return None if name in PACKAGES else name.lower()
+    hyphened = name.replace("_", "-")
+    # few names have an underscore, and no kernel module's
+    if name.startswith("kmod_") or ("_" in name and hyphened in PACKAGES):
+        return hyphened
     if len(name) < _MIN_LETTERS:
         return None
     return next(

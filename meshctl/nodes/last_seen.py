@@ -19,6 +19,7 @@ from meshctl.nodes.connections import ConnectionPool
 from meshctl.nodes.slots import nodes_in_work
 from meshctl.report.duration import duration
 from meshctl.topology import Sighting, names_by_mac, report_of, seen_by
+from meshctl.wording import counted
 
 # batman-adv purges an originator after 200 s (PURGE_TIMEOUT, net/batman-adv/main.h).
 REMEMBERED_MS = 200_000
@@ -65,7 +66,7 @@ class LastSeen:
             )
         if not self.asked:
             return "no other node is reachable"
-        return f"heard by none of the {self.asked} node{'s' if self.asked != 1 else ''} that answered"
+        return f"heard by none of the {counted(self.asked, 'node')} that answered"
 
     @property
     def facts(self) -> dict[str, str]:

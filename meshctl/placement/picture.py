@@ -12,6 +12,7 @@ from itertools import pairwise
 from meshctl.placement.occupancy_map import OccupancyMap
 from meshctl.placement.path_loss import Point, Wall
 from meshctl.placement.planner import PlacementPlan
+from meshctl.wording import counted
 
 WIDTH = 1200
 _EDGE = 40
@@ -124,7 +125,7 @@ def svg(view: MapView, plan: PlacementPlan) -> str:
 def summary(plan: PlacementPlan) -> str:
     """The plan in one line."""
     count = len(plan.beacons)
-    what = f"{count} beacon{'' if count == 1 else 's'}: {plan.covered_m:.0f} of {plan.length_m:.0f} m"
+    what = f"{counted(count, 'beacon')}: {plan.covered_m:.0f} of {plan.length_m:.0f} m"
     return f"{what} with a margin of {plan.margin_db:g} dB"
 
 

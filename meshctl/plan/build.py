@@ -13,6 +13,7 @@ from meshctl.plan.switch import MeshSwitches, switches
 from meshctl.plan.values import Cut, NodePlan, Plan, Stage, StageKind, Verdict
 from meshctl.plan.ways import Pace, ways_of
 from meshctl.topology import Graph
+from meshctl.wording import MAX_IN_FULL, node_list
 
 
 def fleet_plan(
@@ -107,6 +108,14 @@ def _refused_together(stages: Iterable[Stage], plans: Mapping[str, NodePlan]) ->
     )
 
 
+def _folded(refused: Mapping[str, str]) -> str:
+    """`b01, b02: no port eth1; b03: wrong board`: each reason once."""
+    nodes: dict[str, list[str]] = {}
+    for name, reason in refused.items():
+        nodes.setdefault(reason, []).append(name)
+    return "; ".join(f"{node_list(names)}: {reason}" for reason, names in nodes.items())
+
+
 def _refusal(
     found: MeshSwitches,
     plans: Mapping[str, NodePlan],
@@ -116,16 +125,18 @@ def _refusal(
     for mesh, why in found.blocked.items():
         flashes = any(plan.firmware is not None and mesh in plan.parted_from for plan in plans.values())
         return (
-            f"mesh {mesh} changes its cell, but not every member can take part: {'; '.join(why)}",
+            f"mesh {mesh} changes its cell, but not every member can take part: {_folded(why)}",
             "change firmware first, without changing the cell, and fix the refused nodes"
             if flashes
             else "fix the refused nodes, then plan again",
         )
     for mesh, names in found.left_behind.items():
+        few = len(names) <= MAX_IN_FULL
+        how = ",".join(names) if few else "and what selects them ('group:far,state:carried', @FILE, or all)"
         return (
-            f"mesh {mesh} changes its cell and would leave behind {', '.join(names)}: unreachable, or not "
+            f"mesh {mesh} changes its cell and would leave behind {node_list(names)}: unreachable, or not "
             "part of this plan",
-            f"switch them on and select them too, or acknowledge with --leave-behind {','.join(names)}",
+            f"switch them on and select them too, or acknowledge with --leave-behind {how}",
         )
     for name, plan in plans.items():
         if plan.firmware is not None and plan.is_meshed and cuts.get(name) and not accepted & {name, "all"}:

@@ -16,6 +16,7 @@ from meshctl.model import ApplyPolicy
 from meshctl.plan.independent import by_group
 from meshctl.plan.values import Cut, NodePlan, Stage, StageKind
 from meshctl.topology import Graph, Path
+from meshctl.wording import counted
 
 # A stage of more independent meshes does not repeat the reason of each.
 _MAX_REASONS = 3
@@ -67,7 +68,7 @@ def stages_together(
     stage = Stage(
         StageKind.TOGETHER,
         _entry_last((plan.node for plan in at_once), context),
-        f"{count} node{'s' if count != 1 else ''} simultaneously, rolled back unless {context.policy.quorum:.0%}{each} "
+        f"{counted(count, 'node')} simultaneously, rolled back unless {context.policy.quorum:.0%}{each} "
         "pass their checks",
         mesh=", ".join(meshes),
     )
@@ -99,8 +100,7 @@ def _switch(mesh: str, nodes: Sequence[str], context: MeshContext) -> Stage:
     return Stage(
         StageKind.SWITCH,
         _entry_last(nodes, context),
-        f"{what}: {count} node{'s' if count > 1 else ''} simultaneously, rolled back unless "
-        f"{context.policy.quorum:.0%} rejoin",
+        f"{what}: {counted(count, 'node')} simultaneously, rolled back unless {context.policy.quorum:.0%} rejoin",
         mesh=mesh,
     )
 
@@ -200,4 +200,4 @@ def _distance(name: str, paths: Mapping[str, Path]) -> str:
     path = paths.get(name)
     if path is None:
         return f"{name} has no known path to the entry"
-    return f"{name} is {path.hops} hop{'s' if path.hops != 1 else ''} away, quality {path.quality:.0%}"
+    return f"{name} is {counted(path.hops, 'hop')} away, quality {path.quality:.0%}"

@@ -21,11 +21,11 @@ ALL = "all"
 @dataclass(frozen=True, slots=True)
 class MeshSwitches:
     """`nodes`: mesh, or meshes (`main, far`) -> the nodes that change cell together. `left_behind`: mesh -> members
-    that are off and not acknowledged. `blocked`: mesh -> reachable members that cannot take part, with the reason."""
+    that are off and not acknowledged. `blocked`: mesh -> reachable members that cannot take part -> the reason."""
 
     nodes: Mapping[str, tuple[str, ...]]
     left_behind: Mapping[str, tuple[str, ...]]
-    blocked: Mapping[str, tuple[str, ...]]
+    blocked: Mapping[str, Mapping[str, str]]
 
 
 def switches(
@@ -41,7 +41,7 @@ def switches(
     known, new_nodes = set(acknowledged), set(never_meshed)
     nodes: dict[str, tuple[str, ...]] = {}
     left_behind: dict[str, tuple[str, ...]] = {}
-    blocked: dict[str, tuple[str, ...]] = {}
+    blocked: dict[str, dict[str, str]] = {}
     for mesh in fleet.meshes:
         members = [plans[node.name] for node in fleet.members(mesh) if node.name in plans]
         parting = [plan for plan in members if mesh in plan.parted_from and plan.verdict is Verdict.CHANGE]
@@ -54,10 +54,10 @@ def switches(
         if not parting or (len(staying) >= len(parting) and not departs):
             continue
         nodes[mesh] = tuple(plan.node for plan in parting)
-        refused = [f"{plan.node}: {plan.reason}" for plan in members if plan.verdict is Verdict.REFUSED]
-        flashed = [f"{plan.node}: its firmware changes too" for plan in parting if plan.firmware is not None]
+        refused = {plan.node: plan.reason for plan in members if plan.verdict is Verdict.REFUSED}
+        flashed = {plan.node: "its firmware changes too" for plan in parting if plan.firmware is not None}
         if refused or flashed:
-            blocked[mesh] = (*refused, *flashed)
+            blocked[mesh] = refused | flashed
         # members in the inventory's cell are where a rejoining node goes, and what a departing one leaves
         staying_names = {plan.node for plan in staying if not departs or plan.node in plans}
         unplanned = [

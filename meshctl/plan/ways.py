@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from meshctl.plan.values import Cut, NodePlan, Stage, StageKind, Way
+from meshctl.wording import counted
 
 IN_ORDER, TOGETHER = "in order", "together"
 # A change of one node, if none was measured yet: three logins, the reload, the proof.
@@ -127,7 +128,7 @@ def _rolling_risk(stages: Sequence[Stage], plans: Mapping[str, NodePlan]) -> str
         lost = "interrupts nothing"
     else:
         ((worst, most),) = counts.most_common(1)
-        lost = f"{worst} is interrupted or cut off {most} time{'s' if most != 1 else ''}, no node more often"
+        lost = f"{worst} is interrupted or cut off {counted(most, 'time')}, no node more often"
     return f"{lost}; a failure stops the run, and the nodes before it keep the change"
 
 

@@ -30,6 +30,7 @@ from meshctl.model import (
 )
 from meshctl.render.thin import thin_lines, thin_problems, thin_topic_lines
 from meshctl.resolve import has_routed_lans
+from meshctl.wording import counted
 
 # Values that the daemon would reject (docs/render.md).
 DAEMON = "RND030"
@@ -119,7 +120,7 @@ def _key_file(
             problems.append(_problem(fleet, path, "", "", message=str(error), hint=error.hint))
             continue
         if key_bytes(text) is None:
-            found = f"{len(text)} characters"
+            found = counted(len(text), "character")
             hint = "generate one with `openssl rand -hex 32` or `udp-mesh keygen FILE`"
             expected = f"a key of {_KEY_BYTES} bytes as 64 hex digits or 44 characters of base64"
             problems.append(_problem(fleet, path, expected, found, hint=hint))

@@ -14,6 +14,7 @@ from meshctl.uci import Package, Section
 
 # Options that cannot be set (docs/render.md).
 EXTRA = "RND013"
+_HINT = "correct this key of extra_uci: PACKAGE.SECTION creates a section, PACKAGE.SECTION.OPTION sets an option"
 
 
 def with_extra(packages: Mapping[str, Package], intent: Intent) -> dict[str, Package]:
@@ -28,7 +29,9 @@ def with_extra(packages: Mapping[str, Package], intent: Intent) -> dict[str, Pac
             result[name] = _set_option(package, section, option, value) if option else _make(package, section, value)
         except ValueError as error:
             place = intent.extra_positions.get(key, intent.position)
-            failed.append(Diagnostic(EXTRA, Severity.ERROR, place, f"cannot be set: {error}", f"extra_uci.{key}"))
+            failed.append(
+                Diagnostic(EXTRA, Severity.ERROR, place, f"cannot be set: {error}", f"extra_uci.{key}", hint=_HINT)
+            )
     if failed:
         raise InvalidInput(failed)
     return result

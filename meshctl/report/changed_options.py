@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from meshctl.plan import FileChange
 from meshctl.render.rendered import MARKER_PATH
+from meshctl.wording import counted
 
 # above this, settings are only counted
 MAX_SETTINGS = 8
@@ -45,7 +46,7 @@ def settings(change: FileChange) -> tuple[str, ...]:
     if not diff_lines(change):
         return ("digest of its configuration",)
     found = tuple(_by_section(body[2:]))
-    return found or (f"{len(changed_lines(change))} lines",)
+    return found or (counted(len(changed_lines(change)), "line"),)
 
 
 def _by_section(lines: Iterable[str]) -> Iterator[str]:
@@ -87,7 +88,7 @@ def summary(change: FileChange) -> str:
     """The settings as one line; empty for an added or removed file."""
     found = settings(change)
     if len(found) > MAX_SETTINGS:
-        return f"{len(found)} settings"
+        return counted(len(found), "setting")
     parts: dict[str, list[str]] = {}
     for text in found:
         section, colon, rest = text.partition(": ")

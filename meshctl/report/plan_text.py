@@ -15,6 +15,7 @@ from meshctl.plan.ways import IN_ORDER, TOGETHER
 from meshctl.report.changed_options import changed_lines, diff_lines, summary
 from meshctl.report.duration import duration
 from meshctl.report.terminal_escapes import clean
+from meshctl.wording import counted, node_list
 
 # below this width, words are broken
 _MAX_ENTRIES = 4
@@ -95,15 +96,26 @@ def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
     """The totals and the nodes left out, repeated since the first lines have scrolled off the screen."""
     yield Line("")
     yield Line(_totals(plan), "bold")
-    for group in _grouped(nodes, with_diffs=False):
-        node = group[0]
+    groups: dict[tuple[Verdict, str], list[NodePlan]] = {}
+    for node in nodes:
         if node.verdict in (Verdict.AWAY, Verdict.REFUSED):
-            style = "yellow" if node.verdict is Verdict.AWAY else "red"
-            # the error of a failed connection starts with the node
-            who = "" if node.reason.startswith(node.node) else f"{node.node}, "
-            if len(group) > 1:
-                who = f"{', '.join(one.node for one in group)}: "
-            yield Line(f"  {node.verdict.value}: {who}{node.reason}", style)
+            groups.setdefault((node.verdict, _common_reason(node)), []).append(node)
+    for (verdict, common), group in groups.items():
+        node = group[0]
+        # the error of a failed connection starts with the node
+        who = "" if node.reason.startswith(node.node) else f"{node.node}, "
+        text = f"{who}{node.reason}"
+        if len(group) > 1:
+            text = f"{node_list([one.node for one in group])}: {common}"
+        yield Line(f"  {verdict.value}: {text}", "yellow" if verdict is Verdict.AWAY else "red")
+
+
+def _common_reason(node: NodePlan) -> str:
+    """The reason without what differs between nodes: their names and addresses, and where they were last seen."""
+    reason = node.reason.removeprefix(node.node).lstrip(" ")
+    if reason.startswith("("):
+        reason = reason.partition("): ")[2]
+    return reason.partition("; ")[0] if node.verdict is Verdict.AWAY else reason
 
 
 def _stages(plan: Plan) -> Iterator[Line]:
@@ -127,7 +139,7 @@ def _ways(plan: Plan) -> Iterator[Line]:
     yield Line(f"two ways ({plan.pace})", "bold")
     for way in plan.ways:
         mark = "this plan" if way.name == chosen else "--together" if way.name == TOGETHER else "without --together"
-        stages = f"{way.stages} stage{'s' if way.stages != 1 else ''}"
+        stages = f"{counted(way.stages, 'stage')}"
         yield Line(
             f"  {way.name:<9} {mark}: {stages}, about {duration(way.estimated_s)}: {way.risk}",
             "" if way.name == chosen else "dim",
@@ -214,4 +226,4 @@ def question(plan: Plan) -> str:
         f"{flashed} get new firmware" if flashed else "",
     ]
     more = "; ".join(part for part in extra if part)
-    return f"Change {todo} node{'s' if todo != 1 else ''}" + (f" ({more})" if more else "") + "?"
+    return f"Change {counted(todo, 'node')}" + (f" ({more})" if more else "") + "?"

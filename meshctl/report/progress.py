@@ -21,6 +21,7 @@ from rich.text import Text
 from meshctl import event_log
 from meshctl.fleet import Event, EventKind, Outcome, Result
 from meshctl.report.terminal_escapes import clean, json_safe, one_line
+from meshctl.wording import counted
 
 _STYLES = {
     Result.DONE: "green",
@@ -204,7 +205,7 @@ class LiveProgress(RunProgress):
             lines = [*lines[: room - 1], Text(f"... and {len(lines) - room + 1} more in progress")]
         ended = sum(self._counts.values())
         counts = ", ".join(f"{self._counts[result]} {result.value}" for result in Result if self._counts[result])
-        totals = Text(f"{ended}/{self._total} nodes" + (f": {counts}" if counts else ""), "bold")
+        totals = Text(f"{ended}/{counted(self._total, 'node')}" + (f": {counts}" if counts else ""), "bold")
         if not self._stopping:
             return Group(*lines, totals)
         names = ", ".join(list(self._active)[:_MAX_NAMES]) + (" ..." if len(self._active) > _MAX_NAMES else "")

@@ -10,6 +10,7 @@ import re
 
 from meshctl.diagnostics import Diagnostic, Position, Severity
 from meshctl.model import Backend, Encryption, Fleet, Mesh, MeshMode, MissingOrigin, Release, Secret
+from meshctl.wording import counted
 
 # Codes of this module, described in docs/render.md.
 VALUE = "RND001"
@@ -171,4 +172,4 @@ class ValueChecks:
 def _describe_secret(secret: str) -> str:
     """A description of a secret for messages: length and character set only."""
     plain = "" if secret.isascii() and secret.isprintable() else ", some not printable ASCII"
-    return f"{len(secret)} characters{plain}"
+    return f"{counted(len(secret), 'character')}{plain}"

@@ -35,6 +35,7 @@ from meshctl.robots.preconditions import (
 )
 from meshctl.robots.wheel_tags import Target
 from meshctl.robots.wheels import Wheel, cache_wheels, download_wheels, has_all, select_wheels, stock_units
+from meshctl.wording import counted
 
 COLLECTOR_KEY = "collector_key"
 """The fact of an outcome with the collector's public key."""
@@ -257,7 +258,7 @@ def parse_switch(robot: str, release: str, output: str) -> Outcome:
     match one.get("result"):
         case "switched":
             peers = one.get("online", "")
-            peer_text = f", {len(peers.split())} peers online" if peers else ""
+            peer_text = f", {counted(len(peers.split()), 'peer')} online" if peers else ""
             return Outcome(robot, Result.DONE, f"runs {release}{peer_text}", facts={"peers": peers})
         case "rolled-back":
             return Outcome(robot, Result.ROLLED_BACK, f"{reason}; the previous release runs again", hint)

@@ -49,6 +49,7 @@ from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, encode
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json, write_json
 from meshctl.sites.subjects import SiteSubjects
 from meshctl.sites.worker import Worker, run_command
+from meshctl.wording import counted
 
 if TYPE_CHECKING:
     import subprocess
@@ -224,7 +225,7 @@ class NatsWorker:
         part = base64.b64decode(str(message["part"]), validate=True)
         if missing := self.directory.missing_images(images.values()):
             raise OrderRefused(
-                f"{len(missing)} firmware images are not at this site", hint="plan again while it is online"
+                f"not at this site: {counted(len(missing), 'firmware image')}", hint="plan again while it is online"
             )
         run.create(part, {path: self.directory.image(sha256) for path, sha256 in images.items()})
         run.plan.write_text(str(message["plan"]), encoding="utf-8")

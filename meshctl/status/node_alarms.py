@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from meshctl import wording
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.plan import NodePlan, Verdict
@@ -16,6 +17,7 @@ from meshctl.plan.left_over import left_over
 from meshctl.report.duration import duration
 from meshctl.status.values import Alarm, Level, Neighbor, RadioStatus
 from meshctl.topology import Path
+from meshctl.wording import counted
 
 # below this the path loses more than it delivers: move a beacon
 WEAK_QUALITY = 0.3
@@ -138,7 +140,7 @@ def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
         text = "no path through the mesh to the base"
         yield Alarm(Level.WARNING, "no-path", text, "find the missing node between them with meshctl topology")
     elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
-        hops = f"{seen.path.hops} hop{'s' if seen.path.hops > 1 else ''}"
+        hops = f"{counted(seen.path.hops, 'hop')}"
         text = f"path to the base has {seen.path.quality:.0%} quality over {hops}"
         yield Alarm(Level.WARNING, "weak", text, f"drop a beacon between {seen.node.name} and {seen.path.via}")
     if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
@@ -202,7 +204,7 @@ def _resources(seen: NodeAlarmInput) -> Iterator[Alarm]:
         hint = "remove packages or files: a change stores the previous state in flash"
         yield Alarm(Level.WARNING, "flash", f"{flash.free // 1024} KiB of flash left", hint)
     if load is not None and load.minute / load.processors > BUSY_LOAD:
-        text = f"load {load.minute:.1f} on {load.processors} processor{'s' if load.processors > 1 else ''}"
+        text = f"load {load.minute:.1f} on {counted(load.processors, 'processor')}"
         yield Alarm(Level.NOTE, "load", text, f"meshctl run {seen.node.name} -- top -b -n 1")
 
 
@@ -216,7 +218,7 @@ def _changes(seen: NodeAlarmInput) -> Iterator[Alarm]:
         yield Alarm(Level.NOTE, "locked", f"locked by {change.lock_owner}")
     if seen.observation.uci_changes:
         count = len(seen.observation.uci_changes)
-        text = f"{count} uncommitted UCI change{'s' if count > 1 else ''} made by hand"
+        text = f"{counted(count, 'uncommitted UCI change')} made by hand"
         hint = f"meshctl run {seen.node.name} -- uci changes; move them into the inventory, or `uci revert` them"
         yield Alarm(Level.WARNING, "foreign", text, hint)
 
@@ -231,10 +233,8 @@ def _time(seen: NodeAlarmInput) -> Iterator[Alarm]:
 
 
 def join_limited(names: tuple[str, ...]) -> str:
-    """The first names and the number of others."""
-    if len(names) <= MAX_NAMES:
-        return ", ".join(names)
-    return f"{', '.join(names[:MAX_NAMES])} and {len(names) - MAX_NAMES} more"
+    """As many names as an alarm has room for, and the number of others."""
+    return wording.join_limited(names, MAX_NAMES)
 
 
 _CONCERNS: tuple[Callable[[NodeAlarmInput], Iterator[Alarm]], ...] = (

@@ -16,6 +16,7 @@ from meshctl.status.pings import Pings
 from meshctl.status.robots import is_active
 from meshctl.status.topics import is_urgent
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
+from meshctl.wording import counted
 
 # `meshctl status` shows all of them.
 MAX_REASONS = 4
@@ -136,10 +137,6 @@ def _answered_daemons(status: FleetStatus) -> _Answers:
     return _Answers(count, len(robots), "no daemon answers")
 
 
-def _plural(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
 def _alarm_check(
     name: str,
     good: str,
@@ -185,7 +182,8 @@ def _robot_radios(fleet: Fleet, status: FleetStatus) -> Check:
     radios = [node for node in status.nodes if node.node.role is Role.ROBOT]
     deployed = [node for node in radios if node.node.state is NodeState.DEPLOYED]
     shelved = [f"{node.name} ({node.node.state.value})" for node in radios if node.node.state is not NodeState.DEPLOYED]
-    good = f"{_plural(len(deployed), 'robot radio')} answer{'s' if len(deployed) == 1 else ''}" if radios else "none"
+    verb = "answers" if len(deployed) == 1 else "answer"
+    good = f"{counted(len(deployed), 'robot radio')} {verb}" if radios else "none"
     good += f"; not taking part: {join_limited(tuple(shelved))}" if shelved else ""
     return _check("robot radios", [_no_answer_text(node) for node in deployed if node.no_answer_reason], good)
 
@@ -202,7 +200,7 @@ def _beacons(fleet: Fleet, status: FleetStatus) -> Check:
         else []
     )
     on = sum(not node.no_answer_reason for node in beacons)
-    good = f"{_plural(len(beacons), 'beacon')} known, {on} on" if beacons else "none"
+    good = f"{counted(len(beacons), 'beacon')} known, {on} on" if beacons else "none"
     return _check("beacons", [*never_seen, *(_no_answer_text(node) for node in missed)], good)
 
 
@@ -260,7 +258,7 @@ def _daemons(fleet: Fleet, status: FleetStatus) -> Check:
         if robot.computer is None
     ]
     shelved = [robot.name for robot in status.robots if not is_active(robot.state)]
-    good = f"{_plural(len(_active_robots(status)), 'daemon')} up"
+    good = f"{counted(len(_active_robots(status)), 'daemon')} up"
     good += f"; not taking part: {join_limited(tuple(shelved))}" if shelved else ""
     good += f"; {', '.join(without)}" if without else ""
     return _check("daemons", [text for text in bad if text], good)
@@ -280,7 +278,7 @@ def _peers(fleet: Fleet, status: FleetStatus) -> Check:
         bad.append("no daemon answers")
     if not bad and len(names) < 2:
         return Check("peers", True, "fewer than two robots take part", is_checked=False)
-    return _check("peers", bad, f"every robot hears all {_plural(len(names) - 1, 'other')}")
+    return _check("peers", bad, f"every robot hears all {counted(len(names) - 1, 'other')}")
 
 
 def _urgent_topics(fleet: Fleet, status: FleetStatus) -> Check:
@@ -306,7 +304,7 @@ def _delivery(fleet: Fleet, status: FleetStatus, pings: Pings) -> Check:
         return Check("delivery", False, "fewer than two daemons answer: cannot send test messages")
     worst = max(pings.round_trips_s.items(), key=lambda pair: pair[1], default=None)
     slowest = "" if worst is None else f", the slowest {worst[0][0]} to {worst[0][1]} in {worst[1] * 1000:.0f} ms"
-    return _check("delivery", bad, f"urgent messages delivered between all {_plural(len(pairs), 'pair')}{slowest}")
+    return _check("delivery", bad, f"urgent messages delivered between all {counted(len(pairs), 'pair')}{slowest}")
 
 
 def _emergency_stop(stop: StopResult) -> Check:

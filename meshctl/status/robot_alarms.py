@@ -16,6 +16,7 @@ from meshctl.robots.facts import RobotFacts, ServiceFacts
 from meshctl.status.thin_alarms import thin_alarms
 from meshctl.status.topics import is_urgent, urgent_priorities
 from meshctl.status.values import Alarm, Level, TopicStatus
+from meshctl.wording import counted
 
 # A healthy hop takes milliseconds; a longer wait means a broken or congested link.
 URGENT_WAIT_S = 2.0
@@ -105,7 +106,7 @@ def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:
     before = seen.last.facts.get("restarts", "") if seen.last else ""
     again = seen.facts.service.restarts - int(before) if before.isdecimal() else 0
     if again > 0:
-        text = f"its daemon crashed and was restarted {again} time{'s' if again > 1 else ''} since the last snapshot"
+        text = f"its daemon crashed and was restarted {counted(again, 'time')} since the last snapshot"
         yield Alarm(Level.WARNING, "restarts", text, f"meshctl robots logs {seen.robot.name} -n 200")
     uptime_s = seen.facts.computer.uptime_s
     since_s = seen.facts.seen_s - seen.last.seen_s if seen.last else None
@@ -161,7 +162,7 @@ def _queues(seen: RobotAlarmInput) -> Iterator[Alarm]:
     before = last.facts.get("urgent_bytes", "") if last is not None and is_recent else ""
     grows = before.isdecimal() and seen.urgent_bytes > int(before)
     messages, oldest_s = sum(queue.messages for queue in late), max(queue.oldest_s for queue in late)
-    text = f"{messages} urgent message{'s' if messages > 1 else ''} queued, the oldest for {duration(oldest_s)}"
+    text = f"{counted(messages, 'urgent message')} queued, the oldest for {duration(oldest_s)}"
     text += f", and growing ({before} to {seen.urgent_bytes} B)" if grows else ""
     level = Level.ERROR if grows else Level.WARNING
     yield Alarm(level, "urgent-queue", text, f"meshctl robots status {seen.robot.name} shows the unreachable peers")
@@ -200,7 +201,7 @@ def _computer(seen: RobotAlarmInput) -> Iterator[Alarm]:
             "stop other programs",
         )
     if computer.load is not None and computer.cpus and computer.load[0] / computer.cpus > BUSY_LOAD:
-        text = f"load {computer.load[0]:.1f} on {computer.cpus} processors"
+        text = f"load {computer.load[0]:.1f} on {counted(computer.cpus, 'processor')}"
         yield Alarm(Level.NOTE, "load", text, "stop other programs, which delay the daemon")
     if abs(computer.clock_ahead_s) > CLOCK_TOLERANCE_S:
         side = "ahead of" if computer.clock_ahead_s > 0 else "behind"

@@ -13,6 +13,7 @@ from meshctl.inventory.selection import COMPUTER
 from meshctl.report.duration import duration
 from meshctl.status.robot_alarms import size
 from meshctl.status.values import NodeStatus, RobotStatus
+from meshctl.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +147,7 @@ def _path(hops: int | None, quality: float | None) -> TableCell:
     if not hops:
         return TableCell("is base", "base")
     share = "" if quality is None else f" {quality:.0%}"
-    return TableCell(f"{hops} hop{'s' if hops > 1 else ''}{share}", f"{hops}h{share}")
+    return TableCell(f"{counted(hops, 'hop')}{share}", f"{hops}h{share}")
 
 
 def _known_node(facts: Mapping[str, str]) -> dict[str, TableCell]:
@@ -158,7 +159,7 @@ def _known_node(facts: Mapping[str, str]) -> dict[str, TableCell]:
         "channel": TableCell(facts.get("channels", "").replace(" ", ",")),
         "bridge": TableCell(facts.get("lan_ports", "").replace(" ", "+")),
         "hears": TableCell(", ".join(heard), str(len(heard)) if heard else ""),
-        "path": TableCell(f"{hops} hop{'s' if hops != '1' else ''}" if hops else "", f"{hops}h" if hops else ""),
+        "path": TableCell(counted(int(hops), "hop") if hops else "", f"{hops}h" if hops else ""),
         "via": TableCell(facts.get("via", "")),
     }
 

@@ -18,6 +18,7 @@ from meshctl.status.preflight import Check, verdict
 from meshctl.status.rows import row
 from meshctl.status.table import Paint, plain, table_lines
 from meshctl.status.values import Alarm, FleetStatus, Health, Level, NodeStatus, RobotStatus
+from meshctl.wording import counted
 
 # More devices than this with the same alarm share one line.
 MAX_SINGLE_ALARMS = 3
@@ -66,7 +67,7 @@ def verdict_line(status: FleetStatus, paint: Paint = plain) -> str:
     """`lab: DEGRADED: 1 error, 2 warnings (23:45:12 UTC, took 1.2 s)`."""
     word, style = _VERDICTS[status.exit_code]
     counts = {level: sum(alarm.level is level for _, alarm in _all_alarms(status)) for level in reversed(Level)}
-    parts = [f"{count} {level.text}{'s' if count > 1 else ''}" for level, count in counts.items() if count]
+    parts = [f"{counted(count, level.text)}" for level, count in counts.items() if count]
     when = time.strftime("%H:%M:%S UTC", time.gmtime(status.taken_s))
     took = f", took {status.took_s:.1f} s" if status.took_s else ""
     return f"{status.fleet}: {paint(word, style)}{': ' if parts else ''}{', '.join(parts)} ({when}{took})"
@@ -81,7 +82,7 @@ def _totals(status: FleetStatus) -> Iterator[str]:
         if devices:
             counts = [(health, sum(one.health is health for one in devices)) for health in Health]
             text = ", ".join(f"{count} {health.value}" for health, count in counts if count)
-            yield f"{len(devices)} {what}{'s' if len(devices) > 1 else ''}: {text}"
+            yield f"{counted(len(devices), what)}: {text}"
 
 
 def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:

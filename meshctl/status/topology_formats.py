@@ -13,6 +13,7 @@ from typing import Any
 from meshctl.report.duration import duration
 from meshctl.topology import Graph, Report, neighbours_of
 from meshctl.topology.cells import LinkCell
+from meshctl.wording import counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,7 @@ def tree(view: TopologyView) -> str:
     def label(name: str) -> str:
         star = " *" if name in cuts else ""
         path = paths[name]
-        text = "" if not path.hops else f"  {path.hops} hop{'s' if path.hops > 1 else ''}, {path.quality:.0%}"
+        text = "" if not path.hops else f"  {counted(path.hops, 'hop')}, {path.quality:.0%}"
         silent = ", does not answer" if view.was_queried(name) else ", not queried"
         age = f", {duration(view.ages_s[name])} old" if name in view.ages_s else silent
         if path.hops and view.has_several_cells():

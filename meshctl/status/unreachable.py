@@ -13,6 +13,7 @@ from meshctl.report.duration import duration
 from meshctl.status.node_alarms import join_limited
 from meshctl.status.values import Alarm, Level, NoAnswer
 from meshctl.topology import Sighting
+from meshctl.wording import counted
 
 NOT_ASKED = NoAnswer("not queried")
 
@@ -95,12 +96,12 @@ def sighting_text(heard_by: Sequence[Sighting]) -> str:
         return ""
     first = heard_by[0]
     signal = "" if first.signal_dbm is None else f"{first.signal_dbm} dBm, "
-    others = f", and {len(heard_by) - 1} other{'s' if len(heard_by) > 2 else ''}" if len(heard_by) > 1 else ""
+    others = f", and {counted(len(heard_by) - 1, 'other')}" if len(heard_by) > 1 else ""
     return f"{first.by} hears it ({signal}{first.age_ms / 1000:.1f} s ago){others}"
 
 
 def last_place_hint(last: LastKnown) -> str:
     """Where to find an unreachable device, and what to check."""
     via, hops = last.facts.get("via", ""), last.facts.get("hops", "")
-    where = f"it was {hops} hop{'' if hops == '1' else 's'} away, behind {via}: " if via else ""
+    where = f"it was {counted(int(hops), 'hop')} away, behind {via}: " if via else ""
     return f"{where}check power and antenna there" if where else "check power, cable and antenna"

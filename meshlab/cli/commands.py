@@ -16,6 +16,7 @@ from meshctl.device.framing import command_line
 from meshctl.errors import InputError
 from meshctl.model import Backend, Fleet, Release
 from meshctl.resources import shipped
+from meshctl.wording import counted
 from meshlab.cli import links, sweep
 from meshlab.console import run_shell
 from meshlab.errors import LabError
@@ -63,7 +64,8 @@ def up(
         fleet: VirtualFleet = QemuFleet(spec, place).up(wait_s=_REAL_START_S + _REAL_BOOT_S * len(spec.nodes))
     else:
         fleet = VirtualFleet(spec, place).up(wait_s=_START_S + _BOOT_S * len(spec.nodes))
-    echo(f"{len(spec.nodes)} nodes of {spec.name} are up, each at 192.168.1.1 on its own bench port")
+    verb = "is" if len(spec.nodes) == 1 else "are"
+    echo(f"{counted(len(spec.nodes), 'node')} of {spec.name} {verb} up, each at 192.168.1.1 on its own bench port")
     if copy.kept is not None:
         echo(f"kept:      {copy.kept}, the earlier copy of the inventory, which was edited")
     echo(f"inventory: {copy.inventory}")

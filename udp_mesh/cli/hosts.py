@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 
 from udp_mesh.cli.hosts_file import HostEntry, MergedHosts, hosts_of, merge, without_block
-from udp_mesh.cli.output import Exit, print_error, print_json, print_text
+from udp_mesh.cli.output import Exit, counted, print_error, print_json, print_text
 from udp_mesh.client.mesh_client import MeshClient, MeshError
 
 REFRESH_S = 10.0
@@ -121,7 +121,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _status(written: tuple[HostEntry, ...], conflicts: tuple[HostEntry, ...]) -> str:
     names = ", ".join(host.name for host in conflicts)
     left_out = f"; already defined by another line: {names}" if conflicts else ""
-    return f"{len(written)} peers{left_out}"
+    return f"{counted(len(written), 'peer')}{left_out}"
 
 
 class HostsBlock:

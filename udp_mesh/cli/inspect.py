@@ -9,7 +9,16 @@ import time
 from collections.abc import Callable
 from typing import NoReturn
 
-from udp_mesh.cli.output import Exit, fields_text, print_json, print_json_line, print_text, write_raw, write_text
+from udp_mesh.cli.output import (
+    Exit,
+    counted,
+    fields_text,
+    print_json,
+    print_json_line,
+    print_text,
+    write_raw,
+    write_text,
+)
 from udp_mesh.cli.views import Json, logs_view, peers_view, status_view, subscriptions_view, topics_view
 from udp_mesh.client.mesh_client import MeshClient, MeshError
 from udp_mesh.report.terminal_escapes import clean
@@ -96,7 +105,8 @@ def screen_text(text: str, columns: int, lines: int) -> str:
     rows = clean(text).split("\n")
     max_rows = max(lines - 1, 1)
     if len(rows) > max_rows:
-        rows = [*rows[: max_rows - 1], f"... {len(rows) - max_rows + 1} more lines (run without --watch to see all)"]
+        hidden = counted(len(rows) - max_rows + 1, "more line")
+        rows = [*rows[: max_rows - 1], f"... {hidden} (run without --watch to see all)"]
     return HOME + "".join(f"{row[:columns]}{END_OF_LINE}\n" for row in rows) + BELOW
 
 

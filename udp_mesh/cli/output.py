@@ -146,6 +146,11 @@ def milliseconds(seconds: float | None) -> str:
     return f"{seconds * 1000:.3g} ms" if seconds < 0.9995 else duration(seconds)
 
 
+def counted(number: int, noun: str) -> str:
+    """`1 peer`, `2 peers`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def duration(seconds: float | None) -> str:
     """`1 h 02 min`, `3 min 10 s`, `4.2 s`."""
     if seconds is None:

@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from udp_mesh.cli.output import Exit, print_error, print_json, print_text
+from udp_mesh.cli.output import Exit, counted, print_error, print_json, print_text
 from udp_mesh.daemon.interface import RESERVED_PREFIX
 
 if TYPE_CHECKING:
@@ -83,10 +83,9 @@ def check(arguments: argparse.Namespace) -> int:
             }
         )
     else:
-        protection = "UNKEYED" if settings.unkeyed else f"{len(settings.keys)} key(s)"
-        print_text(
-            f"{arguments.config}: valid: {settings.name}, port {settings.port}, {len(topics)} topics, {protection}"
-        )
+        protection = "UNKEYED" if settings.unkeyed else counted(len(settings.keys), "key")
+        topic_count = counted(len(topics), "topic")
+        print_text(f"{arguments.config}: valid: {settings.name}, port {settings.port}, {topic_count}, {protection}")
     return Exit.OK
 
 

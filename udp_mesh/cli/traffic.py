@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from udp_mesh.cli.output import (
     Exit,
+    counted,
     milliseconds,
     print_error,
     print_json,
@@ -156,7 +157,7 @@ def echo(arguments: argparse.Namespace) -> int:
             message = as_message(frame)
             if message is None:
                 if header.get("event") == "dropped":
-                    print_error(f"reading too slowly: {header['messages']} messages were dropped")
+                    print_error(f"reading too slowly: dropped {counted(header['messages'], 'message')}")
                 continue
             shown += 1
             if arguments.raw:
@@ -280,10 +281,8 @@ def bench(arguments: argparse.Namespace) -> int:
         }
         print_json(result)
     else:
-        print_text(
-            f"{run.delivered} of {run.sent} messages of {size(arguments.size)} delivered in {run.seconds:.2f} s: "
-            f"{rate(bits_per_s)}"
-        )
+        messages = f"{counted(run.sent, 'message')} of {size(arguments.size)}"
+        print_text(f"{run.delivered} of {messages} delivered in {run.seconds:.2f} s: {rate(bits_per_s)}")
     return Exit.NOT_DELIVERED if code == Exit.OK and run.delivered < run.sent else code
 
 
@@ -337,5 +336,5 @@ def record_stop(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({key: reply[key] for key in ("path", "bytes", "lines")})
     else:
-        print_text(f"{reply['path']}: {reply['lines']} lines, {size(reply['bytes'])}")
+        print_text(f"{reply['path']}: {counted(reply['lines'], 'line')}, {size(reply['bytes'])}")
     return Exit.OK

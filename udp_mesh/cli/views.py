@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from udp_mesh.cli.output import duration, milliseconds, rate, size, table
+from udp_mesh.cli.output import counted, duration, milliseconds, rate, size, table
 from udp_mesh.cli.thin_view import thin_view
 
 Json = dict[str, Any]
@@ -142,7 +142,7 @@ def status_view(status: Json) -> str:
     lines += [f"link {name} FAILED: {reason}" for name, reason in status["link_failures"].items()]
     lines += [
         f"link {refusal['link']} CANNOT SEND to {refusal['to']}: {refusal['reason']} "
-        f"({refusal['datagrams']} datagrams, last {duration(refusal['last_ago_s'])} ago)"
+        f"({counted(refusal['datagrams'], 'datagram')}, last {duration(refusal['last_ago_s'])} ago)"
         for refusal in status["refusals"]
     ]
     lines += ["", peers_view(conditions["peers"])]
@@ -185,7 +185,8 @@ def status_view(status: Json) -> str:
     saved_messages = sum(peer["saved_messages"] for peer in conditions["peers"])
     if saved_messages:
         saved_bytes = sum(peer["saved_bytes"] for peer in conditions["peers"])
-        lines.append(f"not sent because no program there wants it: {saved_messages} messages, {size(saved_bytes)}")
+        saved = counted(saved_messages, "message")
+        lines.append(f"not sent because no program there wants it: {saved}, {size(saved_bytes)}")
     if dropped := _drops(counters):
         lines.append(f"dropped: {_listed(dropped)}")
     if status["recording"]:
@@ -228,7 +229,7 @@ def relays_view(relaying: Json) -> list[str]:
         by_cause = f" ({_listed(causes)})" if dropped else ""
         lines += [
             "",
-            f"relay: {counters['passed_on']} datagrams passed on ({size(counters['passed_on_bytes'])}), "
+            f"relay: {counted(counters['passed_on'], 'datagram')} passed on ({size(counters['passed_on_bytes'])}), "
             f"{dropped} dropped{by_cause}, {size(relaying['queued_bytes'])} queued",
         ]
     return lines

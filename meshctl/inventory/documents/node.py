@@ -8,7 +8,7 @@ from pydantic import Field
 
 from meshctl.inventory.addresses import AddressField
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document
-from meshctl.inventory.fields import Address, Line, Mac, Name, Real, ReleaseName, Text, Whole
+from meshctl.inventory.fields import Address, Line, Mac, Name, Port, Real, ReleaseName, Text, Whole
 from meshctl.model import NodeState, Role
 
 
@@ -76,7 +76,7 @@ class NodeLayer(Document):
     """Hostname. Default: the node's name."""
     release: ReleaseName = NOT_WRITTEN
     """OpenWrt release series. Default: the hardware profile's."""
-    lan_ports: tuple[Text, ...] = NOT_WRITTEN
+    lan_ports: tuple[Port, ...] = NOT_WRITTEN
     """Ports bridged into the LAN. Default: the hardware profile's."""
     lan_filter: LanFilterLayer | None = NOT_WRITTEN
     """Keep the broadcasts of devices on its wired ports, such as a lidar, out of the mesh: `{}`, or with exceptions.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from meshctl.inventory.documents.base import NOT_WRITTEN, Document, SecretDocument
-from meshctl.inventory.fields import Flag, Mac, Name, Network, Real, ReleaseName, SwitchPorts, Text, VlanId, Whole
+from meshctl.inventory.fields import Flag, Mac, Name, Network, Port, Real, ReleaseName, SwitchPorts, Text, VlanId, Whole
 from meshctl.model import AntennaKind, Backend, Band, Encryption, MeshMode
 
 
@@ -62,7 +62,7 @@ class HardwareDocument(Document):
     """OpenWrt release series."""
     radios: dict[Name, RadioHardwareDocument]
     """Radios by the names of their UCI sections."""
-    lan_ports: tuple[Text, ...]
+    lan_ports: tuple[Port, ...]
     """Ports bridged into the LAN, from `/etc/board.json`; `[]` for none."""
     switch_vlans: dict[VlanId, SwitchPorts] = Field(default_factory=dict)
     """VLANs of `switch0` and their ports, if swconfig drives it (ports such as eth0.1): `{1: "3 0t"}`."""

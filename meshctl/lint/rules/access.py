@@ -1,8 +1,9 @@
-"""Login: operators' keys, host keys, passwords (MC421 to MC433)."""
+"""Login: operators' keys, host keys, passwords (MC421 to MC434)."""
 
 from __future__ import annotations
 
 import base64
+import re
 import struct
 from collections.abc import Iterator
 
@@ -11,15 +12,18 @@ from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.inventory.file_paths import file_path, known_hosts_path
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, join_limited
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.secrets import logins
 from meshctl.lint.sshkey import AuthorizedKey, BadKey, parse_authorized_key
 from meshctl.model import Fleet
+from meshctl.wording import join_limited
 
 # NIST SP 800-57 part 1: 2048 bits are the minimum
 _MIN_RSA_BITS = 2048
 # a well-formed key for examples, without a known private key
+# an IPv6 address needs brackets before a port
+_HOST_AND_PORT = re.compile(r"\[(.*)\](?::(\d+))?|([^:]*):(\d+)")
 _ALICE = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f alice"
 
 
@@ -291,6 +295,26 @@ def public_key_to_log_in(fleet: Fleet, context: LintContext) -> Iterator[Finding
         for index, file in enumerate(ssh.key_files):
             if file.endswith(".pub") or _is_public_key(context.files.text(file_path(fleet, file)) or ""):
                 yield Finding((*place, "key_files", str(index)), "login needs the private key", "a private key", file)
+
+
+@fleet_rule(
+    "MC434",
+    Severity.ERROR,
+    "An SSH host contains the user or the port",
+    why="`ssh.host` is a name or an address alone: with a user or a port in it, no login reaches the device.",
+    fix="Write them under their own keys: `ssh: {host: gw.example, port: 2222, user: mesh}`.",
+    failing="robots: {husky1: {computer: {ssh: {host: 'robot@10.42.0.110:2222'}}}}",
+    passing="robots: {husky1: {computer: {ssh: {host: 10.42.0.110, port: 2222}}}}",
+)
+def host_with_user_or_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for place, ssh in logins(fleet):
+        user, _, rest = ssh.host.rpartition("://")[2].rpartition("@")
+        found = _HOST_AND_PORT.fullmatch(rest)
+        bracketed, port, host, other_port = found.groups(default="") if found else ("", "", rest, "")
+        if (bracketed or host) != ssh.host:
+            parts = {"host": bracketed or host, "port": port or other_port, "user": user}
+            expected = ", ".join(f"{key}: {value}" for key, value in parts.items() if value)
+            yield Finding((*place, "host"), "not a host name or address alone", expected, ssh.host)
 
 
 def _is_public_key(text: str) -> bool:

@@ -7,11 +7,12 @@ from ipaddress import IPv4Address, ip_address
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, join_limited
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, Node
 from meshctl.model.ip import IpAddress, IpInterface, IpNetwork, host_and_port
+from meshctl.wording import join_limited
 
 # so many nodes of a mesh, and all of them, outside its network: the network is wrong, not each address
 _WRONG_NETWORK_NODES = 3

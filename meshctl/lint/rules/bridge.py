@@ -1,4 +1,4 @@
-"""Bridging into the robot's LAN: ports, loops, confirm windows, extra options, broadcasts (MC521 to MC532)."""
+"""Bridging into the robot's LAN: ports, loops, confirm windows, extra options, broadcasts (MC521 to MC534)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, group_by_key, join_limited
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Mesh, Node
+from meshctl.wording import join_limited
 
 # resynchronization of loop avoidance blocks broadcasts for up to 30 s; the rest is for the health checks
 _LOOP_AVOIDANCE_S = 60
@@ -356,3 +357,41 @@ def filter_without_bridge(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         written = fleet.where("nodes", node.name, "lan_filter").layer
         if node.lan_filter is not None and not node.bridges_lan and written != "defaults":
             yield Finding(("nodes", node.name, "lan_filter"), "it bridges nothing", "a bridged LAN", "none")
+
+
+@fleet_rule(
+    "MC533",
+    Severity.WARNING,
+    "A switch port is untagged in two VLANs",
+    why="""Frames without a tag that enter the port belong to one VLAN only, the port's own (PVID): what is connected
+    there hears both VLANs and reaches one, or the WAN and the LAN are one network.""",
+    fix="List the port in one of them, or tagged (`5t`) in one.",
+    failing="hardware: {rocket: {switch_vlans: {1: 2 3 0t, 2: 1 3 0t}}}",
+    passing="hardware: {rocket: {switch_vlans: {1: 2 3 0t, 2: 1 3t 0t}}}",
+)
+def untagged_twice(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        untagged = [(port, vlan) for vlan, ports in profile.switch_vlans for port in ports.split() if port.isdigit()]
+        for port, (first, *later) in duplicates(untagged):
+            for vlan in later:
+                path = ("hardware", profile.name, "switch_vlans", vlan)
+                yield Finding(path, f"port {port} is untagged in VLAN {first} as well", f"{port} in one of them", port)
+
+
+@fleet_rule(
+    "MC534",
+    Severity.WARNING,
+    "A VLAN port's VLAN has no tagged port",
+    why="""The processor sends and receives eth0.1 with the tag of VLAN 1. Where the switch's port to the processor is
+    untagged in that VLAN, eth0.1 receives nothing: the wired ports are dead.""",
+    fix="Tag the processor's port, `0t` on most boards, as in the device's own /etc/config/network.",
+    failing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 3 0}}}",
+    passing="hardware: {rocket: {lan_ports: [eth0.1], switch_vlans: {1: 3 0t}}}",
+)
+def vlan_without_tag(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for profile in fleet.hardware.values():
+        bridged = {port.rpartition(".")[2]: port for port in profile.lan_ports if "." in port}
+        for vlan, ports in profile.switch_vlans:
+            if vlan in bridged and "t" not in ports:
+                path = ("hardware", profile.name, "switch_vlans", vlan)
+                yield Finding(path, f"no tagged port for {bridged[vlan]}", "the processor's port, such as 0t", ports)

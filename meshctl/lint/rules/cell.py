@@ -6,11 +6,12 @@ from collections.abc import Iterable, Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, group_by_key, join_limited
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.access import RSA_KEY
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
 from meshctl.regdb import occupied_span
+from meshctl.wording import join_limited
 
 # IEEE 802.11: the basic rates of 802.11b, and the OFDM rates of 802.11a and g
 _DSSS_KBPS = (1000, 2000, 5500, 11000)

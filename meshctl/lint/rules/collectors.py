@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.access import RSA_KEY
 from meshctl.lint.sshkey import BadKey, parse_authorized_key
 from meshctl.model import Computer, Fleet, Node, Robot
+from meshctl.wording import join_limited
 
 # a well-formed key for examples, without a known private key
 _KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g collector of husky1"

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet
 from meshctl.model.computers import ARCHITECTURES, ROS_1, ROS_2, ROS_TOO_OLD
+from meshctl.wording import join_limited
 
 # one label of a host name (RFC 1123, section 2.1), and not an address
 _HOST_LABEL = re.compile(r"(?!\d+$)[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.openwrt_names import is_one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, RadioHardware
+from meshctl.wording import join_limited
 
 # modes that no firmware of the driver supports (docs/facts/openwrt-facts.md, section 6)
 _LACKS = {

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Encryption, Fleet, Mesh, MeshMode, Node, Release
 from meshctl.resolve import FULL_SUPPLICANTS, supplicant_need
+from meshctl.wording import counted, join_limited
 
 # a shorter passphrase can be guessed offline from a recorded handshake
 _MIN_PASSPHRASE_CHARACTERS = 16
@@ -198,9 +199,9 @@ def passphrase_not_allowed(fleet: Fleet, context: LintContext) -> Iterator[Findi
         path = ("meshes", mesh.name, "key")
         if mesh.encryption is Encryption.PSK2 and not _is_passphrase(value):
             expected = "8 to 63 printable ASCII characters, or 64 hexadecimal digits"
-            yield Finding(path, "invalid passphrase", expected, f"{len(value)} characters")
+            yield Finding(path, "invalid passphrase", expected, _length(value))
         elif mesh.encryption is Encryption.SAE and not (1 <= len(value) <= 128 and value.isprintable()):
-            yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", f"{len(value)} characters")
+            yield Finding(path, "invalid passphrase", "1 to 128 characters on one line", _length(value))
         elif mesh.encryption is Encryption.SAE and len(value.encode()) == 64 and _before_23_05(fleet, mesh):
             message = "up to OpenWrt 22.03, a key of 64 characters joins no SAE mesh"
             found = f"64 characters, and an older release than 23.05 on {join_limited(_before_23_05(fleet, mesh))}"
@@ -245,5 +246,12 @@ def passphrase_short(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if is_tried and len(value) < _MIN_PASSPHRASE_CHARACTERS:
             expected = f"at least {_MIN_PASSPHRASE_CHARACTERS} characters"
             yield Finding(
-                ("meshes", mesh.name, "key"), "vulnerable to offline guessing", expected, f"{len(value)} characters"
+                ("meshes", mesh.name, "key"),
+                "vulnerable to offline guessing",
+                expected,
+                _length(value),
             )
+
+
+def _length(secret: str) -> str:
+    return counted(len(secret), "character")

@@ -1,4 +1,4 @@
-"""Hardware profiles, their packages and targets (MC821 to MC834)."""
+"""Hardware profiles, their packages and targets (MC821 to MC835)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from meshctl import firmware
 from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import nearest
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_package
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
@@ -18,9 +17,14 @@ from meshctl.lint.rules.firmware import ROCKET_IMAGE
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_files, package_needs
+from meshctl.wording import join_limited
 
 # no security fixes (openwrt.org/docs/guide-developer/security)
 _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
+# fw3 and what filters beside nftables; iptables-nft and its modules translate to it
+_FW3 = re.compile(r"firewall|ip6?tables(-legacy|-zz-legacy)?")
+# since 23.05 (package/network/services/hostapd/Makefile)
+_MBEDTLS = re.compile(r"(wpad|wpa-supplicant|hostapd)(-basic|-mesh|-mini)?-mbedtls")
 # OpenWrt's 4/32 warning: 8 MiB flash and 64 MiB RAM are the minimum
 _MIN_MEMORY_MIB = 64
 _MIN_FLASH_MIB = 8
@@ -355,3 +359,34 @@ def target_of_other_chip(fleet: Fleet, _context: LintContext) -> Iterator[Findin
                 message = f"{radio.name} is at {radio.path}"
                 yield Finding(("hardware", profile.name, "target"), message, f"{expected}/...", profile.target)
                 break
+
+
+@fleet_rule(
+    "MC835",
+    Severity.WARNING,
+    "A package does not fit the OpenWrt release",
+    why="""The ImageBuilder fails on a package that the release does not have. From 22.03 on the firewall is nftables
+    (`firewall4`): beside it, rules of iptables filter the same frames a second time, and `firewall` does not read the
+    configuration that meshctl renders for that release.""",
+    fix="""Remove it: each release's image has its own firewall and supplicant. For programs that call iptables, use
+    `iptables-nft`.""",
+    failing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, firewall]}}",
+    passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, firewall4]}}",
+)
+def package_of_other_release(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for node in fleet.managed():
+        for name in (*node.hardware.packages, *node.packages):
+            reason, expected = _misfit(name, node.release)
+            if reason:
+                yield Finding(packages_path(node, name), f"OpenWrt {node.release} {reason}", expected, name)
+
+
+def _misfit(package: str, release: Release) -> tuple[str, str]:
+    """Why a package does not fit, and what does; empty if it does, or if it is unknown."""
+    if package == "firewall4" and not release.has_fw4:
+        return "has no firewall4", "firewall"
+    if _FW3.fullmatch(package) and release.has_fw4:
+        return "filters with nftables", "firewall4" if package == "firewall" else "iptables-nft, or none"
+    if _MBEDTLS.fullmatch(package) and release < Release.V23_05:
+        return "has no supplicant with mbedtls", package.replace("mbedtls", "wolfssl")
+    return "", ""

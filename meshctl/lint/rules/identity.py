@@ -10,10 +10,11 @@ from meshctl.diagnostics import Severity
 from meshctl.errors import InputError
 from meshctl.inventory.file_paths import known_hosts_path
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, join_limited
+from meshctl.lint.grouping import duplicates
 from meshctl.lint.places import is_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Node, NodeState
+from meshctl.wording import join_limited
 
 # one label of a host name: RFC 1123 section 2.1 and RFC 952, at most 63 octets (RFC 1035 section 2.3.4)
 _LABEL = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")

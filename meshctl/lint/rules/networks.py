@@ -1,4 +1,4 @@
-"""Networks: overlaps, public and unusable ranges, room, prefixes, the base station's (MC205 to MC221)."""
+"""Networks: overlaps, public and unusable ranges, room, prefixes, the base station's (MC205 to MC222)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from ipaddress import ip_network
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited, overlaps
+from meshctl.lint.grouping import group_by_key, overlaps
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import meshes_of, networks, stations
 from meshctl.lint.rules.team import reached_from_base
 from meshctl.model import Backend, Fleet, Mesh, Role
 from meshctl.model.ip import IpAddress, IpNetwork
+from meshctl.wording import join_limited
 
 # RFC 1918, RFC 6598 (carrier-grade NAT), and RFC 4193 (unique local IPv6)
 _PRIVATE = tuple(
@@ -265,3 +266,39 @@ def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Findi
         message = f"only an address in it reaches {join_limited(nodes)}"
         expected = f"a base station's computer in {network}"
         yield Finding(("meshes", name, "network"), message, expected, join_limited(sorted(map(str, known))))
+
+
+@fleet_rule(
+    "MC222",
+    Severity.WARNING,
+    "No station has an address in a mesh's network",
+    why="""The network is another's, or none: it is a typing error, or left from an earlier one. Checks of overlaps and
+    addresses use it, and nodes whose addresses are added later get a prefix that fits nothing.""",
+    fix="Give the mesh the network of its members' addresses, which meshes under one routing interface may share.",
+    failing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.77.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes: {base: {radios: {radio1: {mesh: second}}}, b01: {radios: {radio1: {mesh: second}}}}
+    """,
+    passing="""
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes: {base: {radios: {radio1: {mesh: second}}}, b01: {radios: {radio1: {mesh: second}}}}
+    """,
+)
+def network_without_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    taken = [address for address, _ in stations(fleet)]
+    for mesh in fleet.meshes.values():
+        members = [node for node in fleet.members(mesh.name) if node.state.is_managed]
+        # where no mesh of a node has its address, MC202 reports the node, or this network
+        if (
+            members
+            and all(any(node.address.ip in one.network for one in meshes_of(fleet, node)) for node in members)
+            and not any(address in mesh.network for address in taken)
+        ):
+            others = {str(one.network) for node in members for one in meshes_of(fleet, node) if one is not mesh}
+            names = join_limited([node.name for node in members])
+            message = f"contains no address of {names}, nor of a computer"
+            yield Finding(("meshes", mesh.name, "network"), message, join_limited(sorted(others)), str(mesh.network))

@@ -7,9 +7,10 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import FixedPosition, Fleet
+from meshctl.wording import join_limited
 
 # Directional links of hundreds of kilometers exist as records; a mesh's are shorter than this.
 MAX_LINK_M = 100_000.0

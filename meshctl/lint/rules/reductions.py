@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Topic
 from meshctl.model.computers import ROS_1
+from meshctl.wording import join_limited
 
 _IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 _CLOUDS = ("sensor_msgs/PointCloud2",)

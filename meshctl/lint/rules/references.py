@@ -7,9 +7,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Role
+from meshctl.wording import join_limited
 
 # A fleet may have as many wrong names as nodes: comparing each of them with all names takes too long.
 _MAX_COMPARED = 500

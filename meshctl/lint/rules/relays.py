@@ -7,13 +7,13 @@ from collections.abc import Iterator, Mapping
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.rules.secrets import identity
 from meshctl.model import Computer, ComputerLink, Fleet
 from meshctl.render.daemon import LINK_SELECTORS, link_problems
 from meshctl.resolve import computer_gateway
+from meshctl.wording import join_limited
 
 _ALL = "all"
 

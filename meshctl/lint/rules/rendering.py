@@ -1,4 +1,4 @@
-"""Trial rendering of every kind of node: templates, firewall, values (MC901 to MC903)."""
+"""Trial rendering of every kind of node: templates, firewall, values (MC901 to MC905)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.file_access import located
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.lint.context import LintContext
+from meshctl.lint.openwrt_names import is_one_edit_apart
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.trial_rendering import kinds, placeholder
 from meshctl.model import Fleet, Node
@@ -16,6 +18,7 @@ from meshctl.render.extra import EXTRA
 from meshctl.render.template_files import NO_TEMPLATE, NOT_UCI, TEMPLATE
 from meshctl.resolve import resolve
 from meshctl.resolve.intent import BACKBONE, LAN
+from meshctl.wording import join_limited
 
 # a path in the inventory can be very long
 _MAX_SHOWN_CHARACTERS = 200
@@ -25,10 +28,10 @@ _TEMPLATE_CODES = (TEMPLATE, NOT_UCI, NO_TEMPLATE, EXTRA)
 @fleet_rule(
     "MC901",
     Severity.ERROR,
-    "A template fails or does not produce UCI",
-    why="""A template of the inventory or of the back end's operator parts fails, or its output is not valid UCI:
-    `provision` would stop there.""",
-    fix="Fix the template; `meshctl render NODE` shows the location.",
+    "A template or a key of extra_uci fails",
+    why="""A template of the inventory or of the back end's operator parts fails, its output is not valid UCI, or a key
+    of `extra_uci` does not fit it: `provision` would stop there.""",
+    fix="Fix it at the place that the finding names: a line of a template, or a key of `extra_uci`.",
     failing=Example(
         "apply: {max_down: 1}", files={"templates/common/etc/config/extra.j2": "config {{ intent.no_such_value }}\n"}
     ),
@@ -122,3 +125,90 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                     seen.add((item.position, item.path))
                     path = tuple(item.path.split("."))
                     yield Finding(path, item.message, item.expected, item.found, item.hint, item.position)
+
+
+@fleet_rule(
+    "MC904",
+    Severity.ERROR,
+    "An extra wireless interface names a radio or network that is not there",
+    why="""OpenWrt brings up an interface of `wireless` on the radio that `device` names and attaches it to `network`.
+    Where either is missing, it silently does nothing: the access point is not on the air, or leads nowhere.""",
+    fix="Name a radio of the hardware profile, and an interface of `network`, such as `lan`.",
+    failing="""
+    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio9, wireless.guest.mode: ap,
+      wireless.guest.ssid: guests, wireless.guest.network: lan}}}
+    """,
+    passing="""
+    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
+    """,
+)
+def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for node, outcome in context.trial.of(fleet):
+        if not isinstance(outcome, Rendered):
+            continue
+        packages = {file.package.name: file.package for file in outcome.files if file.package is not None}
+        for key, value in node.extra_uci.items():
+            package, _, rest = key.partition(".")
+            section, _, option = rest.rpartition(".")
+            needed = _REFERENCES.get(option)
+            if package != "wireless" or needed is None or not _is_interface(packages.get(package), section):
+                continue
+            place, kind = needed
+            known = [one.name for one in packages[place].of_type(kind) if one.name] if place in packages else []
+            for name in value.split():
+                if name not in known:
+                    path = ("nodes", node.name, "extra_uci", key)
+                    hint = did_you_mean(name, known)
+                    yield Finding(path, f"no {kind} of {place}", f"one of {join_limited(known)}", name, hint)
+
+
+# option of a wifi-iface -> the package and type of the section that it names
+_REFERENCES = {"device": ("wireless", "wifi-device"), "network": ("network", "interface")}
+
+
+def _is_interface(wireless: uci.Package | None, key: str) -> bool:
+    keys = () if wireless is None else wireless.keys()
+    return wireless is not None and key in keys and wireless.sections[keys.index(key)].type == "wifi-iface"
+
+
+@fleet_rule(
+    "MC905",
+    Severity.WARNING,
+    "A key of extra_uci creates a section that nothing reads",
+    why="""A key of two parts creates a section, and its value is the section's type: `system.cronloglevel: "9"` is an
+    empty section of the type 9, and the log level stays as it was. A misspelled package is a file of its own.""",
+    fix="""An option has three parts: `"system.@system[0].cronloglevel": "9"`. Name packages as in /etc/config.""",
+    failing="nodes: {b01: {extra_uci: {system.cronloglevel: '9'}}}",
+    passing="""
+    nodes: {b01: {extra_uci: {'system.@system[0].cronloglevel': '9', system.led1: led, system.led1.sysfs: usb}}}
+    """,
+)
+def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for node in kinds(fleet):
+        for key in node.extra_uci:
+            package = key.partition(".")[0]
+            near = next((one for one in _OWNED if is_one_edit_apart(package, one)), None)
+            if near is not None:
+                path = ("nodes", node.name, "extra_uci", key)
+                yield Finding(path, "no program reads this package", near, package, f"did you mean '{near}'?")
+    for node, outcome in context.trial.of(fleet):
+        if not isinstance(outcome, Rendered):
+            continue
+        packages = {file.package.name: file.package for file in outcome.files if file.package is not None}
+        for key, value in node.extra_uci.items():
+            package, _, section = key.partition(".")
+            made = packages[package].section(section) if package in packages and "." not in section else None
+            others = (
+                [] if made is None else [one for one in packages[package].sections if one is not made and one.options]
+            )
+            # an empty section of a known type may have a meaning: all its defaults
+            if made is not None and not made.options and others and made.type not in {one.type for one in others}:
+                path = ("nodes", node.name, "extra_uci", key)
+                message = f"creates an empty section of the type {value!r}"
+                yield Finding(path, message, f"an option, such as {package}.@{others[0].type}[0].{section}", key)
+
+
+# the packages that every node has
+_OWNED = ("dhcp", "dropbear", "firewall", "network", "system", "wireless")

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import join_limited, overlaps
+from meshctl.lint.grouping import overlaps
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.addresses import lan_address_path, meshes_of, networks
 from meshctl.lint.rules.routing import MESHMERIZE, PARTS
 from meshctl.model import Backend, Fleet, Robot
 from meshctl.model.ip import IpNetwork
+from meshctl.wording import join_limited
 
 # the robot of the examples with a LAN of its own
 _ROUTED = """

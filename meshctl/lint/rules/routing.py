@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Backend, Fleet, Mesh, NodeState
 from meshctl.resolve import (
@@ -19,6 +19,7 @@ from meshctl.resolve import (
     heal_s,
     originator_airtime,
 )
+from meshctl.wording import counted, join_limited
 
 # airtime shares from which MC516, MC502 and MC501 report
 _AIRTIME_NOTE = 0.03
@@ -95,7 +96,7 @@ def _airtime_findings(fleet: Fleet, least: float, most: float) -> Iterator[Findi
         options = mesh.batman
         share = originator_airtime(nodes, interval_ms, mesh.mcast_rate_kbps, is_aggregated=options.aggregated_ogms)
         if least <= share < most:
-            message = f"{nodes} nodes, one message per {interval_ms} ms, at {mesh.mcast_rate_kbps} kbit/s"
+            message = f"{counted(nodes, 'node')}, one message per {interval_ms} ms, at {mesh.mcast_rate_kbps} kbit/s"
             found = f"{share:.0%} of the channel"
             written = options.orig_interval_ms is not None
             key = ("batman", "orig_interval_ms") if written else ("reconnect_s",)

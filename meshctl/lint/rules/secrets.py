@@ -15,6 +15,7 @@ from meshctl.lint.rule import Example, Finding, fleet_rule, text_rule
 from meshctl.model import Fleet, Secret, SecretKind, SecretRef, SshSettings
 from meshctl.render.daemon import key_bytes, key_text
 from meshctl.uci import is_secret_option
+from meshctl.wording import counted
 
 # as in udp_mesh/crypto/keys.py
 _KEY_BYTES = 32
@@ -75,12 +76,14 @@ def _secret_files(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], Path, str]]:
 
 
 def logins(fleet: Fleet) -> Iterator[tuple[tuple[str, ...], SshSettings]]:
-    """The SSH settings of every node and computer, with their paths."""
+    """The SSH settings of every node, computer and site, with their paths."""
     for node in fleet.nodes.values():
         yield ("nodes", node.name, "ssh"), node.ssh
     for robot in fleet.robots.values():
         for place, _, computer in robot.all_computers():
             yield ("robots", robot.name, *place, "ssh"), computer.ssh
+    for site in fleet.sites.values():
+        yield ("sites", site.name, "ssh"), site.ssh
 
 
 @text_rule(
@@ -179,7 +182,7 @@ def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Findin
         secret = context.secret(ref)
         if secret is not None and key_bytes(key_text(secret)) is None:
             expected = f"{_KEY_BYTES} bytes: {2 * _KEY_BYTES} hexadecimal digits, or base64"
-            found = f"{len(key_text(secret))} characters"
+            found = counted(len(key_text(secret)), "character")
             yield Finding(path, "invalid key", expected, found)
 
 

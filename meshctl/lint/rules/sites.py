@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.sshkey import BadKey, parse_authorized_key
 from meshctl.model import Fleet
+from meshctl.wording import join_limited
 
 _KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g worker"
 _NORTH = f"{{ssh: {{host: north.example.org}}, worker_key: {_KEY}}}"

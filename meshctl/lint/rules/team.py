@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import duplicates, group_by_key, join_limited
+from meshctl.lint.grouping import duplicates, group_by_key
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.relays import behind_further_links
 from meshctl.model import Fleet, NodeState, Role
+from meshctl.wording import counted, join_limited
 
 
 @fleet_rule(
@@ -50,7 +51,7 @@ def mesh_cut_off(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         members = members_of.get(name, ())
         if members and name not in reached:
             path = ("meshes", name)
-            message = f"{len(members)} nodes ({join_limited(members)}) cannot reach the base"
+            message = f"{counted(len(members), 'node')} ({join_limited(members)}) cannot reach the base"
             yield Finding(path, message, f"a radio in {join_limited(sorted(reached))} as well", "none")
 
 

@@ -1,4 +1,4 @@
-"""Topics: delivery, names, differences, subscriptions (MC712 to MC725)."""
+"""Topics: delivery, names, differences, subscriptions (MC712 to MC726)."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
+from meshctl.inventory.suggest import nearest
 from meshctl.lint.context import LintContext
+from meshctl.lint.ros_types import MESSAGES
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Fleet, Outbox, Topic, TopicClass
 from meshctl.resolve import has_routed_lans
+from meshctl.wording import counted
 
 _ALL = "all"
 # at 5 % loss 0.95**32, one in five, of such best-effort messages arrive
@@ -74,7 +77,7 @@ def best_effort_large(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         fragments = -(-topic.size_bytes // fleet.udp_mesh.fragment_bytes)
         if not topic.reliable and not topic.repair and fragments > _BEST_EFFORT_FRAGMENTS:
             expected = f"at most {_BEST_EFFORT_FRAGMENTS} fragments"
-            found = f"{fragments} fragments; {0.95**fragments:.0%} arrive at 5 % loss"
+            found = f"{counted(fragments, 'fragment')}; {0.95**fragments:.0%} arrive at 5 % loss"
             yield Finding(_path(topic, "size_bytes"), "lost if any fragment is lost", expected, found)
 
 
@@ -252,3 +255,25 @@ def _always_sent(fleet: Fleet, topic: Topic) -> str:
     if topic.log is not None:
         return "it is a shared log"
     return f"its outbox is {topic.outbox.value}" if topic.outbox is not Outbox.NONE else ""
+
+
+@fleet_rule(
+    "MC726",
+    Severity.WARNING,
+    "A topic's type does not exist in its ROS package",
+    why="""The packages that come with ROS have a fixed set of messages. The bridge finds none of this name, so
+    nothing is passed on the topic.""",
+    fix="Write the message's name as `rosmsg show` or `ros2 interface show` know it.",
+    failing="topics: {commands: {type: std_msgs/Boolean}}",
+    passing="topics: {commands: {type: my_msgs/Boolean}}",
+)
+def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for topic in fleet.topics:
+        package, _, rest = topic.type_name.partition("/")
+        known = MESSAGES.get(package, frozenset())
+        name = rest.removeprefix("msg/")
+        if known and "/" not in name and _TYPE.fullmatch(topic.type_name) is not None and name not in known:
+            near = nearest(name, sorted(known))
+            expected = topic.type_name.removesuffix(name) + near if near else f"a message of {package}"
+            hint = f"did you mean '{expected}'?" if near else ""
+            yield Finding(_path(topic, "type"), f"{package} has no such message", expected, topic.type_name, hint)

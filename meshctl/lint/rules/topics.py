@@ -6,10 +6,11 @@ from collections.abc import Iterable, Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
-from meshctl.lint.grouping import group_by_key, join_limited
+from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Topic, TopicClass
+from meshctl.wording import join_limited
 
 _ALL = "all"
 # large, and can wait

@@ -45,11 +45,6 @@ def shown_line(excerpts: Mapping[str, Excerpts], position: Position) -> tuple[st
     return None if found is None or len(found[0]) > _LONGEST_LINE else found
 
 
-def counted(number: int, noun: str) -> str:
-    """`1 error`, `2 errors`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def printable(text: str) -> str:
     """Text within a line, with a stand-in for each character that could move a terminal's cursor."""
     return one_line(text)

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping
 
 from meshctl.diagnostics import Diagnostic, Severity
 from meshctl.inventory.redaction import Excerpts
-from meshctl.report.findings.document import Findings, counted, printable, shown_line
+from meshctl.report.findings.document import Findings, printable, shown_line
+from meshctl.wording import counted
 
 
 def text(findings: Findings) -> str:

@@ -110,7 +110,7 @@ def test_a_dry_run_shows_the_change_and_writes_nothing(inventory: Path) -> None:
     before = (inventory / "fleet.yaml").read_bytes()
     done = run(inventory, "node,serial\nbase,SN-1\n", "--dry-run")
     assert "serial: SN-1" in done.stdout
-    assert "1 rows: 1 nodes to change, 0 to add" in done.stderr
+    assert "1 row: 1 node to change, 0 to add" in done.stderr
     assert (inventory / "fleet.yaml").read_bytes() == before
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from meshctl.errors import InputError
 from meshctl.model import Fleet, Node, NodeState
-from meshctl.plan import Plan, StageKind, Verdict, fleet_plan
+from meshctl.plan import NodePlan, Plan, StageKind, Verdict, fleet_plan
 from meshctl.plan.saved import SavedPlan, dump, load, stale_reason
 from tests.meshctl.plan.support import PASS_PHRASE, SALT, factory, fleet, graph, planned, plans, running, two_meshes
 
@@ -225,3 +225,18 @@ def test_a_stale_plan_is_distinguished_from_one_that_still_applies() -> None:
     assert "inventory has changed" in stale_reason(agreed, planned(fleet(channel=1), "b01", running(fleet(), "b01")))
     rebooted = replace(running(fleet(), "b01"), boot_id="another", uptime_s=3.0)
     assert stale_reason(agreed, planned(fleet(channel=11), "b01", rebooted)) == ""
+
+
+def test_a_refusal_counts_the_nodes_that_it_would_leave_behind() -> None:
+    """It listed 75 names, and its hint listed them again."""
+    new = fleet(channel=11)
+    more = {f"h{number:02}": replace(new.nodes["b05"], name=f"h{number:02}") for number in range(75)}
+    large = replace(new, nodes=MappingProxyType({**new.nodes, **more}))
+    made = plans(new, {name: running(fleet(), name) for name in new.nodes})
+    away = {name: NodePlan(name, Verdict.AWAY, reason="did not answer") for name in more}
+    plan = fleet_plan(large, {**made, **away}, STAR, now_s=0.0)
+    assert "would leave behind 75 nodes (h00, h01, h02, h03 and 71 more): unreachable" in plan.refusal
+    assert "h00" not in plan.refusal_hint
+    refused = {name: NodePlan(name, Verdict.REFUSED, reason="it has no port eth1") for name in more}
+    plan = fleet_plan(large, {**made, **refused}, STAR, now_s=0.0)
+    assert plan.refusal.endswith("can take part: 75 nodes (h00, h01, h02, h03 and 71 more): it has no port eth1")

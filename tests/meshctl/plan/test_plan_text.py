@@ -129,7 +129,9 @@ def test_nodes_refused_for_the_same_reason_form_one_block() -> None:
     text = read(Plan("team", 0.0, ("b00",), refused), order=ORDER)
     assert "15 nodes  refused: it has no port eth9\n  b00, b01, b02," in text
     assert text.count("it has no port eth9") == 2
-    assert ", b12, uav1-radio, gone: it has no port eth9\n  refused: odd, wrong board" in text
+    assert (
+        "  refused: 15 nodes (b00, b01, b02, b03 and 11 more): it has no port eth9\n  refused: odd, wrong board" in text
+    )
     assert text.count("hint: correct it") == 1
 
 
@@ -186,3 +188,17 @@ def test_nodes_that_differ_only_in_the_digest_of_their_configuration_form_one_bl
     assert "-node=spare1" in read(
         Plan("team", 0.0, ("b01",), {"b01": NodePlan("b01", Verdict.CHANGE, files=(renamed,))})
     )
+
+
+def test_a_refused_change_of_a_large_mesh_names_its_absent_nodes_once() -> None:
+    """75 names stood in the block of each reason, in the totals, in the refusal and in its hint."""
+    names = [f"h{number:02}" for number in range(75)]
+    plan = large()
+    away = {
+        name: NodePlan(name, Verdict.AWAY, reason=f"{name} (10.42.1.{number}): no answer; heard by b0{number % 9}")
+        for number, name in enumerate(names)
+    }
+    text = read(replace(plan, nodes={**plan.nodes, **away}))
+    assert all(text.count(f"{name}  away: {name} (10.") == 1 for name in names)
+    assert all(text.count(name) == 2 for name in names[4:])
+    assert "  away: 75 nodes (h00, h01, h02, h03 and 71 more): no answer\n" in f"{text}\n"

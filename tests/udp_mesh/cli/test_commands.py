@@ -306,7 +306,7 @@ def test_check_reports_configuration_errors_as_text_and_json(
     path.write_text('name = "ugv1"\nkey_file = "fleet.key"\n[topics]\nvideo = { priority = 9 }\n')
     capsys.readouterr()
     assert main(["check", str(path)]) == Exit.OK
-    assert f"{path}: valid: ugv1, port 8700, 1 topics, 1 key(s)" in capsys.readouterr().out
+    assert f"{path}: valid: ugv1, port 8700, 1 topic, 1 key" in capsys.readouterr().out
     assert main(["check", str(path), "--json"]) == Exit.OK
     assert json.loads(capsys.readouterr().out)["topics"][0]["name"] == "video"
     path.write_text('key_file = "fleet.key"\nport = 0\nwindo = 3\n')

@@ -1,0 +1,26 @@
+"""How messages count and list things: `1 line`, `2 lines`; `a, b, c, d and 71 more`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+# names in one sentence
+_MAX_NAMES = 4
+# names that are not yet folded into a count
+MAX_IN_FULL = 8
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 error`, `2 errors`; an `s` is added to `noun`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def join_limited(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
+    """The first `limit` names, and how many others there are."""
+    shown = ", ".join(names[:limit])
+    return shown if len(names) <= limit else f"{shown} and {len(names) - limit} more"
+
+
+def node_list(names: Sequence[str]) -> str:
+    """All names of a few nodes; `75 nodes (a, b, c, d and 71 more)` of many."""
+    return ", ".join(names) if len(names) <= MAX_IN_FULL else f"{counted(len(names), 'node')} ({join_limited(names)})"

@@ -1,0 +1,90 @@
+"""Mistakes of writing that lint accepted: each is found at its line, and what is sound beside it is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from meshctl.diagnostics import Diagnostic
+from meshctl.lint import Example, check_path
+from meshctl.lint.example import environment, write
+from meshctl.lint.openwrt_names import suggest_package
+from meshctl.regdb import SHIPPED, load
+
+_REGDB = load(SHIPPED)
+
+
+def _found(fragment: str, directory: Path) -> list[Diagnostic]:
+    example = Example(fragment)
+    return list(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
+
+
+@pytest.mark.parametrize("ports", ["[eth1 eth2]", "['eth1:eth2']", "['eth0/1']", "[a-name-of-16-letters]"])
+def test_what_cannot_be_a_port_is_refused(ports: str, tmp_path: Path) -> None:
+    (finding,) = _found(f"hardware: {{rocket: {{lan_ports: {ports}}}}}", tmp_path)
+    assert (finding.code, finding.path) == ("INV021", "hardware.rocket.lan_ports.0")
+    assert finding.expected == "the name of one port such as eth0.1, without blanks; commas separate ports"
+
+
+@pytest.mark.parametrize("port", ["eth0", "eth0.1", "lan1", "wan", "lan-x"])
+def test_ports_as_in_openwrt_are_accepted(port: str, tmp_path: Path) -> None:
+    codes = {one.code for one in _found(f"hardware: {{rocket: {{lan_ports: [{port}]}}}}", tmp_path)}
+    assert codes <= {"MC530"}
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("gw.example:2222", "host: gw.example, port: 2222"),
+        ("mesh@gw.example", "host: gw.example, user: mesh"),
+        ("ssh://mesh@10.1.2.3:22", "host: 10.1.2.3, port: 22, user: mesh"),
+        ("[fd51::1]:2222", "host: fd51::1, port: 2222"),
+    ],
+)
+def test_a_user_or_port_in_a_host_is_reported_at_sites_too(host: str, expected: str, tmp_path: Path) -> None:
+    found = [one for one in _found(f"sites: {{north: {{ssh: {{host: '{host}'}}}}}}", tmp_path) if one.code == "MC434"]
+    assert [(one.path, one.expected, one.found) for one in found] == [("sites.north.ssh.host", expected, host)]
+
+
+@pytest.mark.parametrize("host", ["gw.example", "10.1.2.3", "fd51::1", "fe80::5:6%eth0"])
+def test_host_names_and_addresses_are_hosts(host: str, tmp_path: Path) -> None:
+    found = _found(f"robots: {{husky1: {{computer: {{ssh: {{user: robot, host: '{host}'}}}}}}}}", tmp_path)
+    assert "MC434" not in {one.code for one in found}
+
+
+def test_underscores_are_no_hyphens_in_package_names() -> None:
+    assert suggest_package("kmod_ath10k_ct") == "kmod-ath10k-ct"
+    assert suggest_package("batctl_full") == "batctl-full"
+    assert suggest_package("rtl_433") is None
+
+
+@pytest.mark.parametrize(
+    ("type_name", "expected"),
+    [
+        ("std_msgs/Boolean", "std_msgs/Bool"),
+        ("sensor_msgs/msg/PointClouds2", "sensor_msgs/msg/PointCloud2"),
+        ("nav_msgs/Odom", "nav_msgs/Odometry"),
+        ("std_msgs/Qqqqqq", "a message of std_msgs"),
+    ],
+)
+def test_the_nearest_message_is_offered(type_name: str, expected: str, tmp_path: Path) -> None:
+    found = [one for one in _found(f"topics: {{commands: {{type: {type_name}}}}}", tmp_path) if one.code == "MC726"]
+    assert [one.expected for one in found] == [expected]
+
+
+def test_a_key_of_extra_uci_is_what_is_to_be_corrected_and_not_a_template(tmp_path: Path) -> None:
+    """The finding said "Fix the template", of an inventory without one."""
+    fragment = "nodes:\n  b01:\n    extra_uci:\n      wireless.guest.device: radio0\n"
+    (finding,) = _found(fragment, tmp_path)
+    assert (finding.code, finding.hint.partition(":")[0]) == ("MC901", "correct this key of extra_uci")
+    lines = (tmp_path / "fleet.yaml").read_text(encoding="utf-8").splitlines()
+    assert "wireless.guest.device" in lines[finding.position.line - 1]
+
+
+def test_a_misspelled_package_of_extra_uci_is_found_where_its_section_is_created(tmp_path: Path) -> None:
+    """Only the options below it were reported, as if their section were missing."""
+    found = _found("nodes: {b01: {extra_uci: {wireles.guest: wifi-iface, sqm.wan: queue}}}", tmp_path)
+    assert [(one.code, one.path, one.expected) for one in found] == [
+        ("MC905", "nodes.b01.extra_uci.wireles.guest", "wireless")
+    ]
