@@ -28,7 +28,7 @@ from meshctl.inventory.documents import (
     SshLayer,
     SystemDocument,
 )
-from meshctl.inventory.file_paths import from_inventory
+from meshctl.inventory.file_paths import base_of, path_of, paths_of
 from meshctl.inventory.layers import NodeSpec
 from meshctl.inventory.nodes import build_nodes, fixed_position, ssh_settings, ssh_values
 from meshctl.inventory.provenance import Provenance
@@ -84,7 +84,7 @@ def build(
             for node in getattr(robot, names):
                 robot_of.setdefault(node, robot.name)
     lan_addresses = _lan_addresses(document, robots, root, diagnostics)
-    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses, _base(root))
+    built = build_nodes(specs, hardware, meshes, robot_of, lan_addresses, base_of(root))
     diagnostics.extend(built.diagnostics)
     if diagnostics:
         return Built(None, tuple(diagnostics))
@@ -100,7 +100,7 @@ def build(
         operators=Operators(
             ssh_keys=tuple(document.operators.ssh_keys),
             password_login=document.operators.password_login,
-            known_hosts=_path(root, document.operators.known_hosts, "operators", "known_hosts"),
+            known_hosts=path_of(root, document.operators.known_hosts, "operators", "known_hosts"),
         ),
         system=SystemSettings(
             timezone=document.system.timezone,
@@ -119,7 +119,7 @@ def build(
         ),
         provenance=Provenance(root, specs, robot_of),
         files=tuple(str(path) for path in files),
-        base=_base(root),
+        base=base_of(root),
         sites=MappingProxyType({name: _site(name, item, root) for name, item in document.sites.items()}),
         nats=_nats_hub(document.nats, root),
     )
@@ -131,21 +131,6 @@ def _zonename(document: SystemDocument) -> str:
     if document.zonename is not None:
         return document.zonename
     return "UTC" if document.timezone == "UTC" else ""
-
-
-def _base(root: MappingNode, *path: str | int) -> str:
-    """The directory of the file that sets `path`; of the first file if none does."""
-    tree = descend(root, path)
-    return str(Path((root if tree is None else tree).file).parent)
-
-
-def _path(root: MappingNode, written: str, *path: str | int) -> str:
-    """The path that the file with `path` writes, relative to the inventory's directory."""
-    return from_inventory(written, _base(root, *path), _base(root))
-
-
-def _paths(root: MappingNode, written: tuple[str, ...], *path: str) -> tuple[str, ...]:
-    return tuple(_path(root, text, *path, number) for number, text in enumerate(written))
 
 
 def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> HardwareProfile:
@@ -180,10 +165,10 @@ def _hardware(name: str, document: HardwareDocument, root: MappingNode) -> Hardw
             sha256=document.firmware.sha256.lower(),
             revision=document.firmware.revision,
             usign_key=document.firmware.usign_key,
-            base=_base(root, "hardware", name, "firmware"),
+            base=base_of(root, "hardware", name, "firmware"),
         ),
         packages=tuple(document.packages),
-        package_files=_paths(root, document.package_files, "hardware", name, "package_files"),
+        package_files=paths_of(root, document.package_files, "hardware", name, "package_files"),
         confirm_window_s=document.confirm_window_s,
         flash_timeout_s=document.flash_timeout_s,
         recovery=document.recovery,
@@ -203,7 +188,7 @@ def _mesh(name: str, document: MeshDocument, root: MappingNode) -> Mesh:
         htmode=document.htmode,
         mode=document.mode,
         encryption=document.encryption,
-        key=_secret(document.key, _base(root, "meshes", name, "key")) if document.key is not None else None,
+        key=_secret(document.key, base_of(root, "meshes", name, "key")) if document.key is not None else None,
         mcast_rate_kbps=document.mcast_rate_kbps,
         distance_m=document.distance_m,
         beacon_interval_tu=document.beacon_interval_tu,
@@ -226,12 +211,12 @@ def _mesh(name: str, document: MeshDocument, root: MappingNode) -> Mesh:
         ),
         operator_parts=OperatorParts(
             templates=parts.templates,
-            package_files=_paths(root, parts.package_files, "meshes", name, "operator_parts", "package_files"),
+            package_files=paths_of(root, parts.package_files, "meshes", name, "operator_parts", "package_files"),
             packages=tuple(parts.packages),
             service=parts.service,
             status_command=parts.status_command,
             interface=parts.interface,
-            base=_base(root, "meshes", name, "operator_parts"),
+            base=base_of(root, "meshes", name, "operator_parts"),
         ),
     )
 
@@ -354,15 +339,15 @@ def _nats_hub(document: NatsHubDocument | None, root: MappingNode) -> NatsHub | 
         return None
     return NatsHub(
         document.url,
-        _path(root, document.credentials, "nats", "credentials") if document.credentials else "",
-        _path(root, document.ca, "nats", "ca") if document.ca else "",
+        path_of(root, document.credentials, "nats", "credentials") if document.credentials else "",
+        path_of(root, document.ca, "nats", "ca") if document.ca else "",
         document.domain,
         document.order_hours,
     )
 
 
 def _computer_ssh(document: SshLayer, root: MappingNode, *path: str) -> SshSettings:
-    return ssh_settings(ssh_values(document, descend(root, (*path, "ssh")), _base(root)), user="")
+    return ssh_settings(ssh_values(document, descend(root, (*path, "ssh")), base_of(root)), user="")
 
 
 def _computer(document: ComputerDocument, root: MappingNode, *path: str) -> Computer:
@@ -383,7 +368,7 @@ def _computer(document: ComputerDocument, root: MappingNode, *path: str) -> Comp
 
 
 def _transport_keys(documents: tuple[SecretDocument, ...], key: str, root: MappingNode) -> tuple[SecretRef, ...]:
-    return tuple(_secret(item, _base(root, "udp_mesh", key, number)) for number, item in enumerate(documents))
+    return tuple(_secret(item, base_of(root, "udp_mesh", key, number)) for number, item in enumerate(documents))
 
 
 def _udp_mesh(document: InventoryDocument, root: MappingNode) -> UdpMesh:

@@ -484,18 +484,6 @@ def test_the_range_of_host_addresses_has_none_that_is_refused(tmp_path: Path) ->
     assert finding.expected == "one of 10.42.0.1 to 10.42.0.254"
 
 
-def test_a_package_file_is_found_beside_the_included_file_that_names_it(tmp_path: Path) -> None:
-    """It was looked for beside the inventory's first file: a false finding, and `provision` failed."""
-    shared = (
-        "hardware: {other: {board: a, profile: a, target: ath79/generic, release: '24.10', lan_ports: [], radios: {}, "
-    )
-    files = {
-        "common/hardware.yaml": f"{shared}package_files: [../packages/tool.ipk]}}}}\n",
-        "packages/tool.ipk": "package",
-    }
-    assert "MC811" not in _codes(Example("include: [common/hardware.yaml]", files=files), tmp_path)
-
-
 def test_package_files_of_operator_parts_are_offered_to_the_nodes_of_the_mesh(tmp_path: Path) -> None:
     """They were part of images only: `plan` refused a node that lacked a package whose file was there."""
     text = _SECOND_CELL.replace("packages: [mm]", "packages: [mm], package_files: [mm_1_all.ipk]")

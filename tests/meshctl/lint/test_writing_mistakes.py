@@ -15,8 +15,8 @@ from meshctl.regdb import SHIPPED, load
 _REGDB = load(SHIPPED)
 
 
-def _found(fragment: str, directory: Path) -> list[Diagnostic]:
-    example = Example(fragment)
+def _found(given: Example | str, directory: Path) -> list[Diagnostic]:
+    example = Example(given) if isinstance(given, str) else given
     return list(check_path(write(example, directory), _REGDB, environment(example)).diagnostics)
 
 
@@ -88,3 +88,17 @@ def test_a_misspelled_package_of_extra_uci_is_found_where_its_section_is_created
     assert [(one.code, one.path, one.expected) for one in found] == [
         ("MC905", "nodes.b01.extra_uci.wireles.guest", "wireless")
     ]
+
+
+def test_a_package_file_is_found_beside_the_included_file_that_names_it(tmp_path: Path) -> None:
+    """It was looked for beside the inventory's first file: a false finding, and `provision` failed."""
+    shared = (
+        "hardware: {other: {board: a, profile: a, target: ath79/generic, release: '24.10', lan_ports: [], radios: {}, "
+    )
+    files = {
+        "common/hardware.yaml": f"{shared}package_files: [../packages/tool.ipk]}}}}\n",
+        "packages/tool.ipk": "package",
+    }
+    assert "MC811" not in {
+        one.code for one in _found(Example("include: [common/hardware.yaml]", files=files), tmp_path)
+    }
