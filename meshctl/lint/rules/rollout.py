@@ -1,15 +1,18 @@
-"""Policy of changes: how many nodes at once, canary, quorum, when to stop, radar detection (MC613 to MC620)."""
+"""Policy of changes: how many nodes at once, canary, quorum, when to stop, radar detection, spares (MC613 to MC621)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import PurePath
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Example, Finding, fleet_rule
-from meshctl.model import Fleet, Mesh, MeshMode
+from meshctl.model import Fleet, Mesh, MeshMode, NodeState
 from meshctl.regdb import CHANNELS, Country, DfsRegion, Flag, Span, check_span, occupied_span, primary_span
+from meshctl.resolve import package_files, package_needs, package_plan
+from meshctl.wording import join_limited
 
 # Radar detection before the first frame on a channel (channel availability check): the kernel's minimum, and that of
 # ETSI EN 301 893 where the channel overlaps weather radar.
@@ -151,3 +154,34 @@ def _span(mesh: Mesh) -> Span:
     except ValueError:
         occupied = None
     return occupied or primary_span(mesh.band, mesh.channel)
+
+
+@fleet_rule(
+    "MC621",
+    Severity.NOTE,
+    "A spare lacks a package of nodes that it may replace",
+    why="""A spare's image has the packages of the spare's own entry. `meshctl replace` refuses it for a node of the
+    same hardware that needs another one, such as `kmod-nft-bridge` for a LAN filter, in the field.""",
+    fix="""List the package in the hardware profile, which all of its nodes share, or bring it as one of
+    `package_files`.""",
+    failing="nodes: {husky1-front: {lan_filter: {}}, s01: {address: 10.42.0.150, label: S1}}",
+    passing="""
+    hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, kmod-nft-bridge]}}
+    nodes: {husky1-front: {lan_filter: {}}, s01: {address: 10.42.0.150, label: S1}}
+    """,
+)
+def spare_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    known = [node for node in fleet.managed() if all(name in fleet.meshes for name in node.meshes)]
+    for spare in (node for node in known if node.state is NodeState.SPARE):
+        like = [node for node in known if (node.hardware, node.release) == (spare.hardware, spare.release)]
+        has = package_plan(fleet, spare).install
+        brought = tuple(PurePath(file).name for file in package_files(fleet, spare))
+        needed = ((need.any_of, node.name) for node in like for need in package_needs(fleet, node))
+        for any_of, names in group_by_key(needed).items():
+            if (
+                spare.name not in names
+                and not set(has).intersection(any_of)
+                and not any(file.startswith(any_of) for file in brought)
+            ):
+                message = f"cannot replace {join_limited(names)}"
+                yield Finding(("nodes", spare.name), message, f"one of {join_limited(any_of)}", "none of them")
