@@ -138,6 +138,8 @@ def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path:
             **({"ansible_user": entry.ssh.user} if entry.ssh.user else {}),
             **({"ansible_ssh_private_key_file": str(key_path(entry.ssh.key_files[0]))} if entry.ssh.key_files else {}),
             "ansible_ssh_common_args": " ".join(options),
+            # `raw` asks for a terminal, which a program on a router does not need and which ends its lines with CR
+            **({"ansible_ssh_use_tty": False} if entry.is_openwrt else {}),
         }
         own = ("openwrt" if entry.is_openwrt else "computers", *entry.groups)
         for index, group in enumerate(dict.fromkeys(_group_name(name) for name in own)):

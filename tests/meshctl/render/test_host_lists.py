@@ -56,6 +56,7 @@ def test_the_ansible_inventory_lists_every_host_with_its_address_once() -> None:
     for name, host in children["openwrt"]["hosts"].items():
         assert host["ansible_host"]
         assert f"HostKeyAlias={name}" in host["ansible_ssh_common_args"]
+        assert host["ansible_ssh_use_tty"] is False
     assert all(host == {} for host in children["role_beacon"]["hosts"].values())
 
 
