@@ -388,5 +388,10 @@ def _misfit(package: str, release: Release) -> tuple[str, str]:
     if _FW3.fullmatch(package) and release.has_fw4:
         return "filters with nftables", "firewall4" if package == "firewall" else "iptables-nft, or none"
     if _MBEDTLS.fullmatch(package) and release < Release.V23_05:
-        return "has no supplicant with mbedtls", package.replace("mbedtls", "wolfssl")
+        return (
+            "has no supplicant with mbedtls",
+            "wpad-basic"
+            if package == "wpad-basic-mbedtls" and release < Release.V21_02
+            else package.replace("mbedtls", "wolfssl"),
+        )
     return "", ""

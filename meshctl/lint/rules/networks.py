@@ -289,14 +289,17 @@ def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Findi
     """,
 )
 def network_without_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    taken = [address for address, _ in stations(fleet)]
+    taken = [(address, path[1]) for address, (path, _) in stations(fleet)]
+    bases = {robot.name for robot in fleet.robots.values() if robot.is_base}
     for mesh in fleet.meshes.values():
         members = [node for node in fleet.members(mesh.name) if node.state.is_managed]
+        # another site's nodes may have addresses in it
+        own = bases.union(*((node.name, node.robot) for node in members))
         # where no mesh of a node has its address, MC202 reports the node, or this network
         if (
             members
             and all(any(node.address.ip in one.network for one in meshes_of(fleet, node)) for node in members)
-            and not any(address in mesh.network for address in taken)
+            and not any(address in mesh.network for address, who in taken if who in own)
         ):
             others = {str(one.network) for node in members for one in meshes_of(fleet, node) if one is not mesh}
             names = join_limited([node.name for node in members])
