@@ -290,10 +290,11 @@ def base_in_other_network(fleet: Fleet, _context: LintContext) -> Iterator[Findi
 )
 def network_without_station(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     taken = [(address, path[1]) for address, (path, _) in stations(fleet)]
-    bases = {robot.name for robot in fleet.robots.values() if robot.is_base}
     for mesh in fleet.meshes.values():
         members = [node for node in fleet.members(mesh.name) if node.state.is_managed]
         # another site's nodes may have addresses in it
+        sites = {node.site for node in members}
+        bases = {node.robot for node in fleet.managed() if node.role is Role.BASE and node.site in sites}
         own = bases.union(*((node.name, node.robot) for node in members))
         # where no mesh of a node has its address, MC202 reports the node, or this network
         if (
