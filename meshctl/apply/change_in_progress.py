@@ -46,6 +46,8 @@ PACKAGES_SETTLE_S = 3.0
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # How long a node that keeps its address is waited for over the connection that sent the change.
 AWAIT_RELOAD_S = 30
+# A rollback restores the files and reloads the services, which takes a board some 10 s.
+ROLLBACK_S = 30.0
 # Erasing 16 MB of NOR takes up to three minutes, more with other work beside it; then its init scripts run.
 FIRST_BOOT_TIMEOUT_S = 600.0
 # A login at an address other than the new one may hang: another device may have that address, or the server may be
@@ -116,6 +118,12 @@ class ChangeInProgress:
     def is_window_over(self) -> bool:
         """Whether the node has confirmed it or rolled it back by now."""
         return self.started_s is None or time.monotonic() - self.started_s > self.extra_s + self.window_s
+
+    @property
+    def is_undone(self) -> bool:
+        """Whether its timer has rolled it back and reloaded the services by now, unless it was confirmed."""
+        limit_s = self.extra_s + self.window_s + ROLLBACK_S
+        return self.started_s is not None and time.monotonic() - self.started_s > limit_s
 
     @property
     def first_look_s(self) -> float:

@@ -5,7 +5,9 @@ unicast frames until the numbers have caught up, while broadcasts pass and batma
 Without its station entry it learns the node from the next beacon. Removing the entry of a radio that did *not* restart
 causes the same loss in the other direction. So the holder of an entry verifies it first: it removes the entry of a
 neighbor that it hears and that does not answer it (scripts/stale_station.sh). Where it has no batman-adv to verify
-that, it removes the entry only if meshctl observed that the radio restarted.
+that, it removes the entry only if meshctl observed that the radio restarted. An answer to an echo request does not
+show that logins pass, which are of another traffic class: if a node stays unreachable although its timer has undone the
+change, its neighbors try to connect to its SSH server instead.
 
     observations -> the holders of entries of a node's radios (`entries_of`), nodes that may hold one
     (`possible_holders`), nodes whose route to the base leads through the node (`routed_through`)
@@ -20,10 +22,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
 from meshctl.device.scripts import script
+from meshctl.model import Node
 from meshctl.plan.radios import EVERY_RADIO, SLACK_S, Radios
 from meshctl.topology import NEIGHBOUR_FRESH_MS, mesh_macs
 
@@ -42,6 +46,10 @@ GONE, KEPT, UNKNOWN = "gone", "kept", "unknown"
 CAUGHT_UP = "caught-up"
 # all wireless interfaces, for sh; Linux allows no blank in an interface name
 _EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')\""
+
+
+# The address and port of a node's SSH server.
+Login: TypeAlias = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +85,12 @@ def entries_of(
         for station in seen.stations or ()
         if station.mac.lower() in macs
     )
+
+
+def login_of(node: Node, before: Observation) -> Login | None:
+    """Where a node's neighbors can log in to it, unless its change gives it another address than it had `before`."""
+    had = {address.partition("/")[0] for interface in before.interfaces or () for address in interface.addresses}
+    return (str(node.address.ip), node.ssh.port) if str(node.address.ip) in had else None
 
 
 def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
@@ -154,16 +168,23 @@ def routed_through(node: str, observations: Mapping[str, Observation], base_macs
     )
 
 
-def flush_script(entries: Iterable[StationEntry], *, older_than_s: float, has_restarted: bool = False) -> str:
+def flush_script(
+    entries: Iterable[StationEntry],
+    *,
+    older_than_s: float,
+    has_restarted: bool = False,
+    login: Login | None = None,
+) -> str:
     """POSIX sh that removes a holder's entries that are at least that old and stale; with `has_restarted` all that are
-    that old.
+    that old. `login`: where the entries' node accepts logins, if no other answer of it counts.
 
     It prints `gone|kept|answers|unknown MAC` for each entry that is old enough and whose neighbor is heard.
     """
     verb = "flush_restarted" if has_restarted else "flush_stale"
+    where = "" if login is None else f" {quoted(login[0])} {login[1]}"
     calls = [
         f"{verb} {quoted(entry.ifname) if entry.ifname else _EVERY_INTERFACE} {quoted(entry.mac)} "
-        f"{math.ceil(older_than_s)}\n"
+        f"{math.ceil(older_than_s)}{where}\n"
         for entry in entries
     ]
     return "".join((script("stale_station.sh"), *calls))

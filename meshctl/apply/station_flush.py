@@ -2,7 +2,8 @@
 
     armed: nodes reached through the node, and the node itself, start to watch their entries
     unreachable: the other holders are queried, with growing pauses; after `BOOT_S` those of its other radios as well,
-        which restart if it has lost its power
+        which restart if it has lost its power; once its timer has undone the change, only an answer of its SSH server
+        counts
     ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
@@ -31,11 +32,13 @@ from meshctl.apply.stale_stations import (
     KEPT,
     MAX_QUERIED,
     UNKNOWN,
+    Login,
     StationEntry,
     by_holder,
     current_neighbors,
     entries_of,
     flush_script,
+    login_of,
     next_query_s,
     own_entries,
     possible_holders,
@@ -91,6 +94,7 @@ class StationFlush:
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
+    _tried_login: bool = False
     # nodes whose radios restart at the same moment and keep no entry from before
     _restarting: frozenset[str] = frozenset()
     # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
@@ -189,10 +193,13 @@ class StationFlush:
             ended.set()
             thread.join()
 
-    def unreachable(self, among: Container[str] | None = None) -> None:
-        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable."""
+    def unreachable(self, among: Container[str] | None = None, *, is_undone: bool = False) -> None:
+        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable.
+        `is_undone`: its timer has undone the change, so the change does not refuse logins any more."""
         now_s = time.monotonic()
-        if self._started_s is None or now_s < next_query_s(self._queried_s):
+        login = login_of(self.ctx.node, self.ctx.before) if is_undone else None
+        is_due = now_s >= next_query_s(self._queried_s) or (login is not None and not self._tried_login)
+        if self._started_s is None or not is_due:
             return
         answered_s = max(self._started_s, self._observed_s or 0.0)
         # a plan for this node alone may have observed none of its neighbors
@@ -200,7 +207,8 @@ class StationFlush:
         names = [name for name in holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._queried_s.append(now_s)
-            self._flush({name: holders[name] for name in names}, self._started_s)
+            self._tried_login = login is not None
+            self._flush({name: holders[name] for name in names}, self._started_s, login=login)
 
     def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
         """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
@@ -259,11 +267,16 @@ class StationFlush:
         return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if asked[name]}
 
     def _flush(
-        self, asked: Mapping[str, Sequence[StationEntry]], since_s: float, *, has_restarted: bool = False
+        self,
+        asked: Mapping[str, Sequence[StationEntry]],
+        since_s: float,
+        *,
+        has_restarted: bool = False,
+        login: Login | None = None,
     ) -> dict[str, str]:
         """Have these holders remove stale entries; returns the answers."""
         scripts = {
-            name: partial(_flush_since, entries, since_s, has_restarted=has_restarted)
+            name: partial(_flush_since, entries, since_s, has_restarted=has_restarted, login=login)
             for name, entries in asked.items()
         }
         answers = self._query("flush neighbor station entries", scripts)
@@ -343,8 +356,11 @@ class StationFlushes:
         return unflushed
 
 
-def _flush_since(entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False) -> str:
-    return flush_script(entries, older_than_s=time.monotonic() - since_s, has_restarted=has_restarted)
+def _flush_since(
+    entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False, login: Login | None = None
+) -> str:
+    older_than_s = time.monotonic() - since_s
+    return flush_script(entries, older_than_s=older_than_s, has_restarted=has_restarted, login=login)
 
 
 def _joined(scripts: Iterable[Script]) -> str:

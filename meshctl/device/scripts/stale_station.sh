@@ -6,10 +6,15 @@
 # no reply to batman-adv echo requests (layer 2, so no firewall matters). Removing the entry of a radio that did not
 # restart causes the same loss in the other direction.
 #
+# Each traffic class has a window of its own. dropbear marks its packets AF21, so they may be dropped although the replies
+# to echo requests, which are of another class, arrive. So `flush_stale` is told where the neighbor's dropbear listens if
+# nothing but a stale entry explains that nobody can log in.
+#
 # `catch_up` is for the other way round: this node's radio restarted, and the neighbor, which nobody can ask, holds the old
 # entry. It drops only what is numbered before its window, half of all numbers at most, so this node sends so many frames.
 HEARD_MS=2000  # a neighbor sends several times a second: beacons, and OGMs that it originates or repeats
 ECHOES=3       # each is sent up to seven times on the air: a link that loses all of them is useless anyway
+LOGIN_S=3      # for a connection to dropbear: two tries of TCP
 WATCH_PAUSE_S=2
 FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
 SENDERS=40     # of `catch_up`: each sends one echo request per second, until it is answered; 2,080 in all, of 4,096 numbers
@@ -68,13 +73,38 @@ remove() { # DEV MAC
 	if iw dev "$1" station del "$2" 2>/dev/null; then echo "gone $2"; else echo "kept $2"; fi
 }
 
-# flush_stale DEVICES MAC SECONDS: removes the entry if it is that old and stale; prints `gone`, `kept` (it cannot be
-# removed), `answers`, or `unknown` MAC
+# login_is_silent ADDRESS PORT: whether a connection there is neither accepted nor refused
+login_is_silent() {
+	command -v nc >/dev/null || return 1
+	mkdir -p /tmp/meshctl
+	nc "$1" "$2" </dev/null >/tmp/meshctl/login.$$ 2>&1 &
+	login=$! left_s=$LOGIN_S silent=1
+	while [ $silent = 1 ] && [ $left_s -gt 0 ]; do
+		pause 1
+		left_s=$((left_s - 1))
+		! grep -q -e SSH- -e refused /tmp/meshctl/login.$$ || silent=0
+	done
+	kill "$login" 2>/dev/null
+	wait "$login" 2>/dev/null
+	rm -f /tmp/meshctl/login.$$
+	[ $silent = 1 ]
+}
+
+# flush_stale DEVICES MAC SECONDS [ADDRESS PORT]: removes the entry if it is that old and stale; prints `gone`, `kept` (it
+# cannot be removed), `answers`, or `unknown` MAC. With ADDRESS and PORT of the neighbor's dropbear, only an answer from
+# there counts.
 flush_stale() {
 	for dev in $1; do
 		look "$dev" "$2"
 		is_old "$3" && is_heard || continue
-		echo_state "$dev" "$2"
+		if [ -z "$4" ]; then
+			echo_state "$dev" "$2"
+		elif login_is_silent "$4" "$5"; then
+			echo_state "$dev" "$2" 1
+			[ "$ECHO" = unknown ] || ECHO=lost
+		else
+			ECHO=answered
+		fi
 		case $ECHO in
 		answered) echo "answers $2" ;;
 		unknown) echo "unknown $2" ;;

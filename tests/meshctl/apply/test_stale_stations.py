@@ -200,7 +200,11 @@ if [ -f "$HERE/numbers" ] && [ "$(grep -c -- '-c 52 ' "$HERE/asked")" -ge "$(cat
 fi
 sed -n "$(cat "$HERE/now")s/.*|//p" "$HERE"/seconds
 """,
-    "sleep": 'now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"',
+    "sleep": """[ ! -f "$HERE/login" ] || until [ -f "$HERE/called" ]; do /bin/sleep 0.01; done
+now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).00 1.00 >"$HERE/uptime"
+""",
+    # `login` is what the neighbor's dropbear says; then it waits, as dropbear does. A pause lasts until it has spoken
+    "nc": """cat "$HERE/login" >&2; echo "$@" >"$HERE/called"; exec /bin/sleep 60""",
     "start-stop-daemon": 'while [ "$1" != -- ]; do shift; done; shift; exec sh "$@"',
     "mkdir": ":",
     # so that pauses use `sleep`
@@ -287,6 +291,29 @@ def test_an_entry_without_a_known_interface_is_flushed_on_all_interfaces(tmp_pat
     printed, deleted = deletions(tmp_path, [Second(100, 50, LOST)], text)
     assert printed == f"gone {MAC}\n" * 2
     assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
+
+
+@pytest.mark.parametrize(
+    ("login", "echo", "printed"),
+    [
+        ("", ANSWERED, f"gone {MAC}\n"),
+        ("", LOST, f"gone {MAC}\n"),
+        ("", UNREACHABLE, f"unknown {MAC}\n"),
+        ("SSH-2.0-dropbear", LOST, f"answers {MAC}\n"),
+        # a firewall that rejects, or a server that is down
+        ("nc: can't connect to remote host (10.42.0.11): Connection refused", LOST, f"answers {MAC}\n"),
+    ],
+)
+def test_with_the_neighbors_login_only_an_answer_of_its_ssh_server_counts(
+    tmp_path: Path, login: str, echo: str, printed: str
+) -> None:
+    """Seen on real OpenWrt: after a power cut every echo request was answered, and no login for four minutes."""
+    (tmp_path / "login").write_text(login)
+    (tmp_path / "memory").mkdir()
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    assert deletions(tmp_path, [Second(100, 50, echo)] * 9, text)[0] == printed
+    assert (tmp_path / "called").read_text() == "10.42.0.11 22\n"
+    assert list((tmp_path / "memory").iterdir()) == []
 
 
 def reconnected(place: Path, now: Second, *, numbers: int | None = None) -> list[str]:

@@ -17,7 +17,7 @@ from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.neighbor_query import REMEMBERED_S, known_neighbors
 from meshctl.apply.reconnect import HEARD_MS
 from meshctl.apply.station_flush import StationFlushes
-from meshctl.device.observation import Observation, Originator
+from meshctl.device.observation import NetInterface, Observation, Originator
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet.journal import LastKnown
@@ -136,6 +136,25 @@ def test_neighbors_that_the_plan_did_not_observe_are_queried_for_a_node_that_may
     assert name == "b01"
     assert "iw dev 2>/dev/null" in script.splitlines()[-1]
     assert script.endswith(f"{MAC} 25\n")
+
+
+@pytest.mark.parametrize(("had", "login"), [("10.42.0.102", " 10.42.0.102 22"), ("10.42.0.99", "")])
+def test_a_node_that_is_unreachable_although_its_change_is_undone_is_logged_in_to_by_its_neighbors(
+    monkeypatch: pytest.MonkeyPatch, had: str, login: str
+) -> None:
+    """Once, even if they were queried a moment ago; not if the change gives it another address: it has its old one."""
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    interfaces = (NetInterface("lan", up=True, pending=False, proto="static", addresses=(f"{had}/24",)),)
+    near = Neighbours({"b02": replace(node("b02"), interfaces=interfaces), "b01": node("b01", "b02")})
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.started()
+    now_s[0] += 100
+    flush.unreachable()
+    for _ in range(2):
+        flush.unreachable(is_undone=True)
+    lines = [script.splitlines()[-1] for _, script in near.asked]
+    assert lines == [f"flush_stale mesh0 {MAC} 100{where}" for where in ("", login)][: 1 + (login != "")]
 
 
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
