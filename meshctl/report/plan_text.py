@@ -139,7 +139,7 @@ def _ways(plan: Plan) -> Iterator[Line]:
     yield Line(f"two ways ({plan.pace})", "bold")
     for way in plan.ways:
         mark = "this plan" if way.name == chosen else "--together" if way.name == TOGETHER else "without --together"
-        stages = f"{counted(way.stages, 'stage')}"
+        stages = counted(way.stages, "stage")
         yield Line(
             f"  {way.name:<9} {mark}: {stages}, about {duration(way.estimated_s)}: {way.risk}",
             "" if way.name == chosen else "dim",

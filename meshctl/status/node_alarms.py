@@ -140,7 +140,7 @@ def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
         text = "no path through the mesh to the base"
         yield Alarm(Level.WARNING, "no-path", text, "find the missing node between them with meshctl topology")
     elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
-        hops = f"{counted(seen.path.hops, 'hop')}"
+        hops = counted(seen.path.hops, "hop")
         text = f"path to the base has {seen.path.quality:.0%} quality over {hops}"
         yield Alarm(Level.WARNING, "weak", text, f"drop a beacon between {seen.node.name} and {seen.path.via}")
     if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:

@@ -67,7 +67,7 @@ def verdict_line(status: FleetStatus, paint: Paint = plain) -> str:
     """`lab: DEGRADED: 1 error, 2 warnings (23:45:12 UTC, took 1.2 s)`."""
     word, style = _VERDICTS[status.exit_code]
     counts = {level: sum(alarm.level is level for _, alarm in _all_alarms(status)) for level in reversed(Level)}
-    parts = [f"{counted(count, level.text)}" for level, count in counts.items() if count]
+    parts = [counted(count, level.text) for level, count in counts.items() if count]
     when = time.strftime("%H:%M:%S UTC", time.gmtime(status.taken_s))
     took = f", took {status.took_s:.1f} s" if status.took_s else ""
     return f"{status.fleet}: {paint(word, style)}{': ' if parts else ''}{', '.join(parts)} ({when}{took})"
