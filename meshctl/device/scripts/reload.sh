@@ -12,7 +12,7 @@
 # named by process id, because a rollback may start while the reload of its change is still running
 BARRIER=meshctl-barrier-$$
 PASSED=/tmp/meshctl/$BARRIER
-MEMBERS=/tmp/meshctl/members
+MEMBERS=/tmp/meshctl/reload.members
 #
 # The limits are for what hangs, not for what is slow: a change's waits end with its window (is_late), and a reload after a
 # rollback that fails reboots the node, which takes a slow one longer than to wait. deadman.sh ends that after 300 s.
@@ -233,6 +233,7 @@ remember_members() {
 	elif [ -e "$MEMBERS" ]; then
 		read -r members <"$MEMBERS"
 		members=" $members "
+		rm -f "$MEMBERS"
 	fi 2>/dev/null
 }
 

@@ -40,15 +40,15 @@ _UNUSABLE = tuple(
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.128/25,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
-    nodes:
-      base: {radios: {radio1: {mesh: second}}}
+    nodes: {base: {radios: {radio1: {mesh: second}}}}
+    robots: {base-station: {computer: {links: [{address: 10.42.0.130}]}}}
     """,
     passing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
-    nodes:
-      base: {radios: {radio1: {mesh: second}}}
+    nodes: {base: {radios: {radio1: {mesh: second}}}}
+    robots: {base-station: {computer: {links: [{address: 10.43.0.100}]}}}
     """,
 )
 def networks_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

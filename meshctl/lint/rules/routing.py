@@ -279,12 +279,14 @@ def options_of_one_interface(fleet: Fleet, _context: LintContext) -> Iterator[Fi
                encryption: psk2+ccmp, key: {env: MESH_KEY}, backend: meshmerize, operator_parts:
                {templates: parts, service: mm, interface: mm0, status_command: mm-status, packages: [mm]}}
     nodes: {base: {radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
+    robots: {base-station: {computer: {links: [{address: 10.43.0.100}]}}}
     """,
     passing="""
     meshes:
       second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.43.0.0/24,
                encryption: psk2+ccmp, key: {env: MESH_KEY}}
     nodes: {base: {radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
+    robots: {base-station: {computer: {links: [{address: 10.43.0.100}]}}}
     """,
 )
 def back_ends_mixed(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

@@ -36,8 +36,8 @@ camera = { priority = 9, keep_last = 1 }
 """
 LINK = Link(rate=0.2e6, delay_ms=5.0, loss=0.01)
 RATE_HZ, SIZE = 4.0, (160, 120)
-IMAGES = 40
-"""Half of them to settle."""
+IMAGES = 60
+"""Two thirds of them to settle: a fall takes some ten, and a busy host delays some more."""
 
 
 @contextmanager
@@ -98,7 +98,7 @@ def test_the_quality_of_a_camera_settles_at_what_the_link_carries() -> None:
                 sizes.append(len(data))
             time.sleep(0.01)
             details.append(reducer.detail("camera"))
-        settled = details[IMAGES // 2 : IMAGES]
+        settled = details[IMAGES * 2 // 3 : IMAGES]
         assert details[0] == 1.0
         # without oscillating: a range of a few steps; how far down depends on the host, too, which delays images
         assert max(settled) < min(0.8, min(settled) + 0.3)
