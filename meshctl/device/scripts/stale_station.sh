@@ -75,7 +75,6 @@ remove() { # DEV MAC
 
 # login_is_silent ADDRESS PORT: whether a connection there is neither accepted nor refused
 login_is_silent() {
-	command -v nc >/dev/null || return 1
 	mkdir -p /tmp/meshctl
 	nc "$1" "$2" </dev/null >/tmp/meshctl/login.$$ 2>&1 &
 	login=$! left_s=$LOGIN_S silent=1
@@ -92,12 +91,12 @@ login_is_silent() {
 
 # flush_stale DEVICES MAC SECONDS [ADDRESS PORT]: removes the entry if it is that old and stale; prints `gone`, `kept` (it
 # cannot be removed), `answers`, or `unknown` MAC. With ADDRESS and PORT of the neighbor's dropbear, only an answer from
-# there counts.
+# there counts, if this node can try.
 flush_stale() {
 	for dev in $1; do
 		look "$dev" "$2"
 		is_old "$3" && is_heard || continue
-		if [ -z "$4" ]; then
+		if [ -z "$4" ] || ! command -v nc >/dev/null; then
 			echo_state "$dev" "$2"
 		elif login_is_silent "$4" "$5"; then
 			echo_state "$dev" "$2" 1

@@ -316,6 +316,14 @@ def test_with_the_neighbors_login_only_an_answer_of_its_ssh_server_counts(
     assert list((tmp_path / "memory").iterdir()) == []
 
 
+def test_without_nc_echo_requests_decide(tmp_path: Path) -> None:
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    # the host of the tests may have it
+    text = text.replace("command -v nc", "command -v absent")
+    assert deletions(tmp_path, [Second(100, 50, ANSWERED)], text)[0] == f"answers {MAC}\n"
+    assert deletions(tmp_path, [Second(100, 50, LOST)], text)[0] == f"gone {MAC}\n"
+
+
 def reconnected(place: Path, now: Second, *, numbers: int | None = None) -> list[str]:
     """What a holder prints whose neighbor drops its frames until so many senders have sent."""
     if numbers is not None:
