@@ -145,10 +145,7 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for node, outcome in context.trial.of(fleet):
-        if not isinstance(outcome, Rendered):
-            continue
-        packages = {file.package.name: file.package for file in outcome.files if file.package is not None}
+    for node, packages in _with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, rest = key.partition(".")
             section, _, option = rest.rpartition(".")
@@ -162,6 +159,13 @@ def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[F
                     path = ("nodes", node.name, "extra_uci", key)
                     hint = did_you_mean(name, known)
                     yield Finding(path, f"no {kind} of {place}", f"one of {join_limited(known)}", name, hint)
+
+
+def _with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[str, uci.Package]]]:
+    """The nodes with `extra_uci` that render, and their packages by name."""
+    for node, outcome in context.trial.of(fleet):
+        if node.extra_uci and isinstance(outcome, Rendered):
+            yield node, {file.package.name: file.package for file in outcome.files if file.package is not None}
 
 
 # option of a wifi-iface -> the package and type of the section that it names
@@ -193,10 +197,7 @@ def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding
             if near is not None:
                 path = ("nodes", node.name, "extra_uci", key)
                 yield Finding(path, "no program reads this package", near, package, f"did you mean '{near}'?")
-    for node, outcome in context.trial.of(fleet):
-        if not isinstance(outcome, Rendered):
-            continue
-        packages = {file.package.name: file.package for file in outcome.files if file.package is not None}
+    for node, packages in _with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, section = key.partition(".")
             made = packages[package].section(section) if package in packages and "." not in section else None

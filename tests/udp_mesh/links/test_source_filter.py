@@ -18,6 +18,8 @@ from udp_mesh.links.udp import UdpLink
 ALICE, BOB, EVE = "127.0.1.2", "127.0.1.3", "127.0.1.4"
 INSTRUCTION_BYTES = 8
 
+needs_ipv6 = pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
+
 
 def arrivals(link: UdpLink, count: int) -> tuple[list[bytes], list[bytes]]:
     """What arrived from (peers, strangers), `count` datagrams in all."""
@@ -80,7 +82,7 @@ def test_what_a_peer_marks_as_urgent_arrives_at_a_socket_of_its_own() -> None:
         assert by_mark(alice, 3) == ([b"stop"], [b"map"], [b"forged"])
 
 
-@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
+@needs_ipv6
 def test_marks_of_ipv6_datagrams_are_seen() -> None:
     port = free_port()
     attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
@@ -93,7 +95,7 @@ def test_marks_of_ipv6_datagrams_are_seen() -> None:
         assert by_mark(link, 2) == ([b"stop"], [b"map"], [])
 
 
-@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this kernel has no IPv6")
+@needs_ipv6
 def test_ipv6_addresses_are_compared_in_full() -> None:
     port = free_port()
     attachment = Attachment("lo6", "lo", ("::1", port), None, 65_535, 1)
