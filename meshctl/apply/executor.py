@@ -14,12 +14,13 @@ from pathlib import Path
 from meshctl.apply.commit_confirm import configure
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.health_checks import expectation
+from meshctl.apply.images import checked_image
 from meshctl.apply.mesh_commit import commit_mesh
 from meshctl.apply.packages import install
 from meshctl.apply.prepare import Prepared
 from meshctl.apply.stale_stations import unflushed_boot_s
 from meshctl.apply.station_flush import UNFLUSHED, StationFlushes
-from meshctl.apply.sysupgrade import checked_image, flash
+from meshctl.apply.sysupgrade import flash
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import (
@@ -51,7 +52,7 @@ def execute(
     plan, fleet = prepared.plan, run_context.fleet
     images = {
         node.hardware.name: checked_image(node.hardware)
-        for node in (fleet.nodes[name] for name, planned in plan.nodes.items() if planned.firmware is not None)
+        for node in (fleet.nodes[made.node] for made in plan.of(Verdict.CHANGE) if made.firmware is not None)
     }
     outcomes = {name: outcome for name, made in plan.nodes.items() if (outcome := unchanged_outcome(fleet, made))}
     for outcome in outcomes.values():

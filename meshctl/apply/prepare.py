@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
+from meshctl.apply.images import CheckedImages
 from meshctl.apply.reconnect import RELEARN_S, last_relays, reconnect
 from meshctl.device.observation import Observation
 from meshctl.diagnostics import InvalidInput
@@ -220,6 +221,7 @@ def _node_plans(
     fingerprints = Fingerprints(salt)
     desired: dict[str, DesiredState] = {}
     plans: dict[str, NodePlan] = {}
+    images = CheckedImages()
     for name, want in rendered.items():
         observation = seen.observations.get(name)
         desired[name] = want if observation is None else renderer.desired(want.node, observation)
@@ -235,9 +237,11 @@ def _node_plans(
         former = connections.former_addresses().get(name)
         if former is not None and observation is not None and facts_of(observation).get("address") == str(former):
             made = replace(made, notes=(_reached_at(renderer.fleet, want.node, former), *made.notes))
+        if made.firmware is not None and (faults := images.faults(want.node.hardware)):
+            made = made.refused(faults, "correct the image or its hardware profile, or plan with --no-firmware")
         error = seen.refused.get(name)
         if error is not None:
-            made = replace(made, verdict=Verdict.REFUSED, reason=str(error), hint=error.hint)
+            made = made.refused(str(error), error.hint)
         plans[name] = made
     return _NodePlans(plans, desired)
 

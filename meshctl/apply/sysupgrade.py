@@ -1,6 +1,6 @@
 """Flash one node's firmware: check everything that can fail before any service stops, then prove the result.
 
-`flash`: check the image (`checked_image`) and the node's memory, upload, `sysupgrade -T`, print the recovery recipe,
+`flash`: check the node's memory, upload, `sysupgrade -T`, print the recovery recipe,
 start `sysupgrade -n -f` detached. The archive for the new system (`archive`, pure) holds the rendered configuration,
 the node's host keys, the dead-man's switch and a marker. Success means the desired revision, the board and the marker,
 which only a boot after the flash unpacks.
@@ -24,9 +24,8 @@ from meshctl.device.observe import observe
 from meshctl.device.openwrt import FetchedFile
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
-from meshctl.diagnostics import InvalidInput
-from meshctl.errors import InputError, NodeError
-from meshctl.firmware import check, image_path, is_revision
+from meshctl.errors import NodeError
+from meshctl.firmware import is_revision
 from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
 from meshctl.nodes.backoff import Backoff
@@ -42,17 +41,6 @@ HEADROOM_BYTES = 4 << 20
 # If sysupgrade does not run by then, it was not started, or the node has booted without it.
 START_TIMEOUT_S = 120.0
 STILL_UPGRADING = "its sysupgrade has not ended"
-
-
-def checked_image(profile: HardwareProfile) -> Path:
-    """The profile's image, after every check that needs no device. Raises InvalidInput, InputError."""
-    path = image_path(profile)
-    if path is None:
-        raise InputError(f"hardware {profile.name}: the inventory names no firmware image")
-    problems = check(path, profile)
-    if problems:
-        raise InvalidInput(problems)
-    return path
 
 
 def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,14 @@ class WholePlan:
     def plans(self) -> tuple[Plan, ...]:
         made = [site.saved.plan for site in self.sites if site.saved is not None]
         return (*((self.direct.plan,) if self.direct is not None else ()), *made)
+
+    @property
+    def refusal(self) -> Plan | None:
+        """The refused plan because of which nothing can be done: that of the operator's own nodes, or the first if all
+        are refused."""
+        refused = [plan for plan in self.plans if plan.refusal]
+        is_own = self.direct is not None and bool(self.direct.plan.refusal)
+        return refused[0] if refused and (is_own or len(refused) == len(self.plans)) else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -196,15 +204,20 @@ def _reconnect_option(reconnects: bool) -> list[str]:
     return ["--reconnect"] if reconnects else []
 
 
-def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool) -> None:
+def show_everywhere(opened: Session, plan: WholePlan, *, brief: bool, raised: Plan | None = None) -> None:
+    """Print the plans; without the refusal of `raised`, which is the command's error."""
+
+    def show_one(made: Plan) -> None:
+        show(replace(made, refusal="", refusal_hint="") if made is raised else made, opened.fleet, brief=brief)
+
     if plan.direct is not None:
-        show(plan.direct.plan, opened.fleet, brief=brief)
+        show_one(plan.direct.plan)
     for site in plan.sites:
         echo(f"site {site.site.name}:")
         if site.is_queued:
             echo("  offline: an order would wait for it; what still applies of its plan is found out there")
         if site.saved is not None:
-            show(site.saved.plan, opened.fleet, brief=brief)
+            show_one(site.saved.plan)
         if site.error is not None:
             echo(f"  no plan: {site.error}")
             if site.error.hint:
@@ -241,11 +254,8 @@ def check_everywhere(opened: Session, plan: WholePlan, *, as_json: bool, brief: 
 
 def confirm_everywhere(opened: Session, plan: WholePlan, *, yes: bool) -> None:
     """Ask once for all. Raises PlanRefused if nothing can be done."""
-    refused = [each for each in plan.plans if each.refusal]
-    if plan.direct is not None and plan.direct.plan.refusal:
-        raise PlanRefused(plan.direct.plan.refusal, hint=plan.direct.plan.refusal_hint)
-    if len(refused) == len(plan.plans) and refused:
-        raise PlanRefused(refused[0].refusal, hint=refused[0].refusal_hint)
+    if plan.refusal is not None:
+        raise PlanRefused(plan.refusal.refusal, hint=plan.refusal.refusal_hint)
     count = len(plan.changing)
     if count and not yes:
         there = sum(1 for site in plan.sites if site.saved is not None and not site.saved.plan.is_empty)
@@ -314,7 +324,7 @@ def change_everywhere(
         if dry_run:
             return typer.Exit(report_everywhere(opened, made, options.choices, as_json=options.as_json, brief=brief))
         if not options.as_json:
-            show_everywhere(opened, made, brief=brief)
+            show_everywhere(opened, made, brief=brief, raised=made.refusal)
         confirm_everywhere(opened, made, yes=yes)
         return execute_everywhere(opened, made, options)
 

@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from difflib import get_close_matches
+from collections.abc import Iterable, Sequence
+from difflib import SequenceMatcher, get_close_matches
 from functools import lru_cache
 
 # of difflib's ratio: above it, `chanel` resembles `channel`; below it, `absent` does not resemble `base`
 _MIN_SIMILARITY = 0.65
+# of more names that are equally near, none is likely to be meant
+_MAX_NAMES = 3
 
 
-def nearest(wrong: str, known: Iterable[str]) -> str:
-    """The known name most similar to `wrong`, or an empty string."""
+def nearest(wrong: str, known: Iterable[str]) -> tuple[str, ...]:
+    """The known names most similar to `wrong`, all that are equally near; none if they are more than three."""
     # Longer names are not typos, and the comparison is quadratic in their length.
-    return "" if len(wrong) > 64 else _nearest(wrong, tuple(known))
+    return () if len(wrong) > 64 else _nearest(wrong, tuple(known))
 
 
 @lru_cache(maxsize=256)
-def _nearest(wrong: str, names: tuple[str, ...]) -> str:
+def _nearest(wrong: str, names: tuple[str, ...]) -> tuple[str, ...]:
     lowered = {name.lower(): name for name in names}
-    exact = lowered.get(wrong.lower().replace("-", "_"))
+    written = wrong.lower()
+    exact = lowered.get(written.replace("-", "_"))
     if exact is not None:
-        return exact
-    matches = get_close_matches(wrong.lower(), lowered, n=1, cutoff=_MIN_SIMILARITY)
-    return lowered[matches[0]] if matches else ""
+        return (exact,)
+    matches = get_close_matches(written, lowered, n=_MAX_NAMES + 1, cutoff=_MIN_SIMILARITY)
+    similarity = {name: SequenceMatcher(None, name, written).ratio() for name in matches}
+    best = max(similarity.values(), default=0.0)
+    near = tuple(lowered[name] for name in lowered if similarity.get(name) == best)
+    return near if len(near) <= _MAX_NAMES else ()
 
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
     """`did you mean 'channel'?`, or an empty string."""
-    name = nearest(wrong, known)
-    return f"did you mean '{name}'?" if name else ""
+    return asked(nearest(wrong, known))
+
+
+def asked(names: Sequence[str]) -> str:
+    """`did you mean 'b01', 'b02' or 'b03'?`; empty without names."""
+    quoted = [f"'{name}'" for name in names]
+    return f"did you mean {' or '.join(filter(None, (', '.join(quoted[:-1]), quoted[-1])))}?" if quoted else ""

@@ -87,8 +87,9 @@ def validate(root: MappingNode) -> Validated:
 def _without_misspelled(errors: list[ErrorDetails]) -> list[ErrorDetails]:
     """Without keys that are missing because they are misspelled: the unknown key is the mistake."""
     meant = {
-        (*parent, nearest(str(wrong), _known_keys(parent)))
+        (*parent, near)
         for *parent, wrong in (error["loc"] for error in errors if error["type"] == "extra_forbidden")
+        for near in nearest(str(wrong), _known_keys(parent))
     }
     return [error for error in errors if error["type"] != "missing" or error["loc"] not in meant]
 

@@ -14,7 +14,7 @@ from meshctl.diagnostics import Diagnostic, InvalidInput, Position
 from meshctl.inventory import codes
 from meshctl.inventory.compose import compose
 from meshctl.inventory.source import Source, read_source
-from meshctl.inventory.suggest import nearest
+from meshctl.inventory.suggest import did_you_mean
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, describe, position
 
 
@@ -54,8 +54,8 @@ class YamlEntry:
         entries = {key: self._child(None, key) for key in known or ()}
         for key, value in self.tree.values.items():
             if known is not None and key not in known:
-                near = nearest(key, known)
-                meant = f" (did you mean '{near}'?)" if near else ""
+                hint = did_you_mean(key, known)
+                meant = f" ({hint})" if hint else ""
                 place = position(self.tree.keys[key])
                 self._add(codes.UNKNOWN_KEY, place, f"one of {', '.join(known)}{meant}", repr(key))
             else:

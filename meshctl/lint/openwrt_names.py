@@ -7,7 +7,7 @@ Sources: target/linux and package/ of OpenWrt 19.07 to 25.12.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 from meshctl.resolve import FULL_SUPPLICANTS
@@ -60,19 +60,22 @@ def chip_target(radio_path: str) -> str | None:
     return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
 
 
-def suggest_package(name: str) -> str | None:
-    """The known package one edit, upper case or underscores away from `name`; None if `name` is known, or like none."""
+def suggest_packages(name: str) -> tuple[str, ...]:
+    """The known packages one edit, upper case or underscores away from `name`; none if `name` is known."""
     if name.lower() in PACKAGES:
-        return None if name in PACKAGES else name.lower()
+        return () if name in PACKAGES else (name.lower(),)
     hyphened = name.replace("_", "-")
     # few names have an underscore, and no kernel module's
     if name.startswith("kmod_") or ("_" in name and hyphened in PACKAGES):
-        return hyphened
+        return (hyphened,)
     if len(name) < _MIN_LETTERS:
-        return None
-    return next(
-        (known for known in sorted(PACKAGES) if len(known) >= _MIN_LETTERS and is_one_edit_apart(name, known)), None
-    )
+        return ()
+    return one_edit_apart(name, (known for known in PACKAGES if len(known) >= _MIN_LETTERS))
+
+
+def one_edit_apart(name: str, known: Iterable[str]) -> tuple[str, ...]:
+    """The known names that are one edit away, sorted."""
+    return tuple(sorted(one for one in known if is_one_edit_apart(name, one)))
 
 
 def is_one_edit_apart(one: str, other: str) -> bool:

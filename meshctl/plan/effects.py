@@ -66,11 +66,12 @@ def _wireless(before: Package | None, after: Package | None, release: Release) -
 
 def _radio(change: RadioChange) -> Effect:
     options = ", ".join(change.options)
+    down = Cut.MESH if change.has_links else Cut.LAN
     if change.restarts:
-        return Effect("wifi", Cut.MESH, f"{change.radio} restarts: {options}")
+        return Effect("wifi", down, f"{change.radio} restarts: {options}")
     if change.rejoins:
-        return Effect("wifi", Cut.MESH, f"the interfaces of {change.radio} leave their networks and return: {options}")
-    if change.may_lose_range:
+        return Effect("wifi", down, f"the interfaces of {change.radio} leave their networks and return: {options}")
+    if change.may_lose_range and change.has_links:
         return Effect("wifi", Cut.WEAK_LINKS, f"{change.radio}: {options} set without a restart")
     return Effect("wifi", Cut.NOTHING, f"{change.radio}: {options} set without a restart")
 

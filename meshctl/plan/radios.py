@@ -63,13 +63,15 @@ RANGE = frozenset({"txpower", "distance", "country", "antenna_gain"})
 class RadioChange:
     """The change of one radio: `options` differ, in its section or its interfaces'. `restarts`: its interfaces go down
     and up; `may_lose_range`: they stay up, with less range; `rejoins`: they stay on the air, but leave their network
-    (bat0) and return. ORDER among `options`: options that are equal stand in another order."""
+    (bat0) and return. `has_links`: it has links to other nodes, before or after; other radios serve access points, or
+    nothing. ORDER among `options`: options that are equal stand in another order."""
 
     radio: str
     options: tuple[str, ...]
     restarts: bool
     may_lose_range: bool = False
     rejoins: bool = False
+    has_links: bool = True
 
 
 ORDER = "order of options"
@@ -97,7 +99,11 @@ def radio_changes(before: Package, after: Package, release: Release) -> tuple[Ra
         restarts = release < Release.V23_05 or bool(faces) or not device <= in_place
         loses = bool(device & RANGE) and not _is_stronger(device, old_parts[0], new_parts[0])
         options = (*sorted(device | faces), *((ORDER,) if moved_device or moved_faces else ()))
-        changes.append(RadioChange(name, options, restarts, not restarts and loses, not restarts and moved_faces))
+        # of an interface without a mode nothing is known
+        has_links = any(face.get("mode") != "ap" for face in (*old_parts[1:], *new_parts[1:]))
+        changes.append(
+            RadioChange(name, options, restarts, not restarts and loses, not restarts and moved_faces, has_links)
+        )
     return tuple(changes)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 from types import MappingProxyType
 
@@ -23,7 +23,7 @@ class Cut(IntEnum):
     NOTHING = 0
     # new SSH logins, for about a second
     LOGIN = 1
-    # the robot's wired LAN behind the node
+    # the devices behind the node: on its wired LAN, at its access points
     LAN = 2
     # radio links that depend on its current range; all others stay up
     WEAK_LINKS = 3
@@ -37,7 +37,7 @@ class Cut(IntEnum):
         return (
             "nothing",
             "new logins for a second",
-            "its LAN",
+            "its LAN or access points",
             "weak mesh links, if any",
             "its mesh links",
             "the whole node, for minutes",
@@ -110,6 +110,20 @@ class NodePlan:
     observed: str = ""
     wanted: str = ""
     notes: tuple[str, ...] = ()
+
+    def refused(self, reason: str, hint: str) -> NodePlan:
+        """The same node, refused: nothing of it is changed."""
+        return replace(
+            self,
+            verdict=Verdict.REFUSED,
+            reason=reason,
+            hint=hint,
+            firmware=None,
+            packages=None,
+            files=(),
+            left_over=(),
+            effects=(),
+        )
 
     @property
     def reloads(self) -> bool:

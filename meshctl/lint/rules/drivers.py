@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
+from meshctl.inventory.suggest import asked
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
-from meshctl.lint.openwrt_names import is_one_edit_apart
+from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, RadioHardware
 from meshctl.wording import join_limited
@@ -101,11 +102,11 @@ def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for radio in profile.radios:
             if not radio.driver or radio.driver in _DRIVERS:
                 continue
-            near = next((name for name in sorted(_DRIVERS) if is_one_edit_apart(radio.driver, name)), "")
+            near = one_edit_apart(radio.driver, _DRIVERS)
             if near or radio.driver.isdigit():
                 path = ("hardware", profile.name, "radios", radio.name, "driver")
-                hint = f"did you mean {near}?" if near else ""
-                yield Finding(path, "unknown driver", near or "a driver such as ath9k", radio.driver, hint)
+                expected = " or ".join(near) or "a driver such as ath9k"
+                yield Finding(path, "unknown driver", expected, radio.driver, asked(near))
 
 
 @fleet_rule(

@@ -8,9 +8,9 @@ from pathlib import PurePath
 
 from meshctl import firmware
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import nearest
+from meshctl.inventory.suggest import asked, nearest
 from meshctl.lint.context import LintContext
-from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_package
+from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_packages
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.rules.encryption import packages_path
 from meshctl.lint.rules.firmware import ROCKET_IMAGE
@@ -296,16 +296,15 @@ def switch_on_other_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     passing="hardware: {rocket: {packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, my-own-tool]}}",
 )
 def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    judged: dict[str, str | None] = {}
+    judged: dict[str, tuple[str, ...]] = {}
     for node in fleet.managed():
         for written in (*node.hardware.packages, *node.packages):
             name = written.removeprefix("-")
             if name not in judged:
-                judged[name] = suggest_package(name)
+                judged[name] = suggest_packages(name)
             meant = judged[name]
-            if meant is not None:
-                hint = f"did you mean '{meant}'?"
-                yield Finding(packages_path(node, written), "unknown package", meant, name, hint)
+            if meant:
+                yield Finding(packages_path(node, written), "unknown package", " or ".join(meant), name, asked(meant))
 
 
 @fleet_rule(
@@ -330,10 +329,9 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if hint:
                 yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
-            near = nearest(subtarget, sorted(SUBTARGETS[target]))
+            near = [f"{target}/{one}" for one in nearest(subtarget, sorted(SUBTARGETS[target]))]
             if near:
-                expected = f"{target}/{near}"
-                yield Finding(path, "unknown subtarget", expected, profile.target, f"did you mean '{expected}'?")
+                yield Finding(path, "unknown subtarget", " or ".join(near), profile.target, asked(near))
 
 
 @fleet_rule(

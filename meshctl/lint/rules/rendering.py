@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.file_access import located
-from meshctl.inventory.suggest import did_you_mean
+from meshctl.inventory.suggest import asked, did_you_mean
 from meshctl.lint.context import LintContext
-from meshctl.lint.openwrt_names import is_one_edit_apart
+from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.lint.trial_rendering import kinds, placeholder
 from meshctl.model import Fleet, Node
@@ -193,10 +193,10 @@ def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding
     for node in kinds(fleet):
         for key in node.extra_uci:
             package = key.partition(".")[0]
-            near = next((one for one in _OWNED if is_one_edit_apart(package, one)), None)
-            if near is not None:
+            near = one_edit_apart(package, _OWNED)
+            if near:
                 path = ("nodes", node.name, "extra_uci", key)
-                yield Finding(path, "no program reads this package", near, package, f"did you mean '{near}'?")
+                yield Finding(path, "no program reads this package", " or ".join(near), package, asked(near))
     for node, packages in _with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, section = key.partition(".")

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import nearest
+from meshctl.inventory.suggest import asked, nearest
 from meshctl.lint.context import LintContext
 from meshctl.lint.ros_types import MESSAGES
 from meshctl.lint.rule import Finding, fleet_rule
@@ -273,7 +273,6 @@ def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         known = MESSAGES.get(package, frozenset())
         name = rest.removeprefix("msg/")
         if known and "/" not in name and _TYPE.fullmatch(topic.type_name) is not None and name not in known:
-            near = nearest(name, sorted(known))
-            expected = topic.type_name.removesuffix(name) + near if near else f"a message of {package}"
-            hint = f"did you mean '{expected}'?" if near else ""
+            near = [topic.type_name.removesuffix(name) + one for one in nearest(name, sorted(known))]
+            expected, hint = " or ".join(near) or f"a message of {package}", asked(near)
             yield Finding(_path(topic, "type"), f"{package} has no such message", expected, topic.type_name, hint)

@@ -9,7 +9,7 @@ from meshctl.inventory import load_fleet
 from meshctl.inventory.secrets import SecretStore
 from meshctl.lint import Example, check_path, trial_rendering
 from meshctl.lint.example import ENVIRONMENT, compose, environment, write
-from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_package
+from meshctl.lint.openwrt_names import PACKAGES, is_one_edit_apart, suggest_packages
 from meshctl.lint.zones import is_posix, zones
 from meshctl.nodes.desired import Renderer
 from meshctl.regdb import SHIPPED, load
@@ -356,7 +356,7 @@ def test_zero_or_several_edits_are_not_one_edit(one: str, other: str) -> None:
 
 
 def test_no_known_package_is_flagged_as_a_misspelling() -> None:
-    assert [name for name in PACKAGES if suggest_package(name) is not None] == []
+    assert [name for name in PACKAGES if suggest_packages(name)] == []
 
 
 def test_too_small_flash_is_reported_even_without_the_image(tmp_path: Path) -> None:

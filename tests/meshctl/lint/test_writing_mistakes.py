@@ -9,7 +9,7 @@ import pytest
 from meshctl.diagnostics import Diagnostic
 from meshctl.lint import Example, check_path
 from meshctl.lint.example import environment, write
-from meshctl.lint.openwrt_names import suggest_package
+from meshctl.lint.openwrt_names import suggest_packages
 from meshctl.regdb import SHIPPED, load
 
 _REGDB = load(SHIPPED)
@@ -54,9 +54,9 @@ def test_host_names_and_addresses_are_hosts(host: str, tmp_path: Path) -> None:
 
 
 def test_underscores_are_no_hyphens_in_package_names() -> None:
-    assert suggest_package("kmod_ath10k_ct") == "kmod-ath10k-ct"
-    assert suggest_package("batctl_full") == "batctl-full"
-    assert suggest_package("rtl_433") is None
+    assert suggest_packages("kmod_ath10k_ct") == ("kmod-ath10k-ct",)
+    assert suggest_packages("batctl_full") == ("batctl-full",)
+    assert suggest_packages("rtl_433") == ()
 
 
 @pytest.mark.parametrize(

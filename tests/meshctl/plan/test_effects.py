@@ -87,8 +87,35 @@ def test_an_interface_that_differs_restarts_its_radio() -> None:
 def test_a_radio_that_is_added_or_removed_restarts() -> None:
     without = parse("config wifi-device 'radio1'\n\toption channel '36'\n", "wireless")
     found = effects(["etc/config/wireless"], {"wireless": wireless()}, {"wireless": without}, Release.V24_10)
-    assert {effect.why.partition(" ")[0] for effect in found} == {"radio0", "radio1"}
-    assert {effect.cut for effect in found} == {Cut.MESH}
+    assert {effect.why.partition(" ")[0]: effect.cut for effect in found} == {"radio0": Cut.MESH, "radio1": Cut.LAN}
+
+
+GUESTS = """
+config wifi-device 'radio1'
+	option channel '36'
+	option txpower '20'
+
+config wifi-iface 'guests'
+	option device 'radio1'
+	option mode 'ap'
+	option ssid 'guests'
+"""
+
+
+@pytest.mark.parametrize("release", RELEASES)
+@pytest.mark.parametrize(("old", "new"), [("ssid 'guests'", "ssid 'visitors'"), ("'36'", "'40'"), ("'20'", "'9'")])
+def test_a_radio_with_access_points_alone_cuts_no_mesh_link(old: str, new: str, release: Release) -> None:
+    before, after = WIRELESS + GUESTS, WIRELESS + GUESTS.replace(old, new)
+    was, will_be = ({"wireless": parse(text, "wireless")} for text in (before, after))
+    (effect,) = effects(["etc/config/wireless"], was, will_be, release)
+    expected = Cut.NOTHING if new == "'9'" and release >= Release.V23_05 else Cut.LAN
+    assert effect.cut is expected
+
+
+def test_an_access_point_takes_the_mesh_on_its_radio_down_with_it() -> None:
+    texts = [WIRELESS + GUESTS.replace("device 'radio1'", "device 'radio0'").replace("'guests'", name) for name in "ab"]
+    was, will_be = ({"wireless": parse(text, "wireless")} for text in texts)
+    assert effects(["etc/config/wireless"], was, will_be, Release.V24_10)[0].cut is Cut.MESH
 
 
 def test_dropbear_and_firewall_changes_cut_logins() -> None:
