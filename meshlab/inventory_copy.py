@@ -8,7 +8,7 @@ the copy. The copy has its own known_hosts: the original's is neither copied nor
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,8 +19,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from meshctl.fleet.lab_directory import INVENTORY, KEY_COMMENT
 from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, save
-from meshctl.model import Fleet, Release, SecretKind
+from meshctl.model import Fleet, Release
 from meshlab import fleet_directory, propagation_file
+from meshlab.outside_files import bring_includes, outside_references
 from meshlab.propagation import links_of
 from meshlab.spec import LinkSpec
 
@@ -63,10 +64,12 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     key_file = directory / "keys" / "operator"
     needs_rsa = any(node.release is Release.V19_07 for node in fleet.nodes.values())
     public = _key_pair(key_file, needs_rsa=needs_rsa)
+    bring_includes(source, folder, target, environ)
+    references = list(outside_references(fleet, folder, target))
     editor = Editor.open(copied, environ=environ)
     editor.set(("operators", "ssh_keys"), list(dict.fromkeys([*fleet.operators.ssh_keys, public])))
     editor.set(("defaults", "ssh", "key_files"), [str(key_file)])
-    for place, path in _secrets_outside(fleet, folder):
+    for place, path in references:
         editor.set(place, path)
     if fleet.operators.known_hosts != _KNOWN_HOSTS:
         place = ("operators", "known_hosts")
@@ -77,22 +80,6 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     links = target / LINKS_FILE
     link_specs = list(links_of(propagation_file.load(links))) if links.exists() else None
     return InventoryCopy(copied, load_fleet(copied, environ=environ), key_file, link_specs, kept)
-
-
-def _secrets_outside(fleet: Fleet, folder: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Where the inventory refers to files of secrets outside its folder by relative paths, and their absolute paths:
-    from the copy, `../secrets.yaml` would be another file."""
-    refs = [(("meshes", name, "key"), mesh.key) for name, mesh in fleet.meshes.items() if mesh.key is not None]
-    for key in ("keys", "relay_keys"):
-        refs += [(("udp_mesh", key, str(index)), ref) for index, ref in enumerate(getattr(fleet.udp_mesh, key))]
-    for place, ref in refs:
-        written = {SecretKind.FILE: ("file", ref.where), SecretKind.AGE: ("age", ref.where)}
-        for name, text in (*filter(None, (written.get(ref.kind),)), ("identity", ref.identity)):
-            path = Path(ref.base, text)
-            is_relative = bool(text) and not text.startswith(("/", "~"))
-            # one that is not there may be meant to be made beside the copy
-            if is_relative and path.exists() and not path.resolve().is_relative_to(folder.resolve()):
-                yield (*place, name), str(path.resolve())
 
 
 def _key_pair(path: Path, *, needs_rsa: bool) -> str:

@@ -61,6 +61,45 @@ def test_a_fleet_with_19_07_gets_an_rsa_key_in_a_reused_lab_directory(tmp_path: 
     assert keys[1] == keys[2]
 
 
+def test_files_outside_the_inventory_are_still_found_from_the_copy(tmp_path: Path) -> None:
+    """Two fleets in one repository share what is in `common`; one of its files names files beside itself."""
+    project = tmp_path / "project"
+    shutil.copytree(EXAMPLE, project / "north")
+    (project / ".git").mkdir()
+    for name in ("packages/a_1_all.ipk", "packages/b_1_all.ipk", "common/c_1_all.ipk", "common/box.bin", "common/key"):
+        (project / name).parent.mkdir(exist_ok=True)
+        (project / name).write_text(name, encoding="utf-8")
+    (project / "parts/etc/config").mkdir(parents=True)
+    (project / "parts/etc/config/mine.j2").write_text("config mine\n", encoding="utf-8")
+    box = "board: a,b\n    profile: a_b\n    target: ath79/generic\n    release: '24.10'\n    lan_ports: [eth0]\n    radios: {radio0: {path: p, band: 5g, rated_power_dbm: 20, max_drive_dbm: 20}}\n"
+    (project / "common/deep.yaml").write_text(
+        "include: [../north/inside.yaml]\nhardware:\n  box:\n    package_files: [c_1_all.ipk]\n"
+        f"    firmware: {{image: box.bin, usign_key: key}}\n    {box}",
+        encoding="utf-8",
+    )
+    (project / "common/all.yaml").write_text("include: [deep.yaml]\n", encoding="utf-8")
+    (project / "north/inside.yaml").write_text(
+        f"hardware:\n  other:\n    package_files: [../packages/a_1_all.ipk, ../packages/b_1_all.ipk]\n    {box}"
+        "meshes:\n  far: {ssid: f, bssid: 02:ca:fe:00:00:0f, band: 5g, channel: 36, network: 10.9.0.0/24, "
+        "backend: meshmerize,\n    operator_parts: {templates: ../parts, packages: [mm], interface: mm0}}\n",
+        encoding="utf-8",
+    )
+    path = project / "north/fleet.yaml"
+    path.write_text("include: [../common/all.yaml]\n" + path.read_text(encoding="utf-8"), encoding="utf-8")
+    before = contents(project)
+    fleet = copy_inventory(project / "north", tmp_path / "lab").fleet
+    assert contents(project) == before
+    named = [*fleet.hardware["other"].package_files, *fleet.hardware["box"].package_files]
+    firmware = fleet.hardware["box"].firmware
+    found = [Path(fleet.base, file) for file in (*named, firmware.image, firmware.usign_key)]
+    assert [file.read_text(encoding="utf-8") for file in found] == [
+        *("packages/a_1_all.ipk", "packages/b_1_all.ipk", "common/c_1_all.ipk", "common/box.bin", "common/key")
+    ]
+    templates = Path(fleet.base, fleet.meshes["far"].operator_parts.templates)
+    assert templates.is_relative_to(tmp_path / "lab" / INVENTORY)
+    assert (templates / "etc/config/mine.j2").is_file()
+
+
 def test_secrets_beside_the_inventory_are_still_found_from_the_copy(tmp_path: Path) -> None:
     project = tmp_path / "project"
     shutil.copytree(EXAMPLE, project / "inventory")
