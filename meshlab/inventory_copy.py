@@ -21,7 +21,7 @@ from meshctl.inventory import load_fleet
 from meshctl.inventory.edit import Editor, save
 from meshctl.model import Fleet, Release
 from meshlab import fleet_directory, propagation_file
-from meshlab.outside_files import bring_includes, outside_references
+from meshlab.outside_files import bring_outside_files
 from meshlab.propagation import links_of
 from meshlab.spec import LinkSpec
 
@@ -64,13 +64,10 @@ def copy_inventory(source: Path, directory: Path, *, environ: Mapping[str, str] 
     key_file = directory / "keys" / "operator"
     needs_rsa = any(node.release is Release.V19_07 for node in fleet.nodes.values())
     public = _key_pair(key_file, needs_rsa=needs_rsa)
-    bring_includes(source, folder, target, environ)
-    references = list(outside_references(fleet, folder, target))
+    bring_outside_files(source, folder, target, fleet, environ)
     editor = Editor.open(copied, environ=environ)
     editor.set(("operators", "ssh_keys"), list(dict.fromkeys([*fleet.operators.ssh_keys, public])))
     editor.set(("defaults", "ssh", "key_files"), [str(key_file)])
-    for place, path in references:
-        editor.set(place, path)
     if fleet.operators.known_hosts != _KNOWN_HOSTS:
         place = ("operators", "known_hosts")
         is_beside = Path(fleet.where(*place).position.file).parent == folder

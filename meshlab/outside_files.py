@@ -1,14 +1,15 @@
 """Files that an inventory names outside its own folder, for a copy of that folder.
 
-From the copy, `../packages/batctl.ipk` is another file. `bring_includes` copies included files and writes the includes
-anew; `outside_references` gives every other such path: absolute, or of a copy for folders of templates, which are read
-only from the inventory's tree.
+From the copy, `../packages/batctl.ipk` is another file. `bring_outside_files` copies included files, and folders of
+templates, which are read only from the inventory's tree; it writes the paths of these copies, and absolute ones of all
+other files. Paths are replaced where they are written, so anchors and aliases stay as they are.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -18,55 +19,59 @@ from meshctl.inventory.file_paths import file_path
 from meshctl.inventory.include import read_files
 from meshctl.inventory.source import Source
 from meshctl.inventory.text_edit import replace_value
-from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode
+from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, descend
 from meshctl.model import Fleet, SecretKind, SecretRef
 
 # in the copy: what comes from outside the inventory's folder
 _FOLDER = "from-outside"
 _BOM = "\ufeff"
 
-Place = tuple[str, ...]
+Place = tuple[str | int, ...]
 
 
-def bring_includes(source: Path, folder: Path, target: Path, environ: Mapping[str, str]) -> None:
-    """Copy the included files that are outside `folder` into its copy `target`, and include the copies instead."""
+def bring_outside_files(source: Path, folder: Path, target: Path, fleet: Fleet, environ: Mapping[str, str]) -> None:
+    """Make `target`, a copy of `folder`, an inventory of its own: with all that the inventory `source` includes, and
+    paths that lead to the same files. Paths of files that do not exist stay: they may be meant to be made beside it."""
     home = folder.resolve()
-    files = [file.resolve() for file in read_files(source, environ).files]
+    merged = read_files(source, environ)
+    files = list(dict.fromkeys(file.resolve() for file in merged.files))
     copies = {file: target / file.relative_to(home) for file in files if file.is_relative_to(home)}
     outside = [file for file in files if file not in copies]
     copies |= {file: target / _FOLDER / f"{number}-{file.name}" for number, file in enumerate(outside, 1)}
+    # file -> what is replaced in it, by its place in the text
+    edits: dict[Path, dict[int, tuple[Scalar, str]]] = defaultdict(dict)
     for file in files if outside else ():
+        edits[file] |= {item.start: (item, text) for item, text in _includes(file, copies, environ)}
+    for place, path in _references(fleet):
+        tree = None if merged.root is None else descend(merged.root, place)
+        file = Path(tree.file).resolve() if isinstance(tree, Scalar) else None
+        is_elsewhere = file in outside or not path.resolve().is_relative_to(home)
+        if isinstance(tree, Scalar) and file is not None and is_elsewhere and path.exists():
+            real = path.resolve()
+            where = _folder_copy(real, target) if path.is_dir() else real
+            edits[file][tree.start] = tree, str(where)
+    for file in edits:
+        text = _text(file)
+        for tree, path_there in sorted(edits[file].values(), key=lambda edit: -edit[0].start):
+            text = replace_value(text, tree, path_there, None)
         copies[file].parent.mkdir(parents=True, exist_ok=True)
-        copies[file].write_bytes(_with_includes(file, copies, environ).encode())
+        copies[file].write_bytes(text.encode())
 
 
-def _with_includes(file: Path, copies: Mapping[Path, Path], environ: Mapping[str, str]) -> str:
-    """The file's text with the copies as its includes."""
-    with file.open(encoding="utf-8", newline="") as stream:
-        text = stream.read().removeprefix(_BOM)
-    root = compose(Source(str(file), text)).root
+def _text(file: Path) -> str:
+    return file.read_bytes().decode("utf-8").removeprefix(_BOM)
+
+
+def _includes(file: Path, copies: Mapping[Path, Path], environ: Mapping[str, str]) -> Iterator[tuple[Scalar, str]]:
+    """The entries of the file's `include`, with the copies' paths."""
+    root = compose(Source(str(file), _text(file))).root
     includes = root.values.get("include") if isinstance(root, MappingNode) else None
-    items = includes.items if isinstance(includes, SequenceNode) else ()
-    for item in reversed(items):
+    for item in includes.items if isinstance(includes, SequenceNode) else ():
         if isinstance(item, Scalar):
             home = environ.get("HOME", "")
             named = Path(home, item.text[2:]) if item.text.startswith("~/") else file.parent / item.text
-            copy = copies.get(named.resolve())
-            if copy is not None:
-                text = replace_value(text, item, os.path.relpath(copy, copies[file].parent), None)
-    return text
-
-
-def outside_references(fleet: Fleet, folder: Path, target: Path) -> Iterator[tuple[Place, str]]:
-    """Where the inventory refers to existing files by a path that is another one from its copy `target`, and the path
-    to write instead."""
-    home = folder.resolve()
-    for place, path in _references(fleet):
-        real = path.resolve()
-        is_moved = not Path(fleet.where(*place).position.file).resolve().is_relative_to(home)
-        # one that is not there may be meant to be made beside the copy
-        if path.exists() and (is_moved or not real.is_relative_to(home)):
-            yield place, str(_folder_copy(real, target) if path.is_dir() else real)
+            if (copy := copies.get(named.resolve())) is not None:
+                yield item, os.path.relpath(copy, copies[file].parent)
 
 
 def _folder_copy(folder: Path, target: Path) -> Path:
@@ -91,14 +96,14 @@ def _references(fleet: Fleet) -> Iterator[tuple[Place, Path]]:
         yield from _listed(fleet, (*place, "package_files"), parts.package_files)
     for key in ("keys", "relay_keys"):
         for number, ref in enumerate(getattr(fleet.udp_mesh, key)):
-            yield from _secret(("udp_mesh", key, str(number)), ref)
+            yield from _secret(("udp_mesh", key, number), ref)
     for key in ("credentials", "ca"):
         if fleet.nats is not None and (written := getattr(fleet.nats, key)):
             yield ("nats", key), file_path(fleet, written)
 
 
 def _listed(fleet: Fleet, place: Place, files: tuple[str, ...]) -> Iterator[tuple[Place, Path]]:
-    return (((*place, str(number)), file_path(fleet, file)) for number, file in enumerate(files))
+    return (((*place, number), file_path(fleet, file)) for number, file in enumerate(files))
 
 
 def _secret(place: Place, ref: SecretRef) -> Iterator[tuple[Place, Path]]:

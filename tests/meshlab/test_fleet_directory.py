@@ -71,7 +71,9 @@ def test_files_outside_the_inventory_are_still_found_from_the_copy(tmp_path: Pat
         (project / name).write_text(name, encoding="utf-8")
     (project / "parts/etc/config").mkdir(parents=True)
     (project / "parts/etc/config/mine.j2").write_text("config mine\n", encoding="utf-8")
-    box = "board: a,b\n    profile: a_b\n    target: ath79/generic\n    release: '24.10'\n    lan_ports: [eth0]\n    radios: {radio0: {path: p, band: 5g, rated_power_dbm: 20, max_drive_dbm: 20}}\n"
+    radio = "radio0: {path: p, band: 5g, rated_power_dbm: 20, max_drive_dbm: 20}"
+    box = "board: a,b\n    profile: a_b\n    target: ath79/generic\n    release: '24.10'\n    lan_ports: [eth0]\n"
+    box += f"    radios: {{{radio}}}\n"
     (project / "common/deep.yaml").write_text(
         "include: [../north/inside.yaml]\nhardware:\n  box:\n    package_files: [c_1_all.ipk]\n"
         f"    firmware: {{image: box.bin, usign_key: key}}\n    {box}",
@@ -79,7 +81,8 @@ def test_files_outside_the_inventory_are_still_found_from_the_copy(tmp_path: Pat
     )
     (project / "common/all.yaml").write_text("include: [deep.yaml]\n", encoding="utf-8")
     (project / "north/inside.yaml").write_text(
-        f"hardware:\n  other:\n    package_files: [../packages/a_1_all.ipk, ../packages/b_1_all.ipk]\n    {box}"
+        f"hardware:\n  other:\n    package_files: &files [../packages/a_1_all.ipk, ../packages/b_1_all.ipk]\n    {box}"
+        f"  same:\n    package_files: *files\n    {box}"
         "meshes:\n  far: {ssid: f, bssid: 02:ca:fe:00:00:0f, band: 5g, channel: 36, network: 10.9.0.0/24, "
         "backend: meshmerize,\n    operator_parts: {templates: ../parts, packages: [mm], interface: mm0}}\n",
         encoding="utf-8",
@@ -89,6 +92,7 @@ def test_files_outside_the_inventory_are_still_found_from_the_copy(tmp_path: Pat
     before = contents(project)
     fleet = copy_inventory(project / "north", tmp_path / "lab").fleet
     assert contents(project) == before
+    assert fleet.hardware["same"].package_files == fleet.hardware["other"].package_files
     named = [*fleet.hardware["other"].package_files, *fleet.hardware["box"].package_files]
     firmware = fleet.hardware["box"].firmware
     found = [Path(fleet.base, file) for file in (*named, firmware.image, firmware.usign_key)]
