@@ -44,12 +44,11 @@ def bring_outside_files(source: Path, folder: Path, target: Path, fleet: Fleet, 
         edits[file] |= {item.start: (item, text) for item, text in _includes(file, copies, environ)}
     for place, path in _references(fleet):
         tree = None if merged.root is None else descend(merged.root, place)
-        file = Path(tree.file).resolve() if isinstance(tree, Scalar) else None
-        is_elsewhere = file in outside or not path.resolve().is_relative_to(home)
-        if isinstance(tree, Scalar) and file is not None and is_elsewhere and path.exists():
-            real = path.resolve()
-            where = _folder_copy(real, target) if path.is_dir() else real
-            edits[file][tree.start] = tree, str(where)
+        if not isinstance(tree, Scalar) or not path.exists():
+            continue
+        named_in, real = Path(tree.file).resolve(), path.resolve()
+        if named_in in outside or not real.is_relative_to(home):
+            edits[named_in][tree.start] = tree, str(_folder_copy(real, target) if path.is_dir() else real)
     for file in edits:
         text = _text(file)
         for tree, path_there in sorted(edits[file].values(), key=lambda edit: -edit[0].start):
