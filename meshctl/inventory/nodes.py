@@ -126,6 +126,8 @@ class _Building:
     _templates: dict[tuple[Layer, ...], _Template | None] = field(default_factory=dict)
     _counts: Counter[Layer] = field(default_factory=Counter)
     _failed: set[Layer] = field(default_factory=set)
+    # rules of addresses, with what is wrong with them: at the first of their nodes
+    _wrong_rules: set[tuple[Layer, str]] = field(default_factory=set)
 
     def node(self, spec: NodeSpec, robot: str) -> Node | None:
         index_of = self._count(spec)
@@ -245,6 +247,9 @@ class _Building:
             try:
                 value = value.address(template.network, index_of[layer])
             except BadAddress as reason:
+                if (layer, str(reason)) in self._wrong_rules:
+                    return None
+                self._wrong_rules.add((layer, str(reason)))
                 self._report(codes.BAD_ADDRESS, layer, f"{reason} (node '{spec.name}')", below=("address",))
                 return None
         return ip_interface((value, self._prefix_length(value, template.network)))

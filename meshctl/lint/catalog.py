@@ -17,6 +17,7 @@ from meshctl.lint.rules import (
     computers,
     drivers,
     encryption,
+    extra_services,
     firmware,
     hardware,
     housekeeping,
@@ -78,6 +79,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Hardware and packages", hardware),
     ("Drivers", drivers),
     ("Rendering", rendering),
+    ("Further services", extra_services),
 )
 
 

@@ -1,4 +1,4 @@
-"""Radio drivers and device paths (MC841 to MC843)."""
+"""Radio drivers and device paths (MC841 to MC844)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, RadioHardware
+from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, Node, RadioHardware, Release
 from meshctl.wording import join_limited
 
 # modes that no firmware of the driver supports (docs/facts/openwrt-facts.md, section 6)
@@ -139,3 +139,72 @@ def _is_bad_pci(part: str) -> bool:
     if part.startswith("pci") or _LIKE_PCI_BUS.fullmatch(part):
         return _PCI_BUS.fullmatch(part) is None
     return _LIKE_PCI_SLOT.fullmatch(part) is not None and _PCI_SLOT.fullmatch(part) is None
+
+
+# drivers of radios up to 802.11n and 802.11ac, and those of Wi-Fi 6; others may do 802.11be
+_HT_ONLY = frozenset(
+    [
+        *("ath9k", "ath9k-htc", "carl9170", "brcmsmac", "mt7601u", "mt7603", "rt2800-pci", "rt2800-soc"),
+        *("rt2800-usb", "rtl8192cu"),
+    ]
+)
+_UP_TO_VHT = frozenset(
+    [
+        *("ath10k", "ath10k-ct", "brcmfmac", "mt7615e", "mt7663u", "mt76x0e", "mt76x0u", "mt76x2", "mt76x2u"),
+        *("mwifiex-pcie", "mwlwifi", "rtl8821ae", "rtw88"),
+    ]
+)
+_UP_TO_HE = frozenset({"ath11k", "mt7915e", "mt7921e", "mt7921u"})
+_GENERATIONS = ("HT", "VHT", "HE", "EHT")
+# the first release whose scripts know the htmodes (mac80211.sh, wifi-scripts)
+_SINCE = {"HE": Release.V21_02, "EHT": Release.V24_10}
+
+
+@fleet_rule(
+    "MC844",
+    Severity.WARNING,
+    "A radio or release does not support the mesh's htmode",
+    why="""ath9k and other radios of 802.11n know no VHT, 802.11ac no HE, and 19.07's scripts no HE at all. Depending on
+    the release the interface is not created, or joins the mesh with 802.11g rates and another width than its
+    neighbors.""",
+    fix="""Use HT20 or HT40 with 802.11n, VHT with 802.11ac, HE with Wi-Fi 6 from 21.02 on and EHT from 24.10 on;
+    correct `driver` of the radio if it is another one.""",
+    failing="""
+    hardware: {rocket: {radios: {radio0: {driver: ath9k}}}}
+    meshes: {main: {htmode: HE20}}
+    """,
+    passing="""
+    hardware: {rocket: {radios: {radio0: {driver: mt7915e}}}}
+    meshes: {main: {htmode: HE20}}
+    """,
+)
+def htmode_beyond_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    joined = (
+        ((mesh.name, limit), node.name)
+        for node in fleet.managed()
+        for radio in node.radios
+        if (mesh := fleet.meshes.get(radio.mesh or "")) is not None
+        for limit in _limits(node, radio.hardware, mesh.htmode)
+    )
+    for (name, limit), nodes in group_by_key(joined).items():
+        mesh = fleet.meshes[name]
+        message = f"{limit} has no {_generation(mesh.htmode)}: {join_limited(nodes)}"
+        yield Finding(("meshes", mesh.name, "htmode"), message, "an htmode that all its radios support", mesh.htmode)
+
+
+def _generation(htmode: str) -> str:
+    return htmode.rstrip("0123456789+-")
+
+
+def _limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
+    """What keeps the node's radio from the htmode: its driver, its release."""
+    wanted = _generation(htmode)
+    if wanted not in _GENERATIONS:
+        return
+    known = {**dict.fromkeys(_HT_ONLY, "HT"), **dict.fromkeys(_UP_TO_VHT, "VHT"), **dict.fromkeys(_UP_TO_HE, "HE")}
+    driver, _ = _driver(node.hardware, radio)
+    best = known.get(driver, "EHT")
+    if _GENERATIONS.index(wanted) > _GENERATIONS.index(best):
+        yield f"{driver} ({radio.name} of {node.hardware.name})"
+    if wanted in _SINCE and node.release < _SINCE[wanted]:
+        yield f"OpenWrt {node.release}"

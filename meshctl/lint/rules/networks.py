@@ -183,7 +183,7 @@ def network_full(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             path = ("meshes", name, "network")
             yield Finding(
                 path,
-                f"{len(taken[name])} addresses are in use",
+                f"{len(taken[name])} of {mesh.network.num_addresses - 2} in use",
                 f"at least {reserve} free addresses",
                 f"{max(room, 0)}",
             )

@@ -145,7 +145,7 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
-    for node, packages in _with_extra(fleet, context):
+    for node, packages in with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, rest = key.partition(".")
             section, _, option = rest.rpartition(".")
@@ -161,7 +161,7 @@ def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[F
                     yield Finding(path, f"no {kind} of {place}", f"one of {join_limited(known)}", name, hint)
 
 
-def _with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[str, uci.Package]]]:
+def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[str, uci.Package]]]:
     """The nodes with `extra_uci` that render, and their packages by name."""
     for node, outcome in context.trial.of(fleet):
         if node.extra_uci and isinstance(outcome, Rendered):
@@ -197,7 +197,7 @@ def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding
             if near:
                 path = ("nodes", node.name, "extra_uci", key)
                 yield Finding(path, "no program reads this package", " or ".join(near), package, asked(near))
-    for node, packages in _with_extra(fleet, context):
+    for node, packages in with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, section = key.partition(".")
             made = packages[package].section(section) if package in packages and "." not in section else None

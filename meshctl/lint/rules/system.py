@@ -1,4 +1,4 @@
-"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC234)."""
+"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC235)."""
 
 from __future__ import annotations
 
@@ -94,3 +94,33 @@ def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             continue
         if any(address in network for _, network in networks(fleet)):
             yield Finding(path, "no station in the inventory has this address", "the address of a computer", host)
+
+
+@fleet_rule(
+    "MC235",
+    Severity.WARNING,
+    "A radio is named as log host or time server",
+    why="""OpenWrt's logd receives no logs of other devices, and meshctl turns off the time server of the nodes: nothing
+    answers there, logs are lost, and clocks stay wrong.""",
+    fix="""Name the operator's computer. A radio keeps the time of others with `extra_uci: {system.ntp.enable_server:
+    "1"}`, and collects logs with a package such as syslog-ng.""",
+    failing="system: {ntp_servers: [10.42.0.1]}",
+    passing="""
+    system: {ntp_servers: [10.42.0.1]}
+    nodes: {base: {extra_uci: {system.ntp.enable_server: '1'}}}
+    """,
+)
+def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    radios = {str(node.address.ip): node for node in fleet.managed()}
+    node = radios.get(fleet.system.log_host)
+    if node is not None and not any(package in _LOG_SERVERS for package in (*node.hardware.packages, *node.packages)):
+        message = f"{node.name} is a radio, which receives no logs"
+        yield Finding(("system", "log_host"), message, "the address of a computer", fleet.system.log_host)
+    for index, host in enumerate(fleet.system.ntp_servers):
+        node = radios.get(host)
+        if node is not None and node.extra_uci.get("system.ntp.enable_server") != "1":
+            message = f"{node.name} is a radio, whose time server is off"
+            yield Finding(("system", "ntp_servers", str(index)), message, "the address of a computer", host)
+
+
+_LOG_SERVERS = frozenset({"syslog-ng", "rsyslog"})

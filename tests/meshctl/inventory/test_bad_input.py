@@ -389,3 +389,10 @@ def test_a_pipe_in_the_inventory_s_directory_is_not_waited_for(tmp_path: Path) -
 @pytest.mark.parametrize("text", ["operators\n  ssh_keys: []\n", "nodes:\n  a: {}\n b: {}\n"])
 def test_a_syntax_error_that_is_noticed_late_points_above(text: str, tmp_path: Path) -> None:
     assert errors_of(tmp_path, text)[0].hint.startswith("the mistake may be above")
+
+
+def test_what_is_wrong_with_an_address_rule_is_reported_once_for_all_its_nodes(tmp_path: Path) -> None:
+    text = "nodes:\n  n[01-39]: {hardware: rocket, radios: {radio0: {mesh: null}}, address: {rule: network + index}}\n"
+    (error,) = errors_of(tmp_path, text)
+    assert (error.code, error.path) == ("INV036", "nodes.n[01-39].address")
+    assert error.message == "the rule uses `network`, but the node is in no mesh (node 'n01')"
