@@ -20,7 +20,7 @@ from meshctl.plan.firmware import firmware_step
 from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
-from meshctl.plan.packages import NO_NEEDS, Needs, package_step
+from meshctl.plan.packages import NO_NEEDS, Needs, other_versions, package_step
 from meshctl.plan.preconditions import failed_precondition
 from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
@@ -126,6 +126,7 @@ def node_plan(
             *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
             *(f"{text}; the new firmware must bring another driver" for text in lacking),
             *_other_target(node, seen),
+            *(other_versions(seen, desired.package_files) if firmware is None else ()),
         ),
     )
 

@@ -10,8 +10,10 @@ from meshctl.device.observation import Observation
 from meshctl.plan.values import PackageStep
 
 # opkg: NAME_VERSION_ARCH.ipk; apk: NAME-VERSION.apk, where a version starts with a digit
-_IPK = re.compile(r"(?P<name>[^_/]+)_[^/]*\.ipk")
-_APK = re.compile(r"(?P<name>[^/]+?)-[0-9][^/]*\.apk")
+_IPK = re.compile(r"(?P<name>[^_/]+)_(?P<version>[^_/]*)(_[^/]*)?\.ipk")
+_APK = re.compile(r"(?P<name>[^/]+?)-(?P<version>[0-9][^/]*)\.apk")
+# opkg's file names lack the epoch
+_EPOCH = re.compile(r"\d+:")
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +29,26 @@ NO_NEEDS = Needs()
 
 def package_name(file: str) -> str | None:
     """`path/kmod-batman-adv_5.15-1_mips_24kc.ipk` -> `kmod-batman-adv`; None for any other file."""
-    base = file.rpartition("/")[2]
-    match = _IPK.fullmatch(base) or _APK.fullmatch(base)
+    match = _parts(file)
     return None if match is None else match["name"]
+
+
+def _parts(file: str) -> re.Match[str] | None:
+    base = file.rpartition("/")[2]
+    return _IPK.fullmatch(base) or _APK.fullmatch(base)
+
+
+def other_versions(seen: Observation, files: Iterable[str]) -> tuple[str, ...]:
+    """A note for each package file of another version than that which is installed: it is not installed."""
+    installed = seen.packages or {}
+    return tuple(
+        f"{match['name']} is installed as {version}, package_files has {match['version']}: only missing packages are "
+        "installed; to replace it, flash an image that contains it"
+        for file in files
+        if (match := _parts(file)) is not None
+        and (version := _EPOCH.sub("", installed.get(match["name"], ""), count=1))
+        and version != match["version"]
+    )
 
 
 def missing_packages(needs: Needs, seen: Observation) -> tuple[tuple[str, ...], ...]:

@@ -159,7 +159,7 @@ def _grouped(nodes: Iterable[NodePlan], *, with_diffs: bool) -> Iterator[tuple[N
 
 def _effect_key(node: NodePlan, *, with_diffs: bool) -> object:
     if node.verdict is not Verdict.CHANGE:
-        return node.verdict, node.reason, node.hint
+        return node.verdict, node.reason, node.hint, node.notes if node.verdict is Verdict.SAME else ()
     return (
         *(node.cut, node.splits, node.firmware, node.packages, node.effects, node.notes),
         tuple((one.path, one.kind, changed_lines(one) if with_diffs else summary(one)) for one in node.files),
@@ -170,6 +170,10 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
     node = group[0]
     match node.verdict:
         case Verdict.SAME:
+            if node.notes:
+                yield Line("")
+                yield Line(f"{', '.join(one.node for one in group)}  up to date")
+                yield from (Line(f"  note: {note}", "dim") for note in node.notes)
             return
         case Verdict.AWAY | Verdict.REFUSED:
             yield Line("")

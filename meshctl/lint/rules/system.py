@@ -1,7 +1,8 @@
-"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC235)."""
+"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC236)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
@@ -11,6 +12,7 @@ from meshctl.lint.rules.addresses import as_address, networks, stations
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
 from meshctl.model import Fleet
+from meshctl.wording import counted
 
 
 @fleet_rule(
@@ -124,3 +126,27 @@ def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 
 
 _LOG_SERVERS = frozenset({"syslog-ng", "rsyslog"})
+
+
+_OFFSET_OF_UTC = re.compile(r"(UTC|GMT)(?P<sign>[+-]?)0*(?P<hours>\d+)")
+
+
+@fleet_rule(
+    "MC236",
+    Severity.NOTE,
+    "A time zone is an offset in POSIX's direction",
+    why="""POSIX counts hours west of Greenwich: with `UTC+2` a clock is two hours behind UTC, and calls that UTC.
+    Elsewhere UTC+2 is two hours ahead, so one of its readers is wrong.""",
+    fix="Write the offset as the zone's name, too: `<+02>-2` is two hours ahead of UTC, `<-05>5` five hours behind.",
+    failing="system: {timezone: UTC+2}",
+    passing="system: {timezone: '<+02>-2'}",
+)
+def offset_of_utc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    written = fleet.system.timezone
+    match = _OFFSET_OF_UTC.fullmatch(written)
+    if match is not None and match["hours"] and int(match["hours"]):
+        hours = int(match["hours"])
+        is_west = match["sign"] != "-"
+        meant, named = (f"<-{hours:02}>{hours}", "behind") if is_west else (f"<+{hours:02}>-{hours}", "ahead of")
+        hint = f"{written} is {counted(hours, 'hour')} {named} UTC; write {meant}, or the opposite if you meant that"
+        yield Finding(("system", "timezone"), "counts westward", meant, written, hint)

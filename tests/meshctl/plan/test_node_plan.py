@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from meshctl.device.observation import BoardInfo, ChangeStatus, ReleaseInfo
-from meshctl.plan import Cut, Verdict, node_plan
+from meshctl.plan import Cut, Plan, Verdict, node_plan
 from meshctl.plan.masking import Fingerprints
+from meshctl.report.plan_text import plan_lines
 from meshctl.uci import Section
 from tests.meshctl.plan.support import FINGERPRINTS, PASS_PHRASE, factory, fleet, planned, running, wanted
 
@@ -199,3 +200,32 @@ def test_a_removed_threshold_is_noted_because_the_driver_keeps_it(option: str, v
     assert plan.verdict is Verdict.CHANGE
     assert f"radio0: {option} {value} is removed, but stays in force until the node reboots" in plan.notes
     assert not any("stays in force" in note for note in planned(fleet(), "b01", seen).notes)
+
+
+@pytest.mark.parametrize(
+    ("installed", "file", "noted"),
+    [
+        ("2024.3-r1", "batctl-default_2024.3-r2_mips_24kc.ipk", "2024.3-r2"),
+        ("2024.3-r2", "batctl-default_2024.3-r2_mips_24kc.ipk", ""),
+        ("1:2024.3-r2", "batctl-default_2024.3-r2_mips_24kc.ipk", ""),
+        ("2024.3-r1", "batctl-default-2024.3-r2.apk", "2024.3-r2"),
+        ("2024.3-r2", "batctl-default-2024.3-r2.apk", ""),
+        ("2024.3-r1", "other_2024.3-r2_all.ipk", ""),
+    ],
+)
+def test_a_package_file_of_another_version_than_that_installed_is_noted_as_left_out(
+    installed: str, file: str, noted: str
+) -> None:
+    team = fleet()
+    desired = replace(wanted(team, "b01"), package_files=(f"packages/{file}",))
+    seen = running(team, "b01")
+    seen = replace(seen, packages={**(seen.packages or {}), "batctl-default": installed})
+    plan = node_plan(desired, seen, FINGERPRINTS)
+    assert plan.verdict is Verdict.SAME
+    assert [note.partition(":")[0] for note in plan.notes] == (
+        [f"batctl-default is installed as {installed}, package_files has {noted}"] if noted else []
+    )
+    text = "\n".join(
+        line.text for line in plan_lines(Plan("team", 0.0, (), {"b01": plan}), with_diffs=False, width=200)
+    )
+    assert ("b01  up to date" in text) == bool(noted)
