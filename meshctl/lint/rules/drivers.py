@@ -155,6 +155,7 @@ _UP_TO_VHT = frozenset(
     ]
 )
 _UP_TO_HE = frozenset({"ath11k", "mt7915e", "mt7921e", "mt7921u"})
+_BEST = {**dict.fromkeys(_HT_ONLY, "HT"), **dict.fromkeys(_UP_TO_VHT, "VHT"), **dict.fromkeys(_UP_TO_HE, "HE")}
 _GENERATIONS = ("HT", "VHT", "HE", "EHT")
 # the first release whose scripts know the htmodes (mac80211.sh, wifi-scripts)
 _SINCE = {"HE": Release.V21_02, "EHT": Release.V24_10}
@@ -201,9 +202,8 @@ def _limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
     wanted = _generation(htmode)
     if wanted not in _GENERATIONS:
         return
-    known = {**dict.fromkeys(_HT_ONLY, "HT"), **dict.fromkeys(_UP_TO_VHT, "VHT"), **dict.fromkeys(_UP_TO_HE, "HE")}
     driver, _ = _driver(node.hardware, radio)
-    best = known.get(driver, "EHT")
+    best = _BEST.get(driver, "EHT")
     if _GENERATIONS.index(wanted) > _GENERATIONS.index(best):
         yield f"{driver} ({radio.name} of {node.hardware.name})"
     if wanted in _SINCE and node.release < _SINCE[wanted]:
