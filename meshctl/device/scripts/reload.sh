@@ -11,7 +11,7 @@
 #
 # named by process id, because a rollback may start while the reload of its change is still running
 BARRIER=meshctl-barrier-$$
-PASSED=/tmp/meshctl/$BARRIER
+BARRIERS=/tmp/meshctl/meshctl-barrier
 MEMBERS=/tmp/meshctl/reload.members
 #
 # The limits are for what hangs, not for what is slow: a change's waits end with its window (is_late), and a reload after a
@@ -68,17 +68,30 @@ until_s() {
 # barrier: returns once procd has run every script triggered before it. procd delays each trigger and queues the scripts
 # in the order in which their delays end, so ours, triggered last with the same delay, runs last.
 barrier() {
-	[ ! -e "$PASSED" ] || rm -f "$PASSED"
-	if ! ubus call service set "{\"name\":\"$BARRIER\",\"triggers\":[[\"config.change\",[\"if\",[\"eq\",\"package\",\"$BARRIER\"],[\"run_script\",\"touch\",\"$PASSED\"]],1000]]}" ||
+	# a directory, in which a `touch` that procd runs after this script's end makes nothing
+	mkdir -p "$BARRIERS-$$"
+	if ! ubus call service set "{\"name\":\"$BARRIER\",\"triggers\":[[\"config.change\",[\"if\",[\"eq\",\"package\",\"$BARRIER\"],[\"run_script\",\"touch\",\"$BARRIERS-$$/passed\"]],1000]]}" ||
 		! ubus call service event "{\"type\":\"config.change\",\"data\":{\"package\":\"$BARRIER\"}}"; then
 		pause $BLIND_S
+		end_barrier $$
 		return 0
 	fi
-	until_s $BARRIER_LIMIT_S [ -e "$PASSED" ]
+	until_s $BARRIER_LIMIT_S [ -e "$BARRIERS-$$/passed" ]
 	passed=$?
-	ubus call service delete "{\"name\":\"$BARRIER\"}"
-	[ ! -e "$PASSED" ] || rm -f "$PASSED"
+	end_barrier $$
 	return $passed
+}
+
+end_barrier() { # PID: of its script
+	ubus call service delete "{\"name\":\"meshctl-barrier-$1\"}"
+	rm -rf "$BARRIERS-$1"
+}
+
+# end_stopped_barriers: those of reloads that were stopped, as by a rollback
+end_stopped_barriers() {
+	for stopped in "$BARRIERS"-*; do
+		[ ! -d "$stopped" ] || kill -0 "${stopped##*-}" 2>/dev/null || end_barrier "${stopped##*-}"
+	done
 }
 
 # netifd reads /lib/netifd/proto only when it starts (proto_shell_init, 19.07 to 25.12). If the package was installed
@@ -304,6 +317,7 @@ resolve_without_dnsmasq() {
 }
 
 [ -d /tmp/meshctl ] || mkdir -p /tmp/meshctl
+end_stopped_barriers
 split_service "$(ubus call service list '{"name":"dropbear"}' 2>/dev/null)"
 before_options=$WITHOUT_PIDS before_pids=$PIDS
 before_interfaces=' '

@@ -143,6 +143,24 @@ def test_a_reload_that_is_done_before_the_window_ends_succeeds(node: Node) -> No
     assert node.reload("system", environ={"UNTIL_S": "1017"}) == (0, "")
 
 
+@pytest.mark.parametrize("procd_is_later", [False, True], ids=["procd first", "the next reload first"])
+def test_what_a_stopped_reload_has_left_is_gone_after_the_next(node: Node, procd_is_later: bool) -> None:
+    (node.place / "stuck").touch()
+    node.tool("sleep", "kill -KILL $PPID")
+    assert node.reload("system")[0] < 0
+    first_set = next(line for line in node.log if "service set" in line)
+    procd_runs = ["touch", (node.place / "trigger").read_text().strip()]
+    (node.place / "stuck").unlink()
+    if not procd_is_later:
+        subprocess.run(procd_runs, check=True)
+    assert node.reload("system") == (0, "")
+    if procd_is_later:
+        subprocess.run(procd_runs, check=False, capture_output=True)
+    assert [left.name for left in (node.place / "run" / "meshctl").iterdir()] in ([], ["pause"])
+    name = first_set.partition('"name":"')[2].partition('"')[0]
+    assert f'ubus call service delete {{"name":"{name}"}}' in node.log
+
+
 def test_a_fixed_delay_is_used_if_procd_rejects_the_trigger(node: Node) -> None:
     (node.place / "no-triggers").touch()
     assert node.reload("system") == (0, "")
