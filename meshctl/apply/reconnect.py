@@ -2,7 +2,8 @@
 
 A node that rebooted within a minute numbers its frames from 0 again, and each neighbor that still has its station entry
 drops them until the numbers have caught up: batman-adv hears it, logins time out for minutes (docs/lab.md). `reconnect`
-has the neighbors that hear such a node remove their entries if they are stale, which they verify (`stale_stations`).
+has the neighbors that hear such a node remove their entries if they are stale, which they verify (`stale_stations`): by
+its SSH server, too, since the numbers count for each traffic class, and replies to echo requests are of another one.
 If a relay has rebooted, a node behind it drops the relay's frames, and only the relay can reach it: its numbers catch
 up with as many echo requests as it takes.
 """
@@ -14,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
-from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, reconnect_script
+from meshctl.apply.stale_stations import CAUGHT_UP, GONE, MAX_QUERIED, StationEntry, inventory_login, reconnect_script
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.fleet import Event, EventKind, Interrupt, Observer, silent
@@ -26,8 +27,9 @@ from meshctl.topology import mesh_macs
 
 # A neighbor on the air sends several times a second.
 HEARD_MS = 2000
-# Each entry costs its holder up to 3 s.
 QUERY_TIMEOUT_S = 30.0
+# A login that is not answered, and an echo request.
+ENTRY_TIMEOUT_S = 5.0
 # A minute, or twice that on a slow processor (docs/facts/openwrt-checked.md).
 CATCH_UP_TIMEOUT_S = 150.0
 # For at most so many neighbors a holder sends until their numbers have caught up.
@@ -63,11 +65,13 @@ def reconnect(
     if not asked:
         return Reconnected()
     in_use: list[SshConnection] = []
+    logins = {mac: inventory_login(fleet.nodes[name]) for mac, name in owners.items() if name in fleet.nodes}
 
     def ask(holder: str) -> str | None:
         entries = asked[holder]
-        script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP)
-        timeout_s = QUERY_TIMEOUT_S + CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
+        script = reconnect_script(entries, caught_up=MAX_CAUGHT_UP, logins=logins)
+        timeout_s = QUERY_TIMEOUT_S + ENTRY_TIMEOUT_S * len(entries)
+        timeout_s += CATCH_UP_TIMEOUT_S * min(len(entries), MAX_CAUGHT_UP)
         doing = f"repairs its links to nodes that do not answer (at most {timeout_s:.0f} s)"
         observer(Event(EventKind.STEP, holder, time.time(), doing))
         try:

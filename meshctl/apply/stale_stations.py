@@ -7,7 +7,7 @@ causes the same loss in the other direction. So the holder of an entry verifies 
 neighbor that it hears and that does not answer it (scripts/stale_station.sh). Where it has no batman-adv to verify
 that, it removes the entry only if meshctl observed that the radio restarted. An answer to an echo request does not
 show that logins pass, which are of another traffic class: if a node stays unreachable although its timer has undone the
-change, its neighbors try to connect to its SSH server instead.
+change, or is away when a run begins, its neighbors try to connect to its SSH server as well.
 
     observations -> the holders of entries of a node's radios (`entries_of`), nodes that may hold one
     (`possible_holders`), nodes whose route to the base leads through the node (`routed_through`)
@@ -90,7 +90,13 @@ def entries_of(
 def login_of(node: Node, before: Observation) -> Login | None:
     """Where a node's neighbors can log in to it, unless its change gives it another address than it had `before`."""
     had = {address.partition("/")[0] for interface in before.interfaces or () for address in interface.addresses}
-    return (str(node.address.ip), node.ssh.port) if str(node.address.ip) in had else None
+    login = inventory_login(node)
+    return login if login[0] in had else None
+
+
+def inventory_login(node: Node) -> Login:
+    """Where a node accepts logins according to the inventory."""
+    return str(node.address.ip), node.ssh.port
 
 
 def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
@@ -181,20 +187,27 @@ def flush_script(
     It prints `gone|kept|answers|unknown MAC` for each entry that is old enough and whose neighbor is heard.
     """
     verb = "flush_restarted" if has_restarted else "flush_stale"
-    where = "" if login is None else f" {quoted(login[0])} {login[1]}"
     calls = [
         f"{verb} {quoted(entry.ifname) if entry.ifname else _EVERY_INTERFACE} {quoted(entry.mac)} "
-        f"{math.ceil(older_than_s)}{where}\n"
+        f"{math.ceil(older_than_s)}{_where(login)}\n"
         for entry in entries
     ]
     return "".join((script("stale_station.sh"), *calls))
 
 
-def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int) -> str:
+def _where(login: Login | None) -> str:
+    return "" if login is None else f" {quoted(login[0])} {login[1]}"
+
+
+def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int, logins: Mapping[str, Login]) -> str:
     """POSIX sh that repairs a holder's links to these neighbors: it removes stale entries, then sends to the first
-    `caught_up` of those that still do not answer. It prints a line for each of both."""
+    `caught_up` of those that still do not answer. It prints a line for each of both. `logins`: lower-case MAC -> where
+    its node accepts logins."""
     words = [(quoted(entry.ifname), quoted(entry.mac)) for entry in entries]
-    flushes = [f"flush_stale {ifname} {mac} 0\n" for ifname, mac in words]
+    flushes = [
+        f"flush_stale {ifname} {mac} 0{_where(logins.get(entry.mac.lower()))}\n"
+        for (ifname, mac), entry in zip(words, entries, strict=True)
+    ]
     sends = [f"catch_up {ifname} {mac}\n" for ifname, mac in words[:caught_up]]
     return "".join((script("stale_station.sh"), *flushes, f"pause {RELEARN_S}\n", *sends))
 

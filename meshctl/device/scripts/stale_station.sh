@@ -14,7 +14,7 @@
 # entry. It drops only what is numbered before its window, half of all numbers at most, so this node sends so many frames.
 HEARD_MS=2000  # a neighbor sends several times a second: beacons, and OGMs that it originates or repeats
 ECHOES=3       # each is sent up to seven times on the air: a link that loses all of them is useless anyway
-LOGIN_S=3      # for a connection to dropbear: two tries of TCP
+LOGIN_S=3      # for a connection to dropbear: TCP tries at 0 and 1 s, and again at 3 s
 WATCH_PAUSE_S=2
 FLUSHES=3      # per watch and entry: if removing it did not help, repeating it does not either
 SENDERS=40     # of `catch_up`: each sends one echo request per second, until it is answered; 2,080 in all, of 4,096 numbers
@@ -73,36 +73,40 @@ remove() { # DEV MAC
 	if iw dev "$1" station del "$2" 2>/dev/null; then echo "gone $2"; else echo "kept $2"; fi
 }
 
-# login_is_silent ADDRESS PORT: whether a connection there is neither accepted nor refused
-login_is_silent() {
+# try_login ADDRESS PORT: sets LOGIN to answered (a refusal, or a connection without a word from dropbear, is an answer),
+# silent (nothing comes back, although the address is known on the link), or unknown
+try_login() {
+	LOGIN=unknown
+	command -v nc >/dev/null || return 0
 	mkdir -p /tmp/meshctl
 	nc "$1" "$2" </dev/null >/tmp/meshctl/login.$$ 2>&1 &
-	login=$! left_s=$LOGIN_S silent=1
-	while [ $silent = 1 ] && [ $left_s -gt 0 ]; do
+	login=$! left_s=$LOGIN_S
+	while [ $LOGIN = unknown ] && [ $left_s -gt 0 ]; do
 		pause 1
 		left_s=$((left_s - 1))
-		! grep -q -e SSH- -e refused /tmp/meshctl/login.$$ || silent=0
+		! grep -q -e SSH- -e refused /tmp/meshctl/login.$$ || LOGIN=answered
 	done
+	[ $LOGIN = answered ] || case $(netstat -tn 2>/dev/null | grep -F " $1:$2 ") in
+	# 0x0: no device has answered for the address
+	*SYN_SENT*) grep -q "^$1 .* 0x0 " /proc/net/arp || LOGIN=silent ;;
+	?*) LOGIN=answered ;;
+	esac
 	kill "$login" 2>/dev/null
 	wait "$login" 2>/dev/null
 	rm -f /tmp/meshctl/login.$$
-	[ $silent = 1 ]
 }
 
 # flush_stale DEVICES MAC SECONDS [ADDRESS PORT]: removes the entry if it is that old and stale; prints `gone`, `kept` (it
-# cannot be removed), `answers`, or `unknown` MAC. With ADDRESS and PORT of the neighbor's dropbear, only an answer from
-# there counts, if this node can try.
+# cannot be removed), `answers`, or `unknown` MAC. With ADDRESS and PORT of the neighbor's dropbear, a neighbor that answers
+# echo requests has to let something come back from there, too.
 flush_stale() {
 	for dev in $1; do
 		look "$dev" "$2"
 		is_old "$3" && is_heard || continue
-		if [ -z "$4" ] || ! command -v nc >/dev/null; then
-			echo_state "$dev" "$2"
-		elif login_is_silent "$4" "$5"; then
-			echo_state "$dev" "$2" 1
-			[ "$ECHO" = unknown ] || ECHO=lost
-		else
-			ECHO=answered
+		echo_state "$dev" "$2"
+		if [ $ECHO = answered ] && [ -n "$4" ]; then
+			try_login "$4" "$5"
+			[ $LOGIN != silent ] || ECHO=lost
 		fi
 		case $ECHO in
 		answered) echo "answers $2" ;;

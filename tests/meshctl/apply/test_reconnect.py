@@ -71,6 +71,28 @@ def test_an_interrupt_need_not_wait_for_neighbors_that_repair_their_links(when: 
     assert events[0].text.startswith("repairs its links to nodes that do not answer (at most ")
 
 
+def test_a_node_that_does_not_answer_has_its_ssh_server_tried_by_its_neighbors() -> None:
+    """It may answer their echo requests, which are of another traffic class (finding 25 of node-assumptions.md)."""
+    scripts: list[str] = []
+
+    def run(script: str, *, timeout_s: float) -> Any:
+        scripts.append(script)
+        return SimpleNamespace(stdout=f"gone {MAC}\n")
+
+    @contextmanager
+    def borrow(_node: object) -> Iterator[object]:
+        yield SimpleNamespace(run=run)
+
+    heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
+    around = {"b01": replace(running(fleet(), "b01", neighbours=()), stations=(heard,))}
+    pool = cast(ConnectionPool, SimpleNamespace(borrow=borrow))
+    seen = FleetObservation(around, {"b02": "no answer"})
+    assert reconnect(pool, fleet(), seen, {MAC: "b02"}, interrupt=Interrupt()).nodes == {"b02"}
+    (script,) = scripts
+    b02 = fleet().nodes["b02"]
+    assert f"\nflush_stale mesh0 {MAC} 0 {b02.address.ip} {b02.ssh.port}\n" in script
+
+
 def test_only_neighbors_that_hear_an_unreachable_node_now_are_asked_for_stale_entries() -> None:
     heard = Station("mesh0", MAC, inactive_ms=200, connected_s=500)
     silent, reachable = replace(heard, inactive_ms=30_000), replace(heard, mac=MACS["b03"])

@@ -205,6 +205,7 @@ now=$(($(cat "$HERE/now") + $1)); echo $now >"$HERE/now"; echo $((1000 + now)).0
 """,
     # `login` is what the neighbor's dropbear says; then it waits, as dropbear does. A pause lasts until it has spoken
     "nc": """cat "$HERE/login" >&2; echo "$@" >"$HERE/called"; exec /bin/sleep 60""",
+    "netstat": """cat "$HERE/connections" 2>/dev/null""",
     "start-stop-daemon": 'while [ "$1" != -- ]; do shift; done; shift; exec sh "$@"',
     "mkdir": ":",
     # so that pauses use `sleep`
@@ -226,7 +227,7 @@ def deletions(place: Path, seconds: list[Second], text: str, *, bat: str = "bat0
         (place / "net" / "mesh0" / "master").unlink(missing_ok=True)
         (place / "net" / "mesh0" / "master").symlink_to(f"../{bat}")
     text = text.replace("/sys/class/net", str(place / "net")).replace("/proc/uptime", str(place / "uptime"))
-    text = text.replace("/tmp/meshctl", str(place / "memory"))
+    text = text.replace("/tmp/meshctl", str(place / "memory")).replace("/proc/net/arp", str(place / "arp"))
     environ = {"PATH": f"{place}:/usr/bin:/bin", "HERE": str(place)}
     done = subprocess.run(
         ("sh", "-c", text), env=environ, cwd=place, capture_output=True, text=True, check=False, timeout=120
@@ -293,27 +294,49 @@ def test_an_entry_without_a_known_interface_is_flushed_on_all_interfaces(tmp_pat
     assert deleted == [f"1 mesh0 {MAC}", f"1 mesh1 {MAC}"]
 
 
+# What busybox's netstat prints of the connection to the neighbor's dropbear, and /proc/net/arp of its address.
+CONNECTION = "tcp        0      1 10.42.0.12:46772         10.42.0.11:22           %s\n"
+OTHERS = "tcp        0      0 10.42.0.12:22            10.42.0.250:53124       ESTABLISHED\n"
+KNOWN = "10.42.0.11       0x1         0x2         02:00:00:00:01:02     *        br-lan\n"
+UNUSED = "10.42.0.11       0x1         0x0         00:00:00:00:00:00     *        br-lan\n"
+SENT, OPEN = CONNECTION % "SYN_SENT", CONNECTION % "ESTABLISHED"
+
+
 @pytest.mark.parametrize(
-    ("login", "echo", "printed"),
+    ("login", "connections", "arp", "printed"),
     [
-        ("", ANSWERED, f"gone {MAC}\n"),
-        ("", LOST, f"gone {MAC}\n"),
-        ("", UNREACHABLE, f"unknown {MAC}\n"),
-        ("SSH-2.0-dropbear", LOST, f"answers {MAC}\n"),
+        # its SYN-ACK is dropped
+        ("", OTHERS + SENT, KNOWN, f"gone {MAC}\n"),
+        ("SSH-2.0-dropbear", OPEN, KNOWN, f"answers {MAC}\n"),
         # a firewall that rejects, or a server that is down
-        ("nc: can't connect to remote host (10.42.0.11): Connection refused", LOST, f"answers {MAC}\n"),
+        ("nc: can't connect to remote host (10.42.0.11): Connection refused", "", KNOWN, f"answers {MAC}\n"),
+        # a server that accepts and hangs, as one that waits for logd does
+        ("", OPEN, KNOWN, f"answers {MAC}\n"),
+        ("", CONNECTION % "FIN_WAIT2", KNOWN, f"answers {MAC}\n"),
+        # no device has the address: the node does not have its configuration yet
+        ("", SENT, UNUSED, f"answers {MAC}\n"),
+        ("nc: can't connect to remote host (10.42.0.11): No route to host", OTHERS, "", f"answers {MAC}\n"),
     ],
 )
-def test_with_the_neighbors_login_only_an_answer_of_its_ssh_server_counts(
-    tmp_path: Path, login: str, echo: str, printed: str
+def test_a_neighbor_that_answers_echo_requests_has_to_answer_logins_too(
+    tmp_path: Path, login: str, connections: str, arp: str, printed: str
 ) -> None:
     """Seen on real OpenWrt: after a power cut every echo request was answered, and no login for four minutes."""
     (tmp_path / "login").write_text(login)
+    (tmp_path / "connections").write_text(connections)
+    (tmp_path / "arp").write_text(arp)
     (tmp_path / "memory").mkdir()
     text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
-    assert deletions(tmp_path, [Second(100, 50, echo)] * 9, text)[0] == printed
+    assert deletions(tmp_path, [Second(100, 50, ANSWERED)] * 9, text)[0] == printed
     assert (tmp_path / "called").read_text() == "10.42.0.11 22\n"
     assert list((tmp_path / "memory").iterdir()) == []
+
+
+@pytest.mark.parametrize(("echo", "printed"), [(LOST, f"gone {MAC}\n"), (UNREACHABLE, f"unknown {MAC}\n")])
+def test_no_login_is_tried_where_no_echo_request_is_answered(tmp_path: Path, echo: str, printed: str) -> None:
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    assert deletions(tmp_path, [Second(100, 50, echo)] * 9, text)[0] == printed
+    assert not (tmp_path / "called").exists()
 
 
 def test_without_nc_echo_requests_decide(tmp_path: Path) -> None:
@@ -328,7 +351,7 @@ def reconnected(place: Path, now: Second, *, numbers: int | None = None) -> list
     """What a holder prints whose neighbor drops its frames until so many senders have sent."""
     if numbers is not None:
         (place / "numbers").write_text(f"{numbers}")
-    text = reconnect_script([StationEntry("b01", "mesh0", MAC)], caught_up=1)
+    text = reconnect_script([StationEntry("b01", "mesh0", MAC)], caught_up=1, logins={})
     return deletions(place, [now] * 5, text)[0].splitlines()
 
 
@@ -339,6 +362,13 @@ def test_a_neighbor_that_drops_frames_until_their_numbers_catch_up_is_sent_enoug
     # 12 bits of numbers, of which the half that is behind the window is dropped
     assert sent == [f"meshif bat0 ping -i 0.01 -c 52 -t 1 {MAC}"] * 40
     assert len(sent) * 52 > 4096 / 2
+
+
+def test_only_where_the_node_of_a_radio_is_known_its_ssh_server_is_tried() -> None:
+    entries = [StationEntry("b01", "mesh0", MAC.upper()), StationEntry("b01", "mesh0", OTHER)]
+    text = reconnect_script(entries, caught_up=0, logins={MAC: ("10.42.0.11", 2222)})
+    calls = [line for line in text.splitlines() if line.startswith("flush_stale ")]
+    assert calls == [f"flush_stale mesh0 {MAC.upper()} 0 10.42.0.11 2222", f"flush_stale mesh0 {OTHER} 0"]
 
 
 def test_a_neighbor_that_still_does_not_answer_is_sent_no_more(tmp_path: Path) -> None:
@@ -415,7 +445,7 @@ def test_values_reported_by_a_node_are_never_executed_by_the_shell(tmp_path: Pat
     evil = [StationEntry("b01", "mesh0; touch x", "$(touch x)"), StationEntry("b01", "'; touch x; '", "`touch x`")]
     for has_restarted in (False, True):
         text = flush_script(evil, older_than_s=1, has_restarted=has_restarted) + watch_script("b02", evil, for_s=4)
-        text += reconnect_script(evil, caught_up=1)
+        text += reconnect_script(evil, caught_up=1, logins={})
         deletions(tmp_path, [Second(100, 5000, LOST)] * 9, text)
         assert (tmp_path / "deleted").exists()
         assert not (tmp_path / "x").exists()
