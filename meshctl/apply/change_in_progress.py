@@ -31,6 +31,7 @@ from meshctl.model import Secret
 from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
+from meshctl.plan.effects import loaded_package
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
 from meshctl.plan.seen import WIRELESS, packages_seen
 from meshctl.render.rendered import MARKER_PATH
@@ -50,6 +51,8 @@ AWAIT_RELOAD_S = 30
 ROLLBACK_S = 30.0
 # Erasing 16 MB of NOR takes up to three minutes, more with other work beside it; then its init scripts run.
 FIRST_BOOT_TIMEOUT_S = 600.0
+# The UCI packages with which a node may drop a login without an answer; with others it refuses it.
+_MAY_DROP_LOGINS = frozenset({"firewall", "network"})
 # A login at an address other than the new one may hang: another device may have that address, or the server may be
 # going down. While the confirm window runs, each phase of such a login takes at most this share of it.
 ELSEWHERE_SHARE = 1 / 16
@@ -124,6 +127,13 @@ class ChangeInProgress:
         """Whether its timer has rolled it back and reloaded the services by now, unless it was confirmed."""
         limit_s = self.extra_s + self.window_s + ROLLBACK_S
         return self.started_s is not None and time.monotonic() - self.started_s > limit_s
+
+    @property
+    def is_login_due(self) -> bool:
+        """Whether its SSH server has to answer, if only by a refusal: the change cannot drop logins, or its timer has
+        undone it."""
+        touched = (*self.payload.files, *self.payload.removed)
+        return self.is_undone or not any(loaded_package(path.lstrip("/")) in _MAY_DROP_LOGINS for path in touched)
 
     @property
     def first_look_s(self) -> float:

@@ -39,9 +39,9 @@ class ChangeListener(Protocol):
     def waiting(self, connection: SshConnection) -> AbstractContextManager[None]:
         """Wraps a wait for the node's answer over a connection that the change may cut."""
 
-    def unreachable(self, among: Container[str] | None = None, *, is_undone: bool = False) -> None:
-        """The node did not answer. `among`: the only nodes that are reachable now. `is_undone`: the node's timer has
-        undone the change."""
+    def unreachable(self, among: Container[str] | None = None, *, is_login_due: bool = False) -> None:
+        """The node did not answer. `among`: the only nodes that are reachable now. `is_login_due`: from now on its SSH
+        server has to answer a login, if only by a refusal."""
 
     def observed(self) -> None:
         """The node answered, and the change is still applied."""

@@ -111,7 +111,7 @@ def _observe_once(change: ChangeInProgress, proof: SshConnection | None) -> tupl
         with change.listener.connecting():
             connection = connect(change)
     if connection is None:
-        change.listener.unreachable(is_undone=change.is_undone)
+        change.listener.unreachable(is_login_due=change.is_login_due)
         return None, None
     try:
         outcome = _act(change, connection, is_proof=was_reloaded)

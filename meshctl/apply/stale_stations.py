@@ -6,8 +6,8 @@ Without its station entry it learns the node from the next beacon. Removing the 
 causes the same loss in the other direction. So the holder of an entry verifies it first: it removes the entry of a
 neighbor that it hears and that does not answer it (scripts/stale_station.sh). Where it has no batman-adv to verify
 that, it removes the entry only if meshctl observed that the radio restarted. An answer to an echo request does not
-show that logins pass, which are of another traffic class: if a node stays unreachable although its timer has undone the
-change, or is away when a run begins, its neighbors try to connect to its SSH server as well.
+show that logins pass, which are of another traffic class. If a node is unreachable although its change cannot drop
+logins, or its timer has undone that, or it is away when a run begins, its neighbors also try its SSH server.
 
     observations -> the holders of entries of a node's radios (`entries_of`), nodes that may hold one
     (`possible_holders`), nodes whose route to the base leads through the node (`routed_through`)

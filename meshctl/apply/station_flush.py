@@ -2,8 +2,8 @@
 
     armed: nodes reached through the node, and the node itself, start to watch their entries
     unreachable: the other holders are queried, with growing pauses; after `BOOT_S` those of its other radios as well,
-        which restart if it has lost its power; once its timer has undone the change, only an answer of its SSH server
-        counts
+        which restart if it has lost its power; its SSH server has to answer, too, once its timer has undone the change,
+        or at once if the change cannot drop logins
     ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
@@ -94,7 +94,8 @@ class StationFlush:
     # nodes that watch their entries, and may be unreachable while this node is
     _watching: frozenset[str] = frozenset()
     _queried_s: list[float] = field(default_factory=list)
-    _tried_login: bool = False
+    # where the node has to answer logins, since the queries in `_queried_s`
+    _login: Login | None = None
     # nodes whose radios restart at the same moment and keep no entry from before
     _restarting: frozenset[str] = frozenset()
     # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
@@ -153,6 +154,7 @@ class StationFlush:
     def started(self) -> None:
         """The change starts: from now on its radio may restart."""
         self._started_s = time.monotonic()
+        self._login = None
 
     def started_ago(self, ago_s: float) -> None:
         """The change started `ago_s` ago: its radio may have restarted since."""
@@ -193,13 +195,14 @@ class StationFlush:
             ended.set()
             thread.join()
 
-    def unreachable(self, among: Container[str] | None = None, *, is_undone: bool = False) -> None:
+    def unreachable(self, among: Container[str] | None = None, *, is_login_due: bool = False) -> None:
         """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable.
-        `is_undone`: its timer has undone the change, so the change does not refuse logins any more."""
+        `is_login_due`: from now on its SSH server has to answer a login, if only by a refusal."""
         now_s = time.monotonic()
-        login = login_of(self.ctx.node, self.ctx.before) if is_undone else None
-        is_due = now_s >= next_query_s(self._queried_s) or (login is not None and not self._tried_login)
-        if self._started_s is None or not is_due:
+        if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before)):
+            self._login = login
+            self._queried_s.clear()
+        if self._started_s is None or now_s < next_query_s(self._queried_s):
             return
         answered_s = max(self._started_s, self._observed_s or 0.0)
         # a plan for this node alone may have observed none of its neighbors
@@ -207,8 +210,7 @@ class StationFlush:
         names = [name for name in holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._queried_s.append(now_s)
-            self._tried_login = login is not None
-            self._flush({name: holders[name] for name in names}, self._started_s, login=login)
+            self._flush({name: holders[name] for name in names}, self._started_s, login=self._login)
 
     def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
         """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
@@ -222,9 +224,8 @@ class StationFlush:
         if since_s is None or not self.radios:
             return
         self._since_s = since_s
-        silent = self._watching | self._restarting
-        possible = self._possible_holders(now, self.radios)
-        asked = {name: entries for name, entries in possible.items() if name not in silent}
+        asked = self._possible_holders(now, self.radios)
+        asked = {name: entries for name, entries in asked.items() if name not in self._watching | self._restarting}
         answers = self._flush(asked, since_s)
         unsure = [name for name, said in answers.items() if UNKNOWN in said.split()]
         if unsure and now is not None:
@@ -359,8 +360,7 @@ class StationFlushes:
 def _flush_since(
     entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False, login: Login | None = None
 ) -> str:
-    older_than_s = time.monotonic() - since_s
-    return flush_script(entries, older_than_s=older_than_s, has_restarted=has_restarted, login=login)
+    return flush_script(entries, older_than_s=time.monotonic() - since_s, has_restarted=has_restarted, login=login)
 
 
 def _joined(scripts: Iterable[Script]) -> str:

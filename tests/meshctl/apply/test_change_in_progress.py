@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from meshctl.apply import change_in_progress
-from meshctl.apply.change_in_progress import ChangeInProgress, connect, observe_and_decide
+from meshctl.apply.change_in_progress import ROLLBACK_S, ChangeInProgress, connect, observe_and_decide
+from meshctl.apply.commit_confirm import _observe_once
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.next_action import Action
 from meshctl.device.connection import Deadlines, Endpoint
-from meshctl.device.deadman import Change
+from meshctl.device.deadman import Change, NewFile
 from meshctl.device.observation import ChangeStatus, NetInterface, Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import Unreachable
 from meshctl.model import Secret
+from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import parse
 
 NETWORK = """
@@ -98,3 +102,35 @@ def test_a_slow_node_that_has_rolled_back_gets_all_the_time_at_its_old_address()
     change.old = Endpoint("192.168.1.1")
     change.started_s = time.monotonic() - change.window_s - 1
     assert logins_of(change)["192.168.1.1"] == Deadlines()
+
+
+@pytest.mark.parametrize(
+    ("files", "is_due"),
+    [
+        (("etc/config/wireless", "etc/config/dropbear", "etc/config/system"), True),
+        # packages
+        ((), True),
+        (("etc/config/wireless", "etc/config/firewall"), False),
+        (("etc/config/network",), False),
+        ((LAN_FILTER_PATH,), False),
+    ],
+)
+def test_neighbors_try_to_log_in_unless_the_change_may_drop_logins(files: tuple[str, ...], is_due: bool) -> None:
+    """Seen on real OpenWrt: a radio restarted, its neighbor dropped SSH alone, and a good change was rolled back."""
+    calls = list[bool]()
+    change = a_change()
+    change.payload = replace(change.payload, files={f"/{path}": NewFile(b"") for path in files})
+    change.started_s = time.monotonic()
+    listener = cast("SimpleNamespace", change.listener)
+    listener.connecting = nullcontext
+    listener.unreachable = lambda *, is_login_due: calls.append(is_login_due)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise Unreachable("no answer")
+
+    cast("SimpleNamespace", change.ctx.run).connections = SimpleNamespace(open=refuse, deadlines=Deadlines())
+    assert _observe_once(change, None) == (None, None)
+    # its timer has rolled it back
+    change.started_s -= change.window_s + ROLLBACK_S + 1
+    assert _observe_once(change, None) == (None, None)
+    assert calls == [is_due, True]

@@ -139,7 +139,7 @@ def test_neighbors_that_the_plan_did_not_observe_are_queried_for_a_node_that_may
 
 
 @pytest.mark.parametrize(("had", "login"), [("10.42.0.102", " 10.42.0.102 22"), ("10.42.0.99", "")])
-def test_a_node_that_is_unreachable_although_its_change_is_undone_is_logged_in_to_by_its_neighbors(
+def test_a_node_that_is_unreachable_although_it_must_answer_logins_is_logged_in_to_by_its_neighbors(
     monkeypatch: pytest.MonkeyPatch, had: str, login: str
 ) -> None:
     """Once, even if they were queried a moment ago; not if the change gives it another address: it has its old one."""
@@ -152,9 +152,17 @@ def test_a_node_that_is_unreachable_although_its_change_is_undone_is_logged_in_t
     now_s[0] += 100
     flush.unreachable()
     for _ in range(2):
-        flush.unreachable(is_undone=True)
+        flush.unreachable(is_login_due=True)
     lines = [script.splitlines()[-1] for _, script in near.asked]
     assert lines == [f"flush_stale mesh0 {MAC} 100{where}" for where in ("", login)][: 1 + (login != "")]
+    # also where it is noticed that the node is silent before a connection has failed
+    now_s[0] += 100
+    flush.unreachable()
+    assert near.asked[-1][1].endswith(f" {MAC} 200{login}\n")
+    flush.started()
+    now_s[0] += 100
+    flush.unreachable()
+    assert near.asked[-1][1].endswith(f" {MAC} 100\n")
 
 
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
