@@ -106,6 +106,9 @@ def node_plan(
     if still_on:
         why = f"{', '.join(still_on)}: turned off by its configuration, but on the air: taken down"
         node_effects = (*node_effects, Effect("wifi", Cut.MESH, why))
+    if packages is not None and packages.remove:
+        why = f"all radios restart, because {', '.join(packages.remove)} is replaced"
+        node_effects = (*node_effects, Effect("wifi", Cut.MESH, why))
     if firmware is not None:
         node_effects = (
             Effect("firmware", Cut.NODE, f"{firmware.from_revision} -> {firmware.to_revision}"),

@@ -172,6 +172,26 @@ def test_missing_packages_are_not_noted_on_a_node_in_its_mesh() -> None:
     assert (plan.verdict, plan.notes) == (Verdict.CHANGE, ())
 
 
+def test_replacing_the_supplicant_cuts_the_mesh_although_no_file_changes() -> None:
+    """`apply/packages.py` restarts all radios. Seen on real OpenWrt: planned as if it interrupted nothing."""
+    team = fleet()
+    seen = running(team, "b01")
+    want = wanted(team, "b01")
+    (full,) = (name for name in seen.packages or {} if name.startswith("wpad"))
+    had = {name: version for name, version in (seen.packages or {}).items() if name != full}
+    given = replace(want, package_files=(f"{full}_1_mips.ipk",))
+
+    def effects_with(old: str) -> dict[str, Cut]:
+        plan = node_plan(given, replace(seen, packages=had | {old: "1"}), FINGERPRINTS, owner="", with_firmware=False)
+        assert (plan.verdict, plan.files) == (Verdict.CHANGE, ())
+        return {effect.why: effect.cut for effect in plan.effects}
+
+    assert effects_with("wpad-basic-mbedtls") == {
+        "all radios restart, because wpad-basic-mbedtls is replaced": Cut.MESH
+    }
+    assert effects_with("nano") == {}
+
+
 def test_an_untagged_port_to_a_vlan_switch_is_planned_with_a_note() -> None:
     team = fleet()
     seen = factory(team, "b01")
