@@ -52,8 +52,8 @@ from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
 from meshctl.plan.radios import EVERY_RADIO, Radios, observed_restarts, started_within
 
-# A neighbor waits up to 3 s for an echo, once for each of a node's two radios.
-QUERY_TIMEOUT_S = 10.0
+# A neighbor waits up to 3 s for an echo, and 3 s for a login, once for each of a node's two radios.
+QUERY_TIMEOUT_S = 15.0
 # A failed query does no damage, so these deadlines are shorter than elsewhere.
 _DEADLINES = Deadlines(
     connect_s=5.0,
