@@ -18,6 +18,7 @@ from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Op
 from meshctl.cli.input_file import read_input
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.public_key import own_public_key
+from meshctl.diagnostics import Diagnostic, Severity
 from meshctl.errors import InputError
 from meshctl.interchange.device import MARKER, ExistingDevice, exported_device, observed_device, release_of
 from meshctl.interchange.device_differences import Fate
@@ -28,8 +29,10 @@ from meshctl.interchange.new_inventory import edited, edits_of, load_text, new_t
 from meshctl.inventory.edit import FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.secrets import SecretStore
+from meshctl.lint import DiskFiles, LintContext, lint
 from meshctl.model import Fleet, NodeState, Release, Role, Secret, SecretRef
 from meshctl.model.ip import IpInterface
+from meshctl.regdb import load as load_regdb
 
 FLEET_FILE = "fleet.yaml"
 _HEADINGS: Mapping[Fate, str] = {
@@ -235,12 +238,13 @@ def _import(target: ImportTarget, device: ExistingDevice, source: str) -> None:
     edits = () if target.new is not None else edits_of(target.inventory, os.environ, made.values)
     text = new_text(made.values, source, made.assumed) if target.new is not None else ""
     files = _secret_files(target, made)
+    errors = _lint_errors(target, made)
     if not target.dry_run:
         _write(target, text, edits, files)
     if target.as_json:
-        echo_json(json.dumps(_as_json(target, made, files), indent=2))
+        echo_json(json.dumps(_as_json(target, made, files, errors), indent=2))
     else:
-        _show(target, device, made, text, edits, files)
+        _show(target, device, made, text, edits, files, errors)
 
 
 def _loader(target: ImportTarget, source: str) -> Callable[[Mapping[tuple[str, ...], Any]], Fleet]:
@@ -269,6 +273,18 @@ def _secret_files(target: ImportTarget, made: DeviceImport) -> dict[Path, Secret
             )
         files[path] = secret
     return files
+
+
+def _lint_errors(target: ImportTarget, made: DeviceImport) -> tuple[Diagnostic, ...]:
+    """What `meshctl lint` will call an error, and the inventory did not have before."""
+    context = LintContext(load_regdb(), DiskFiles())
+    before = lint(target.fleet, context) if target.fleet is not None else ()
+    known = {(each.code, each.path) for each in before}
+    return tuple(
+        each
+        for each in lint(made.fleet, context)
+        if each.severity is Severity.ERROR and (each.code, each.path) not in known
+    )
 
 
 def _write(target: ImportTarget, text: str, edits: tuple[FileEdit, ...], files: Mapping[Path, Secret]) -> None:
@@ -305,6 +321,7 @@ def _show(
     text: str,
     edits: tuple[FileEdit, ...],
     files: Mapping[Path, Secret],
+    errors: tuple[Diagnostic, ...],
 ) -> None:
     echo(f"{made.name}: {device.board}, OpenWrt {device.release}")
     if target.dry_run and target.new is not None:
@@ -317,6 +334,7 @@ def _show(
     _list("not written by meshctl, stays on the device", [", ".join(made.untouched)] if made.untouched else [])
     _list("not UCI, not mapped, stays on the device", list(made.unreadable))
     _list("assumed, to be checked", list(made.assumed))
+    _list("to be set before provisioning", [f"{each.text} [{each.code}]. {each.hint}" for each in errors])
     if target.dry_run:
         return
     for path in files:
@@ -334,7 +352,9 @@ def _list(heading: str, lines: list[str]) -> None:
             echo(f"  {line}")
 
 
-def _as_json(target: ImportTarget, made: DeviceImport, files: Mapping[Path, Secret]) -> dict[str, Any]:
+def _as_json(
+    target: ImportTarget, made: DeviceImport, files: Mapping[Path, Secret], errors: tuple[Diagnostic, ...]
+) -> dict[str, Any]:
     return {
         "node": made.name,
         "file": str(target.file),
@@ -355,4 +375,7 @@ def _as_json(target: ImportTarget, made: DeviceImport, files: Mapping[Path, Secr
         "unreadable": list(made.unreadable),
         "assumed": list(made.assumed),
         "secret_files": [str(path) for path in files],
+        "lint_errors": [
+            {"code": each.code, "path": each.path, "text": each.text, "hint": each.hint} for each in errors
+        ],
     }

@@ -35,6 +35,7 @@ _LONGEST_WAIT_S = 15.0
 _WATCH_S = 0.25
 # A site without contact for so long is left to itself; `meshctl resume` meets its run again.
 GIVE_UP_S = 900.0
+_LEAVING = f"meshctl gives up {GIVE_UP_S / 60:g} min after its last contact, or on Ctrl-C"
 
 
 def new_run_id() -> str:
@@ -185,7 +186,7 @@ class SiteExecution:
         return {name: outcome for run in runs for name, outcome in run.outcomes.items()}
 
     def _execute_site(self, run: SiteRun) -> None:
-        wait_s, contact_s = _FIRST_WAIT_S, time.monotonic()
+        wait_s, contact_s, said = _FIRST_WAIT_S, time.monotonic(), ""
         while not run.is_over and not self._leaves(run) and time.monotonic() - contact_s < GIVE_UP_S:
             try:
                 offset = run.offset
@@ -195,9 +196,13 @@ class SiteExecution:
                     contact_s = time.monotonic()
                 if run.offset != offset:
                     wait_s = _FIRST_WAIT_S
-                self._note(f"site {run.site.name}: {error}; connecting again" + (
+                text = f"site {run.site.name}: {error}; connecting again" + (
                     ", the site continues on its own" if run.is_started else ""
-                ))  # fmt: skip
+                )
+                # the same reason again and again is said once
+                if text != said:
+                    self._note(f"{text}; {_LEAVING}" + (f"\nhint: {error.hint}" if error.hint else ""))
+                    said = text
                 self.interrupt.wait(wait_s)
                 wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             except MeshctlError as error:

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from meshctl.errors import InputError, MeshctlError, Unreachable
+from meshctl.errors import Unreachable
 from meshctl.sites.chunks import HEADER, Chunk, chunks_of, parse_chunk
+from meshctl.sites.nats_errors import HINT, NatsLost, not_installed, translated
 from meshctl.sites.nats_login import login_options, tls_context
 
 if TYPE_CHECKING:
@@ -30,15 +31,9 @@ ANSWER_S = 5.0
 # how often a lost server is tried again
 _RECONNECT_S = 1.0
 _KEEPALIVE_S = 5
+# after how many fetches without a message a work queue is checked for a loss
+_FETCHES = 6
 _T = TypeVar("_T")
-
-
-class NatsLost(Unreachable):
-    """The NATS server, or the stream behind it, cannot be reached."""
-
-
-class NoListener(NatsLost):
-    """The server says that no one listens to a subject."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +82,7 @@ class NatsClient:
             from nats.aio.client import Client
             from nats.errors import Error
         except ImportError as error:
-            raise _not_installed(error) from error
+            raise not_installed(error) from error
         options: dict[str, Any] = {
             "name": self._server.name,
             "connect_timeout": CONNECT_S,
@@ -111,13 +106,13 @@ class NatsClient:
                 return client
             except ImportError as error:
                 # nats-py needs nkeys for credentials
-                raise _not_installed(error) from error
+                raise not_installed(error) from error
             except (TimeoutError, Error, OSError) as error:
                 with suppress(Error, OSError):
                     await client.close()
                 if not waits_at_start:
                     text = str(error) or f"no answer within {CONNECT_S:g} s"
-                    raise NatsLost(f"NATS server {self._server.url}: {text}", hint=_HINT) from error
+                    raise NatsLost(f"NATS server {self._server.url}: {text}", hint=HINT) from error
                 await asyncio.sleep(_RECONNECT_S)
 
     def _run(self, work: Coroutine[Any, Any, _T], timeout_s: float | None = ANSWER_S * 2) -> _T:
@@ -130,12 +125,12 @@ class NatsClient:
             return future.result(timeout_s)
         except TimeoutError as error:
             future.cancel()
-            raise NatsLost(f"NATS server {self._server.url}: no answer", hint=_HINT) from error
+            raise NatsLost(f"NATS server {self._server.url}: no answer", hint=HINT) from error
         except BaseException as error:
-            translated = _translated(error, self._server.url)
-            if translated is None:
+            known = translated(error, self._server.url)
+            if known is None:
                 raise
-            raise translated from error
+            raise known from error
 
     @property
     def is_connected(self) -> bool:
@@ -143,7 +138,7 @@ class NatsClient:
 
     def _check_connected(self) -> None:
         if not self.is_connected:
-            raise NatsLost(f"NATS server {self._server.url}: the connection is lost", hint=_HINT)
+            raise NatsLost(f"NATS server {self._server.url}: the connection is lost", hint=HINT)
 
     def publish(self, subject: str, data: bytes) -> None:
         """Send a message that is not stored."""
@@ -256,6 +251,25 @@ class NatsClient:
         self._check_connected()
         return self._run(count())
 
+    def restart_consumer(self, stream: str, consumer: str) -> None:
+        """Make the consumer of a stream that has lost its messages again: the stream numbers from 1, and the consumer
+        would wait for the next number that it has not seen."""
+        from nats.js.errors import NotFoundError
+
+        async def restart() -> None:
+            js = self._jetstream("")
+            try:
+                found = await js.consumer_info(stream, consumer)
+                stored = (await js.stream_info(stream)).state.last_seq
+            except NotFoundError:
+                return
+            if found.delivered is not None and found.delivered.stream_seq > stored:
+                await js.delete_consumer(stream, consumer)
+                await js.add_consumer(stream, found.config)
+
+        self._check_connected()
+        self._run(restart())
+
     def purge(self, stream: str, subject: str) -> int:
         """Delete the messages of a subject; how many there were."""
         found = self.queued(stream, subject)
@@ -264,7 +278,8 @@ class NatsClient:
         return found
 
     def work(self, stream: str, subject: str, domain: str, consumer: str) -> Iterator[StoredMessage]:
-        """The messages of a work queue, forever, whether or not it can be reached."""
+        """The messages of a work queue, forever, whether or not it can be reached, and after it was lost and made
+        again."""
         from nats.errors import Error
         from nats.js.api import AckPolicy, ConsumerConfig
 
@@ -278,13 +293,17 @@ class NatsClient:
             except TimeoutError:
                 return []
 
-        subscription = None
+        subscription, empty = None, 0
         while not self._loop.is_closed():
             try:
                 self._check_connected()
                 if subscription is None:
-                    subscription = self._run(subscribe())
+                    subscription, empty = self._run(subscribe()), 0
                 messages = self._run(fetch(subscription), ANSWER_S * 3)
+                empty = 0 if messages else empty + 1
+                if empty and empty % _FETCHES == 0:
+                    # fetching from a consumer that is gone is no error
+                    self._run(subscription.consumer_info())
             except (Unreachable, Error):
                 subscription = None
                 threading.Event().wait(_RECONNECT_S)
@@ -345,9 +364,6 @@ class NatsClient:
         self._end_loop()
 
 
-_HINT = "check the address, the credentials and the network; `nats.url` in the inventory"
-
-
 async def _cancel_all() -> None:
     """Cancel the other tasks of the loop."""
     left = asyncio.all_tasks() - {asyncio.current_task()}
@@ -358,27 +374,6 @@ async def _cancel_all() -> None:
 
 async def _ignore(error: Exception) -> None:
     """What the client does about it shows in `is_connected`."""
-
-
-def _not_installed(error: ImportError) -> InputError:
-    return InputError(f"sites over NATS need nats-py: {error}", hint="pip install 'meshctl-fleet[nats]'")
-
-
-def _translated(error: BaseException, url: str) -> Unreachable | None:
-    if isinstance(error, MeshctlError):
-        return None
-    from nats.errors import Error, NoRespondersError
-    from nats.js.errors import APIError
-
-    match error:
-        case NoRespondersError():
-            return NoListener(f"NATS server {url}: no one listens")
-        case APIError():
-            return NatsLost(f"NATS server {url}: {error.description or error}", hint=_HINT)
-        case Error() | asyncio.TimeoutError() | OSError():
-            return NatsLost(f"NATS server {url}: {error}", hint=_HINT)
-        case _:
-            return None
 
 
 def stream_settings(days: int, max_bytes: int) -> dict[str, Any]:

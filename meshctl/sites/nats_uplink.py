@@ -37,15 +37,18 @@ from meshctl.sites.envelope import (
     signed,
     verified,
 )
-from meshctl.sites.nats_client import NatsLost, NatsServer, shared, stream_settings
+from meshctl.sites.nats_client import NatsServer, shared, stream_settings
+from meshctl.sites.nats_errors import NatsLost
 from meshctl.sites.protocol import SILENCE_S, WorkerError, raise_error
 from meshctl.sites.service import unit_name
-from meshctl.sites.subjects import SiteSubjects
+from meshctl.sites.subjects import CONSUMER, SiteSubjects
 from meshctl.sites.uplink import Greeting, Parcel, SiteOffline, Uplink, greeting_of
 
 # How long the hub keeps orders and events, whatever their own limits are.
 KEPT_DAYS = 90
-MAX_ORDERS_BYTES = MAX_EVENTS_BYTES = 256 << 20
+# What it may store for a site. The server sets this much aside, and refuses streams beyond three quarters of its disk.
+MAX_ORDERS_BYTES = 32 << 20
+MAX_EVENTS_BYTES = 64 << 20
 _SLICE_BYTES = 256 << 10
 _POLL_S = 0.5
 # After so long without events, a worker that is heard is asked for them.
@@ -183,7 +186,11 @@ class NatsUplink(Uplink):
     def start(self, parcel: Parcel) -> None:
         subject, stream = self._subjects.order(parcel.run), self._subjects.order_stream
         limits = stream_settings(KEPT_DAYS, MAX_ORDERS_BYTES)
-        self._client.ensure_stream(name=stream, subjects=[self._subjects.orders], retention="workqueue", **limits)
+        # one order too many is refused: it replaces none that waits
+        self._client.ensure_stream(
+            name=stream, subjects=[self._subjects.orders], retention="workqueue", discard="new", **limits
+        )
+        self._client.restart_consumer(stream, CONSUMER)
         # not to be deleted when this uplink is closed: the order may be on its way
         self._planned = [run for run in self._planned if run != parcel.run]
         if self._client.queued(stream, subject):
@@ -214,6 +221,7 @@ class NatsUplink(Uplink):
         if self._client.queued(self._subjects.run_stream, self._subjects.run(run)):
             return "in progress"
         if self._client.queued(self._subjects.order_stream, self._subjects.order(run)):
+            self._client.restart_consumer(self._subjects.order_stream, CONSUMER)
             return "waiting"
         return super().state_of(run)
 

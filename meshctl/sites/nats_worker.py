@@ -47,7 +47,7 @@ from meshctl.sites.order import (
 )
 from meshctl.sites.protocol import BEAT_S, MAX_EVENTS_BYTES, encode
 from meshctl.sites.runs import RunDirectory, SiteDirectory, read_json, write_json
-from meshctl.sites.subjects import SiteSubjects
+from meshctl.sites.subjects import CONSUMER, SiteSubjects
 from meshctl.sites.worker import Worker, run_command
 from meshctl.wording import counted
 
@@ -56,7 +56,6 @@ if TYPE_CHECKING:
 
     from nats.aio.msg import Msg
 
-CONSUMER = "worker"
 # How long events wait at the leaf node for an uplink.
 KEPT_DAYS = 90
 MAX_STREAM_BYTES = 64 << 20

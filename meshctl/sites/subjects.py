@@ -11,6 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# The consumer of a site's orders, which its worker makes.
+CONSUMER = "worker"
+
 
 @dataclass(frozen=True, slots=True)
 class SiteSubjects:

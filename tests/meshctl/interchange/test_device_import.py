@@ -321,3 +321,31 @@ def test_a_failed_write_leaves_no_key_behind(tmp_path: Path, monkeypatch: pytest
     done = run("uci", str(EXPORTS / "foreign.uci"), "--new", str(tmp_path / "valley"), *BOARD)
     assert done.exit_code == 130
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_what_lint_will_call_an_error_is_listed_with_what_to_do(tmp_path: Path) -> None:
+    """A radar channel, an MTU beyond a frame, and no base: the device has them, and meshctl would refuse them."""
+    text = (EXPORTS / "foreign.uci").read_text(encoding="utf-8")
+    changed = (
+        ("option band '2g'", "option band '5g'"), ("option channel '6'", "option channel '52'"),
+        ("option mtu '1536'", "option mtu '2304'"),
+    )  # fmt: skip
+    for old, new in changed:
+        assert old in text
+        text = text.replace(old, new, 1)
+    (tmp_path / "dfs.uci").write_text(text, encoding="utf-8")
+    words = ("uci", str(tmp_path / "dfs.uci"), "--new", str(tmp_path / "valley"), *BOARD)
+    done = run(*words, "--dry-run", "--json")
+    assert done.exit_code == 0, done.output
+    errors = {each["code"]: each for each in json.loads(done.output)["lint_errors"]}
+    assert set(errors) == {"MC507", "MC602", "MC620"}
+    assert errors["MC507"]["path"] == "meshes.valley.mtu"
+    assert "`confirm_window_s` to 200" in errors["MC620"]["hint"]
+    shown = run(*words).output
+    assert "to be set before provisioning:\n  meshes.valley.mtu: exceeds an 802.11 frame" in shown
+    assert "[MC602]. Set `role: base` on the operator's radio" in shown
+    # the next node repeats none of them
+    second = run("uci", str(tmp_path / "dfs.uci"), "-i", str(tmp_path / "valley"), "--name", "near",
+                 "--address", "10.42.0.78/24", *BOARD, "--dry-run", "--json")  # fmt: skip
+    assert second.exit_code == 0, second.output
+    assert "MC620" not in {each["code"] for each in json.loads(second.output)["lint_errors"]}

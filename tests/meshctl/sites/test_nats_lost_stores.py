@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -21,7 +22,7 @@ from meshctl.sites.nats_client import NatsClient, NatsServer, stream_settings
 from meshctl.sites.nats_uplink import NatsUplink
 from meshctl.sites.nats_worker import NatsWorker
 from meshctl.sites.runs import RunDirectory, SiteDirectory, write_json
-from meshctl.sites.subjects import SiteSubjects
+from meshctl.sites.subjects import CONSUMER, SiteSubjects
 from meshctl.sites.uplink import SiteOffline
 from tests.meshctl.device.servers import keypair, public
 from tests.meshctl.sites.nats_servers import NatsServerProcess, NatsSites
@@ -149,6 +150,73 @@ nats: {{url: {hub}}}
 sites: {{north: {{nats: {{}}, ssh: {{key_files: ["{private}"]}}, worker_key: {worker}}}}}
 nodes: {{}}
 """
+
+
+class Orders:
+    """A work queue at the hub and what reaches a worker at the leaf node, which runs in a `with` block."""
+
+    def __init__(self, hub: NatsClient, leaf: NatsServerProcess) -> None:
+        self._hub, self._worker = hub, NatsClient(NatsServer(leaf.url))
+        self._stream = _SUBJECTS.order_stream
+        self.reached: list[str] = []
+
+    def give(self, run: str) -> None:
+        """Store an order, as `NatsUplink.start` does."""
+        orders = [_SUBJECTS.orders]
+        self._hub.ensure_stream(name=self._stream, subjects=orders, retention="workqueue", **_LIMITS)
+        self._hub.restart_consumer(self._stream, CONSUMER)
+        self._hub.store(_SUBJECTS.order(run), run, b"an order")
+
+    def give_and_wait(self, *runs: str) -> None:
+        for run in runs:
+            self.give(run)
+        until(lambda: [_SUBJECTS.order(run) for run in runs] == self.reached[-len(runs) :], "the orders", wait_s=60)
+        until(lambda: not self._hub.subjects(self._stream), "the hub to know", wait_s=60)
+
+    def _work(self) -> None:
+        with suppress(CancelledError):
+            for message in self._worker.work(self._stream, _SUBJECTS.orders, "hub", CONSUMER):
+                message.acknowledge()
+                self.reached.append(message.subject)
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._worker.close()
+        self._thread.join()
+
+
+@pytest.fixture
+def orders(servers: NatsSites, hub: NatsClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[Orders]:
+    monkeypatch.setattr("meshctl.sites.nats_client._FETCHES", 1)
+    monkeypatch.setattr("meshctl.sites.nats_client.ANSWER_S", 1.0)
+    with Orders(hub, servers.leaves["north"]) as made:
+        yield made
+
+
+@pytest.mark.parametrize("lost", ["*", "streams/*/msgs/*"], ids=["everything", "the messages of its streams"])
+def test_an_order_after_a_hub_has_lost_its_store_reaches_the_worker(
+    lost: str, servers: NatsSites, hub: NatsClient, orders: Orders
+) -> None:
+    """The worker would wait for the next number of a stream that begins again."""
+    orders.give_and_wait("1", "2", "3")
+    servers.hub.stop()
+    for path in (servers.hub.store / "jetstream" / "$G").glob(lost):
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    servers.hub.start()
+    until(lambda: hub.is_connected, "the operator's connection", wait_s=60)
+    orders.give_and_wait("4")
+    assert orders.reached == [_SUBJECTS.order(run) for run in ("1", "2", "3", "4")]
+
+
+def test_a_worker_whose_consumer_was_deleted_makes_it_again(hub: NatsClient, orders: Orders) -> None:
+    """To fetch from a consumer that is gone is silent, like fetching from one without messages."""
+    orders.give_and_wait("1")
+    hub._run(hub._jetstream("").delete_consumer(_SUBJECTS.order_stream, CONSUMER))
+    orders.give_and_wait("2")
 
 
 def test_a_worker_that_cannot_store_events_is_asked_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
