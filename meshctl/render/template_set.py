@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import resource
 import traceback
 from collections.abc import Callable, Mapping
@@ -84,6 +86,13 @@ class TemplateSet:
         except Exception as error:
             # a template can raise any exception; report all of them with the position
             raise InvalidInput([_diagnostic(file, error)]) from error
+
+
+@functools.cache
+def shipped_set(backend: Backend) -> TemplateSet:
+    """The templates of a back end without any of the operator's: the same for every fleet, compiled once a process."""
+    folder = shipped("templates")
+    return TemplateSet((folder,), backend, OperatorParts(), Boundary((os.path.realpath(folder),)))
 
 
 class _BoundedLoader(FileSystemLoader):

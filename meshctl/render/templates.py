@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Templates:
-    """The templates of one fleet, compiled once; share the object between nodes."""
+    """The templates of one fleet, compiled once; share the object between nodes. All fleets share the shipped ones."""
 
     def __init__(self, folders: tuple[Path, ...], boundary: Boundary | None = None) -> None:
         self._folders = folders
@@ -79,8 +79,10 @@ class Templates:
         return self._only_shipped_folders and not parts.templates
 
     def _set(self, backend: Backend, parts: OperatorParts) -> TemplateSet:
-        from meshctl.render.template_set import TemplateSet
+        from meshctl.render.template_set import TemplateSet, shipped_set
 
+        if self.are_shipped(parts):
+            return shipped_set(backend)
         key = (backend, parts)
         if key not in self._sets:
             self._sets[key] = TemplateSet(self._folders, backend, parts, self._boundary)
