@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import pytest
 
@@ -27,6 +28,7 @@ OTHER = "02:00:00:00:00:02"
 LAN = (NetInterface("lan", True, False, "static", "br-lan", ("10.42.0.101/24",)),)
 
 
+@cache
 def good() -> Observation:
     return running(
         fleet(),

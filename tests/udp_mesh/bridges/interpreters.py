@@ -10,16 +10,20 @@ import sys
 from pathlib import Path
 
 
-def older_interpreters(*minors: int) -> list[str]:
+@functools.cache
+def older_interpreters(*minors: int) -> tuple[str, ...]:
     """Each Python 3.8 or later, older than this one (or of these minor versions), on the path or among pyenv's."""
     named = [f"python3.{minor}" for minor in minors or range(8, sys.version_info.minor)]
     found = [path for path in map(shutil.which, named) if path]
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     found += [str(path) for name in named for path in sorted(pyenv.glob(f"{name[6:]}.*/bin/python"))]
     # A pyenv shim of a version that is not selected does not start.
-    return [
-        path for path in found if subprocess.run([path, "-c", ""], capture_output=True, check=False).returncode == 0
-    ]
+    # `-I -S`: without site packages it starts in half the time.
+    return tuple(
+        path
+        for path in found
+        if subprocess.run([path, "-I", "-S", "-c", ""], capture_output=True, check=False).returncode == 0
+    )
 
 
 ROS_PYTHON = "/usr/bin/python3"

@@ -29,7 +29,8 @@ TOPICS = (
     Topic("map", priority=8, compression=True),
     Topic("tiles", priority=5, compression=True),
 )
-MAP = bytes(random.Random(1).choices(range(8), k=40 * STEP_BYTES))
+# of eight values
+MAP = random.Random(1).randbytes(40 * STEP_BYTES).translate(bytes(range(8)) * 32)
 
 
 def world(**changes: object) -> World:
