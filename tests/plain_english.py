@@ -26,10 +26,15 @@ _PAGE_WORDS = re.compile(rf"\b(?:{_EVERYWHERE}|{_IN_PAGES})\b", re.I)
 _CODE_OR_ANCHOR = re.compile(r"```.*?```|^ {4}.*?$|`[^`]*`|\(#[\w-]+\)|\{ #[\w-]+ \}", re.MULTILINE | re.DOTALL)
 
 
+def has_listed_word(text: str) -> bool:
+    """Whether a word of the list occurs in it, also where it is allowed."""
+    return _WORDS.search(text) is not None
+
+
 def bad_words(text: str) -> list[str]:
     """The words of the list in a message, docstring, comment or line of a page."""
     # what is allowed contains such a word, and few texts have one
-    return [match[0] for match in _WORDS.finditer(_ALLOWED.sub("", text))] if _WORDS.search(text) else []
+    return [match[0] for match in _WORDS.finditer(_ALLOWED.sub("", text))] if has_listed_word(text) else []
 
 
 def bad_page_words(page: str) -> list[str]:
