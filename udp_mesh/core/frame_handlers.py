@@ -104,6 +104,8 @@ def process_frames(
         receiver.on_accepted(number, now, ack_now=ack_now)
         if receiver.acks.send_now:
             state.schedule_control(session)
+            if receiver.ack_overdue():
+                ack_mid_batch(state, session, now)
     if receiver.confirmed:
         state.schedule_control(session)
     _send_refusals(state, session)
@@ -121,8 +123,7 @@ def _send_refusals(state: State, session: Session) -> None:
 
 def ack_mid_batch(state: State, session: Session, now: float) -> None:
     """Acknowledge in the middle of a large batch, before its beginning leaves the bitmap."""
-    ack = session.build_ack(now, ())
-    if ack is not None:
+    for ack in session.build_acks(now, ()):
         session.queue_control(ack)
 
 

@@ -21,7 +21,7 @@ from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.settings import RELAY_LINK, Address, LinkKind
 from udp_mesh.core.state import MAINTENANCE_INTERVAL_S, State
 from udp_mesh.wire.codec import encode
-from udp_mesh.wire.frames import Cancel, Delivered, Frame, Ping
+from udp_mesh.wire.frames import Cancel, Delivered, Ping
 from udp_mesh.wire.limits import MAX_FRAMES_PER_DATAGRAM, MAX_IDS
 
 BATCH_BYTES = 65_536
@@ -89,16 +89,15 @@ def _send_control(state: State, session: Session, now: float, out: list[Datagram
     if not path.link or peer is None or peer.session is not session:
         # The packet numbers of an earlier boot are not those that the sender keeps account of.
         return
-    frames: list[Frame] = []
+    # Acknowledgements from the middle of a batch among them: after a later one their packets would count as lost.
+    frames = list(session.pending_control)
+    session.pending_control.clear()
     if session.receiver.acks.pending or session.receiver.acks.send_now:
         state.late_acknowledgements += session.receiver.acks.is_late
         waiting = state.priority_backoff.local_waiting(state.waiting_senders(), now)
-        ack = session.build_ack(now, waiting[:1])
-        if ack is not None:
-            frames.append(ack)
-            state.event_queue.counters.acknowledgements_sent += 1
-    frames.extend(session.pending_control)
-    session.pending_control.clear()
+        acks = session.build_acks(now, waiting[:1])
+        frames.extend(acks)
+        state.event_queue.counters.acknowledgements_sent += len(acks)
     confirmed = session.receiver.confirmed
     while confirmed:
         frames.append(Delivered(tuple(confirmed[:MAX_IDS])))

@@ -358,15 +358,19 @@ class Session:
         if len(self.pending_control) < MAX_PENDING_CONTROL:
             self.pending_control.append(frame)
 
-    def build_ack(self, now: float, waiting: tuple[Waiting, ...]) -> Ack | None:
-        """The acknowledgement to send now, if there is one. It then counts as sent."""
+    def build_acks(self, now: float, waiting: tuple[Waiting, ...]) -> list[Ack]:
+        """The acknowledgements to send now, mostly one. They then count as sent."""
         acks = self.receiver.acks
         if acks.largest < 0:
-            return None
-        delay_us = min((1 << 24) - 1, int(max(0.0, now - acks.arrived_at) * 1e6))
-        acks.on_ack_sent()
+            return []
         arriving = min(0xFFFFFFFF, int(self.meters.received.per_s(now)))
-        return Ack(acks.largest, acks.received >> 1, delay_us, arriving, waiting)
+        overtaken = acks.overtaken
+        built = []
+        for each in (overtaken, acks) if overtaken is not None and overtaken.pending else (acks,):
+            delay_us = min((1 << 24) - 1, int(max(0.0, now - each.arrived_at) * 1e6))
+            built.append(Ack(each.largest, each.received >> 1, delay_us, arriving, waiting))
+        acks.on_ack_sent()
+        return built
 
     def update_from(self, beat: Heartbeat, now: float) -> None:
         """Record what a heartbeat says about its sender."""

@@ -4,6 +4,8 @@ An acknowledgement carries the largest packet number and a 256-bit bitmap below 
 or a delay, whichever comes first, or at once if a packet requests it.
 """
 
+from __future__ import annotations
+
 from udp_mesh.wire.limits import ACK_BITMAP_BITS
 
 _ALL = (1 << (ACK_BITMAP_BITS + 1)) - 1
@@ -19,7 +21,7 @@ LARGE_WINDOW_SPACING = 8
 class AckState:
     """`received` has bit 0 for `largest` itself and bit i for `largest - i`."""
 
-    __slots__ = ("arrived_at", "due_at", "largest", "pending", "received", "requested", "send_now")
+    __slots__ = ("arrived_at", "due_at", "largest", "overtaken", "pending", "received", "requested", "send_now")
 
     def __init__(self) -> None:
         self.largest = -1
@@ -32,6 +34,9 @@ class AckState:
         """When `largest` arrived."""
         self.due_at: float | None = None
         self.send_now = False
+        self.overtaken: AckState | None = None
+        """Of packets that an urgent one overtook by more than the bitmap, in a socket's queue or a radio's: they are
+        acknowledged on their own, or the sender would take them for lost."""
 
     def on_packet(self, number: int, now: float) -> None:
         """Record a packet (each number once: the replay window comes first)."""
@@ -46,6 +51,12 @@ class AckState:
             self.arrived_at = now
         elif -ahead <= ACK_BITMAP_BITS:
             self.received |= 1 << -ahead
+        else:
+            if self.overtaken is None:
+                self.overtaken = AckState()
+            if number > self.overtaken.largest - ACK_BITMAP_BITS:
+                self.overtaken.on_packet(number, now)
+                self.overtaken.pending += 1
 
     @property
     def is_late(self) -> bool:
@@ -55,6 +66,8 @@ class AckState:
 
     def on_ack_sent(self) -> None:
         """Record that an acknowledgement was sent."""
+        if self.overtaken is not None:
+            self.overtaken.pending = 0
         self.pending = 0
         self.requested = 0
         self.due_at = None
