@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
+from tests.udp_mesh.core.hostile_teams import HostileTeam
 from tests.udp_mesh.core.random_teams import LOG, TOPICS, Broken, RandomTeam
 from udp_mesh.core import transmit
 from udp_mesh.core.interfaces import Datagram
@@ -153,10 +154,10 @@ def priorities_watched() -> Iterator[None]:
         yield
 
 
-def play(seed: int, seconds: float) -> RandomTeam:
+def play(seed: int, seconds: float, *, hostile: bool = False) -> RandomTeam:
     """Messages and changes for so long, then none."""
     with priorities_watched(), numbers_watched():
-        team = RandomTeam(seed)
+        team = HostileTeam(seed) if hostile else RandomTeam(seed)
         dice = team.dice
         go(team, 2.0)
         end = team.now + seconds
@@ -197,11 +198,12 @@ def main() -> None:
     parser.add_argument("first", type=int)
     parser.add_argument("last", type=int)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--hostile", action="store_true", help="networks also replay, damage and filter")
     arguments = parser.parse_args()
     failed = 0
     for seed in range(arguments.first, arguments.last):
         try:
-            play(seed, arguments.seconds)
+            play(seed, arguments.seconds, hostile=arguments.hostile)
         except Exception as error:  # noqa: BLE001
             failed += 1
             sys.stdout.write(f"seed {seed}: {type(error).__name__}: {str(error)[:600]}\n")

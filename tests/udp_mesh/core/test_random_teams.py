@@ -12,6 +12,11 @@ def test_every_promise_is_kept_whatever_happens(seed: int) -> None:
     play(seed, 8.0)
 
 
+@pytest.mark.parametrize("seed", [3, 4, 7])
+def test_every_promise_is_kept_by_hostile_networks(seed: int) -> None:
+    play(seed, 8.0, hostile=True)
+
+
 def test_a_boot_that_is_first_heard_over_an_unplugged_link_gets_what_waits() -> None:
     """Its datagram was on its way when the link went, so it had no path until it was heard over the other one."""
     play(255, 20.0)
@@ -23,6 +28,16 @@ def test_every_promise_is_kept_in_three_thousand_teams() -> None:
     for seed in range(3000):
         try:
             play(seed, 20.0)
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {error}") from error
+
+
+@pytest.mark.proof
+@pytest.mark.timeout(4 * 3600)
+def test_every_promise_is_kept_by_a_thousand_hostile_networks() -> None:
+    for seed in range(1000):
+        try:
+            play(seed, 20.0, hostile=True)
         except AssertionError as error:
             raise AssertionError(f"seed {seed}: {error}") from error
 
