@@ -46,6 +46,7 @@ class HostileTeam(RandomTeam):
     def __init__(self, seed: int) -> None:
         self.faults: dict[str, Faults] = {}
         self._recorded: deque[tuple[str, SimNetwork, bytes, Address]] = deque(maxlen=RECORDED)
+        self.replays_until = 0.0
         super().__init__(seed)
 
     def add_network(self, network: SimNetwork) -> SimNetwork:
@@ -74,6 +75,7 @@ class HostileTeam(RandomTeam):
     def come_again(self, count: int, delays_s: Iterable[float], source: Address | None = None) -> None:
         """Deliver recorded datagrams once more, after a while, maybe from another address."""
         for delay_s in delays_s:
+            self.replays_until = max(self.replays_until, self.now + delay_s + 1.0)
             for name, network, data, sent_from in self.rng.sample(
                 list(self._recorded), min(count, len(self._recorded))
             ):
