@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from meshctl.cli.context import AsJson
+from meshctl.cli.context import AsJson, line_width
 from meshctl.cli.history_follow import concerns, is_pattern
 from meshctl.cli.history_follow import follow as follow_runs
 from meshctl.cli.output import echo, echo_error, echo_json
@@ -21,6 +21,8 @@ from meshctl.fleet.journal_store import open_journal
 from meshctl.fleet.run_files import CHANGES, RunFiles
 from meshctl.plan.values import FileChange
 from meshctl.report.changed_options import diff_lines, summary
+from meshctl.report.line_wrap import wrap
+from meshctl.report.terminal_escapes import clean
 
 
 def history(
@@ -148,13 +150,13 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
         echo_json(json.dumps(document, indent=1))
         return
     fleet = _fleet_text(record.fleet, record.lab)
-    echo(f"run {record.id}: {record.command} of {fleet} by {record.owner}, {_moment(record.began_s)}")
-    echo(f"  {record.inventory}: {record.state}")
+    _echo_wrapped(f"run {record.id}: {record.command} of {fleet} by {record.owner}, {_moment(record.began_s)}")
+    _echo_wrapped(f"  {record.inventory}: {record.state}")
     width = max((len(step.step) for step in steps), default=0)
     for outcome in outcomes:
-        echo(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
+        _echo_wrapped(f"{outcome}" + (f" ({outcome.duration_s:.1f} s)" if outcome.duration_s else ""))
         for change in changes.get(outcome.node, ()):
-            echo(f"  {change.kind} /{change.path}: {summary(change)}".rstrip(": "))
+            _echo_wrapped(f"  {change.kind} /{change.path}: {summary(change)}".rstrip(": "))
             if with_diffs:
                 for line in diff_lines(change):
                     echo(f"    {line}")
@@ -163,6 +165,11 @@ def _show_run(journal: Journal, run_id: int, node: str | None, *, as_json: bool,
                 took = "interrupted" if step.duration_s is None else f"{step.duration_s:.2f} s"
                 result = "" if step.result == "done" else step.result
                 echo(f"  {step.step:<{width}} {took:>10}  {result}".rstrip())
+
+
+def _echo_wrapped(text: str) -> None:
+    for line in wrap(clean(text), line_width()):
+        echo(line)
 
 
 def _changes(journal: Journal, run_id: int) -> dict[str, tuple[FileChange, ...]]:

@@ -6,7 +6,6 @@ nodes left out.
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
@@ -14,12 +13,11 @@ from meshctl.plan import Cut, NodePlan, Plan, StageKind, Verdict
 from meshctl.plan.ways import IN_ORDER, TOGETHER
 from meshctl.report.changed_options import changed_lines, diff_lines, summary
 from meshctl.report.duration import duration
+from meshctl.report.line_wrap import wrap
 from meshctl.report.terminal_escapes import clean
 from meshctl.wording import counted, node_list
 
-# below this width, words are broken
 _MAX_ENTRIES = 4
-_MIN_WIDTH = 20
 
 
 class Line(NamedTuple):
@@ -40,11 +38,7 @@ def plan_lines(
     """
     for line in _plan_lines(plan, with_diffs=with_diffs, order=order):
         text = clean(line.text)
-        if width is None or line.is_diff or len(text) <= width:
-            yield line._replace(text=text)
-            continue
-        indent = " " * (len(text) - len(text.lstrip()) + 2)
-        for part in textwrap.wrap(text, max(width, _MIN_WIDTH), subsequent_indent=indent, break_on_hyphens=False):
+        for part in wrap(text, None if line.is_diff else width):
             yield line._replace(text=part)
 
 

@@ -39,6 +39,23 @@ def test_runs_are_listed_newest_first_below_a_header(capfd: pytest.CaptureFixtur
     assert "mine (lab)" in lines[3]
 
 
+def test_a_run_is_wrapped_at_the_width_of_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with Journal(tmp_path / "meshctl" / "journal.sqlite") as journal:
+        run = journal.begin("provision", fleet="mine", inventory="/x", nodes=("b01",))
+        reason = "unreachable at its new address, so that it returned to its previous state by itself"
+        run.finish_node(Outcome("b01", Result.ROLLED_BACK, reason))
+        run.end("1 rolled back")
+    monkeypatch.setenv("COLUMNS", "40")
+    narrow = said(capfd, "1").splitlines()
+    assert len(narrow) > 4
+    assert max(map(len, narrow)) <= 40
+    monkeypatch.delenv("COLUMNS")
+    assert f"b01: rolled back: {reason}" in said(capfd, "1").splitlines()
+
+
 @pytest.mark.usefixtures("journal")
 def test_the_runs_of_a_node_are_grouped_by_fleet(capfd: pytest.CaptureFixture[str]) -> None:
     text = said(capfd, "--node", "b01")
