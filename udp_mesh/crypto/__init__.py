@@ -16,7 +16,7 @@ from udp_mesh.crypto.channel import (
     check_long,
 )
 from udp_mesh.crypto.keys import Key, Keyring, UnknownKeyError
-from udp_mesh.crypto.replay import ReplayWindow
+from udp_mesh.crypto.replay import ReplayWindow, age_together
 
 __all__ = [
     "LONG_OVERHEAD_BYTES",
@@ -30,5 +30,6 @@ __all__ = [
     "ReplayWindow",
     "SendChannel",
     "UnknownKeyError",
+    "age_together",
     "check_long",
 ]

@@ -5,6 +5,8 @@ Call `would_accept(number)` before decrypting (a replay costs no decryption), `a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 BLOCK_BITS = 64
 WINDOW_BLOCKS = 64
 WINDOW_PACKETS = (WINDOW_BLOCKS - 1) * BLOCK_BITS
@@ -31,12 +33,18 @@ class ReplayWindow:
         """The largest number one and two steps of `age` ago."""
 
     @property
+    def floor(self) -> int:
+        """All numbers below it count as seen."""
+        return self._floor
+
+    @property
     def next_new(self) -> int:
         """No number from this one on was accepted or ruled out."""
         return max(self.largest + 1, self._floor)
 
-    def age(self, now: float) -> None:
-        """Call periodically: everything below the largest number of two steps (10 s) ago counts as seen.
+    def age(self, now: float, largest: int = -1) -> None:
+        """Call periodically: everything below the largest number of two steps (10 s) ago counts as seen. `largest` is
+        that of the channel's windows for other keys.
 
         An attacker may replay a datagram that was lost. After that time it is worthless: its fragments were
         retransmitted under new numbers long before.
@@ -46,7 +54,7 @@ class ReplayWindow:
         elif now - self._aged_at >= AGE_STEP_S:
             self._aged_at = now
             self._floor = max(self._floor, self._older + 1)
-            self._older, self._newer = self._newer, self.largest
+            self._older, self._newer = self._newer, max(self.largest, largest)
 
     def would_accept(self, number: int) -> bool:
         top = self.largest
@@ -91,3 +99,11 @@ class ReplayWindow:
     def raise_floor(self, number: int) -> None:
         """Reject all numbers below `number` from now on."""
         self._floor = max(self._floor, number)
+
+
+def age_together(windows: Sequence[ReplayWindow], now: float) -> None:
+    """Age the windows of one channel, one for each live key: numbers continue from key to key, so what a node could not
+    open for want of a key is as old as what it opened with another one."""
+    largest = max((window.largest for window in windows), default=-1)
+    for window in windows:
+        window.age(now, largest)

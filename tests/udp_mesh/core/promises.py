@@ -186,11 +186,12 @@ def play(seed: int, seconds: float, *, hostile: bool = False) -> RandomTeam:
             raise Broken(f"{len(left)} messages have no outcome after {within_s:.0f} s: {left[:5]}")
         # Until the holders of logs agree.
         go(team, 40.0)
-        if isinstance(team, HostileTeam):
-            go(team, max(0.0, team.replays_until - team.now))
         if team.partial_bytes():
-            # A message that was given up: the notice of that was lost. Or a fragment that came again after that.
-            go(team, RELIABLE_TIMEOUT_S + 30.0)
+            # A message that was given up: the notice of that was lost.
+            go(team, RELIABLE_TIMEOUT_S)
+        if isinstance(team, HostileTeam):
+            # What comes again so late is not taken.
+            go(team, max(0.0, team.replays_until - team.now))
         check_finished(team)
         return team
 

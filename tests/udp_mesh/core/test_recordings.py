@@ -389,6 +389,31 @@ def test_replays_stay_rejected_after_rotating_keys_away_and_back() -> None:
     assert payloads(both) == [b"new"]
 
 
+@pytest.mark.parametrize("knows_the_key_s", [0.0, 60.0])
+def test_what_could_not_be_opened_for_want_of_a_key_is_rejected_later(knows_the_key_s: float) -> None:
+    """A fragment in the middle of a message has no timestamp: only its number shows its age, under whichever key."""
+    other = Key(bytes(range(1, 33)))
+    both = acquainted(replace(BEST, reliable=True))
+
+    def use(node: str, *keys: Key) -> None:
+        getattr(both, node).apply(replace(settings(node, replace(BEST, reliable=True)), keys=keys), both.now)
+
+    use("a", other, KEY)
+    recorded = overheard(both, "pose", bytes(5000))[1:-1]
+    both.a._state.peer_table.peers["b"].open_sender().finish_all(ExpiryReason.DEADLINE)
+    assert recorded
+    replay(both, recorded)
+    assert both.b.conditions(both.now).counters.dropped_unauthenticated >= len(recorded)
+    use("a", KEY, other)
+    both.roundtrip(times=int(600 - knows_the_key_s * 10), step_s=0.1)
+    use("b", KEY, other)
+    both.roundtrip(times=int(knows_the_key_s * 10), step_s=0.1)
+    before = both.b.conditions(both.now).counters.dropped_replayed
+    replay(both, recorded)
+    now = both.b.conditions(both.now)
+    assert (now.partial_bytes, now.counters.dropped_replayed) == (0, before + len(recorded))
+
+
 def test_clock_wraparound_and_drift_do_not_make_datagrams_stale() -> None:
     freshness = Freshness()
     for minute in range(60 * 24 * 60):

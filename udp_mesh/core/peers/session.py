@@ -24,7 +24,7 @@ from udp_mesh.core.sender.path import Path
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.core.subscriptions.table import KnownTable
-from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel
+from udp_mesh.crypto import TO_ALL, Key, ReceiveChannel, SendChannel, age_together
 from udp_mesh.wire.frames import Ack, Feature, Frame, Heartbeat, Waiting
 from udp_mesh.wire.limits import HEARD_TAG_BYTES, MAX_HEARD
 
@@ -269,7 +269,8 @@ class Session:
     def _receive_channels(
         self, before: list[ReceiveChannel], receiver: bytes, keys: tuple[Key, ...]
     ) -> list[ReceiveChannel]:
-        """A key that returns continues its numbers: what was sealed with it before is a replay."""
+        """A key that returns continues its numbers: what was sealed with it before is a replay. What is too old under
+        one key is too old under a new one as well."""
         known = {channel.key: channel for channel in before}
         floors = self._key_floors
         for channel in before:
@@ -277,12 +278,13 @@ class Session:
                 floors[channel.key.key_id, channel.receiver_boot] = channel.window.next_new
         while len(floors) > MAX_REMEMBERED_FLOORS:
             self._forgotten_floor = max(self._forgotten_floor, floors.pop(next(iter(floors))))
+        too_old = max((channel.window.floor for channel in before), default=0)
         channels = []
         for key in keys:
             kept = known.get(key)
             if kept is None:
                 kept = ReceiveChannel(key, self.boot_id, receiver)
-                kept.window.raise_floor(floors.get((key.key_id, receiver), self._forgotten_floor))
+                kept.window.raise_floor(max(too_old, floors.get((key.key_id, receiver), self._forgotten_floor)))
             channels.append(kept)
         return channels
 
@@ -310,10 +312,8 @@ class Session:
         for token, challenge in list(self.challenges.items()):
             if now - challenge.sent_at > CHALLENGE_TIMEOUT_S:
                 del self.challenges[token]
-        for channel in self.data_channels:
-            channel.window.age(now)
-        for channel in self.broadcast_channels:
-            channel.window.age(now)
+        age_together([channel.window for channel in self.data_channels], now)
+        age_together([channel.window for channel in self.broadcast_channels], now)
 
     @property
     def is_current(self) -> bool:

@@ -11,7 +11,7 @@ import hmac
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, SendChannel, check_long
+from udp_mesh.crypto import TO_ALL, Key, OpenError, ReceiveChannel, ReplayError, SendChannel, age_together, check_long
 from udp_mesh.wire.errors import DecodeError
 from udp_mesh.wire.header import Kind, LongHeader, parse_header
 from udp_mesh.wire.relay import PROOF_BYTES, RELAY_BYTE
@@ -123,8 +123,8 @@ class HopChannels:
 
     def age(self, now: float) -> None:
         for hop in self.hops.values():
-            for channel in (*hop.data, *hop.hello):
-                channel.window.age(now)
+            age_together([channel.window for channel in hop.data], now)
+            age_together([channel.window for channel in hop.hello], now)
 
     def seal(self, hop: Hop, frame: bytes) -> tuple[int, bytes]:
         """Packet number and relay datagram to this neighbor."""
