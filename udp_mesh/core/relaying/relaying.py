@@ -297,7 +297,8 @@ class Relaying:
 
     def _select(self, boot_ids: Iterable[bytes], now: float) -> None:
         """Choose routes again, tell the core, and move what waits for a next hop that is no longer used."""
-        boot_ids = set(boot_ids)
+        # The order of a set differs from process to process, and a simulation must not.
+        boot_ids = sorted(set(boot_ids))
         changed = self.routes.select(boot_ids, self.neighbours, self.round, self._max_hops, now)
         for before, after in changed:
             if before is not None and after is None:

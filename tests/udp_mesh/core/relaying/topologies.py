@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from udp_mesh.core.events import Event
 from udp_mesh.core.relaying.conditions import RelayConditions
 from udp_mesh.core.settings import RelaySettings, Settings, Topic
@@ -27,9 +29,9 @@ def chain(count: int, seed: int = 1, *, loss: float = 0.0, relay: RelaySettings 
     return topology
 
 
-def ring(seed: int = 1, *, loss: float = 0.0) -> Topology:
+def ring(seed: int = 1, *, loss: float = 0.0, make: Callable[[int], Topology] = Topology) -> Topology:
     """a and d are joined by two paths: a - b - d and a - c - e - d."""
-    topology = Topology(seed)
+    topology = make(seed)
     for network in ("ab", "bd", "ac", "ce", "ed"):
         topology.network(network, loss=loss)
     topology.add(node("a"), ["ab", "ac"])
