@@ -22,6 +22,8 @@ class MeshtasticAir(SerialAir):
     """`hop_limits` are those of the packets; `limited` are the ports whose radio refuses for its duty cycle."""
 
     overhead_bytes = MESHTASTIC_OVERHEAD_BYTES
+    # The firmware listens before it sends.
+    senses_carrier = True
 
     def __init__(self, count: int, *, bits_per_s: float) -> None:
         super().__init__(count, bits_per_s=bits_per_s)

@@ -43,6 +43,8 @@ class SerialAir:
 
     overhead_bytes = 0
     """What they add to a frame on the air."""
+    senses_carrier = False
+    """Whether a radio waits until it hears no other one."""
 
     def __init__(self, count: int, *, bits_per_s: float, loss: float = 0.0, seed: int = 1) -> None:
         self.bits_per_s, self.loss = bits_per_s, loss
@@ -96,11 +98,15 @@ class SerialAir:
         except BlockingIOError:
             return
         for frame in self._taken(port):
-            starts = max(time.monotonic(), port.sends_until)
+            heard = [other.sends_until for other in self.ports if self.senses_carrier and self._hears(port, other)]
+            starts = max(time.monotonic(), port.sends_until, *heard)
             airtime_s = 8 * (len(frame) + self.overhead_bytes) / self.bits_per_s
             port.sends_until = starts + airtime_s
             port.sent_s.append((starts, airtime_s))
             self._transmissions.append(_Transmission(port, starts, starts + airtime_s, frame))
+
+    def _hears(self, port: Port, other: Port) -> bool:
+        return not {self.ports.index(port), self.ports.index(other)} & self.cut
 
     def _taken(self, port: Port) -> Iterator[bytes]:
         """The frames that the radio now has completely; they leave `port.line`."""
@@ -119,8 +125,8 @@ class SerialAir:
                 continue
             one.delivered = True
             collided = any(other is not one and _overlap(other, one) for other in self._transmissions)
-            for number, port in enumerate(self.ports):
-                if port is one.port or {number, self.ports.index(one.port)} & self.cut:
+            for port in self.ports:
+                if port is one.port or not self._hears(port, one.port):
                     continue
                 if collided:
                     self.collided += 1

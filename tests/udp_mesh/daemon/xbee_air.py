@@ -24,6 +24,8 @@ class XBeeAir(SerialAir):
     """Radios with AP=1, or with AP=2 if `escaped`; `np` is their largest payload."""
 
     overhead_bytes = AIR_OVERHEAD_BYTES
+    # IEEE 802.15.4's CSMA-CA. Without it, frames that this process reads late would collide, whenever written.
+    senses_carrier = True
 
     def __init__(self, count: int, *, bits_per_s: float, escaped: bool, np: int = 256) -> None:
         super().__init__(count, bits_per_s=bits_per_s)
