@@ -118,11 +118,12 @@ class NodeRunner:
             os.dup2(console, 2)
             os.close(gate_end)
             become_node(container, report_end, gate)
+        # before the gate opens: a node that cannot start ends at once, and its network could not be opened any more
+        pidfd = os.pidfd_open(pid)
+        network = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         self._open_gate(container, pid, gate_end, report_end)
         for descriptor in (console, silence, report_end, gate, gate_end):
             os.close(descriptor)
-        pidfd = os.pidfd_open(pid)
-        network = os.open(f"/proc/{pid}/ns/net", os.O_RDONLY | os.O_CLOEXEC)
         self._nodes[container.name] = _RunningNode(pid, pidfd, network, container.deny_setgroups)
         self._selector.register(pidfd, selectors.EVENT_READ, lambda: self._ended(container.name, report))
         self._send_event({"event": "started", "node": container.name, "pid": pid})
