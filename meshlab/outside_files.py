@@ -16,7 +16,7 @@ from pathlib import Path
 from meshctl.file_access import located
 from meshctl.inventory.compose import compose
 from meshctl.inventory.file_paths import file_path
-from meshctl.inventory.include import read_files
+from meshctl.inventory.include import include_path, read_files
 from meshctl.inventory.source import Source
 from meshctl.inventory.text_edit import replace_value
 from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, descend
@@ -66,11 +66,10 @@ def _includes(file: Path, copies: Mapping[Path, Path], environ: Mapping[str, str
     root = compose(Source(str(file), _text(file))).root
     includes = root.values.get("include") if isinstance(root, MappingNode) else None
     for item in includes.items if isinstance(includes, SequenceNode) else ():
-        if isinstance(item, Scalar):
-            home = environ.get("HOME", "")
-            named = Path(home, item.text[2:]) if item.text.startswith("~/") else file.parent / item.text
-            if (copy := copies.get(named.resolve())) is not None:
-                yield item, os.path.relpath(copy, copies[file].parent)
+        if not isinstance(item, Scalar) or (named := include_path(item.text, file, environ)) is None:
+            continue
+        if (copy := copies.get(named.resolve())) is not None:
+            yield item, os.path.relpath(copy, copies[file].parent)
 
 
 def _folder_copy(folder: Path, target: Path) -> Path:

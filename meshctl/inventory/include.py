@@ -18,7 +18,6 @@ from meshctl.inventory.tree import MappingNode, Scalar, SequenceNode, Tree, desc
 MAX_FILES = 256
 # The first file of a directory.
 FIRST_FILE = "fleet.yaml"
-_MISSING_HINT = "expected in {directory}: name another with `--inventory`, or write a first one with `meshctl init DIR`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +32,14 @@ class MergedFiles:
 def first_file(path: Path) -> Path:
     """The first file: `path`, or `fleet.yaml` in it if it is a directory."""
     return path / FIRST_FILE if os.path.isdir(path) else path
+
+
+def include_path(written: str, including: Path, environ: Mapping[str, str]) -> Path | None:
+    """The path that an `include` entry of the file `including` names; None if its `~` needs `HOME`, which is unset."""
+    if not written.startswith("~/"):
+        return including.parent / written
+    home = environ.get("HOME", "")
+    return Path(home) / written[2:] if home else None
 
 
 def read_files(path: Path, environ: Mapping[str, str], read: Reader = read_bytes) -> MergedFiles:
@@ -141,13 +148,10 @@ class _FileMerger:
         if "\0" in item.text:
             self._fail(codes.error(codes.INCLUDE, position(item), "not a path: it contains a NUL character"))
             return None
-        if item.text.startswith("~/"):
-            home = self.environ.get("HOME", "")
-            if not home:
-                self._fail(codes.error(codes.INCLUDE, position(item), "`~` needs the environment variable HOME"))
-                return None
-            return Path(home) / item.text[2:]
-        return path.parent / item.text
+        target = include_path(item.text, path, self.environ)
+        if target is None:
+            self._fail(codes.error(codes.INCLUDE, position(item), "`~` needs the environment variable HOME"))
+        return target
 
     def _report_at_include(self, item: Scalar | Tree, target: Path, known: int) -> None:
         """Report an unreadable file at its include."""
