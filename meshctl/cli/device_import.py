@@ -278,13 +278,11 @@ def _secret_files(target: ImportTarget, made: DeviceImport) -> dict[Path, Secret
 def _lint_errors(target: ImportTarget, made: DeviceImport) -> tuple[Diagnostic, ...]:
     """What `meshctl lint` will call an error, and the inventory did not have before."""
     context = LintContext(load_regdb(), DiskFiles())
-    before = lint(target.fleet, context) if target.fleet is not None else ()
-    known = {(each.code, each.path) for each in before}
-    return tuple(
-        each
-        for each in lint(made.fleet, context)
-        if each.severity is Severity.ERROR and (each.code, each.path) not in known
-    )
+    errors = tuple(each for each in lint(made.fleet, context) if each.severity is Severity.ERROR)
+    if not errors or target.fleet is None:
+        return errors
+    known = {(each.code, each.path) for each in lint(target.fleet, context)}
+    return tuple(each for each in errors if (each.code, each.path) not in known)
 
 
 def _write(target: ImportTarget, text: str, edits: tuple[FileEdit, ...], files: Mapping[Path, Secret]) -> None:
