@@ -13,10 +13,11 @@ from udp_mesh.crypto.channel import (
     ReceiveChannel,
     ReplayError,
     SendChannel,
+    age_together,
     check_long,
 )
 from udp_mesh.crypto.keys import Key, Keyring, UnknownKeyError
-from udp_mesh.crypto.replay import ReplayWindow, age_together
+from udp_mesh.crypto.replay import ReplayWindow
 
 __all__ = [
     "LONG_OVERHEAD_BYTES",

@@ -181,6 +181,14 @@ class ReceiveChannel(_Channel):
             raise OpenError(f"packet {number} cannot be decrypted") from error
 
 
+def age_together(channels: Sequence[ReceiveChannel], now: float) -> None:
+    """Age the replay windows of channels that differ in their key alone. Numbers continue from key to key, so what a
+    node could not open for want of a key is as old as what it opened with another one."""
+    largest = max((channel.window.largest for channel in channels), default=-1)
+    for channel in channels:
+        channel.window.age(now, largest)
+
+
 def check_long(key: Key, data: bytes | bytearray | memoryview, header: LongHeader) -> None:
     """Raises `OpenError` unless the long header was written by a holder of `key` (one short hash, no key derived)."""
     clear = memoryview(data)[: LONG_HEADER_BYTES - CHECK_BYTES]

@@ -5,8 +5,6 @@ Call `would_accept(number)` before decrypting (a replay costs no decryption), `a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 BLOCK_BITS = 64
 WINDOW_BLOCKS = 64
 WINDOW_PACKETS = (WINDOW_BLOCKS - 1) * BLOCK_BITS
@@ -99,11 +97,3 @@ class ReplayWindow:
     def raise_floor(self, number: int) -> None:
         """Reject all numbers below `number` from now on."""
         self._floor = max(self._floor, number)
-
-
-def age_together(windows: Sequence[ReplayWindow], now: float) -> None:
-    """Age the windows of one channel, one for each live key: numbers continue from key to key, so what a node could not
-    open for want of a key is as old as what it opened with another one."""
-    largest = max((window.largest for window in windows), default=-1)
-    for window in windows:
-        window.age(now, largest)

@@ -14,9 +14,11 @@ from udp_mesh.crypto import (
     ReplayError,
     SendChannel,
     UnknownKeyError,
+    age_together,
     check_long,
 )
 from udp_mesh.crypto.channel import MAX_PACKET_NUMBER, expand_number
+from udp_mesh.crypto.replay import AGE_STEP_S
 from udp_mesh.wire.header import Kind, LongHeader, ShortHeader, parse_header
 
 KEY = Key(bytes(range(32)))
@@ -155,3 +157,15 @@ def test_a_key_is_read_from_hexadecimal_and_base64_and_never_shown() -> None:
         Key.parse("00ff" * 7)
     assert "00ff" not in str(caught.value)
     assert "28 characters" in str(caught.value)
+
+
+def test_windows_of_one_channel_age_together() -> None:
+    channels = [ReceiveChannel(key, ALICE, BOB) for key in (KEY, Key(bytes(range(1, 33))))]
+    used, unused = (channel.window for channel in channels)
+    assert used.accept(100)
+    for step in range(3):
+        assert unused.would_accept(99)
+        age_together(channels, step * AGE_STEP_S)
+    age_together(channels, 3 * AGE_STEP_S)
+    assert not unused.would_accept(99)
+    assert unused.would_accept(101)

@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from udp_mesh.crypto.replay import AGE_STEP_S, WINDOW_PACKETS, ReplayWindow, age_together
+from udp_mesh.crypto.replay import WINDOW_PACKETS, ReplayWindow
 
 
 @given(st.integers(0, 1 << 40), st.lists(st.integers(-5000, 5000), max_size=80), st.integers(0, 10_000))
@@ -51,14 +51,3 @@ def test_the_accepted_share_counts_the_newest_numbers(numbers: set[int], first: 
     counted = range(max(first, max(numbers) - newest + 1), max(numbers) + 1)
     expected = len(numbers.intersection(counted)) / len(counted) if len(counted) >= least else None
     assert window.accepted_share(first, newest, least) == expected
-
-
-def test_windows_of_one_channel_age_together() -> None:
-    used, unused = ReplayWindow(), ReplayWindow()
-    assert used.accept(100)
-    for step in range(3):
-        assert unused.would_accept(99)
-        age_together((used, unused), step * AGE_STEP_S)
-    age_together((used, unused), 3 * AGE_STEP_S)
-    assert not unused.would_accept(99)
-    assert unused.would_accept(101)

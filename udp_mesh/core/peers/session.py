@@ -312,8 +312,8 @@ class Session:
         for token, challenge in list(self.challenges.items()):
             if now - challenge.sent_at > CHALLENGE_TIMEOUT_S:
                 del self.challenges[token]
-        age_together([channel.window for channel in self.data_channels], now)
-        age_together([channel.window for channel in self.broadcast_channels], now)
+        age_together(self.data_channels, now)
+        age_together(self.broadcast_channels, now)
 
     @property
     def is_current(self) -> bool:

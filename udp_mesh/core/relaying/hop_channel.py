@@ -123,8 +123,8 @@ class HopChannels:
 
     def age(self, now: float) -> None:
         for hop in self.hops.values():
-            age_together([channel.window for channel in hop.data], now)
-            age_together([channel.window for channel in hop.hello], now)
+            age_together(hop.data, now)
+            age_together(hop.hello, now)
 
     def seal(self, hop: Hop, frame: bytes) -> tuple[int, bytes]:
         """Packet number and relay datagram to this neighbor."""

@@ -12,6 +12,7 @@ Only members (holders of the hop's key) are neighbors; one datagram in becomes a
 from __future__ import annotations
 
 from collections.abc import Iterable
+from collections.abc import Set as AbstractSet
 
 from udp_mesh.core.events import PeerRouteChanged
 from udp_mesh.core.interfaces import Datagram
@@ -295,10 +296,10 @@ class Relaying:
 
     # Routes
 
-    def _select(self, boot_ids: Iterable[bytes], now: float) -> None:
+    def _select(self, nodes: AbstractSet[bytes], now: float) -> None:
         """Choose routes again, tell the core, and move what waits for a next hop that is no longer used."""
         # The order of a set differs from process to process, and a simulation must not.
-        boot_ids = sorted(set(boot_ids))
+        boot_ids = sorted(nodes)
         changed = self.routes.select(boot_ids, self.neighbours, self.round, self._max_hops, now)
         for before, after in changed:
             if before is not None and after is None:
