@@ -315,13 +315,13 @@ def _verb(
             f"{connection.endpoint.label}: {verb}: {answer.text}",
             code=answer.code,
             exit_status=done.exit_status,
-            hint=_HINTS.get(answer.code, ""),
+            hint=HINTS.get(answer.code, ""),
         )
     raise _unreadable(connection, verb, done)
 
 
 # Hints by refusal code, where the text has none (docs/device-scripts.md).
-_HINTS = {
+HINTS = {
     "locked": "wait until the other run ends or its lock expires",
     "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what uses the space",
     "moved-on": "the node has changed since it was planned: plan again",
