@@ -136,7 +136,8 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
                 connection.close()
         except NodeError as error:
             last_error = str(error)
-            listener.unreachable()
+            # nothing drops logins silently while it is written or boots, and then all of its radios have restarted
+            listener.unreachable(is_login_due=True)
         else:
             ctx.run.record(ctx.name, seen)
             if upgrade is None:

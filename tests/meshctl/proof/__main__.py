@@ -54,8 +54,8 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         out.flush()
 
     def tell(case: Case, phase: str, batch: int) -> None:
-        told = {"part": part, "phase": phase, "batch": batch, "version": version(), "at_s": round(time.time())}
-        write({**told, **case.object()})
+        record = {"part": part, "phase": phase, "batch": batch, "version": version(), "at_s": round(time.time())}
+        write({**record, **case.object()})
         if not case.holds:
             sys.stderr.write(f"does not hold: {case}\n")
 
