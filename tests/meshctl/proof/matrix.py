@@ -8,6 +8,8 @@ puts that into a page.
 from __future__ import annotations
 
 import hashlib
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -189,21 +191,37 @@ def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
 
 
 def filled(page: str, rows: Iterable[str]) -> str:
-    """The page with these rows of `table` in place of those of the same operation and fault; others stay."""
-    new = [row for row in rows if not row.startswith(("| operation", "| ---"))]
-    updated = {_subject(row) for row in new}
+    """The page with these rows of `table` in place of those of the same operation, fault and step; others stay. The
+    sentence that counts the cases follows from all of them."""
+    new = {_subject(row): f"{row}\n" for row in rows if not row.startswith(("| operation", "| ---"))}
     lines = page.splitlines(keepends=True)
     head = next(number for number, line in enumerate(lines) if line.startswith("| operation |"))
     end = next(number for number, line in enumerate(lines[head:], head) if not line.startswith("|"))
-    kept = [line for line in lines[head + 2 : end] if _subject(line) not in updated]
-    rows = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
-    return "".join([*lines[: head + 2], *rows, *lines[end:]])
+    kept = [new.pop(_subject(line), line) for line in lines[head + 2 : end]]
+    # stable: a step that the page did not have comes after the others of its fault
+    all_rows = sorted([*kept, *new.values()], key=lambda row: _ORDER.index(_subject(row)[:2]))
+    text = "".join([*lines[: head + 2], *all_rows, *lines[end:]])
+    return _COUNTED.sub(lambda _: counted_cases(all_rows), text, count=1)
 
+
+def counted_cases(rows: Iterable[str]) -> str:
+    """How many cases the rows of a table have, and with which scripts they were recorded."""
+    by_script: Counter[int] = Counter()
+    bad = 0
+    for row in rows:
+        _, _, _, _, script, cases, *_, neither, away, left, _ = (cell.strip() for cell in row.split("|"))
+        by_script[int(script)] += int(cases)
+        bad += int(neither) + int(away) + int(left)
+    which = ", ".join(f"{cases} with version {script}" for script, cases in sorted(by_script.items(), reverse=True))
+    return f"{by_script.total()} cases, {bad} failed: {which} of the dead-man script"
+
+
+_COUNTED = re.compile(r"\d+ cases, \d+ failed: [^.:]* of the dead-man script")
 
 # operations and faults in the order of the page
 _ORDER = [(operation, fault) for operation in ("apply", "flash") for fault in ("power-cut", "sever", "kill meshctl")]
 
 
-def _subject(row: str) -> tuple[str, str]:
-    _, operation, fault, *_ = (cell.strip() for cell in row.split("|"))
-    return operation, fault
+def _subject(row: str) -> tuple[str, str, str]:
+    _, operation, fault, step, *_ = (cell.strip() for cell in row.split("|"))
+    return operation, fault, step

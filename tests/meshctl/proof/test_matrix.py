@@ -9,6 +9,7 @@ from meshctl.device.deadman import version
 from tests.meshctl.proof.__main__ import next_batch
 from tests.meshctl.proof.matrix import filled, table
 
+PAGE = Path(__file__).parents[3] / "docs" / "proof.md"
 CASE = {"verb": "apply", "kind": "sever", "phase": "lock", "state": "old", "reachable": True, "resumed": True}
 
 
@@ -29,5 +30,15 @@ def test_a_row_says_with_which_script_its_cases_were_recorded() -> None:
         "| apply | sever | lock | 9 | 1 | 1 | 0 | 0 | 0 | 0 | 0 |",
     ]
     other = "| apply | power-cut | lock | 9 | 7 | 0 | 7 | 0 | 0 | 0 | 0 |"
-    page = "\n".join(["# Title", head, line, other, rows[1], "the end", ""])
-    assert filled(page, table([new])).splitlines()[3:] == [other, rows[0].replace("| 2 | 2 |", "| 1 | 1 |"), "the end"]
+    page = ["# Title", head, line, other, rows[1], "8 cases, 0 failed: 8 with version 9 of the dead-man script.", ""]
+    assert filled("\n".join(page), table([new])).splitlines()[3:] == [
+        other,
+        rows[0].replace("| 2 | 2 |", "| 1 | 1 |"),
+        "8 cases, 0 failed: 1 with version 10, 7 with version 9 of the dead-man script.",
+    ]
+
+
+def test_the_page_counts_the_cases_of_its_table() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert filled(page, []) == page
+    assert "of the dead-man script" in page
