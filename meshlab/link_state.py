@@ -15,7 +15,7 @@ from meshlab.fleet_state import FleetState
 from meshlab.shaped_tunnel import Shape
 from meshlab.spec import LinkSpec, Medium, changed_link
 from meshlab.state import NodeState
-from meshlab.station_tables import StationTables
+from meshlab.station_tables import StationTables, TrafficClass
 
 # recomputing all tables of a big fleet is slow; at most this share of the time is spent on it
 _BUSY_SHARE = 0.2
@@ -41,7 +41,7 @@ class LinkState:
         self._graph: dict[str, list[mesh_model.Edge]] = {}
         self._base_routes: dict[str, mesh_model.Route] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._stations = StationTables()
+        self._stations = StationTables(TrafficClass(word) for word in fleet.spec.stale)
         # the current boot of each running node
         self._boots: dict[str, int] = {}
         # the boot in which each node last had a neighbor
@@ -115,7 +115,7 @@ class LinkState:
         path = self._base_routes.get(name)
         if path is None or not state.effective.holds(address, over="mesh"):
             return None
-        if not all(self._passes(sender, edge) for sender, edge in path.hops):
+        if not all(self._logs_in(sender, edge) for sender, edge in path.hops):
             return None
         rates = [link.rate_kbps for link in path.links if link.rate_kbps is not None]
         arrives = 1.0
@@ -150,6 +150,9 @@ class LinkState:
 
     def _passes(self, sender: str, edge: mesh_model.Edge) -> bool:
         return self._stations.passes(sender, self._boots, edge)
+
+    def _logs_in(self, sender: str, edge: mesh_model.Edge) -> bool:
+        return self._stations.logs_in(sender, self._boots, edge)
 
     def _count_boots(self) -> None:
         self._boots = {name: state.boots for name, state in self._fleet.nodes.items() if state.is_running}
@@ -221,6 +224,7 @@ class LinkState:
         for name, state in self._fleet.nodes.items():
             routes = mesh_model.best_routes(self._graph, name) if name in nodes else {}
             text = mesh_model.heard_text(name, nodes, self._graph, routes, self._station_rows(name), self._passes)
+            text += mesh_model.servers_text(name, nodes, self._graph, self._logs_in)
             if self._written.get(name) != text:
                 self._written[name] = text
                 _replace(state.home / "air" / "heard", text)

@@ -270,6 +270,24 @@ def heard_text(
     return "".join(f"{line}\n" for line in lines)
 
 
+def servers_text(
+    name: str,
+    nodes: Mapping[str, EffectiveState],
+    graph: Mapping[str, list[Edge]],
+    logs_in: Callable[[str, Edge], bool],
+) -> str:
+    """The rest of air/heard: L address state, of the SSH servers of the neighbors, for the stand-in of nc: `answers`,
+    `refused` by a firewall, or `silent`."""
+    states: dict[str, str] = {}
+    for edge in graph.get(name, ()):
+        if not edge.own.routes_with(edge.peer):
+            continue
+        for one in nodes[edge.node].addresses:
+            if one.over_mesh and states.get(one.address) != "answers":
+                states[one.address] = "refused" if not one.admitted else "answers" if logs_in(name, edge) else "silent"
+    return "".join(f"L\t{address}\t{state}\n" for address, state in states.items())
+
+
 def _delivered_per_mille(hops: Iterable[tuple[str, Edge]], passes: Callable[[str, Edge], bool]) -> int:
     """How many of 1000 unicast frames over the hops are answered."""
     share = 1.0

@@ -160,7 +160,8 @@ class FleetSpec:
 
     0 lets the supervisor choose a free one, which `VirtualFleet.port` returns. `seed` seeds the random start-up times
     of services and radios. A virtual node boots in a second, a real one takes about as long as neighbors keep the entry
-    of a silent station; with `quick_boot` they keep it over a boot, as after a real boot within a minute.
+    of a silent station; with `quick_boot` they keep it over a boot, as after a real boot within a minute. `stale`: the
+    traffic classes that a stale station entry drops (`station_tables.TrafficClass`).
     """
 
     name: str
@@ -172,6 +173,7 @@ class FleetSpec:
     lans: tuple[LanSpec, ...] = ()
     seed: int = 0
     quick_boot: bool = False
+    stale: tuple[str, ...] = ("ordinary", "logins")
 
     def __post_init__(self) -> None:
         names = [node.name for node in self.nodes]
@@ -232,4 +234,4 @@ def _loaded(data: dict[str, Any]) -> FleetSpec:
     )
     links = tuple(LinkSpec(**link) for link in data.pop("links"))
     lans = tuple(LanSpec(**{**lan, "nodes": tuple(lan["nodes"])}) for lan in data.pop("lans"))
-    return FleetSpec(nodes=nodes, links=links, lans=lans, **data)
+    return FleetSpec(nodes=nodes, links=links, lans=lans, stale=tuple(data.pop("stale")), **data)

@@ -269,9 +269,11 @@ def connect(change: ChangeInProgress) -> SshConnection | None:
         try:
             connection = ctx.run.connections.open(ctx.node, endpoint=endpoint, deadlines=_deadlines(change, endpoint))
         except NodeError as error:
-            change.last_error = change.connect_error = str(error)
-            if isinstance(error, AuthenticationRefused):
-                change.login_refused = change.last_error
+            change.last_error = str(error)
+            # what a login meets while its timer rolls it back is not why it does
+            if change.started_s is None or not change.is_window_over:
+                change.connect_error = change.last_error
+                change.login_refused = str(error) if isinstance(error, AuthenticationRefused) else change.login_refused
             continue
         if endpoint in change.candidates:
             change.found_at = endpoint
@@ -346,13 +348,12 @@ def _while_it_reloads(change: ChangeInProgress, connection: SshConnection) -> Ac
         change.login_refused = change.connect_error = ""
         change.listener.observed()
     change.unmet = (RELOADING,)
-    leaving = change.ctx.run.interrupt.leaving
     return next_action(
         change.id,
         status,
         change.unmet,
         is_at_new_address=False,
-        leaving=leaving,
+        leaving=change.ctx.run.interrupt.leaving,
         is_abandoned=change.is_abandoned,
     )
 

@@ -19,11 +19,11 @@ from meshctl.apply.health_checks import Expectation
 from meshctl.device import deadman
 from meshctl.device.deadman import Change
 from meshctl.device.framing import quoted
-from meshctl.device.observation import Observation
+from meshctl.device.observation import Observation, Space
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
 from meshctl.errors import InputError, NodeError
-from meshctl.fleet import Outcome
+from meshctl.fleet import Outcome, Result
 from meshctl.inventory.file_paths import file_path
 from meshctl.plan import PackageStep
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
@@ -36,6 +36,7 @@ INSTALL_TIMEOUT_S = 300.0
 _RESTART_RADIOS = "[ ! -x /sbin/wifi ] || /sbin/wifi\n"
 # A package's uci-defaults edit /etc/config and commit it (base-files, default_postinst), which needs a reload.
 _RELOAD = "reload_config\n"
+FLASH_HINT = deadman.HINTS["flash-full"]
 
 
 def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> Outcome:
@@ -55,7 +56,18 @@ def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> O
     except BaseException:
         connection.close()
         raise
-    return run_change(_new_change(ctx, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    outcome = run_change(_new_change(ctx, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    return with_full_flash(outcome, ctx.before.overlay, sum(file.stat().st_size for file in files))
+
+
+def with_full_flash(outcome: Outcome, flash: Space | None, needed_bytes: int) -> Outcome:
+    """The outcome of an installation, with the free flash if the package files, compressed as flash is, had not
+    fitted into it: neither package tool's failure nor the node's refusal says so."""
+    if outcome.result not in (Result.REFUSED, Result.ROLLED_BACK) or flash is None or flash.free >= needed_bytes:
+        return outcome
+    free, needed = flash.free >> 10, -(-needed_bytes >> 10)
+    why = f"{outcome.reason}; its flash is too full: {free} KiB were free, the package files have {needed} KiB"
+    return replace(outcome, reason=why, hint=outcome.hint or FLASH_HINT)
 
 
 def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:

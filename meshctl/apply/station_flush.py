@@ -2,16 +2,14 @@
 
     armed: nodes reached through the node, and the node itself, start to watch their entries
     unreachable: the other holders are queried, with growing pauses; after `BOOT_S` those of its other radios as well,
-        which restart if it has lost its power; its SSH server has to answer, too, once its timer has undone the change,
-        or at once if the change cannot drop logins
+        which restart if it has lost its power; its SSH server has to answer, too: at once if the node watches its own
+        entries or the change cannot drop logins, otherwise once its timer has undone the change
     ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
 
-The first three are events of a change (`change_listener`).
-
-A query is harmless where no radio restarted: each neighbor verifies that its entry is stale before it removes it. All
-are queried in parallel, each for at most `QUERY_TIMEOUT_S`. A neighbor that does not answer, or cannot remove its entry
+The first three are events of a change (`change_listener`). A query is harmless where no radio restarted: each neighbor
+verifies that its entry is stale before it removes it. A neighbor that does not answer, or cannot remove its entry
 (19.07), changes no outcome; a note names it.
 """
 
@@ -91,20 +89,21 @@ class StationFlush:
     radios: Radios
     unfinished: list[StationFlush] = field(repr=False)
     _holders: dict[str, tuple[StationEntry, ...]] = field(init=False, repr=False)
-    # nodes that watch their entries, and may be unreachable while this node is
+    # nodes that watch their entries, and may be unreachable while this node is; whether it watches its own
     _watching: frozenset[str] = frozenset()
+    _watches_itself: bool = False
     _queried_s: list[float] = field(default_factory=list)
     # where the node has to answer logins, since the queries in `_queried_s`
     _login: Login | None = None
     # nodes whose radios restart at the same moment and keep no entry from before
     _restarting: frozenset[str] = frozenset()
-    # reported once each, although a node that is flashed is unreachable for minutes and queried for many times
+    # once each, although a node that is flashed is queried for many times
     _journaled_steps: set[str] = field(default_factory=set)
     _reported: set[str] = field(default_factory=set)
-    # since when its radio may have restarted: first by the change, then by its rollback
+    # since when its radio may have restarted, by the change and by its rollback
     _started_s: float | None = None
     _observed_s: float | None = None
-    # the holders that did not answer at the end, and since when an entry is not stale
+    # the holders that did not answer at the end; since when an entry is not stale
     _unanswered: dict[str, tuple[StationEntry, ...]] = field(default_factory=dict)
     _since_s: float = 0.0
 
@@ -145,11 +144,11 @@ class StationFlush:
 
     def watch_own_entries(self, connection: SshConnection, *, for_s: float) -> None:
         """Start a watch on the node itself. If a neighbor removes its entry although the radio did not restart, the
-        node removes its own, and both count from 0. If the node's part of a simultaneous change is called off before
-        its radio restarts, it keeps its entries of those that do restart."""
+        node removes its own, and both count from 0. Otherwise a node whose part of a simultaneous change is called off
+        would keep its entries of those that restart."""
         entries = own_entries(self.node, self.ctx.before, self.radios)
         if entries:
-            connection.run(watch_script(self.node, entries, for_s=for_s))
+            self._watches_itself = connection.run(watch_script(self.node, entries, for_s=for_s)).exit_status == 0
 
     def started(self) -> None:
         """The change starts: from now on its radio may restart."""
@@ -196,9 +195,10 @@ class StationFlush:
             thread.join()
 
     def unreachable(self, among: Container[str] | None = None, *, is_login_due: bool = False) -> None:
-        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable.
-        `is_login_due`: from now on its SSH server has to answer a login, if only by a refusal."""
+        """The node did not answer: query its neighbors if it is time to."""
         now_s = time.monotonic()
+        # there, an entry that is removed by mistake costs seconds
+        is_login_due |= self._watches_itself
         if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before)):
             self._login = login
             self._queried_s.clear()

@@ -24,7 +24,7 @@ from meshctl.device.observe import observe
 from meshctl.device.openwrt import FetchedFile
 from meshctl.device.ssh import SshConnection
 from meshctl.device.upload import upload
-from meshctl.errors import NodeError
+from meshctl.errors import NodeError, Unreachable
 from meshctl.firmware import is_revision
 from meshctl.fleet import Outcome, Result
 from meshctl.model import HardwareProfile
@@ -47,7 +47,12 @@ def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
     """Flash a node and prove it. Owns `connection`. Raises NodeError only while nothing is stopped on the node."""
     listener = ctx.run.new_listener(ctx, EVERY_RADIO)
     try:
-        marker = _upload_and_start(ctx, connection, image, listener)
+        marker = _upload(ctx, connection, image)
+        listener.armed(None, for_s=_longest_s(ctx.node.hardware))
+        listener.started()
+        # if the answer is lost, the node itself shows whether it runs
+        with suppress(Unreachable):
+            openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     except NodeError:
         with suppress(NodeError):
             deadman.unlock(connection, ctx.run.owner)
@@ -58,8 +63,8 @@ def flash(ctx: NodeContext, connection: SshConnection, image: Path) -> Outcome:
         return _await_return(ctx, marker, listener)
 
 
-def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, listener: ChangeListener) -> str:
-    """All steps up to the start of sysupgrade; returns the marker that the new system will have."""
+def _upload(ctx: NodeContext, connection: SshConnection, image: Path) -> str:
+    """All steps before the start of sysupgrade; returns the marker that the new system will have."""
     size = image.stat().st_size
     with ctx.step("check"):
         _check_memory(ctx.before, size)
@@ -87,9 +92,6 @@ def _upload_and_start(ctx: NodeContext, connection: SshConnection, image: Path, 
         upload(connection, archive(ctx.desired, keys, marker), ARCHIVE_PATH, mode=0o600)
     recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
-    listener.armed(None, for_s=_longest_s(ctx.node.hardware))
-    listener.started()
-    openwrt.start_sysupgrade(connection, IMAGE_PATH, ARCHIVE_PATH)
     return marker
 
 
@@ -136,7 +138,8 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
                 connection.close()
         except NodeError as error:
             last_error = str(error)
-            listener.unreachable()
+            # nothing drops logins silently while it is written or boots, and then all of its radios have restarted
+            listener.unreachable(is_login_due=True)
         else:
             ctx.run.record(ctx.name, seen)
             if upgrade is None:

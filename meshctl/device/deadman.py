@@ -20,7 +20,7 @@ from meshctl.device.errors import CommandFailed, NodeRefused
 from meshctl.device.observation import ChangeStatus
 from meshctl.device.parse.deadman import parse_answer, parse_status
 from meshctl.device.scripts import script
-from meshctl.device.upload import UploadProgress, upload
+from meshctl.device.upload import UploadProgress, longest_s, paced, upload
 from meshctl.model import Secret
 
 PROGRAM = "/usr/sbin/meshctl-deadman"
@@ -36,6 +36,7 @@ BUNDLE_DIRECTORY = "/tmp/meshctl"
 STAGE_TIMEOUT_S = 180.0
 # Sent with one command; configuration and keys of a node are a tenth of it.
 MAX_INLINE_BUNDLE_BYTES = 64 << 10
+_NO_ROOM = f"echo 'refused tmp-full no room in {BUNDLE_DIRECTORY} for the bundle'"
 
 _PATH = re.compile(r"(?:/[A-Za-z0-9._+@-]+){2,}")
 _LINK_TARGET = re.compile(r"\.\./init\.d/[A-Za-z0-9._+@-]+")
@@ -180,13 +181,30 @@ def stage(
 ) -> None:
     """Upload and stage a change: no file changes yet, and the previous state is saved in flash.
 
-    Raises NodeRefused with the node's reason: `foreign-changes`, `moved-on`, `flash-full`, `bad-uci`, `locked`, `busy`.
+    Raises NodeRefused with the node's reason: `foreign-changes`, `moved-on`, `flash-full`, `tmp-full`, `bad-uci`,
+    `locked`, `busy`.
     """
+    content = bundle(change)
     path = f"{BUNDLE_DIRECTORY}/{change.change_id}.tgz"
-    upload(connection, bundle(change), path, mode=0o600, rate_bytes_per_s=rate_bytes_per_s, progress=progress)
-    # by the same command: it also goes if this process is killed, or the link is cut, while it is staged
+    words = (owner, change.change_id, path)
+    # by the same command: it also goes if this process is killed, or the link is cut, while it is sent or staged
     then = f"rm -f {shlex.quote(path)}"
-    _verb(connection, "stage", owner, change.change_id, path, timeout_s=STAGE_TIMEOUT_S, then=then)
+    if len(content) > MAX_INLINE_BUNDLE_BYTES:
+        upload(connection, content, path, mode=0o600, rate_bytes_per_s=rate_bytes_per_s, progress=progress)
+        _verb(connection, "stage", *words, timeout_s=STAGE_TIMEOUT_S, then=then)
+        return
+    _verb(
+        connection,
+        "stage",
+        *words,
+        stdin=content if rate_bytes_per_s is None else paced(content, rate_bytes_per_s),
+        timeout_s=STAGE_TIMEOUT_S + longest_s(content, rate_bytes_per_s),
+        # `stage` refuses what a broken connection has cut short
+        first=f"mkdir -p -m 700 {BUNDLE_DIRECTORY}; cat 2>/dev/null >{path} || {{ {_NO_ROOM}; {then}; exit 3; }}",
+        then=then,
+    )
+    if progress is not None:
+        progress(UploadProgress(len(content), len(content)))
 
 
 def arm(connection: Connection, owner: str, change_id: str, *, nonce: Secret, window_s: int) -> None:
@@ -279,13 +297,15 @@ def _verb(
     *words: str,
     stdin: bytes | Iterable[bytes] = b"",
     timeout_s: float | None = None,
+    first: str = "",
     then: str = "",
 ) -> dict[str, str]:
-    """Run a verb, and `then` whatever it says."""
+    """Run `first`, the verb, and `then` whatever it says."""
     for word in words:
         if not _WORD.fullmatch(word) and not word.startswith("/"):
             raise ValueError(f"{verb}: expected letters, digits and @._:+-, found {word!r}")
     command = shlex.join([PROGRAM, verb, *words]) + (f"; s=$?; {then}; exit $s" if then else "")
+    command = f"{first}\n{command}" if first else command
     done = connection.run(command, stdin=stdin, timeout_s=timeout_s)
     answer = parse_answer(done.stdout)
     if answer.ok:
@@ -295,13 +315,13 @@ def _verb(
             f"{connection.endpoint.label}: {verb}: {answer.text}",
             code=answer.code,
             exit_status=done.exit_status,
-            hint=_HINTS.get(answer.code, ""),
+            hint=HINTS.get(answer.code, ""),
         )
     raise _unreadable(connection, verb, done)
 
 
 # Hints by refusal code, where the text has none (docs/device-scripts.md).
-_HINTS = {
+HINTS = {
     "locked": "wait until the other run ends or its lock expires",
     "flash-full": "`meshctl run NODE -- du -ak /overlay` shows what uses the space",
     "moved-on": "the node has changed since it was planned: plan again",

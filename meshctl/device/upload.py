@@ -192,18 +192,22 @@ def _send_chunk(
     sleep: Callable[[float], None],
 ) -> bool:
     script = _CHUNK.format(partial=quoted(partial), start=index * CHUNK_BYTES, length=len(data))
-    slowest = min(MIN_BYTES_PER_S, (rate_bytes_per_s or MIN_BYTES_PER_S) / 2)
     answer = connection.run(
         script,
-        stdin=data if rate_bytes_per_s is None else _paced(data, rate_bytes_per_s, sleep),
-        timeout_s=_COMMAND_TIMEOUT_S + len(data) / slowest,
+        stdin=data if rate_bytes_per_s is None else paced(data, rate_bytes_per_s, sleep),
+        timeout_s=_COMMAND_TIMEOUT_S + longest_s(data, rate_bytes_per_s),
     )
     if answer.exit_status != 0:
         raise UploadFailed(f"{connection.endpoint.label}: {partial}: cannot be written: {answer.stderr.strip()}")
     return answer.stdout.split()[:1] == [hashlib.sha256(data).hexdigest()]
 
 
-def _paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None]) -> Iterator[bytes]:
+def longest_s(data: bytes, rate_bytes_per_s: float | None) -> float:
+    """How long sending `data` may take: over a link that is slower still it counts as lost."""
+    return len(data) / min(MIN_BYTES_PER_S, (rate_bytes_per_s or MIN_BYTES_PER_S) / 2)
+
+
+def paced(data: bytes, rate_bytes_per_s: float, sleep: Callable[[float], None] = time.sleep) -> Iterator[bytes]:
     """`data` in pieces, each followed by the pause for its size at that rate."""
     for start in range(0, len(data), _PIECE_BYTES):
         piece = data[start : start + _PIECE_BYTES]

@@ -10,6 +10,7 @@ from pathlib import Path
 import paramiko
 import pytest
 
+from meshctl.device.scripts import script
 from meshctl.model import Release
 from meshlab.fleet import VirtualFleet, VirtualNode
 from meshlab.images import firmware_image, opkg_package
@@ -314,6 +315,14 @@ def test_a_power_cut_happens_before_the_given_step(fleet: VirtualFleet, node: Vi
         until(lambda old=boot_id: node.boot_id not in (None, old), "the reboot")  # type: ignore[misc]
         assert node.exec("cd /etc && ls one two 2>/dev/null").stdout.split() == left.split()
         node.exec("rm -f /etc/one /etc/two; sync")
+
+
+def test_commands_of_a_watch_over_station_entries_are_not_counted(node: VirtualNode) -> None:
+    """It runs beside a change, and how many they are depends on the host's speed."""
+    node.record_steps()
+    node.exec(script("stale_station.sh") + "watch_stale 3 mesh0/02:00:00:00:00:01").check("watch")
+    node.exec("rm -f /etc/one")
+    assert node.steps() == ("rm -f /etc/one",)
 
 
 def test_a_fault_step_can_be_given_as_command_text(fleet: VirtualFleet, node: VirtualNode) -> None:

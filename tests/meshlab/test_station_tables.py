@@ -10,7 +10,7 @@ import pytest
 from meshlab import mesh_model
 from meshlab.mesh_model import Edge, EffectiveState
 from meshlab.spec import LinkSpec
-from meshlab.station_tables import DEAF_S, EXPIRY_S, StationTables
+from meshlab.station_tables import DEAF_S, EXPIRY_S, StationTables, TrafficClass
 from tests.meshlab.test_mesh_model import node
 
 BOOTS = {"a": 1, "b": 1}
@@ -140,3 +140,26 @@ def test_a_reboot_clears_the_nodes_own_station_table(pair: Pair) -> None:
     assert pair.connected_s("a") == [0]
     assert pair.connected_s("b") == [50]
     assert not pair.passes()
+
+
+@pytest.mark.parametrize("dropped", TrafficClass)
+def test_a_stale_entry_may_drop_one_traffic_class_and_pass_the_other(pair: Pair, dropped: TrafficClass) -> None:
+    pair.stations = StationTables([dropped])
+    pair.hear()
+    pair.restart("b")
+    edge = pair.graph()["a"][0]
+    # a's server answers in a class that its own neighbor b, whose entry of a is new, does not drop
+    assert pair.passes() == (dropped is TrafficClass.LOGINS)
+    assert pair.stations.logs_in("a", pair.boots, edge) == (dropped is TrafficClass.ORDINARY)
+    assert pair.stations.logs_in("b", pair.boots, pair.graph()["b"][0]) == (dropped is TrafficClass.LOGINS)
+    pair.stations.delete("a", "mesh0", B, pair.now_s)
+    assert pair.passes()
+    assert pair.stations.logs_in("a", pair.boots, edge)
+
+
+def test_deleting_an_entry_that_is_not_stale_drops_every_class(pair: Pair) -> None:
+    pair.stations = StationTables([TrafficClass.LOGINS])
+    pair.hear()
+    pair.stations.delete("a", "mesh0", B, pair.now_s)
+    assert not pair.passes()
+    assert not pair.stations.logs_in("b", pair.boots, pair.graph()["b"][0])

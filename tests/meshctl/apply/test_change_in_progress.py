@@ -18,6 +18,7 @@ from meshctl.apply.health_checks import Expectation
 from meshctl.apply.next_action import Action
 from meshctl.device.connection import Deadlines, Endpoint
 from meshctl.device.deadman import Change, NewFile
+from meshctl.device.errors import AuthenticationRefused
 from meshctl.device.observation import ChangeStatus, NetInterface, Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import Unreachable
@@ -102,6 +103,23 @@ def test_a_slow_node_that_has_rolled_back_gets_all_the_time_at_its_old_address()
     change.old = Endpoint("192.168.1.1")
     change.started_s = time.monotonic() - change.window_s - 1
     assert logins_of(change)["192.168.1.1"] == Deadlines()
+
+
+@pytest.mark.parametrize(("late_s", "refused"), [(-10.0, "b01: login refused"), (1.0, "")])
+def test_a_login_that_is_refused_while_the_change_is_rolled_back_is_not_given_as_the_reason(
+    late_s: float, refused: str
+) -> None:
+    """Seen in a bootstrap on a busy machine: the operator's key was gone because the window had run out."""
+    change = a_change()
+    change.started_s = time.monotonic() - change.window_s - late_s
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AuthenticationRefused("b01: login refused")
+
+    cast("SimpleNamespace", change.ctx.run).connections = SimpleNamespace(open=refuse, deadlines=Deadlines())
+    assert connect(change) is None
+    assert (change.login_refused, change.connect_error) == (refused, refused)
+    assert change.last_error == "b01: login refused"
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,16 @@ class Neighbours:
         return sorted(name for name, _ in self.asked)
 
 
+def watching(scripts: list[str], exit_status: int = 0) -> SshConnection:
+    """A connection to the node, on which it starts to watch or cannot."""
+
+    def run(script: str) -> SimpleNamespace:
+        scripts.append(script)
+        return SimpleNamespace(exit_status=exit_status)
+
+    return cast("SshConnection", SimpleNamespace(run=run))
+
+
 def test_repeated_queries_are_journaled_and_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -165,6 +175,21 @@ def test_a_node_that_is_unreachable_although_it_must_answer_logins_is_logged_in_
     assert near.asked[-1][1].endswith(f" {MAC} 100\n")
 
 
+@pytest.mark.parametrize(("exit_status", "login"), [(0, " 10.42.0.102 22"), (1, "")])
+def test_neighbors_log_in_to_a_node_that_would_notice_if_they_removed_an_entry_by_mistake(
+    exit_status: int, login: str
+) -> None:
+    """A change of the network may drop logins, and so may a stale entry that passes echo replies."""
+    interfaces = (NetInterface("lan", up=True, pending=False, proto="static", addresses=("10.42.0.102/24",)),)
+    near = Neighbours({"b02": replace(node("b02", "b01"), interfaces=interfaces), "b01": node("b01", "b02")})
+    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    flush.armed(watching([], exit_status), for_s=100.0)
+    flush.started()
+    flush.unreachable()
+    ((_, script),) = near.asked
+    assert script.splitlines()[-1] == f"flush_stale mesh0 {MAC} 1{login}"
+
+
 def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -> None:
     near = Neighbours({"b02": node("b02"), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, NO_RADIOS)
@@ -183,7 +208,7 @@ def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through
     near = Neighbours({**around, "b03": replace(around["b03"], originators=(route,))}, answer="watching\n")
     near.work.current_base_macs = lambda node: frozenset({base})  # type: ignore[method-assign]
     own: list[str] = []
-    connection = cast("SshConnection", SimpleNamespace(run=own.append))
+    connection = watching(own)
     near.flushes.listener(near.job, NO_RADIOS).armed(connection, for_s=100.0)
     assert (own, near.asked) == ([], [])
     near.flushes.listener(near.job, EVERY_RADIO).armed(None, for_s=100.0)
@@ -204,7 +229,7 @@ def test_a_node_watches_its_entries_of_nodes_that_restart_at_the_same_moment() -
     own: list[str] = []
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.restarting(["b01", "b02"])
-    flush.armed(cast("SshConnection", SimpleNamespace(run=own.append)), for_s=100.0)
+    flush.armed(watching(own), for_s=100.0)
     assert ["watch_stale 100" in script and MACS["b01"] in script for script in own] == [True]
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import tarfile
 import time
+from contextlib import nullcontext
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -16,7 +18,8 @@ from meshctl.apply.sysupgrade import MARKER_PATH, archive, has_booted, verdict, 
 from meshctl.device import deadman
 from meshctl.device.observation import BoardInfo, FileInfo, Observation, ReleaseInfo
 from meshctl.device.openwrt import FetchedFile, Upgrade
-from meshctl.errors import NodeError
+from meshctl.device.ssh import SshConnection
+from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
 from tests.meshctl.plan.support import fleet, wanted
@@ -114,6 +117,13 @@ def test_an_upgrade_that_failed_is_reported_with_what_it_said() -> None:
     assert why_not_flashed(Upgrade.NOT_STARTED, "", after_s=121.0) == "no sysupgrade runs on it"
 
 
+def ignore(*_: object, **__: object) -> None:
+    """An event that no one listens to."""
+
+
+LISTENER = cast(Any, SimpleNamespace(armed=ignore, started=ignore, unreachable=ignore, ended=ignore))
+
+
 class SlowNode:
     """A node that answers with its previous firmware until `leaves_s`, then not, and with the new one from `back_s`."""
 
@@ -143,18 +153,46 @@ class SlowNode:
     def wait(self, for_s: float) -> None:
         self.now_s += for_s
 
-    def outcome(self) -> Outcome:
+    @property
+    def ctx(self) -> NodeContext:
         run = SimpleNamespace(
-            interrupt=SimpleNamespace(leaving=False, wait=self.wait), connections=self, record=lambda *_: None
+            interrupt=SimpleNamespace(leaving=False, wait=self.wait),
+            connections=self,
+            record=lambda *_: None,
+            new_listener=lambda *_: LISTENER,
         )
-        ctx = SimpleNamespace(name="b01", node=self.node, before=BEFORE, run=run)
-        listener = SimpleNamespace(unreachable=lambda: None, ended=lambda *_, **__: None)
-        return sysupgrade._await_return(cast(NodeContext, ctx), "mark", cast(Any, listener))
+        step = nullcontext
+        return cast(NodeContext, SimpleNamespace(name="b01", node=self.node, before=BEFORE, run=run, step=step))
+
+    def outcome(self) -> Outcome:
+        return sysupgrade._await_return(self.ctx, "mark", LISTENER)
 
 
 def test_the_time_of_a_flash_counts_from_when_the_node_was_last_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a slow processor minutes pass before anything is written."""
     assert SlowNode(monkeypatch, leaves_s=290, back_s=580, timeout_s=300).outcome().result is Result.DONE
+
+
+@pytest.mark.parametrize(("leaves_s", "result"), [(20, Result.DONE), (1e9, Result.FAILED)])
+def test_a_node_shows_whether_it_is_flashed_if_the_link_broke_as_that_was_to_start(
+    monkeypatch: pytest.MonkeyPatch, leaves_s: float, result: Result
+) -> None:
+    """It was reported as unreachable, without a change, while its flash was written."""
+    node = SlowNode(monkeypatch, leaves_s=leaves_s, back_s=leaves_s + 100, timeout_s=300)
+
+    def cut(*_: object) -> None:
+        raise Unreachable("b01: the connection broke")
+
+    monkeypatch.setattr("meshctl.device.openwrt.start_sysupgrade", cut)
+    monkeypatch.setattr("meshctl.device.openwrt.upgrade_state", lambda _connection: (Upgrade.NOT_STARTED, ""))
+    monkeypatch.setattr(sysupgrade, "_upload", lambda *_: "mark")
+    closed: list[bool] = []
+    connection = cast(SshConnection, SimpleNamespace(close=lambda: closed.append(True)))
+    outcome = sysupgrade.flash(node.ctx, connection, Path("new.bin"))
+    assert (outcome.result, closed) == (result, [True])
+    assert outcome.reason == (
+        "" if result is Result.DONE else "no sysupgrade runs on it; it runs the previous firmware"
+    )
 
 
 def test_a_slower_flash_is_waited_for_if_the_inventory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import random
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,6 +16,7 @@ from meshctl.device.deadman import Change, NewFile
 from meshctl.device.errors import CommandFailed, NodeRefused
 from meshctl.device.observe import observe
 from meshctl.device.ssh import SshConnection
+from meshctl.errors import Unreachable
 from meshctl.model import Secret
 from tests.meshctl.device.changes import change, is_after, is_before, prepare
 from tests.meshctl.device.sandbox import Sandbox
@@ -129,8 +134,40 @@ def test_a_missing_or_broken_dead_mans_switch_is_reported(connection: SshConnect
         deadman.apply(connection, OWNER, "c1", in_s=1, at_uptime_s=1)
 
 
+def test_a_bundle_whose_sender_dies_does_not_stay_in_memory(
+    connection: SshConnection, node: Sandbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = threading.Event()
+
+    def half(data: bytes, rate_bytes_per_s: float) -> Iterator[bytes]:
+        yield data[: len(data) // 2]
+        closed.wait()
+
+    monkeypatch.setattr(deadman, "paced", half)
+    prepare(node)
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    with ThreadPoolExecutor(1) as sender:
+        sent = sender.submit(deadman.stage, connection, OWNER, change(), rate_bytes_per_s=1000.0)
+        uploads = node.path("/tmp/meshctl")
+        eventually(lambda: any(file.stat().st_size for file in uploads.glob("*c1.tgz*")))
+        connection.close()
+        closed.set()
+        with pytest.raises(Unreachable):
+            sent.result()
+    eventually(lambda: not list(uploads.glob("*c1.tgz*")))
+    assert not node.path("/etc/meshctl/change").exists()
+
+
+def test_a_bundle_without_room_in_memory_is_refused(connection: SshConnection, node: Sandbox) -> None:
+    deadman.lock(connection, OWNER, ttl_s=1000)
+    node.path("/tmp/meshctl/c1.tgz").mkdir()
+    with pytest.raises(NodeRefused, match="no room in /tmp/meshctl for the bundle") as caught:
+        deadman.stage(connection, OWNER, change())
+    assert (caught.value.code, "du -ak /tmp" in caught.value.hint) == ("tmp-full", True)
+
+
 def test_a_change_of_many_kilobytes_arrives_whole(connection: SshConnection, node: Sandbox) -> None:
-    content = bytes(range(256)) * 2048
+    content = random.Random(1).randbytes(2 * deadman.MAX_INLINE_BUNDLE_BYTES)
     deadman.lock(connection, OWNER, ttl_s=1000)
     deadman.stage(connection, OWNER, Change("big", {"/etc/big/file": NewFile(content, 0o600)}, "true"))
     assert node.path("/etc/meshctl/change/new/etc/big/file").read_bytes() == content

@@ -1,7 +1,8 @@
 """`python -m tests.meshctl.proof`: run the proofs, write every case to a JSONL file, print the tables.
 
-Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early and prints the `--first` with which the
-next call continues. `--table FILE` prints the tables of earlier runs, and with `--fill PAGE` puts them there.
+Parts: apply, kill, flash, flash-kill, crowd. `--minutes` ends a part early. The next call with the same file, `--nodes`
+and `--every` continues after the last batch in it of this version of the dead-man script. `--table FILE` prints the
+tables of earlier runs, and with `--fill PAGE` puts their rows there, in place of those of the same operation and fault.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import time
 from pathlib import Path
 from typing import Any, TextIO
 
+from meshctl.device.deadman import version
 from tests.meshctl.proof.crowd import hurt_and_provision
 from tests.meshctl.proof.kills import Case
 from tests.meshctl.proof.matrix import apply_matrix, filled, firmware, flash_matrix, kill_matrix, table
@@ -33,7 +35,7 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=8, help="nodes struck at once")
     parser.add_argument("--crowd", type=int, default=200, help="nodes of the big fleet")
     parser.add_argument("--every", type=int, default=1, help="strike at every so many steps")
-    parser.add_argument("--first", type=int, default=1, help="begin at this batch (apply) or word of meshctl (kills)")
+    parser.add_argument("--first", type=int, default=0, help="begin at this batch, or word of meshctl (kills)")
     parser.add_argument("--minutes", type=float, default=math.inf, help="begin nothing more after so many (not crowd)")
     parser.add_argument("--table", type=Path, help="print the tables of this file, run nothing")
     parser.add_argument("--fill", type=Path, help="with --table: the page to put its rows into")
@@ -51,13 +53,15 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         out.write(json.dumps(record) + "\n")
         out.flush()
 
-    def tell(case: Case, phase: str) -> None:
-        write({"part": part, "phase": phase, "at_s": round(time.time()), **case.object()})
+    def tell(case: Case, phase: str, batch: int) -> None:
+        record = {"part": part, "phase": phase, "batch": batch, "version": version(), "at_s": round(time.time())}
+        write({**record, **case.object()})
         if not case.holds:
             sys.stderr.write(f"does not hold: {case}\n")
 
     deadline = time.monotonic() + 60.0 * chosen.minutes
-    where = {"every": chosen.every, "first": chosen.first, "is_enough": lambda: time.monotonic() > deadline}
+    first = chosen.first or next_batch(chosen.out, part, chosen.every if "kill" in part else 1)
+    where = {"every": chosen.every, "first": first, "is_enough": lambda: time.monotonic() > deadline}
     following = 0
     match part:
         case "apply":
@@ -71,7 +75,7 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
         case "flash":
             with Rig(directory, chosen.nodes, firmware=firmware(directory)) as rig:
                 _take_in(rig)
-                flash_matrix(rig, tell)
+                following = flash_matrix(rig, tell, first=first, is_enough=where["is_enough"])
         case "flash-kill":
             with Rig(directory, FLASHED_AT_ONCE, firmware=firmware(directory)) as rig:
                 _take_in(rig)
@@ -80,12 +84,19 @@ def _run(part: str, chosen: argparse.Namespace, out: TextIO, directory: Path) ->
             with Rig(directory, chosen.crowd) as rig:
                 began = time.monotonic()
                 _take_in(rig)
-                first = {"bootstrap_s": round(time.monotonic() - began, 1)}
-                write({"part": part, **first, **hurt_and_provision(rig, share=0.05, old="a", new="b")})
+                taken = {"bootstrap_s": round(time.monotonic() - began, 1)}
+                write({"part": part, **taken, **hurt_and_provision(rig, share=0.05, old="a", new="b")})
         case _:
             raise SystemExit(f"no part is called {part!r}: expected {', '.join(PARTS)}")
     if following:
         sys.stderr.write(f"{part}: go on with --first {following}\n")
+
+
+def next_batch(path: Path, part: str, step: int) -> int:
+    """The batch after the last one of this part in the file, of this version."""
+    records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    done = [one["batch"] for one in records if (one["part"], one.get("version")) == (part, version())]
+    return max(done) + step if done else 1
 
 
 def _take_in(rig: Rig) -> None:

@@ -253,6 +253,17 @@ def leftovers(rig: Rig, names: Iterable[str]) -> dict[str, str]:
         time.sleep(1.0)
 
 
+def uploads(rig: Rig, names: Iterable[str]) -> dict[str, str]:
+    """Node -> the archives of changes in its memory. A node deletes what a killed operator has sent half."""
+    limit_s = time.monotonic() + TIMER_TURN_S
+    while True:
+        listed = {name: rig.fleet.node(name).exec("ls -A /tmp/meshctl | grep 'tgz'").stdout for name in names}
+        found = {name: " ".join(files.split()) for name, files in listed.items() if files}
+        if not found or time.monotonic() > limit_s:
+            return found
+        time.sleep(1.0)
+
+
 # all files but those of a process that ends by itself, as the watch for stale station entries does
 _NOT_IN_USE = """
 cd /tmp/meshctl && for file in $(ls -A); do

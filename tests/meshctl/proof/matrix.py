@@ -8,6 +8,8 @@ puts that into a page.
 from __future__ import annotations
 
 import hashlib
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -18,6 +20,8 @@ from tests.meshctl.proof.kills import Case, strike_meshctl, strike_nodes
 from tests.meshctl.proof.rig import Rig
 
 T = TypeVar("T")
+# a case, its phase, and the number of its batch (of its word, for kills)
+Tell = Callable[[Case, str, int], None]
 IsEnough = Callable[[], bool]
 
 
@@ -75,9 +79,7 @@ def recorded(rig: Rig, new: str) -> list[str]:
     return commands
 
 
-def apply_matrix(
-    rig: Rig, tell: Callable[[Case, str], None], *, every: int = 1, first: int = 1, is_enough: IsEnough = never
-) -> int:
+def apply_matrix(rig: Rig, tell: Tell, *, every: int = 1, first: int = 1, is_enough: IsEnough = never) -> int:
     """Power and links cut at every `every`-th command of an apply, from the `first` batch on; the next, or 0."""
     phases = phases_of(recorded(rig, "b"))
     there, other = "b", "a"
@@ -89,14 +91,14 @@ def apply_matrix(
             return number
         steps = {name: str(step) for name, step in zip(rig.names, batch, strict=False)}
         for case in strike_nodes(rig, steps, kind, old=there, new=other):
-            tell(case, phases[int(case.step) - 1])
+            tell(case, phases[int(case.step) - 1], number)
         there, other = other, there
     return 0
 
 
 def kill_matrix(
     rig: Rig,
-    tell: Callable[[Case, str], None],
+    tell: Tell,
     *,
     every: int = 1,
     first: int = 1,
@@ -116,24 +118,27 @@ def kill_matrix(
         cases = strike_meshctl(rig, words, old=there, new=other, verb=verb)
         is_killed = any(case.outcome == "killed" for case in cases)
         for case in cases if is_killed else ():
-            tell(case, case.step)
+            tell(case, case.step, words)
         there, other = other, there
         words += every
     return 0
 
 
-def flash_matrix(rig: Rig, tell: Callable[[Case, str], None]) -> None:
-    """Power and links cut at the steps of a flash; the firmware goes back and forth with the configuration."""
+def flash_matrix(rig: Rig, tell: Tell, *, first: int = 1, is_enough: IsEnough = never) -> int:
+    """Power and links cut at the steps of a flash, from the `first` batch on; the firmware goes back and forth with the
+    configuration. The next batch, or 0."""
     there, other = "a", "b"
     phase_at = {words: phase for phase, words in FLASH_STEPS}
-    for kind in ("power-cut", "sever"):
-        for batch in _batches(tuple(phase_at), rig.count):
-            steps = dict(zip(rig.names, batch, strict=False))
-            for case in strike_nodes(rig, steps, kind, old=there, new=other, verb="flash"):
-                tell(case, phase_at[case.step])
-            there, other = other, there
-    for case in strike_nodes(rig, {rig.names[0]: "flash"}, "power-cut", old=there, new=other, verb="flash"):
-        tell(case, "writing")
+    batches = [(kind, batch) for kind in ("power-cut", "sever") for batch in _batches(tuple(phase_at), rig.count)]
+    batches.append(("power-cut", ("flash",)))
+    for number, (kind, batch) in enumerate(batches[first - 1 :], first):
+        if is_enough():
+            return number
+        steps = dict(zip(rig.names, batch, strict=False))
+        for case in strike_nodes(rig, steps, kind, old=there, new=other, verb="flash"):
+            tell(case, phase_at.get(case.step, "writing"), number)
+        there, other = other, there
+    return 0
 
 
 # Commands that only read are many and alike: of those every so many is struck.
@@ -167,39 +172,56 @@ def firmware(directory: Path) -> dict[str, str]:
 
 
 def table(records: Iterable[Mapping[str, object]]) -> Iterator[str]:
-    """A Markdown table of the cases that were struck: operation, fault, step, and how they ended."""
-    rows: dict[tuple[str, str, str], list[Mapping[str, object]]] = {}
+    """A Markdown table of the cases that were struck: operation, fault, step, version of the script, how they ended."""
+    rows: dict[tuple[str, str, str, str], list[Mapping[str, object]]] = {}
     for record in records:
         if not record.get("struck", True):
             continue
-        key = (str(record["verb"]), str(record["kind"]), str(record["phase"]))
+        key = (str(record["verb"]), str(record["kind"]), str(record["phase"]), str(record["version"]))
         rows.setdefault(key, []).append(record)
-    yield "| operation | fault | step | cases | old | new | bricked | neither | unreachable | not resumed |"
-    yield "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
-    for (verb, kind, phase), cases in rows.items():
+    yield "| operation | fault | step | script | cases | old | new | bricked | neither | unreachable | not resumed |"
+    yield "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+    for (verb, kind, phase, script), cases in rows.items():
         old, new, bricked = (sum(case["state"] == state for case in cases) for state in ("old", "new", "bricked"))
         mixed = len(cases) - old - new - bricked
         away = sum(not case["reachable"] for case in cases)
         left = sum(not case["resumed"] for case in cases)
-        yield (f"| {verb} | {kind} | {phase} | {len(cases)} | {old} | {new} | {bricked} | {mixed} | {away} | {left} |")
+        counts = " | ".join(str(count) for count in (len(cases), old, new, bricked, mixed, away, left))
+        yield f"| {verb} | {kind} | {phase} | {script} | {counts} |"
 
 
 def filled(page: str, rows: Iterable[str]) -> str:
-    """The page with these rows of `table` in place of those of the same operation and fault; others stay."""
-    new = [row for row in rows if not row.startswith(("| operation", "| ---"))]
-    updated = {_subject(row) for row in new}
+    """The page with these rows of `table` in place of those of the same operation, fault and step; others stay. The
+    sentence that counts the cases follows from all of them."""
+    new = {_subject(row): f"{row}\n" for row in rows if not row.startswith(("| operation", "| ---"))}
     lines = page.splitlines(keepends=True)
     head = next(number for number, line in enumerate(lines) if line.startswith("| operation |"))
     end = next(number for number, line in enumerate(lines[head:], head) if not line.startswith("|"))
-    kept = [line for line in lines[head + 2 : end] if _subject(line) not in updated]
-    rows = sorted([*(f"{row}\n" for row in new), *kept], key=lambda row: _ORDER.index(_subject(row)))
-    return "".join([*lines[: head + 2], *rows, *lines[end:]])
+    kept = [new.pop(_subject(line), line) for line in lines[head + 2 : end]]
+    # stable: a step that the page did not have comes after the others of its fault
+    all_rows = sorted([*kept, *new.values()], key=lambda row: _ORDER.index(_subject(row)[:2]))
+    text = "".join([*lines[: head + 2], *all_rows, *lines[end:]])
+    return _COUNTED.sub(lambda _: counted_cases(all_rows), text, count=1)
 
+
+def counted_cases(rows: Iterable[str]) -> str:
+    """How many cases the rows of a table have, and with which scripts they were recorded."""
+    by_script: Counter[int] = Counter()
+    bad = 0
+    for row in rows:
+        _, _, _, _, script, cases, *_, neither, away, left, _ = (cell.strip() for cell in row.split("|"))
+        by_script[int(script)] += int(cases)
+        bad += int(neither) + int(away) + int(left)
+    which = ", ".join(f"{cases} with version {script}" for script, cases in sorted(by_script.items(), reverse=True))
+    return f"{by_script.total()} cases, {bad} failed: {which} of the dead-man script"
+
+
+_COUNTED = re.compile(r"\d+ cases, \d+ failed: [^.:]* of the dead-man script")
 
 # operations and faults in the order of the page
 _ORDER = [(operation, fault) for operation in ("apply", "flash") for fault in ("power-cut", "sever", "kill meshctl")]
 
 
-def _subject(row: str) -> tuple[str, str]:
-    _, operation, fault, *_ = (cell.strip() for cell in row.split("|"))
-    return operation, fault
+def _subject(row: str) -> tuple[str, str, str]:
+    _, operation, fault, step, *_ = (cell.strip() for cell in row.split("|"))
+    return operation, fault, step

@@ -117,6 +117,8 @@ class Rig:
     is_chain: bool = False
     # node -> `NodeSpec.slowness`, where it is not 1
     slowness: Mapping[str, int] = field(default_factory=dict)
+    # the traffic classes that a stale station entry drops: `FleetSpec.stale`
+    stale: tuple[str, ...] = ("ordinary", "logins")
     fleet: VirtualFleet = field(init=False)
     # which of the inventories a and b the nodes run
     current: str = "a"
@@ -162,7 +164,7 @@ class Rig:
         nearer = names[:-1] if self.is_chain else ["base"] * self.count
         links = tuple(LinkSpec(near, name) for near, name in zip(nearer, self.names, strict=True))
         # nodes boot within a second: those around them still know their radios
-        spec = FleetSpec("proof", nodes, links, quick_boot=True)
+        spec = FleetSpec("proof", nodes, links, quick_boot=True, stale=self.stale)
         self.fleet = VirtualFleet(spec, self.directory / "lab").up(wait_s=60.0 + 5.0 * self.count)
         return self
 

@@ -16,7 +16,7 @@ def test_no_cut_at_any_step_of_an_apply_strands_a_node(tmp_path_factory: pytest.
     bad: list[Case] = []
     with Rig(tmp_path_factory.mktemp("apply"), 8) as rig:
         assert rig.take_in("a").code == 0
-        apply_matrix(rig, lambda case, phase: None if case.holds else bad.append(case))
+        apply_matrix(rig, lambda case, phase, batch: None if case.holds else bad.append(case))
     assert bad == []
 
 
@@ -24,7 +24,7 @@ def test_killing_meshctl_at_any_event_strands_no_node(tmp_path_factory: pytest.T
     bad: list[Case] = []
     with Rig(tmp_path_factory.mktemp("kill"), 8) as rig:
         assert rig.take_in("a").code == 0
-        kill_matrix(rig, lambda case, phase: None if case.holds else bad.append(case))
+        kill_matrix(rig, lambda case, phase, batch: None if case.holds else bad.append(case))
     assert bad == []
 
 
@@ -33,7 +33,7 @@ def test_no_cut_at_any_step_of_a_flash_strands_a_node(tmp_path_factory: pytest.T
     directory = tmp_path_factory.mktemp("flash")
     with Rig(directory, 8, firmware=firmware(directory)) as rig:
         assert rig.take_in("a").code == 0
-        flash_matrix(rig, lambda case, phase: None if case.holds else bad.append(case))
+        flash_matrix(rig, lambda case, phase, batch: None if case.holds else bad.append(case))
     assert bad == []
 
 
@@ -44,7 +44,7 @@ def test_killing_meshctl_at_any_event_of_a_flash_strands_no_node(
     directory = tmp_path_factory.mktemp("flash-kill")
     with Rig(directory, 2, firmware=firmware(directory)) as rig:
         assert rig.take_in("a").code == 0
-        kill_matrix(rig, lambda case, phase: None if case.holds else bad.append(case), verb="flash")
+        kill_matrix(rig, lambda case, phase, batch: None if case.holds else bad.append(case), verb="flash")
     assert bad == []
 
 
