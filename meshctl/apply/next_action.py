@@ -81,7 +81,8 @@ def applied_age_s(status: ChangeStatus) -> float | None:
     return max(0.0, status.window_s - status.left_s)
 
 
-# The switch's reasons, for messages.
+# The switch's reasons, for messages; with these the change has not come into force, and no check says why.
+NOT_IN_FORCE = ("failed", "flash-full")
 REASONS = {
     "timeout": "it was not confirmed in time",
     "abort": "it was aborted",
@@ -89,6 +90,7 @@ REASONS = {
     "guard": "its timer was killed; its second timer took over",
     "expired": "it was armed but not started before its operator's lock expired",
     "failed": "the files could not be written, or the packages could not be installed",
+    "flash-full": "its flash has no room for the packages",
     "moved-on": "a file on it was changed by someone else",
     "operator": "it was canceled",
 }
@@ -105,6 +107,8 @@ def rollback_reason(
     reason = REASONS.get(word, word or "for an unknown reason")
     if rest:
         reason += ", and the packages it installed could not be removed"
+    if word in NOT_IN_FORCE:
+        return reason
     # a node whose network has reloaded halfway says no more than that
     seen = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
     failed = "; ".join(seen)

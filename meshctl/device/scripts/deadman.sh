@@ -8,10 +8,11 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=10
+VERSION=11
 SELF=/usr/sbin/meshctl-deadman
 CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
+SNAPSHOT=/var/run/rpcd/snapshot-files # RAM: what rpcd copies back when its timer ends
 RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
 SPARE_KIB=64               # flash that must stay free: uci, dropbear and jffs2's garbage collector write too
 GUARD_GRACE_CS=3000        # the second timer fires 30 s after the first should have
@@ -189,9 +190,25 @@ tidy() {
 no_foreign_changes() {
 	changes=$(uci changes 2>/dev/null)
 	[ -z "$changes" ] || refuse foreign-changes "uncommitted: $(echo "$changes" | tr '\n' ';')"
-	for f in /var/run/rpcd/snapshot-files/*; do
-		[ ! -e "$f" ] || refuse foreign-changes "rpcd waits for the confirmation of a change to ${f##*/} (LuCI: Save & Apply)"
+	for f in "$SNAPSHOT"/*; do
+		[ ! -e "$f" ] || ! rpcd_waits ||
+			refuse foreign-changes "rpcd waits for the confirmation of a change to ${f##*/} (LuCI: Save & Apply)"
 	done
+}
+
+# rpcd_waits: 1 if rpcd has no timer, or does not run. A snapshot alone is no sign: "Apply unchecked" leaves one,
+# too. To confirm under a name that is no session's changes nothing; the answer's number differs between versions of ubus.
+rpcd_waits() {
+	case $(ubus -t 5 call uci confirm '{"ubus_rpc_session":"meshctl"}' 2>&1) in
+	*'No response'* | *'Not found'*) return 1 ;;
+	esac
+}
+
+# Else a timer of rpcd that began in the window would bring back, after the restore, what the change had put there.
+into_snapshot() { # PATH, of what is about to be restored
+	[ -e "$SNAPSHOT/${1##*/}" ] && [ "$1" = "/etc/config/${1##*/}" ] || return 0
+	# rpcd skips names with a dot, and removes them with the others
+	cp "$CHANGE/prev$1" "$SNAPSHOT/.meshctl" && mv -f "$SNAPSHOT/.meshctl" "$SNAPSHOT/${1##*/}"
 }
 
 # kib_free DIRECTORY: FREE, of the last line of df, because a long device name breaks its row in two
@@ -494,6 +511,12 @@ pause() {
 # extra VERB DIRECTORY: what else a change does and undoes besides files; says nothing, since sessions read our answers
 extra() { [ ! -f "$2/extra" ] || sh "$2/extra" "$1" "$2" >"$RUN/extra.log" 2>&1; }
 
+# why_failed: REASON, of what the packages' tool said: apk repeats the system's error, opkg looks before it begins
+why_failed() {
+	reason=failed
+	[ ! -f "$CHANGE/extra" ] || ! grep -q -e 'No space left' -e 'Only have .* available' "$RUN/extra.log" || reason=flash-full
+}
+
 # move_new: moves the files FROM into the directory AT
 move_new() {
 	[ -n "$FROM" ] || return 0
@@ -524,7 +547,10 @@ put_previous() {
 	rm -rf "$CHANGE/new"
 	while read -r kind path; do
 		case $kind in
-		not) rm -f "$path" ;;
+		not)
+			case $path in /etc/config/*) rm -f "$SNAPSHOT/${path##*/}" ;; esac
+			rm -f "$path"
+			;;
 		dir) rmdir "$path" 2>/dev/null ;;
 		esac
 	done <"$CHANGE/previous"
@@ -532,6 +558,7 @@ put_previous() {
 	while read -r kind path; do
 		[ "$kind" = had ] && exists "$CHANGE/prev$path" || continue
 		[ -d "${path%/*}" ] || mkdir -p "${path%/*}"
+		into_snapshot "$path"
 		mv -f "$CHANGE/prev$path" "$path"
 		! exists "$CHANGE/prev$path" || left=1
 	done <"$CHANGE/previous"
@@ -625,7 +652,8 @@ watch() { # ID DUE_CS: detached
 		mv "$CHANGE/armed.$ID" "$CHANGE/staged.$ID" && finish refused moved-on
 	elif ! put_new; then
 		applied_at_now
-		restore failed
+		why_failed
+		restore $reason
 	else
 		# a reload that is not done by then would run at once with the one of the restore
 		now

@@ -96,6 +96,14 @@ def test_the_rollback_reason_is_human_readable() -> None:
     assert rollback_reason(late, ("its LAN is down",)) == "it was not confirmed in time: its LAN is down"
 
 
+def test_a_change_that_never_came_into_force_is_not_explained_by_a_failed_check() -> None:
+    """Seen on 25.12.5: apk found no room in flash, and the message ended with "its services are still reloading"."""
+    status = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason="flash-full")
+    assert rollback_reason(status, (RELOADING,)) == "its flash has no room for the packages"
+    stays = replace(status, last_reason="failed+packages-stay")
+    assert rollback_reason(stays, ("its LAN is down",)).endswith("installed could not be removed")
+
+
 def test_a_rollback_by_a_foreign_sysupgrade_names_both_builds() -> None:
     def running(revision: str) -> Observation:
         return Observation(0.0, 0.0, release=ReleaseInfo("OpenWrt", "24.10.7", revision, "ath79/generic"))

@@ -5,7 +5,8 @@ their database last; before a removal, `prerm` disables and stops the services; 
 writes it, apk renames a new one and unpacks each file under a temporary name.
 
 /harness/hang-STEP stops a tool for good at prerm, removed (while it writes the database), unpack, postinst or installed
-(while it writes the database); /harness/fail makes it fail after the first package, /harness/stuck each removal.
+(while it writes the database); /harness/fail makes it fail after the first package and print what is in it,
+/harness/stuck each removal.
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ install)
 		tar -xzOf "$file" ./data.tar.gz | unpack "$name"
 		echo "control of $name" >"$lists/$name.control"
 		names="$names $name"
-		[ ! -e /harness/fail ] || { status=255 && break; }
+		[ ! -e /harness/fail ] || { cat /harness/fail >&2 && status=255 && break; }
 	done
 	[ $status -ne 0 ] || postinst $names
 	write installed "$(cat $db; echo; entries $names)$new_line$new_line"
@@ -123,7 +124,7 @@ add)
 		name=${name%-[0-9]*}
 		unpack "$name" <"$file"
 		names="$names $name"
-		[ ! -e /harness/fail ] || exit 1
+		[ ! -e /harness/fail ] || { cat /harness/fail >&2 && exit 1; }
 	done
 	postinst $names
 	write installed "$(cat $db; echo; entries $names)$new_line$new_line"

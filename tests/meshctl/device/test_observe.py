@@ -261,7 +261,7 @@ def test_the_script_runs_on_the_real_ash_and_reports_the_facts(connection: SshCo
     assert len(seen.authorized_keys) == 1
     assert seen.mesh is None
     assert seen.change is not None
-    assert (seen.change.state, seen.change.version) == ("idle", "10")
+    assert (seen.change.state, seen.change.version) == ("idle", "11")
     assert seen.is_first_boot is False
     secret, large, nowhere, init = (seen.files[path] for path in paths)
     assert secret is not None

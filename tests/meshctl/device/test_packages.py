@@ -150,6 +150,24 @@ def test_a_failed_package_installation_is_rolled_back_before_any_file_changes(no
     assert last(node) == ("c1", "restored", "failed")
 
 
+# apk-tools 3.0.5 on a full tmpfs of 5 MiB; opkg of 24.10.7, whose check of the space comes first (opkg_install.c)
+NO_ROOM = {
+    "apk": "ERROR: batman-1.0-r1: failed to extract usr/lib/batman/blob: No space left on device\n",
+    "opkg": " * verify_pkg_installable: Only have 12kb available on filesystem /overlay, pkg batman needs 300\n",
+}
+
+
+def test_a_flash_without_room_for_the_packages_is_named(node: Sandbox, tool: str) -> None:
+    with_tool(node, tool)
+    node.put("/harness/fail", NO_ROOM[tool])
+    armed(node, LONG, change(tool))
+    before = root(node)
+    node.deadman("apply", OWNER, "c1", "now")
+    eventually(lambda: state(node) == "idle" and not node.processes())
+    assert root(node) == before
+    assert last(node) == ("c1", "restored", "flash-full")
+
+
 @pytest.mark.parametrize("step", ["prerm", "removed", "unpack", "postinst", "installed"])
 def test_a_power_cut_during_package_changes_is_rolled_back_at_boot(node: Sandbox, tool: str, step: str) -> None:
     with_tool(node, tool)
