@@ -73,7 +73,7 @@ class HostileTeam(RandomTeam):
         super()._arrive(name, network, data, source)
 
     def _record_for_all(self, name: str, network: SimNetwork, datagram: Datagram) -> None:
-        """Whoever records a datagram may be where its receiver does not hear it."""
+        """Recorded near the sender: also what its receivers do not hear."""
         for member in network.members:
             if member != name and datagram.destination in (None, network.broadcast, network.address(member)):
                 self._recorded.append((member, network, bytes(datagram.data), network.address(name)))

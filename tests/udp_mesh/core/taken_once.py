@@ -1,5 +1,5 @@
 """What must hold of every datagram, whatever a network does with it: it takes effect at most once at each boot of a
-node, only if a node sent it, and not long after that.
+node, only if a node sent it, and not long after that. And an address without a node is never taken for a peer's.
 
 Messages have numbers of their own, so a replayed one does no visible harm most of the time. A replayed acknowledgment,
 refusal or announcement might.
@@ -13,7 +13,8 @@ from unittest.mock import patch
 
 from tests.udp_mesh.core.random_teams import Broken, RandomTeam
 from udp_mesh.core import endpoint, receive
-from udp_mesh.core.peers.session import Session
+from udp_mesh.core.peers.session import Challenge, Session
+from udp_mesh.core.receiver import replay_check
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S
 from udp_mesh.core.receiver.replay_check import clock_of, timestamp_of
 from udp_mesh.core.settings import Address
@@ -52,11 +53,16 @@ class Effects:
     def check_age(self, state: State, session: Session, *, timestamped: bool) -> None:
         sent_at = self._team.sealed_at.get(self._seal)
         if sent_at is None:
-            raise Broken(f"a datagram that nobody sent took effect at {state.settings.name} as from {session.name}")
+            raise Broken(f"a datagram that no node sent took effect at {state.settings.name} as from {session.name}")
         age_s, boots = self._team.now - sent_at, (state.boot_id, session.boot_id)
         least_s = self._least_ages_s[boots] = min(age_s, self._least_ages_s.get(boots, age_s))
         if age_s > (least_s + ACCEPT_AGE_S + CLOCK_ERROR_S if timestamped else MAX_AGE_S) or age_s > MAX_AGE_S:
             raise Broken(f"a datagram from {session.name} took effect at {state.settings.name} {age_s:.1f} s later")
+
+    def on_path_validated(self, state: State, session: Session, challenge: Challenge) -> None:
+        network = self._team.networks.get(challenge.link)
+        if network is not None and challenge.address not in [network.address(member) for member in network.members]:
+            raise Broken(f"{state.settings.name} takes {challenge.address} for an address of {session.name}")
 
     def _once(self, key: tuple[bytes, bytes, int], state: State, session: Session) -> None:
         if key in self._seen:
@@ -70,6 +76,7 @@ def effects_watched(team: RandomTeam) -> Iterator[None]:
     while another one is received."""
     effects, released = Effects(team), False
     receive_datagram, process_frames = endpoint.receive_datagram, receive.process_frames  # type: ignore[attr-defined]
+    on_path_validated = replay_check.on_path_validated  # type: ignore[attr-defined]
     release_held, receive_broadcast = receive._release_held, receive._receive_broadcast
 
     def received(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
@@ -105,7 +112,12 @@ def effects_watched(team: RandomTeam) -> Iterator[None]:
             effects.on_broadcast(state, session)
             effects.check_age(state, session, timestamped=timestamp_of(frames) is not None)
 
+    def validated(state: State, session: Session, challenge: Challenge, now: float) -> None:
+        effects.on_path_validated(state, session, challenge)
+        on_path_validated(state, session, challenge, now)
+
     with (
+        patch.object(replay_check, "on_path_validated", validated),
         patch.object(endpoint, "receive_datagram", received),
         patch.object(receive, "process_frames", processed),
         patch.object(receive, "_release_held", releases),
