@@ -213,9 +213,13 @@ def _queue(state: State, peer: Peer, accepted: AcceptedMessage, now: float, stor
     if topic.delta:
         message.version = OutgoingVersion(state.versions.of(peer.name))
     sender = peer.open_sender()
-    sender.accept(message, now)
     if peer.state is PeerState.LOST:
+        # It never waits: until the peer is heard, which may be never, nothing would take it out of the scheduler.
+        sender.add(message)
         sender.finish(message, Outcome.PEER_LOST)
+        report_ended(state, peer, now)
+        return
+    sender.accept(message, now)
     if topic.rate_limit_bytes_per_s is not None and topic.name not in state.rate_limits:
         state.rate_limits[topic.name] = TokenBucket(topic.rate_limit_bytes_per_s, now)
     if sender.ended:

@@ -88,11 +88,11 @@ class UdpLink:
         self._urgent = [(level, name, _INT.pack(urgent_dscp << 2))] if urgent_dscp else []
         self.peers: frozenset[Address] = frozenset()
         """The senders whose datagrams arrive at the first two sockets."""
-        # In use by another process? The sockets that share the port would not fail.
-        self._open(family, RECEIVE_BUFFER_BYTES, share=False).close()
-        # Bound in the order of `STRANGERS`, `MARKED` and `UNMARKED`.
-        self._strangers = self._open(family, STRANGERS_BUFFER_BYTES)
+        # Bound in the order of `STRANGERS`, `MARKED` and `UNMARKED`. The first one shares the port only afterwards, so
+        # it fails if another process has it, or is opening it right now.
+        self._strangers = self._open(family, STRANGERS_BUFFER_BYTES, share=False)
         try:
+            self._strangers.setsockopt(socket.SOL_SOCKET, SO_REUSEPORT, 1)
             self._socket = self._open(family, RECEIVE_BUFFER_BYTES)
             try:
                 self._unmarked = self._open(family, RECEIVE_BUFFER_BYTES)

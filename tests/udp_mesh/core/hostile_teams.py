@@ -58,6 +58,7 @@ class HostileTeam(RandomTeam):
     def _transmit(self, name: str, datagram: Datagram) -> None:
         network, faults = self.networks[datagram.link], self.faults[datagram.link]
         kind = "broadcast" if datagram.destination in (None, network.broadcast) else "unicast"
+        self._record_for_all(name, network, datagram)
         vanishes = faults.only not in ("", kind) or len(datagram.data) > faults.room.get(name, ANY_SIZE)
         if vanishes or name in faults.refusing:
             self._on_datagram(name, network.name, datagram, self.now)
@@ -65,12 +66,17 @@ class HostileTeam(RandomTeam):
         super()._transmit(name, datagram)
 
     def _arrive(self, name: str, network: SimNetwork, data: bytes, source: Address) -> None:
-        self._recorded.append((name, network, data, source))
         if self.rng.random() < self.faults[network.name].damage:
             damaged = bytearray(data)
             damaged[self.rng.randrange(len(data))] ^= 1 << self.rng.randrange(8)
             data = bytes(damaged)
         super()._arrive(name, network, data, source)
+
+    def _record_for_all(self, name: str, network: SimNetwork, datagram: Datagram) -> None:
+        """Recorded near the sender: also what its receivers do not hear."""
+        for member in network.members:
+            if member != name and datagram.destination in (None, network.broadcast, network.address(member)):
+                self._recorded.append((member, network, bytes(datagram.data), network.address(name)))
 
     def come_again(self, count: int, delays_s: Iterable[float], source: Address | None = None) -> None:
         """Deliver recorded datagrams once more, after a while, maybe from another address."""
@@ -93,7 +99,7 @@ class HostileTeam(RandomTeam):
         faults, name = self.faults[network.name], self.dice.choice(list(self.homes))
         match dice.choice(HOSTILE_CHANGES):
             case "again":
-                self.come_again(dice.choice((5, 200)), [dice.choice((0.0, 2.0, 12.0))])
+                self.come_again(dice.choice((5, 200)), [dice.choice((0.0, 2.0, 12.0, 30.0))])
             case "much-later":
                 self.come_again(50, [60.0, 180.0])
             case "from-elsewhere":

@@ -6,6 +6,7 @@ Messages and changes for some seconds, then everything is repaired. Throughout a
 - `delivered` means received, and with an outbox on disk also confirmed; no run of a node receives a message twice;
 - what is ready to be sent has a timer, no less urgent level is served first, and packets have the numbers that
   acknowledgements mean;
+- a datagram takes effect once, and not long after it was sent (`taken_once`);
 - nothing is left over, and an idle team is quiet.
 """
 
@@ -20,6 +21,7 @@ from unittest.mock import patch
 
 from tests.udp_mesh.core.hostile_teams import HostileTeam
 from tests.udp_mesh.core.random_teams import LOG, TOPICS, Broken, RandomTeam
+from tests.udp_mesh.core.taken_once import effects_watched
 from udp_mesh.core import transmit
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.session import Peer
@@ -156,8 +158,8 @@ def priorities_watched() -> Iterator[None]:
 
 def play(seed: int, seconds: float, *, hostile: bool = False) -> RandomTeam:
     """Messages and changes for so long, then none."""
-    with priorities_watched(), numbers_watched():
-        team = HostileTeam(seed) if hostile else RandomTeam(seed)
+    team = HostileTeam(seed) if hostile else RandomTeam(seed)
+    with priorities_watched(), numbers_watched(), effects_watched(team):
         dice = team.dice
         go(team, 2.0)
         end = team.now + seconds

@@ -1,5 +1,6 @@
 """Real sockets: datagrams arrive in runs or one by one, and a send error costs only its datagram."""
 
+import contextlib
 import errno
 import socket
 from collections.abc import Iterator
@@ -165,6 +166,31 @@ def test_a_port_in_use_is_an_error_and_leaks_nothing() -> None:
     port = free_port()
     with closing(open_link(ALICE, port)), pytest.raises(OSError, match="in use"):
         open_link(ALICE, port)
+
+
+@pytest.mark.parametrize("sockets_before", [0, 1, 2])
+def test_of_two_that_open_a_port_at_the_same_time_only_one_succeeds(sockets_before: int) -> None:
+    """Both would share it, and each receive a part of what is sent to it."""
+    port = free_port()
+    with contextlib.ExitStack() as links:
+        opened: list[str] = []
+
+        def open_as(name: str, kind: type[UdpLink]) -> None:
+            with contextlib.suppress(OSError):
+                links.enter_context(closing(kind(Attachment(ALICE, "lo", (ALICE, port), None, 65_535, 1))))
+                opened.append(name)
+
+        class Overtaken(UdpLink):
+            sockets = 0
+
+            def _open(self, family: int, buffer_bytes: int, *, share: bool = True) -> socket.socket:
+                if self.sockets == sockets_before:
+                    open_as("the other", UdpLink)
+                self.sockets += 1
+                return super()._open(family, buffer_bytes, share=share)
+
+        open_as("the first", Overtaken)
+        assert opened == ["the first" if sockets_before else "the other"]
 
 
 def test_ipv6_neighbors_are_reached() -> None:

@@ -15,6 +15,11 @@ SMALL_OVERHEAD_BYTES = 13
 """Approximate bytes of header of a small message in a datagram with others."""
 
 
+MIN_PURGE_MESSAGES = 64
+"""A level that holds this many messages, or twice as many as after the last time, forgets those that have ended: while
+a peer cannot be sent anything, `keep_last` and deadlines end messages that nothing else takes out."""
+
+
 class Run(NamedTuple):
     """Fragments of one message ready to send: `length` positions starting at `position`.
 
@@ -29,18 +34,35 @@ class Run(NamedTuple):
 
 
 class _Level:
-    __slots__ = ("alternates", "fresh", "fresh_bytes", "retransmit", "stale_fresh", "stale_next", "stale_retransmits")
+    __slots__ = (
+        "alternates",
+        "fresh",
+        "fresh_bytes",
+        "purge_at",
+        "retransmit",
+        "stale_fresh",
+        "stale_next",
+        "stale_retransmits",
+    )
 
     def __init__(self) -> None:
         self.alternates = False
         """Stale and fresh messages are sent in turn, until one of them has run out."""
         self.stale_next = False
+        self.purge_at = MIN_PURGE_MESSAGES
+        """Length of `fresh` at which messages that have ended are forgotten."""
         self.fresh_bytes = 0
         """Bytes of the messages in `fresh`, with `SMALL_OVERHEAD_BYTES` each; approximate when some have ended."""
         self.retransmit: deque[tuple[OutgoingMessage, int]] = deque()
         self.fresh: deque[OutgoingMessage] = deque()
         self.stale_retransmits: deque[tuple[OutgoingMessage, int]] = deque()
         self.stale_fresh: deque[OutgoingMessage] = deque()
+
+    def purge(self) -> None:
+        """Forget messages that have ended."""
+        self.fresh = deque(message for message in self.fresh if not message.ended)
+        self.fresh_bytes = sum(len(message.body) + SMALL_OVERHEAD_BYTES for message in self.fresh)
+        self.purge_at = max(MIN_PURGE_MESSAGES, 2 * len(self.fresh))
 
     def empty(self) -> bool:
         return not (self.retransmit or self.fresh or self.stale_retransmits or self.stale_fresh)
@@ -66,6 +88,8 @@ class Scheduler:
     def push(self, message: OutgoingMessage, *, first: bool = False) -> None:
         """Queue the unsent part of a message; `first` puts it at the front of its level."""
         level = self._levels[message.priority]
+        if len(level.fresh) >= level.purge_at:
+            level.purge()
         fresh = level.fresh
         level.fresh_bytes += len(message.body) + SMALL_OVERHEAD_BYTES
         if first:

@@ -146,7 +146,7 @@ class Ether(threading.Thread):
                         continue
                     if _udp_start(frame):
                         self._pass_on(name, other, frame)
-                    elif _resolves_addresses(frame) and self.paths[name, other].up:
+                    elif _is_control(frame) and self.paths[name, other].up:
                         self._send_at(time.monotonic(), other, frame)
 
     def _pass_on(self, name: str, other: str, frame: bytes) -> None:
@@ -207,10 +207,14 @@ def _udp_start(frame: bytes) -> int:
     return 0
 
 
-def _resolves_addresses(frame: bytes) -> bool:
-    """ARP, or ICMPv6 with neighbor discovery."""
+def _is_control(frame: bytes) -> bool:
+    """ARP, or ICMP: neighbor discovery, and what a kernel says of datagrams to a port that is closed."""
     kind = frame[12:14]
-    return kind == ARP or (kind == IPV6 and frame[IP_START + 6] == socket.IPPROTO_ICMPV6)
+    return (
+        kind == ARP
+        or (kind == IPV4 and frame[IP_START + 9] == socket.IPPROTO_ICMP)
+        or (kind == IPV6 and frame[IP_START + 6] == socket.IPPROTO_ICMPV6)
+    )
 
 
 def _from(frame: bytes, source: tuple[str, int] | None) -> bytes:

@@ -24,7 +24,7 @@ NETWORK_CHANGES = (
 )
 ROBOT_CHANGES = (
     *("kill", "leave", "suspend", "disk", "reader", "pause", "writer"),
-    *("move", "unplug", "reload", "stranger", "twin", "clock", "link-mtu"),
+    *("move", "unplug", "renumber", "refuse", "reload", "stranger", "twin", "second", "read-only", "clock", "link-mtu"),
 )
 SMALL, LARGE = (60, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 SETTLE_S, LEAST_BYTES_PER_S = 120.0, 15_000
@@ -117,6 +117,22 @@ def change_robot(team: LiveTeam, kind: str, name: str) -> None:
         case "unplug":
             robot.ip("link set mesh0 down")
             team.later(dice.choice((0.0, 0.5, 5.0)), robot.plug_in)
+        case "renumber":
+            robot.unplug(dice.randrange(1, 250) + 256 * (robot.place + 1))
+            team.later(dice.choice((0.0, 0.5, 5.0)), robot.plug_in)
+        case "refuse":
+            robot.refuse_to_send(dice.choice(("prohibit", "unreachable", "blackhole")))
+            team.later(dice.choice((0.2, 2.0, 8.0)), robot.allow_to_send)
+        case "second":
+            if robot.running and dice.random() < 0.3:
+                robot.start_second()
+        case "read-only":
+            if robot.daemon.process is not None:
+                team.disk_trouble.add(name)
+                team.end(name, politely=dice.random() < 0.5)
+                robot.set_disk("ro")
+                team.later(dice.choice((0.0, 3.0)), partial(start, team, name))
+                team.later(dice.choice((1.0, 8.0)), partial(robot.set_disk, "rw"))
         case "link-mtu":
             # IPv6 needs 1280. Larger datagrams of others do not arrive.
             team.ether.too_long |= {(one, name) for one in team.names}
@@ -151,7 +167,9 @@ def repair(team: LiveTeam) -> None:
     ether.rate_bits_per_s = 20e6
     ether.outside_ports.clear()
     for name, robot in team.robots.items():
+        robot.set_disk("rw")
         robot.free_disk()
+        robot.allow_to_send()
         robot.resume()
         robot.ip("link set mesh0 mtu 1500")
         robot.plug_in()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 from tests.udp_mesh.daemon.live.ether import Ether
@@ -33,6 +34,8 @@ NEVER_EXPIRE = ("stop", "stored", "limited", "map", "grid")
 """Topics without deadline, `keep_last` or small outbox: their messages only end as delivered, unwanted or with their
 peer lost."""
 DISK_BYTES = 40_000_000
+REFUSING_RULE = 10
+"""Preference of the routing rule that makes the kernel refuse to send."""
 PASSED_ON_S = 10.0
 """Between the acknowledgment and the program's socket lies one turn of a daemon, even on a busy machine."""
 RATES = """
@@ -166,12 +169,45 @@ state_directory = "{folder}/{self.name}.disk"
 
     def move(self, host: int, *, overlaps: bool) -> None:
         """Another address, as from another DHCP lease: instead of the old one, or before that goes."""
-        old, self.host = self.address, host
-        if not overlaps:
-            self.ip(f"addr del {old} dev mesh0")
-        self.plug_in()
         if overlaps:
+            self.plug_in()
+        else:
+            self.ip("addr flush dev mesh0")
+        old, self.host = self.address, host
+        self.plug_in()
+        if overlaps and old != self.address:
             self.ip(f"addr del {old} dev mesh0")
+
+    def unplug(self, host: int) -> None:
+        """The interface goes down and loses its address; it will get another one."""
+        self.ip("link set mesh0 down")
+        self.ip("addr flush dev mesh0")
+        self.host = host
+
+    def refuse_to_send(self, how: str) -> None:
+        """The kernel refuses datagrams to single peers, with EACCES (`prohibit`), ENETUNREACH (`unreachable`) or EINVAL
+        (`blackhole`)."""
+        self.allow_to_send()
+        self.ip(f"{self._family} rule add pref {REFUSING_RULE} to {'fe80::/10' if self.ipv6 else '10.7.0.0/16'} {how}")
+
+    def allow_to_send(self) -> None:
+        rules = f"nsenter -t {self.holder.pid} -n ip {self._family} rule del pref {REFUSING_RULE}"
+        subprocess.run(rules.split(), check=False, stderr=subprocess.DEVNULL)
+
+    @property
+    def _family(self) -> str:
+        return "-6" if self.ipv6 else "-4"
+
+    def start_second(self) -> None:
+        """Start the daemon once more while it runs. Raises Broken unless that is refused."""
+        command = [*self.daemon.prefix, sys.executable, "-m", *self.daemon.module, "run", str(self.daemon.file)]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        if done.returncode == 0 or "Traceback" in done.stderr:
+            raise Broken(f"a second daemon of {self.name} ended with {done.returncode}: {done.stderr[-2000:]}")
+
+    def set_disk(self, access: str) -> None:
+        """Make the disk read-only (`ro`) or writable (`rw`)."""
+        run(f"mount -o remount,{access} {self._filler.parent}")
 
     def set_clock(self, offset_s: float) -> None:
         """Sets the daemon's wall clock to the host's and so much."""

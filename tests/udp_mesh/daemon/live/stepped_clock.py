@@ -2,11 +2,12 @@
 
 The host's clock cannot be set for one process alone. Here `time.time` and the kernel's timestamps of datagrams are
 moved by the last line of the file CLOCK, in seconds. What arrived before that line was written has the offset before
-it, as after settimeofday(2).
+it, as after settimeofday(2). With SMALL_BUFFERS in the environment, the sockets hold a few datagrams only.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -15,6 +16,8 @@ from udp_mesh.cli import main as command
 from udp_mesh.links import udp
 from udp_mesh.links.attachments import Address
 
+SMALL_BUFFER_BYTES = 8192
+"""The kernel doubles it and counts its own overhead: about ten full datagrams."""
 _real_time = time.time
 
 
@@ -49,6 +52,8 @@ def main() -> int:
 
         return receive(self, from_socket, moved, limit, stop_after - clock.offset_s())  # type: ignore[arg-type]
 
+    if "SMALL_BUFFERS" in os.environ:
+        udp.RECEIVE_BUFFER_BYTES = udp.STRANGERS_BUFFER_BYTES = udp.SEND_BUFFER_BYTES = SMALL_BUFFER_BYTES
     time.time = clock.time
     udp.UdpLink._receive = received  # type: ignore[method-assign]
     return command.main()

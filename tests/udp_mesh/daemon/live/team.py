@@ -80,6 +80,8 @@ class LiveTeam:
         robot = Robot(self.folder, name, place, self.ether, ipv6=self.ipv6, key=key, called=called, version=version)
         self._stack.callback(robot.close)
         robot.attach()
+        if self.dice.random() < 0.15:
+            robot.daemon.environment["SMALL_BUFFERS"] = "1"
         if name in self.names:
             self.robots[name] = robot
             if self.dice.random() < 0.1:
