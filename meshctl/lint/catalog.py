@@ -17,6 +17,7 @@ from meshctl.lint.rules import (
     computers,
     drivers,
     encryption,
+    extra_networks,
     extra_services,
     firmware,
     hardware,
@@ -80,6 +81,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Drivers", drivers),
     ("Rendering", rendering),
     ("Further services", extra_services),
+    ("Further networks", extra_networks),
 )
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.rendering import with_extra
+from meshctl.lint.rules.rendering import created_sections, with_extra
 from meshctl.model import Fleet
-from meshctl.uci import Package, Section
 from meshctl.wording import join_limited
 
 # of hostapd's encryptions, those with a passphrase that every client knows
@@ -30,12 +29,13 @@ _WITH_PASSPHRASE = ("psk", "sae", "wep")
     """,
     passing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
-      wireless.guest.ssid: guests, wireless.guest.network: lan, wireless.guest.encryption: owe}}}
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, wireless.guest.encryption: owe,
+      network.visitors: interface, network.visitors.proto: none}}}
     """,
 )
 def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in _created(node.extra_uci, packages.get("wireless"), "wireless"):
+        for name, interface in created_sections(node.extra_uci, packages.get("wireless"), "wireless"):
             encryption = interface.get("encryption")
             given = any(interface.get(option) for option in ("key", "sae_password", "wpa_psk_file", "key1"))
             if interface.type == "wifi-iface" and encryption.startswith(_WITH_PASSPHRASE) and not given:
@@ -55,19 +55,12 @@ def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def port_used_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in _created(node.extra_uci, packages.get("network"), "network"):
+        for name, interface in created_sections(node.extra_uci, packages.get("network"), "network"):
             for option in ("device", "ifname"):
                 found = [port for port in interface.get(option).split() if port in node.lan_ports]
                 if interface.type == "interface" and found:
                     path = ("nodes", node.name, "extra_uci", f"network.{name}.{option}")
                     yield Finding(path, "bridged into br-lan", "a port that is not in lan_ports", join_limited(found))
-
-
-def _created(extra: Mapping[str, str], package: Package | None, name: str) -> Iterator[tuple[str, Section]]:
-    """The named sections that `extra_uci` creates in a package."""
-    for section in () if package is None else package.sections:
-        if section.name is not None and f"{name}.{section.name}" in extra:
-            yield section.name, section
 
 
 @fleet_rule(
@@ -79,9 +72,15 @@ def _created(extra: Mapping[str, str], package: Package | None, name: str) -> It
     gateways.""",
     fix="""Turn on the DHCP server of one node, or set `network.bat0.gw_mode: server` on those that have one and
     give each a range of its own.""",
-    failing="groups: {serving: {extra_uci: {dhcp.lan.ignore: '0'}}}\n"
-    "nodes: {base: {groups: [serving]}, b01: {groups: [serving]}}",
-    passing="nodes: {base: {extra_uci: {dhcp.lan.ignore: '0'}}}",
+    failing="""
+    groups: {serving: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
+      dhcp.dns.authoritative: '1'}}}
+    nodes: {base: {groups: [serving]}, b01: {groups: [serving]}}
+    """,
+    passing="""
+    nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
+      dhcp.dns.authoritative: '1'}}}
+    """,
 )
 def several_address_servers(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     serving = [

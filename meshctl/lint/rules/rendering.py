@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
@@ -136,7 +136,8 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     fix="Name a radio of the hardware profile, and an interface of `network`, such as `lan`.",
     failing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio9, wireless.guest.mode: ap,
-      wireless.guest.ssid: guests, wireless.guest.network: lan}}}
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
     """,
     passing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
@@ -166,6 +167,15 @@ def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[
     for node, outcome in context.trial.of(fleet):
         if node.extra_uci and isinstance(outcome, Rendered):
             yield node, {file.package.name: file.package for file in outcome.files if file.package is not None}
+
+
+def created_sections(
+    extra: Mapping[str, str], package: uci.Package | None, name: str
+) -> Iterator[tuple[str, uci.Section]]:
+    """The named sections that `extra_uci` creates in a package."""
+    for section in () if package is None else package.sections:
+        if section.name is not None and f"{name}.{section.name}" in extra:
+            yield section.name, section
 
 
 # option of a wifi-iface -> the package and type of the section that it names
