@@ -19,6 +19,7 @@ from meshctl.lint.rules import (
     encryption,
     extra_networks,
     extra_services,
+    extra_values,
     firmware,
     hardware,
     housekeeping,
@@ -82,6 +83,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Rendering", rendering),
     ("Further services", extra_services),
     ("Further networks", extra_networks),
+    ("Further values", extra_values),
 )
 
 

@@ -9,7 +9,8 @@ from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.rendering import created_sections, with_extra
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Node
+from meshctl.uci import Package
 from meshctl.wording import join_limited
 
 # of hostapd's encryptions, those with a passphrase that every client knows
@@ -46,21 +47,36 @@ def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC912",
     Severity.ERROR,
-    "An interface of extra_uci uses a port of the bridge",
-    why="""A port of `lan_ports` belongs to the bridge br-lan: the kernel hands what arrives there to the bridge, so an
-    interface on the port itself gets no address and no answer.""",
-    fix="Take the port out of `lan_ports` of the hardware profile or of the node, or name another port.",
+    "An interface or a bridge of extra_uci uses a port of the bridge",
+    why="""A port of `lan_ports` and the mesh's `bat0` belong to the bridge br-lan: the kernel hands what arrives there
+    to the bridge, so an interface on the port itself gets no address and no answer. A second bridge takes the port
+    away: the node is no longer reachable through it.""",
+    fix="""Take the port out of `lan_ports` of the hardware profile or of the node, or name another port, or a VLAN such
+    as `bat0.30`.""",
     failing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth0}}}",
     passing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth1}}}",
 )
 def port_used_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in created_sections(node.extra_uci, packages.get("network"), "network"):
-            for option in ("device", "ifname"):
-                found = [port for port in interface.get(option).split() if port in node.lan_ports]
-                if interface.type == "interface" and found:
+        network = packages.get("network")
+        taken = set(node.lan_ports) if network is None else {*node.lan_ports, *_bridged(node, network)}
+        for name, section in created_sections(node.extra_uci, network, "network"):
+            for option in _PORT_OPTIONS.get(section.type, ()):
+                found = [port for port in section.get(option).split() if port in taken]
+                if found:
                     path = ("nodes", node.name, "extra_uci", f"network.{name}.{option}")
-                    yield Finding(path, "bridged into br-lan", "a port that is not in lan_ports", join_limited(found))
+                    yield Finding(path, "bridged into br-lan", "a port that is not in br-lan", join_limited(found))
+
+
+# where sections of these types name ports
+_PORT_OPTIONS = {"interface": ("device", "ifname"), "device": ("ports", "ifname")}
+
+
+def _bridged(node: Node, network: Package) -> Iterator[str]:
+    """The ports of the bridges that are not in `extra_uci`."""
+    for section in (*network.of_type("device"), *network.of_type("interface")):
+        if section.get("type") == "bridge" and f"network.{section.name}" not in node.extra_uci:
+            yield from (*section.get("ports").split(), *section.get("ifname").split())
 
 
 @fleet_rule(
