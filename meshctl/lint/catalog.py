@@ -17,7 +17,9 @@ from meshctl.lint.rules import (
     computers,
     drivers,
     encryption,
+    extra_networks,
     extra_services,
+    extra_values,
     firmware,
     hardware,
     housekeeping,
@@ -80,6 +82,8 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Drivers", drivers),
     ("Rendering", rendering),
     ("Further services", extra_services),
+    ("Further networks", extra_networks),
+    ("Further values", extra_values),
 )
 
 

@@ -269,8 +269,8 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     nodes:
       b01:
         extra_uci: {wireless.radio0.rts: '500', wireless.guest: wifi-iface, wireless.guest.device: radio0,
-          wireless.guest.mode: ap, wireless.guest.ssid: guests, wireless.guest.network: lan,
-          network.bat0.gw_mode: server}
+          wireless.guest.mode: ap, wireless.guest.ssid: guests, wireless.guest.network: visitors,
+          network.visitors: interface, network.visitors.proto: none, network.bat0.gw_mode: server}
     """,
 )
 def extra_checked(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

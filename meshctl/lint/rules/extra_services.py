@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.rendering import with_extra
-from meshctl.model import Fleet
-from meshctl.uci import Package, Section
+from meshctl.lint.rules.rendering import created_sections, with_extra
+from meshctl.model import Fleet, Node
+from meshctl.uci import Package
 from meshctl.wording import join_limited
 
 # of hostapd's encryptions, those with a passphrase that every client knows
@@ -30,12 +30,13 @@ _WITH_PASSPHRASE = ("psk", "sae", "wep")
     """,
     passing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
-      wireless.guest.ssid: guests, wireless.guest.network: lan, wireless.guest.encryption: owe}}}
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, wireless.guest.encryption: owe,
+      network.visitors: interface, network.visitors.proto: none}}}
     """,
 )
 def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in _created(node.extra_uci, packages.get("wireless"), "wireless"):
+        for name, interface in created_sections(node.extra_uci, packages.get("wireless"), "wireless"):
             encryption = interface.get("encryption")
             given = any(interface.get(option) for option in ("key", "sae_password", "wpa_psk_file", "key1"))
             if interface.type == "wifi-iface" and encryption.startswith(_WITH_PASSPHRASE) and not given:
@@ -46,28 +47,36 @@ def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC912",
     Severity.ERROR,
-    "An interface of extra_uci uses a port of the bridge",
-    why="""A port of `lan_ports` belongs to the bridge br-lan: the kernel hands what arrives there to the bridge, so an
-    interface on the port itself gets no address and no answer.""",
-    fix="Take the port out of `lan_ports` of the hardware profile or of the node, or name another port.",
+    "An interface or a bridge of extra_uci uses a port of the bridge",
+    why="""A port of `lan_ports` and the mesh's `bat0` belong to the bridge br-lan: the kernel hands what arrives there
+    to the bridge, so an interface on the port itself gets no address and no answer. A second bridge takes the port
+    away: the node is no longer reachable through it.""",
+    fix="""Take the port out of `lan_ports` of the hardware profile or of the node, or name another port, or a VLAN such
+    as `bat0.30`.""",
     failing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth0}}}",
     passing="nodes: {b01: {extra_uci: {network.wan: interface, network.wan.proto: dhcp, network.wan.device: eth1}}}",
 )
 def port_used_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in _created(node.extra_uci, packages.get("network"), "network"):
-            for option in ("device", "ifname"):
-                found = [port for port in interface.get(option).split() if port in node.lan_ports]
-                if interface.type == "interface" and found:
+        network = packages.get("network")
+        taken = set(node.lan_ports) if network is None else {*node.lan_ports, *_bridged(node, network)}
+        for name, section in created_sections(node.extra_uci, network, "network"):
+            for option in _PORT_OPTIONS.get(section.type, ()):
+                found = [port for port in section.get(option).split() if port in taken]
+                if found:
                     path = ("nodes", node.name, "extra_uci", f"network.{name}.{option}")
-                    yield Finding(path, "bridged into br-lan", "a port that is not in lan_ports", join_limited(found))
+                    yield Finding(path, "bridged into br-lan", "a port that is not in br-lan", join_limited(found))
 
 
-def _created(extra: Mapping[str, str], package: Package | None, name: str) -> Iterator[tuple[str, Section]]:
-    """The named sections that `extra_uci` creates in a package."""
-    for section in () if package is None else package.sections:
-        if section.name is not None and f"{name}.{section.name}" in extra:
-            yield section.name, section
+# where sections of these types name ports
+_PORT_OPTIONS = {"interface": ("device", "ifname"), "device": ("ports", "ifname")}
+
+
+def _bridged(node: Node, network: Package) -> Iterator[str]:
+    """The ports of the bridges that are not in `extra_uci`."""
+    for section in (*network.of_type("device"), *network.of_type("interface")):
+        if section.get("type") == "bridge" and f"network.{section.name}" not in node.extra_uci:
+            yield from (*section.get("ports").split(), *section.get("ifname").split())
 
 
 @fleet_rule(
@@ -79,9 +88,15 @@ def _created(extra: Mapping[str, str], package: Package | None, name: str) -> It
     gateways.""",
     fix="""Turn on the DHCP server of one node, or set `network.bat0.gw_mode: server` on those that have one and
     give each a range of its own.""",
-    failing="groups: {serving: {extra_uci: {dhcp.lan.ignore: '0'}}}\n"
-    "nodes: {base: {groups: [serving]}, b01: {groups: [serving]}}",
-    passing="nodes: {base: {extra_uci: {dhcp.lan.ignore: '0'}}}",
+    failing="""
+    groups: {serving: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
+      dhcp.dns.authoritative: '1'}}}
+    nodes: {base: {groups: [serving]}, b01: {groups: [serving]}}
+    """,
+    passing="""
+    nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
+      dhcp.dns.authoritative: '1'}}}
+    """,
 )
 def several_address_servers(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     serving = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
@@ -130,13 +130,16 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 @fleet_rule(
     "MC904",
     Severity.ERROR,
-    "An extra wireless interface names a radio or network that is not there",
-    why="""OpenWrt brings up an interface of `wireless` on the radio that `device` names and attaches it to `network`.
-    Where either is missing, it silently does nothing: the access point is not on the air, or leads nowhere.""",
-    fix="Name a radio of the hardware profile, and an interface of `network`, such as `lan`.",
+    "An option of extra_uci names something that is not there",
+    why="""OpenWrt brings up a wireless interface on the radio that `device` names and attaches it to `network`. Zones,
+    forwardings, rules, routes and DHCP ranges name networks and zones, too. Where the name is missing, OpenWrt does
+    nothing: the access point is not on the air, its clients get no address, or their packets are rejected.""",
+    fix="""Name a radio of the hardware profile, an interface of `network` such as `lan`, or a zone of the firewall such
+    as `management`, by its option `name`.""",
     failing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio9, wireless.guest.mode: ap,
-      wireless.guest.ssid: guests, wireless.guest.network: lan}}}
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
     """,
     passing="""
     nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
@@ -144,21 +147,41 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
       network.visitors.proto: none}}}
     """,
 )
-def extra_interface_of_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+def extra_names_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, rest = key.partition(".")
-            section, _, option = rest.rpartition(".")
-            needed = _REFERENCES.get(option)
-            if package != "wireless" or needed is None or not _is_interface(packages.get(package), section):
+            name, _, option = rest.rpartition(".")
+            section = find_section(packages.get(package), name)
+            needed = None if section is None else _REFERENCES.get((package, section.type, option))
+            if needed is None:
                 continue
-            place, kind = needed
-            known = [one.name for one in packages[place].of_type(kind) if one.name] if place in packages else []
-            for name in value.split():
-                if name not in known:
+            known = _names(packages, *needed)
+            for word in value.split():
+                if not _is_there(word, known, option):
                     path = ("nodes", node.name, "extra_uci", key)
-                    hint = did_you_mean(name, known)
-                    yield Finding(path, f"no {kind} of {place}", f"one of {join_limited(known)}", name, hint)
+                    hint = did_you_mean(word, known)
+                    yield Finding(path, f"no {needed[1]} of {needed[0]}", f"one of {join_limited(known)}", word, hint)
+
+
+def find_section(package: uci.Package | None, key: str) -> uci.Section | None:
+    """The section with this name or `@type[index]`."""
+    keys = () if package is None else package.keys()
+    return None if package is None or key not in keys else package.sections[keys.index(key)]
+
+
+def _names(packages: Mapping[str, uci.Package], package: str, kind: str, option: str) -> list[str]:
+    """The names of a package's sections of one type: their own, or the value of an option."""
+    sections = packages[package].of_type(kind) if package in packages else ()
+    names = (section.get(option) if option else section.name for section in sections)
+    return [name for name in names if name]
+
+
+def _is_there(word: str, known: list[str], option: str) -> bool:
+    if option in ("src", "dest") and word == "*":
+        return True
+    # netifd makes wan_4 and wan_6 while wan is up
+    return word in known or (word[-2:] in ("_4", "_6") and word[:-2] in known)
 
 
 def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[str, uci.Package]]]:
@@ -168,13 +191,27 @@ def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[
             yield node, {file.package.name: file.package for file in outcome.files if file.package is not None}
 
 
-# option of a wifi-iface -> the package and type of the section that it names
-_REFERENCES = {"device": ("wireless", "wifi-device"), "network": ("network", "interface")}
+def created_sections(
+    extra: Mapping[str, str], package: uci.Package | None, name: str
+) -> Iterator[tuple[str, uci.Section]]:
+    """The named sections that `extra_uci` creates in a package."""
+    for section in () if package is None else package.sections:
+        if section.name is not None and f"{name}.{section.name}" in extra:
+            yield section.name, section
 
 
-def _is_interface(wireless: uci.Package | None, key: str) -> bool:
-    keys = () if wireless is None else wireless.keys()
-    return wireless is not None and key in keys and wireless.sections[keys.index(key)].type == "wifi-iface"
+_INTERFACE = ("network", "interface", "")
+_ZONE = ("firewall", "zone", "name")
+# package, section type and option -> package and type of the section that it names, and where that has the name
+_REFERENCES = {
+    ("wireless", "wifi-iface", "device"): ("wireless", "wifi-device", ""),
+    ("wireless", "wifi-iface", "network"): _INTERFACE,
+    ("network", "route", "interface"): _INTERFACE,
+    ("network", "route6", "interface"): _INTERFACE,
+    ("dhcp", "dhcp", "interface"): _INTERFACE,
+    ("firewall", "zone", "network"): _INTERFACE,
+    **{("firewall", kind, end): _ZONE for kind in ("forwarding", "rule", "redirect") for end in ("src", "dest")},
+}
 
 
 @fleet_rule(

@@ -113,7 +113,9 @@ def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    radios = {str(node.address.ip): node for node in fleet.managed()}
+    radios = {
+        str(address.ip): node for node in fleet.managed() for address in (node.address, node.lan_address) if address
+    }
     node = radios.get(fleet.system.log_host)
     if node is not None and not any(package in _LOG_SERVERS for package in (*node.hardware.packages, *node.packages)):
         message = f"{node.name} is a radio, which receives no logs"

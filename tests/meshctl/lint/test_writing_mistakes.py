@@ -102,3 +102,9 @@ def test_a_package_file_is_found_beside_the_included_file_that_names_it(tmp_path
     assert "MC811" not in {
         one.code for one in _found(Example("include: [common/hardware.yaml]", files=files), tmp_path)
     }
+
+
+def test_a_router_named_by_its_address_in_its_lan_is_a_radio(tmp_path: Path) -> None:
+    robots = "robots: {base-station: {lan: {network: 10.43.0.0/24}, computer: {address: 10.43.0.10/24}}}"
+    found = [one for one in _found(f"system: {{log_host: 10.43.0.1}}\n{robots}", tmp_path) if one.code == "MC235"]
+    assert [(one.path, one.found) for one in found] == [("system.log_host", "10.43.0.1")]

@@ -1,0 +1,121 @@
+"""Values of extra_uci that OpenWrt does not understand (MC918)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from ipaddress import IPv4Network, ip_interface
+
+from meshctl.diagnostics import Severity
+from meshctl.inventory.suggest import asked, did_you_mean
+from meshctl.lint.context import LintContext
+from meshctl.lint.openwrt_names import one_edit_apart
+from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.rendering import find_section, with_extra
+from meshctl.model import Fleet
+
+# what is wrong with a value: what was expected, and a hint; None if nothing is
+_Check = Callable[[str], tuple[str, str] | None]
+
+_MAX_SSID_BYTES = 32
+# OpenWrt's wifi scripts look for these in the value
+_METHODS = ("psk", "sae", "owe", "wpa", "wep", "8021x")
+
+
+def _one_of(*words: str) -> _Check:
+    def check(value: str) -> tuple[str, str] | None:
+        return None if value in words else (f"one of {', '.join(words)}", did_you_mean(value, words))
+
+    return check
+
+
+def _not_misspelled(*words: str) -> _Check:
+    """Packages add further words, so only what is almost one of these is wrong."""
+
+    def check(value: str) -> tuple[str, str] | None:
+        near = () if value in words else one_edit_apart(value, words)
+        return (" or ".join(near), asked(near)) if near else None
+
+    return check
+
+
+def _ssid(value: str) -> tuple[str, str] | None:
+    return None if len(value.encode()) <= _MAX_SSID_BYTES else (f"at most {_MAX_SSID_BYTES} bytes", "")
+
+
+def _encryption(value: str) -> tuple[str, str] | None:
+    if value == "none" or any(method in value for method in _METHODS):
+        return None
+    return "none, owe, psk2, sae or another method of OpenWrt", "an unknown method is no encryption"
+
+
+def _addresses(value: str) -> tuple[str, str] | None:
+    try:
+        for word in value.split():
+            ip_interface(word)
+    except ValueError:
+        return "an IP address", ""
+    return None
+
+
+def _netmask(value: str) -> tuple[str, str] | None:
+    try:
+        IPv4Network(f"0.0.0.0/{value}")
+    except ValueError:
+        return "a netmask such as 255.255.255.0", ""
+    return None
+
+
+_POLICY = _one_of("ACCEPT", "REJECT", "DROP")
+_CHECKS: dict[tuple[str, str, str], _Check] = {
+    ("wireless", "wifi-iface", "mode"): _one_of("ap", "sta", "adhoc", "mesh", "monitor"),
+    ("wireless", "wifi-iface", "ssid"): _ssid,
+    ("wireless", "wifi-iface", "encryption"): _encryption,
+    ("network", "interface", "proto"): _not_misspelled("static", "dhcp", "dhcpv6", "none", "pppoe", "wireguard"),
+    ("network", "interface", "ipaddr"): _addresses,
+    ("network", "interface", "ip6addr"): _addresses,
+    ("network", "interface", "netmask"): _netmask,
+    ("network", "interface", "gw_mode"): _one_of("off", "client", "server"),
+    **{("firewall", kind, chain): _POLICY for kind in ("defaults", "zone") for chain in ("input", "output", "forward")},
+    ("firewall", "rule", "target"): _not_misspelled("ACCEPT", "REJECT", "DROP", "MARK", "NOTRACK"),
+    ("firewall", "redirect", "target"): _not_misspelled("DNAT", "SNAT"),
+}
+_TYPES = {
+    "wireless": _not_misspelled("wifi-iface", "wifi-device"),
+    "network": _not_misspelled("interface", "device", "route", "route6", "rule", "rule6"),
+    "firewall": _not_misspelled("zone", "forwarding", "rule", "redirect", "include", "ipset"),
+    "dhcp": _not_misspelled("dhcp", "dnsmasq", "host", "odhcpd"),
+}
+
+
+@fleet_rule(
+    "MC918",
+    Severity.ERROR,
+    "A value of extra_uci is not one that OpenWrt understands",
+    why="""UCI stores any text. An access point with a mistyped `encryption` is open, one with a mistyped `mode` is not
+    on the air, a zone with a mistyped policy is not loaded, and a section with a mistyped type is not read: no program
+    says so.""",
+    fix="Correct the value.",
+    failing="""
+    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: app,
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
+    """,
+    passing="""
+    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
+      wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
+      network.visitors.proto: none}}}
+    """,
+)
+def value_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
+    for node, packages in with_extra(fleet, context):
+        for key, value in node.extra_uci.items():
+            package, _, rest = key.partition(".")
+            name, _, option = rest.rpartition(".")
+            section = find_section(packages.get(package), name)
+            check = (
+                _TYPES.get(package) if not name else _CHECKS.get((package, section.type, option)) if section else None
+            )
+            wrong = check(value) if check is not None and value else None
+            if wrong is not None:
+                path = ("nodes", node.name, "extra_uci", key)
+                yield Finding(path, "OpenWrt does not understand this value", wrong[0], value, wrong[1])
