@@ -1,13 +1,23 @@
-"""How messages count and list things: `1 line`, `2 lines`; `a, b, c, d and 71 more`."""
+"""How messages count, list and name things: `1 line`, `2 lines`; `a, b, c, d and 71 more`."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 # names in one sentence
 _MAX_NAMES = 4
 # names that are not yet folded into a count
 MAX_IN_FULL = 8
+
+
+# as `fleet.process` names a process: user@host:pid:start
+_LOCK = re.compile(r"(?P<who>[^\s:]+@[^\s:]+):(?P<pid>[0-9]+):[0-9]+")
+
+
+def lock_owners(text: str) -> str:
+    """The text with the owners of locks as a person reads them: `ada@base (process 17)` for `ada@base:17:4711`."""
+    return _LOCK.sub(r"\g<who> (process \g<pid>)", text)
 
 
 def counted(number: int, noun: str) -> str:

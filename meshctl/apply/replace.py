@@ -2,9 +2,9 @@
 
 The new device is a spare of the inventory, or one on the bench. `adopt` also pins its host key under the old name; the
 old node's configuration is then applied as any other change, and the inventory gets the new MAC, serial number and
-label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were. If meshctl is killed, both
-devices are trusted under the old name, and the same command completes what is left: a spare that has taken over by then
-is known by its host key.
+label (`identity_edits`, pure). If the change fails, pins and inventory stay as they were. If meshctl is killed, or does
+not know how the change ended, both devices are trusted under the old name, and the same command completes what is left:
+a device that has taken over by then is known by its host key, which is pinned under `name_of_new` until the end.
 """
 
 from __future__ import annotations
@@ -14,13 +14,20 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from meshctl.apply.bootstrap import BenchTarget, Discovered, FoundDevice, connect_to_bench, require_site
+from meshctl.apply.bootstrap import (
+    BenchTarget,
+    Discovered,
+    FoundDevice,
+    connect_to_bench,
+    require_site,
+    restore_pins,
+)
 from meshctl.apply.prepare import other_paths
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
-from meshctl.device.trust import AcceptAnyKey, TrustStore
+from meshctl.device.trust import AcceptAnyKey, HostKey, TrustStore
 from meshctl.errors import InputError, NodeError, Unreachable
-from meshctl.fleet import Interrupt
+from meshctl.fleet import Interrupt, Result
 from meshctl.model import Fleet, Node, NodeState, Role
 from meshctl.nodes.collect import observe_cleared
 from meshctl.nodes.connections import ConnectionPool
@@ -29,10 +36,26 @@ from meshctl.nodes.desired import Renderer
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """The device that takes over: `spare` is its node in the inventory, None for a device on the bench."""
+    """The device that takes over: its host key is also pinned under `new_name`, where `new_pins` were before."""
 
     discovered: Discovered
-    spare: Node | None
+    new_name: str
+    new_pins: tuple[HostKey, ...]
+
+    def put_back_pins(self, trust: TrustStore) -> None:
+        """Pin the previous keys again, because the device has not taken over."""
+        restore_pins(trust, self.discovered, self.discovered.found)
+        trust.replace(self.new_name, *self.new_pins)
+
+
+def name_of_new(old: Node, spare: Node | None) -> str:
+    """The name in known_hosts of a device that takes over: the spare's; a device on the bench has none of its own."""
+    return spare.name if spare is not None else f"{old.name}.replacement"
+
+
+def has_old_state(result: Result) -> bool:
+    """Whether a device whose change ended so is certain not to have taken over."""
+    return not result.is_good and result is not Result.UNCERTAIN
 
 
 def adopt(
@@ -56,9 +79,9 @@ def adopt(
         require_site(old, target)
         connection = connect_to_bench(connections, target, recorder)
         key = recorder.key
-    elif spare is not None:
+    elif has_taken_over or spare is not None:
         # checked against its own pin
-        connection = connections.open(old) if has_taken_over else _open_spare(connections, spare, old)
+        connection = connections.open(old) if has_taken_over or spare is None else _open_spare(connections, spare, old)
         key = connection.host_key
     else:
         raise InputError("expected a spare of the inventory, or a device on the bench")
@@ -71,7 +94,11 @@ def adopt(
         raise
     pins = trust.pinned(old.name)
     # that of the old device stays until the change is confirmed: whatever ends this process, either is trusted
-    trust.replace(old.name, key, *pins)
+    trust.replace(old.name, key, *(pin for pin in pins if pin != key))
+    new_name = name_of_new(old, spare)
+    new_pins = trust.pinned(new_name)
+    if key not in new_pins:
+        trust.replace(new_name, key)
     if (target is not None and not target.site) or (spare is not None and spare.name in connections.on_bench):
         connections.on_bench.add(old.name)
     if not has_taken_over:
@@ -80,7 +107,7 @@ def adopt(
         connections.interfaces[old.name] = connection.endpoint.interface
     connections.release(old.name, connection)
     where = target or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
-    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key, pins)}, ()), spare)
+    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key, pins)}, ()), new_name, new_pins)
 
 
 def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConnection:
@@ -109,8 +136,8 @@ def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConne
 
 
 def require_off(connections: ConnectionPool, trust: TrustStore, old: Node, spare: Node | None) -> bool:
-    """The old device must be off: two devices with the same address conflict. Returns whether the spare answers there,
-    because a replacement by it was cut short after its change.
+    """The old device must be off: two devices with the same address conflict. Returns whether the new one answers
+    there, because a replacement by it was cut short after its change.
 
     Raises NodeError, also if the gateway on the way to it cannot be asked.
     """
@@ -121,7 +148,7 @@ def require_off(connections: ConnectionPool, trust: TrustStore, old: Node, spare
             raise
         return False
     with closing(connection):
-        if spare is not None and connection.host_key in trust.pinned(spare.name):
+        if connection.host_key in trust.pinned(name_of_new(old, spare)):
             return True
     raise still_on(old, str(connections.endpoint(old).address))
 

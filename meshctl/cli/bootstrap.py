@@ -22,7 +22,15 @@ from meshctl.apply.bootstrap import (
     restore_pins,
 )
 from meshctl.apply.prepare import PlanOptions
-from meshctl.apply.replace import adopt, identity_edits, require_off, still_on, with_identity
+from meshctl.apply.replace import (
+    Replacement,
+    adopt,
+    has_old_state,
+    identity_edits,
+    require_off,
+    still_on,
+    with_identity,
+)
 from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, places_in_lab, with_site
 from meshctl.cli.context import (
     AsJson,
@@ -236,7 +244,7 @@ def replace(
             )
         if not as_json:
             echo(_replacement_text(node, spare, new, successor.discovered.found.get(node.name)))
-        status = int(ExitCode.FINDINGS)
+        ended: dict[str, Outcome] = {}
         try:
             prepared = plan_discovered(
                 opened.renderer,
@@ -258,15 +266,17 @@ def replace(
                 brief=True,
                 rate=rate,
                 dry_run=dry_run,
+                on_outcomes=ended.update,
             )
-        except typer.Exit as ended:
-            status = ended.exit_code
+        except typer.Exit as exited:
+            status = exited.exit_code
         finally:
-            if status != ExitCode.OK or dry_run:
-                restore_pins(opened.trust, successor.discovered, [node.name])
-        if status == ExitCode.OK:
-            found = successor.discovered.found[node.name]
-            changes = _record_identity(opened, inventory, old_node, spare, found, dry_run=dry_run)
+            if node.name not in ended or has_old_state(ended[node.name].result):
+                successor.put_back_pins(opened.trust)
+        # not by the exit code: after Ctrl-C the device may have taken over, too
+        has_succeeded = status == ExitCode.OK if dry_run else ended[node.name].result.is_good
+        if has_succeeded:
+            changes = _record_identity(opened, inventory, old_node, spare, successor, dry_run=dry_run)
             echo("".join(change.diff() for change in changes), nl=False, err=as_json)
         raise typer.Exit(status)
 
@@ -320,9 +330,10 @@ def _spare(opened: Session, old: Node, new: str) -> Node | None:
 
 
 def _record_identity(
-    opened: Session, inventory: Path, node: Node, spare: Node | None, found: FoundDevice, *, dry_run: bool
+    opened: Session, inventory: Path, node: Node, spare: Node | None, successor: Replacement, *, dry_run: bool
 ) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
+    found = successor.discovered.found[node.name]
     mine, theirs = identity_edits(node, spare, found.seen)
     if dry_run:
         return _identity_changes(inventory, node, spare, found, mine, theirs)
@@ -337,9 +348,8 @@ def _record_identity(
             f"{node.name} runs on its new device, but the inventory could not be updated: {error}",
             hint=f"fix the inventory, then repeat the command, or add under `nodes`: {json.dumps(edits)}",
         ) from error
-    # last: by it, a repeated command knows the spare that has taken over
-    if spare is not None:
-        opened.trust.forget(spare.name)
+    # last: by it, a repeated command knows the device that has taken over
+    opened.trust.forget(successor.new_name)
     return changes
 
 

@@ -214,8 +214,14 @@ def import_export(
 
     Example: meshctl inventory import uci b07.uci --hardware rocket
     """
-    profile = None if target.fleet is None else target.fleet.hardware.get(target.options.hardware)
+    profiles = {} if target.fleet is None else target.fleet.hardware
+    profile = profiles.get(target.options.hardware)
     if profile is None and not (release and board):
+        if profiles and target.options.hardware:
+            raise InputError(
+                f"no hardware profile {target.options.hardware!r}: expected one of {', '.join(profiles)}",
+                hint="or pass --release and --board for a new one",
+            )
         raise InputError(
             "expected --release and --board, which `uci export` does not contain",
             hint="or name a hardware profile of the inventory with --hardware",

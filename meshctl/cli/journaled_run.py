@@ -137,7 +137,7 @@ def retry_command(command: str, undoes: int | None = None) -> str:
     """The command that takes up what a run of `command` left; `undoes` is the run that a rollback takes back."""
     if undoes is not None:
         return f"meshctl rollback {undoes}"
-    return "meshctl restore" if command == "restore" else "meshctl resume"
+    return f"meshctl {command}" if command in ("restore", "replace") else "meshctl resume"
 
 
 def print_totals(

@@ -19,7 +19,7 @@ from meshctl.lint import BY_CODE, RULES, CheckResult, Rule, check_path
 from meshctl.lint import baseline as baselines
 from meshctl.lint.pages import page
 from meshctl.regdb import SHIPPED, load, shipped_version
-from meshctl.report.findings import Findings, formatted
+from meshctl.report.findings import Findings, formatted, summary
 from meshctl.wording import counted
 
 
@@ -105,6 +105,7 @@ def lint(
     report = formatted(findings, "json" if json else format.value)
     if output is not None:
         write_file(output, report)
+        echo(f"{summary(findings)}: written to {output}", err=True)
     else:
         # JSON and SARIF are escaped, which keeps their values; other formats are sanitized
         is_json = json or format in (LintFormat.JSON, LintFormat.SARIF)

@@ -290,8 +290,11 @@ def _ended_without(unknown: Collection[str] | None, ended: typer.Exit) -> typer.
 
 
 def bench_advice(record: RunRecord, plan: Plan) -> tuple[str, ...]:
-    """Advice for unreachable nodes of a bootstrap: resume uses their inventory address, which they may not have yet."""
+    """Advice for a replacement, which resume does not record in the inventory, and for unreachable nodes of a
+    bootstrap: resume uses their inventory address, which they may not have yet."""
     unreachable = [node.node for node in plan.of(Verdict.AWAY)]
+    if record.command == "replace" and not unreachable:
+        return (f"hint: run the same `meshctl replace {' '.join(plan.nodes)} NEW` again to record it in the inventory",)
     if record.command not in ("bootstrap", "replace") or not unreachable:
         return ()
     return (

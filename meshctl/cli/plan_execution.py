@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -30,6 +30,11 @@ from meshctl.plan.switch import ALL
 SALT_BYTES = 16
 # Node -> what becomes of it, and why.
 Verdicts = Mapping[str, tuple[Verdict, str]]
+OnOutcomes = Callable[[Mapping[str, Outcome]], None]
+
+
+def ignore_outcomes(outcomes: Mapping[str, Outcome]) -> None:
+    """For commands with nothing left to do after a run."""
 
 
 class PlanRefused(MeshctlError):
@@ -152,8 +157,10 @@ def confirm_and_execute(
     rate: float | None,
     dry_run: bool = False,
     undoes: int | None = None,
+    on_outcomes: OnOutcomes = ignore_outcomes,
 ) -> None:
-    """Show the plan, ask, execute it and exit; `undoes` is the run that a rollback takes back."""
+    """Show the plan, ask, execute it and exit; `undoes` is the run that a rollback takes back, `on_outcomes` as for
+    `execute_plan`."""
     from meshctl.report.plan_text import question
 
     if dry_run:
@@ -164,7 +171,15 @@ def confirm_and_execute(
     if not prepared.plan.is_empty and not prepared.plan.refusal and not yes:
         confirm(question(prepared.plan))
     execute_plan(
-        opened, prepared, command, choices.with_firmware, as_json=as_json, rate=rate, choices=choices, undoes=undoes
+        opened,
+        prepared,
+        command,
+        choices.with_firmware,
+        as_json=as_json,
+        rate=rate,
+        choices=choices,
+        undoes=undoes,
+        on_outcomes=on_outcomes,
     )
 
 
@@ -193,8 +208,10 @@ def execute_plan(
     rate: float | None,
     choices: PlanOptions | None = None,
     undoes: int | None = None,
+    on_outcomes: OnOutcomes = ignore_outcomes,
 ) -> None:
-    """Execute the plan, journal it, print the totals, exit."""
+    """Execute the plan, journal it, print the totals, exit. `on_outcomes` gets the outcomes before the totals are
+    printed: the exit code alone does not tell what became of a node, for example after Ctrl-C."""
     plan = prepared.plan
     if plan.refusal:
         raise PlanRefused(plan.refusal, hint=plan.refusal_hint)
@@ -208,6 +225,7 @@ def execute_plan(
     with journaled_run(opened, command, tuple(plan.nodes), changing=names, plan=recorded, as_json=as_json) as run:
         save_before(opened, run, changing, replaced_by(prepared))
         run.outcomes.update(execute_direct(opened, run, prepared, rate=rate))
+        on_outcomes(run.outcomes)
     raise print_totals(opened, run, as_json=as_json, retry=retry_command(command, undoes))
 
 

@@ -22,6 +22,7 @@ from meshctl.device.parse.deadman import parse_answer, parse_status
 from meshctl.device.scripts import script
 from meshctl.device.upload import UploadProgress, longest_s, paced, upload
 from meshctl.model import Secret
+from meshctl.wording import lock_owners
 
 PROGRAM = "/usr/sbin/meshctl-deadman"
 INIT_SCRIPT = "/etc/init.d/meshctl-deadman"
@@ -312,7 +313,7 @@ def _verb(
         return answer.values
     if answer.code:
         raise NodeRefused(
-            f"{connection.endpoint.label}: {verb}: {answer.text}",
+            f"{connection.endpoint.label}: {verb}: {lock_owners(answer.text)}",
             code=answer.code,
             exit_status=done.exit_status,
             hint=HINTS.get(answer.code, ""),

@@ -11,6 +11,7 @@ from meshctl.plan.firmware import runs_release
 from meshctl.plan.packages import unavailable
 from meshctl.plan.values import PackageStep
 from meshctl.uci import Package, masked_changes
+from meshctl.wording import lock_owners
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,10 +151,11 @@ def _other_operator(case: _Checked) -> FailedPrecondition | None:
         return None
     if change.lock_owner and change.lock_owner != case.owner:
         left = f" for {change.lock_left_s:.0f} more seconds" if change.lock_left_s else ""
-        return FailedPrecondition(f"locked by {change.lock_owner}{left}")
+        return FailedPrecondition(f"locked by {lock_owners(change.lock_owner)}{left}")
     if change.state in ("armed", "waiting", "applied", "restoring") and change.owner != case.owner:
         return FailedPrecondition(
-            f"{change.owner or 'another operator'} has a change {change.state} on it", "wait until it has ended"
+            f"{lock_owners(change.owner) or 'another operator'} has a change {change.state} on it",
+            "wait until it has ended",
         )
     return None
 

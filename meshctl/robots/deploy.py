@@ -35,7 +35,7 @@ from meshctl.robots.preconditions import (
 )
 from meshctl.robots.wheel_tags import Target
 from meshctl.robots.wheels import Wheel, cache_wheels, download_wheels, has_all, select_wheels, stock_units
-from meshctl.wording import counted
+from meshctl.wording import counted, lock_owners
 
 COLLECTOR_KEY = "collector_key"
 """The fact of an outcome with the collector's public key."""
@@ -229,7 +229,7 @@ def claim(host: Host, *, current: str = "-") -> Iterator[None]:
     if reply[:1] != ["claimed"]:
         _, holder, seconds = (*reply, "", "", "")[:3]
         hint = "wait until it is done; an abandoned claim expires after 15 minutes"
-        raise ScriptRefused(f"{host.label}: locked by {holder} for {seconds} s", code="busy", hint=hint)
+        raise ScriptRefused(f"{host.label}: locked by {lock_owners(holder)} for {seconds} s", code="busy", hint=hint)
     try:
         yield
     finally:

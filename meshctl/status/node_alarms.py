@@ -17,7 +17,7 @@ from meshctl.plan.left_over import left_over
 from meshctl.report.duration import duration
 from meshctl.status.values import Alarm, Level, Neighbor, RadioStatus
 from meshctl.topology import Path
-from meshctl.wording import counted
+from meshctl.wording import counted, lock_owners
 
 # below this the path loses more than it delivers: move a beacon
 WEAK_QUALITY = 0.3
@@ -215,7 +215,7 @@ def _changes(seen: NodeAlarmInput) -> Iterator[Alarm]:
         text = f"a change by {change.owner or 'an unknown owner'} is {change.state}{left}"
         yield Alarm(Level.WARNING, "change", text, "wait until it is confirmed or rolled back")
     if change is not None and change.lock_owner and change.lock_owner != seen.own_lock:
-        yield Alarm(Level.NOTE, "locked", f"locked by {change.lock_owner}")
+        yield Alarm(Level.NOTE, "locked", f"locked by {lock_owners(change.lock_owner)}")
     if seen.observation.uci_changes:
         count = len(seen.observation.uci_changes)
         text = f"{counted(count, 'uncommitted UCI change')} made by hand"

@@ -9,7 +9,7 @@ import pytest
 
 from meshctl.plan.values import FileChange
 from meshctl.report.changed_options import settings
-from meshctl.wording import counted, join_limited
+from meshctl.wording import counted, join_limited, lock_owners
 
 _ROOT = Path(__file__).resolve().parents[2]
 # `{count} node{'s' if count != 1 else ''}`
@@ -24,6 +24,13 @@ def test_a_count_of_one_is_singular(number: int, text: str) -> None:
 def test_a_long_list_ends_with_the_number_of_others() -> None:
     assert join_limited(["a", "b", "c"]) == "a, b, c"
     assert join_limited([f"h{number}" for number in range(75)]) == "h0, h1, h2, h3 and 71 more"
+
+
+def test_the_owner_of_a_lock_is_an_operator_and_a_process() -> None:
+    text = "change: held by ann@lap-top.local:17:4711 for another 149 s"
+    assert lock_owners(text) == "change: held by ann@lap-top.local (process 17) for another 149 s"
+    for text in ("ann@laptop", "alice@laptop:run-7", "10.42.0.11:22:5 is closed", ""):
+        assert lock_owners(text) == text
 
 
 def test_one_changed_line_without_a_setting_is_one_line() -> None:

@@ -6,6 +6,7 @@ Each format is a function of that name, from `Findings` to text, in a module of 
 from importlib import import_module
 
 from meshctl.report.findings.document import Findings
+from meshctl.report.findings.plain import summary
 
 # As the command line names them -> the module, which is imported only for its format.
 FORMATS = {"text": "plain", "json": "machine", "sarif": "sarif", "junit": "junit", "github": "annotations"}
@@ -17,4 +18,4 @@ def formatted(findings: Findings, name: str) -> str:
     return text
 
 
-__all__ = ["FORMATS", "Findings", "formatted"]
+__all__ = ["FORMATS", "Findings", "formatted", "summary"]

@@ -14,7 +14,7 @@ def text(findings: Findings) -> str:
     """Plain text without colors, one block for each finding; ends with a line end."""
     lines = findings.excerpts()
     blocks = ["\n".join(_block(item, lines)) for item in findings.diagnostics]
-    return "\n".join([*blocks, _summary(findings)]) + "\n"
+    return "\n".join([*blocks, summary(findings)]) + "\n"
 
 
 def _block(item: Diagnostic, lines: Mapping[str, Excerpts]) -> Iterator[str]:
@@ -32,7 +32,8 @@ def _block(item: Diagnostic, lines: Mapping[str, Excerpts]) -> Iterator[str]:
         yield f"  = {printable(item.hint)}"
 
 
-def _summary(findings: Findings) -> str:
+def summary(findings: Findings) -> str:
+    """`2 warnings in 1 file (1 suppressed)`."""
     count = findings.count()
     kinds = [counted(count[severity], severity.value) for severity in Severity if count[severity]]
     aside = []

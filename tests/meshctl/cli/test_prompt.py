@@ -70,5 +70,9 @@ def test_a_resumed_bootstrap_advises_connecting_unreachable_nodes_on_the_bench()
         "run 7 was a bootstrap: b01 may still have factory defaults",
         "hint: connect such a device on the bench and run `meshctl bootstrap` again",
     )
+    same = Plan("f", 0.0, ("base",), {"b02": nodes["b02"]})
+    assert bench_advice(run_of("replace"), same) == (
+        "hint: run the same `meshctl replace b02 NEW` again to record it in the inventory",
+    )
     assert bench_advice(run_of("provision"), plan) == ()
-    assert bench_advice(run_of("bootstrap"), Plan("f", 0.0, ("base",), {"b02": nodes["b02"]})) == ()
+    assert bench_advice(run_of("bootstrap"), same) == ()

@@ -221,7 +221,7 @@ def test_json_has_the_entry_and_every_difference(fleet: Path) -> None:
     [
         (("nowhere.uci", "--hardware", "rocket"), "cannot be read"),
         (("foreign.uci",), "expected --release and --board"),
-        (("foreign.uci", "--hardware", "rokcet"), "expected --release and --board"),
+        (("foreign.uci", "--hardware", "rokcet"), "no hardware profile 'rokcet': expected one of rocket"),
         (("foreign.uci", "--release", "18.06", "--board", "x"), "expected a release of 19.07"),
         (("foreign.uci", "--hardware", "rocket", "--name", "base"), "already has a node 'base'"),
         (("foreign.uci", "--hardware", "rocket", "--address", "here"), "expected an IP address"),

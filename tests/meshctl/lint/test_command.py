@@ -48,6 +48,12 @@ def test_findings_exit_with_1_and_show_their_positions(capsys: pytest.CaptureFix
     assert out.endswith("2 warnings in 1 file\n")
 
 
+def test_a_report_in_a_file_is_summarized_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _lint(_file("faulty.yaml", _FAULTY), "--format", "sarif", "--out", "lint.sarif") == 1
+    shown = capsys.readouterr()
+    assert (shown.out, shown.err) == ("", "2 warnings in 1 file: written to lint.sarif\n")
+
+
 def test_an_inventory_that_does_not_load_is_a_finding() -> None:
     assert _lint(_file("wrong.yaml", BASE.replace("channel: 6", "channel: six"))) == 1
     assert _lint(_file("broken.yaml", "a: [")) == 1

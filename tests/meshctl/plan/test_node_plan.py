@@ -101,8 +101,8 @@ def test_an_unreachable_node_is_away_with_the_reason() -> None:
         ({"uci_changes": ("network.lan.ipaddr='1.2.3.4'",)}, "it has uncommitted UCI changes"),
         ({"packages": {"dropbear": "1"}}, "it lacks batctl-default, iw, kmod-batman-adv"),
         (
-            {"change": ChangeStatus("idle", lock_owner="bob@laptop:1", lock_left_s=42.0)},
-            "locked by bob@laptop:1 for 42 more seconds",
+            {"change": ChangeStatus("idle", lock_owner="bob@laptop:17:4711", lock_left_s=42.0)},
+            "locked by bob@laptop (process 17) for 42 more seconds",
         ),
         ({"change": ChangeStatus("applied", owner="bob@laptop:1")}, "bob@laptop:1 has a change applied on it"),
     ],

@@ -13,6 +13,7 @@ import pytest
 
 from meshctl.fleet.interrupt import Interrupt
 from meshctl.fleet.process import lock_owner
+from meshctl.wording import lock_owners
 from tests.meshctl.device.servers import PATIENCE_S, eventually
 from tests.meshctl.robots.fleets import RobotFleet
 
@@ -97,14 +98,14 @@ def test_a_live_lock_blocks_other_operators_and_a_stale_lock_does_not(fleet: Rob
     claim = 'echo "{owner} $(cut -d. -f1 /proc/uptime) $(cat /proc/sys/kernel/random/boot_id)" >/opt/udp-mesh/.claim'
     fleet.shell("husky1", "mkdir -p /opt/udp-mesh && " + claim.format(owner="ann@laptop:17:4711"))
     output = fleet.deploy(exit_code=1)
-    assert "husky1 (10.42.0.10): locked by ann@laptop:17:4711" in output
+    assert "husky1 (10.42.0.10): locked by ann@laptop (process 17) for" in output
     assert "wait until it is done" in output
 
     with subprocess.Popen(["sleep", "600"]) as other:
         start = Path(f"/proc/{other.pid}/stat").read_text().rpartition(")")[2].split()[19]
         dead = f"{lock_owner().rsplit(':', 2)[0]}:{other.pid}:{start}"
         fleet.shell("husky1", claim.format(owner=dead))
-        assert f"locked by {dead}" in fleet.deploy(exit_code=1)
+        assert f"locked by {lock_owners(dead)}" in fleet.deploy(exit_code=1)
         other.kill()
         other.wait(PATIENCE_S)
     assert "husky1: done: runs " in fleet.deploy()
