@@ -22,7 +22,7 @@ from udp_mesh.bridges.configuration import BridgeConfiguration
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.names import inbound_name
-from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class
+from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class, unknown_type
 from udp_mesh.bridges.ros2.publishers import steady_timer
 from udp_mesh.bridges.ros2.quality import ros2_name
 
@@ -214,7 +214,7 @@ class Ros2Calls(MeshCalls):
             if offer.name.endswith(SEND_GOAL):
                 self._publish_events(peer, offer)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            self._warn_once("type-unknown type={} service={} {}".format(offer.type, name, error))
+            self._warn_once("{} (service {})".format(unknown_type(offer.type, error), name))
             return
         self._proxies[peer, offer.name] = proxy
 
