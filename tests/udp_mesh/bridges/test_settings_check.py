@@ -6,6 +6,9 @@ import logging
 
 import pytest
 
+from udp_mesh.bridges import mesh_calls
+from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.reduction import JpegOptions, Reduction
 from udp_mesh.bridges.ros2.interfaces import interface_class, unknown_type
 from udp_mesh.bridges.ros2.shared_graph import DoubleBridge
@@ -63,6 +66,18 @@ def test_each_line_is_logged_once_and_not_without_bound(caplog: pytest.LogCaptur
         for _ in range(2):
             lines.warn(f"line {number}" for number in range(MAX_LOGGED + 5))
     assert len(caplog.records) == MAX_LOGGED
+
+
+def test_a_service_without_a_server_is_reported_once_it_had_time_to_start(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = MeshCalls(DaemonClient("/nonexistent"), "bridge/ros1-calls", "run")
+    calls.note_missing("service", ["/get_map"])
+    assert caplog.messages == []
+    monkeypatch.setattr(mesh_calls, "PATIENCE_S", 0.0)
+    for _ in range(2):
+        calls.note_missing("service", ["/get_map"])
+    assert caplog.messages == ["not-offered service=/get_map has no server on this robot"]
 
 
 def test_a_second_bridge_is_reported_once_and_one_that_was_killed_is_not() -> None:

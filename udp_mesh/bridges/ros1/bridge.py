@@ -125,6 +125,8 @@ class Ros1Bridge:
             known = {part: key for part, key in types.items() if key is not None}
             if len(known) == len(types):
                 offers.append(offer_of(name, known, options.lost_s))
+            else:
+                self._calls.note_missing("action", [name])
         return offers
 
     def _end_lost_goals(self) -> None:

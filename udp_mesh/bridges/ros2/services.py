@@ -150,6 +150,9 @@ class Ros2Calls(MeshCalls):
                 ]
                 events += [(name + FEEDBACK, name + SEND_GOAL), (name + STATUS, name + SEND_GOAL)]
                 self._watch(name, found[name + SEND_GOAL])
+        offered = {offer.name for offer in offers}
+        self.note_missing("service", [name for name in self._options.services if name not in offered])
+        self.note_missing("action", [name for name in self._options.actions if name + SEND_GOAL not in offered])
         self._execute(self._calls.offer(offers, events))
 
     def _client(self, name: str, type_name: str) -> Any:
