@@ -137,7 +137,12 @@ class DaemonClient:
         """Declared topics. Raises MeshError."""
         rows = self.request("topics")["topics"]
         return {
-            row["name"]: MeshTopic(tuple(row.get("destinations", ())), row.get("log") is not None)
+            row["name"]: MeshTopic(
+                tuple(row.get("destinations", ())),
+                row.get("log") is not None,
+                bool(row["reliable"]),
+                row["keep_last"],
+            )
             for row in rows
             if row["configured"]
         }

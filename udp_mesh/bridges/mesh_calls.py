@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Callable, List, Set
+from typing import Callable, Iterable, List, Set
 
 from udp_mesh.bridges.call_messages import SETTINGS
 from udp_mesh.bridges.calls import CallEffect, Calls
@@ -18,6 +18,8 @@ from udp_mesh.client.mesh_client import Frame, as_message
 log = logging.getLogger(__name__)
 
 MAX_WARNED = 1000
+PATIENCE_S = 20.0
+"""For servers that start later than the bridge, before it reports that there is none."""
 
 
 class MeshCalls:
@@ -27,6 +29,7 @@ class MeshCalls:
         self._daemon, self._topic = daemon, topic
         self._calls = Calls(run)
         self._warned: Set[str] = set()
+        self._started_at = time.monotonic()
 
     def _take(self, work: Callable[[], List[CallEffect]]) -> None:
         """Executes the effects of this work, now or on another thread."""
@@ -48,6 +51,12 @@ class MeshCalls:
             self._take(lambda: self._calls.on_peer_online(str(header["peer"])))
         elif header.get("event") == "peer-offline":
             self._take(lambda: self._calls.on_peer_offline(str(header["peer"]), now))
+
+    def note_missing(self, kind: str, names: Iterable[str]) -> None:
+        """Reports services or actions of the bridge's file that have no server."""
+        if time.monotonic() - self._started_at >= PATIENCE_S:
+            for name in names:
+                self._warn_once("not-offered {}={} has no server on this robot".format(kind, name))
 
     def _warn_once(self, text: str) -> None:
         if text not in self._warned and len(self._warned) < MAX_WARNED:

@@ -42,6 +42,11 @@ def outbound_name(own: str, route: Route) -> str:
     return "/{}/{}/{}{}".format(ros_word(own), PREFIX, peer, ros_path(route.topic))
 
 
+def own_prefix(own: str) -> str:
+    """What the ROS names start with on which local nodes publish, without the last slash."""
+    return "/{}/{}".format(ros_word(own), PREFIX)
+
+
 def routes(own: str, topics: Iterable[str], peers: Iterable[str]) -> dict[str, Route]:
     """Every ROS name to subscribe to. If a broadcast topic `x/y` and topic `y` to peer `x` share a name, the peer wins.
 
@@ -62,7 +67,7 @@ def routes(own: str, topics: Iterable[str], peers: Iterable[str]) -> dict[str, R
 
 def undeclared_route(own: str, name: str, peers: Iterable[str]) -> Route | None:
     """The route of a published name whose topic is not declared; None for a name outside our own prefix."""
-    start = "/{}/{}/".format(ros_word(own), PREFIX)
+    start = own_prefix(own) + "/"
     if not name.startswith(start):
         return None
     first, _, rest = name[len(start) :].partition("/")

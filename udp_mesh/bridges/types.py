@@ -35,6 +35,13 @@ class MeshTopic(NamedTuple):
 
     destinations: tuple[str, ...] = ()
     is_log: bool = False
+    reliable: bool = True
+    keep_last: int | None = None
+
+    @property
+    def is_adaptable(self) -> bool:
+        """Whether the daemon reports what became of each message, and the newest replaces those before it."""
+        return self.reliable and self.keep_last == 1
 
 
 class LatchMark(NamedTuple):

@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import errno
 import fcntl
+import math
 import os
 import shutil
 import signal
@@ -73,7 +74,8 @@ def _follow(socket: str, path: Path) -> int:
     try:
         block.write(())
         notifier.ready("waiting for the daemon")
-        answered_s = time.monotonic()
+        answered_s = -math.inf
+        is_gone = False
         while True:
             try:
                 with MeshClient(socket) as mesh:
@@ -81,11 +83,12 @@ def _follow(socket: str, path: Path) -> int:
                     while True:
                         conflicts = block.write(_query(mesh))
                         notifier.alive(_status(block.hosts, conflicts))
-                        answered_s = time.monotonic()
+                        answered_s, is_gone = time.monotonic(), False
                         mesh.next_frame(REFRESH_S)
             except MeshError as error:
-                if block.hosts and time.monotonic() - answered_s > GONE_S:
-                    print_error(f"{error}; removing the peers from {path} until the daemon answers")
+                if not is_gone and time.monotonic() - answered_s > GONE_S:
+                    is_gone = True
+                    print_error(f"{error}; {path} has no peers until the daemon answers")
                     block.write(())
                     notifier.alive("waiting for the daemon")
             time.sleep(RECONNECT_S)

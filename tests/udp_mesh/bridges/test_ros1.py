@@ -126,6 +126,25 @@ def test_an_uninstalled_type_is_relayed_with_its_md5sum_and_definition(team: tup
     )
 
 
+def test_a_name_that_nothing_reads_and_a_second_bridge_are_reported(team: tuple[Side, Side]) -> None:
+    _, bob = team
+    bob.robot.publish("/bob/mesh_comm/maps", "for nobody")
+    second = Ros1Bridge(bob.master, bob.daemon, python=OLD_PYTHON)
+    second.log = bob.master.folder / "second-bridge.log"
+    second.start(arguments=["__name:=second"])
+    expected = [
+        (bob.bridge, "not-sent name=/bob/mesh_comm/maps "),
+        (bob.bridge, "two-bridges node=/second "),
+        (second, "two-bridges node=/mesh_bridge "),
+    ]
+    try:
+        poll(lambda: all(text in bridge.log.read_text() for bridge, text in expected) or None, "the reports")
+        # what robots read, offer or publish for each other is none of those
+        assert bob.bridge.log.read_text().count("not-sent ") == 1
+    finally:
+        second.stop()
+
+
 def test_the_first_message_of_a_topic_reaches_an_existing_subscriber(team: tuple[Side, Side]) -> None:
     alice, bob = team
     bob.robot.subscribe("/alice/mesh_comm/bob/listed")

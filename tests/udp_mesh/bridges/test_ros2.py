@@ -252,6 +252,18 @@ def test_a_killed_bridge_resumes_after_a_restart(team: tuple[Side, Side]) -> Non
         alice.node.publish_until_received(TO_BOB, data, bob.node)
 
 
+def test_a_name_that_nothing_reads_is_reported(team: tuple[Side, Side]) -> None:
+    alice, _ = team
+
+    def reported() -> bool | None:
+        alice.node.publish("/alice/mesh_comm/statsu", "for nobody")
+        return "not-sent name=/alice/mesh_comm/statsu " in alice.bridge.log.read_text() or None
+
+    poll(reported, "the report")
+    # what robots read, offer or publish for each other is none of those
+    assert alice.bridge.log.read_text().count("not-sent ") == 1
+
+
 @pytest.mark.parametrize("name", ["made_up/msg/Thing", "os/path/join", "../msg/String", "std_msgs/msg/Nothing"])
 def test_an_uninstalled_type_is_reported_and_does_not_stop_the_bridge(team: tuple[Side, Side], name: str) -> None:
     alice, bob = team

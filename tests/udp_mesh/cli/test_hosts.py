@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 
 from tests.udp_mesh.cli.conftest import Run
+from tests.udp_mesh.links.sockets import WAIT_S
 from udp_mesh.cli.hosts import MAX_FILE_BYTES, HostsBlock, _lock
 from udp_mesh.cli.hosts_file import BEGIN, HostEntry, MergedHosts, merge
 from udp_mesh.cli.main import main
 
+ROOT = Path(__file__).parents[3]
 SPOT = HostEntry("spot1", "10.42.0.12")
 
 
@@ -96,6 +100,20 @@ def test_a_second_writer_is_refused(file: Path, capsys: pytest.CaptureFixture[st
     assert f"{file}: another `udp-mesh hosts --write` keeps its names there" in capsys.readouterr().err
     assert file.read_bytes() == before
     os.close(_lock(file))
+
+
+def test_a_daemon_that_does_not_answer_is_reported_once(file: Path) -> None:
+    words = ["hosts", "--socket", str(file.with_name("none.sock")), "--write", str(file)]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "udp_mesh.cli.main", *words], stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    assert process.stderr is not None
+    line = process.stderr.readline()
+    process.terminate()
+    assert process.communicate(timeout=WAIT_S)[1] == ""
+    assert "cannot connect to the daemon at" in line
+    assert f"{file} has no peers until the daemon answers" in line
+    assert process.returncode == 0
 
 
 def test_a_missing_or_oversized_file_is_refused_with_its_name(

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 import time
-from typing import Callable
+from typing import Callable, Container, Iterable, Mapping
 
 import rosgraph
 import rospy
@@ -28,6 +29,7 @@ from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.names import (
     Route,
     outbound_name,
+    own_prefix,
     parse_topic_list,
     ros_word,
     routes,
@@ -38,10 +40,18 @@ from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros1.actions import FEEDBACK, FROM_SERVER, RESULT, STATUS, STATUS_ARRAY, Actions, offer_of
-from udp_mesh.bridges.ros1.graph import MASTER_ERRORS, Graph, Parameters, log_to_ros, parameters
+from udp_mesh.bridges.ros1.graph import (
+    MASTER_ERRORS,
+    Graph,
+    Parameters,
+    log_to_ros,
+    parameters,
+    unknown_arguments,
+)
 from udp_mesh.bridges.ros1.services import Ros1Calls
 from udp_mesh.bridges.runtime import BridgeRuntime
-from udp_mesh.bridges.types import TypeKey
+from udp_mesh.bridges.settings_check import SettingsLog, settings_without_effect, unread_names
+from udp_mesh.bridges.types import MeshTopic, TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 log = logging.getLogger(__name__)
@@ -60,6 +70,7 @@ class Ros1Bridge:
         self._daemon = daemon
         self._own = own
         self._refresh_requested = threading.Event()
+        self._options, self._log = options, SettingsLog()
         self._hosts = {str(host) for host in given.host_list}
         listed, problems = parse_topic_list(given.topic_list)
         for problem in problems:
@@ -114,6 +125,8 @@ class Ros1Bridge:
             known = {part: key for part, key in types.items() if key is not None}
             if len(known) == len(types):
                 offers.append(offer_of(name, known, options.lost_s))
+            else:
+                self._calls.note_missing("action", [name])
         return offers
 
     def _end_lost_goals(self) -> None:
@@ -173,7 +186,7 @@ class Ros1Bridge:
             self._master_gone = False
         except MASTER_ERRORS as error:
             if not self._master_gone:
-                log.warning("master-unreachable %s", error)
+                log.warning("master-unreachable uri=%s %s", rosgraph.get_master_uri(), error)
             self._master_gone = True
             return
         try:
@@ -186,8 +199,9 @@ class Ros1Bridge:
             return
         declared = [topic for topic in topics if not topic.startswith("bridge/")]
         table = routes(self._own, declared, peers)
+        published = self._published()
         if undeclared:
-            self._add_undeclared(table, peers)
+            self._add_undeclared(table, peers, published)
         with self._actions_lock:
             self._actions.peers = frozenset(peers)
             table.update(self._actions.routes())
@@ -196,13 +210,31 @@ class Ros1Bridge:
             }
         self._graph.listen(table)
         self._graph.reserve(reserved)
+        self._check(published, table, topics, peers)
 
-    def _add_undeclared(self, table: dict[str, Route], peers: set[str]) -> None:
+    def _published(self) -> dict[str, list[str]]:
+        """Names that programs of this robot publish, and their nodes; none while there is no master."""
         try:
-            published = self._graph.published()
+            return self._graph.published()
         except MASTER_ERRORS as error:
             log.debug("master-unreachable %s", error)
-            return
+            return {}
+
+    def _check(
+        self,
+        published: Mapping[str, Iterable[str]],
+        table: Container[str],
+        topics: Mapping[str, MeshTopic],
+        peers: Iterable[str],
+    ) -> None:
+        """Logs what is published or configured without effect, and a second bridge of this robot."""
+        for node in published.get("/{}/mesh_status".format(ros_word(self._own)), ()):
+            self._log.warn(["two-bridges node={} carries messages of this robot, too: each arrives twice".format(node)])
+        self._log.warn(unread_names(own_prefix(self._own) + "/", published, table, topics, peers))
+        self._log.warn(settings_without_effect(self._options.topics, self._options.reductions, topics))
+
+    def _add_undeclared(self, table: dict[str, Route], peers: set[str], published: Iterable[str]) -> None:
+        """Adds what is published under our prefix, if the daemon accepts any topic."""
         for name in published:
             route = undeclared_route(self._own, name, peers)
             if route is not None and name not in table and outbound_name(self._own, route) == name:
@@ -212,8 +244,12 @@ class Ros1Bridge:
 def main() -> int:
     """Runs until ROS or a signal stops it. Waits for a master and for the daemon."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s %(message)s")
+    unknown = unknown_arguments(sys.argv[1:])
+    if unknown:
+        log.error("argument-refused %s", unknown)
+        return 2
     try:
-        _wait_for(lambda: bool(rosgraph.is_master_online()), "master")
+        _wait_for(_master_problem, "master")
     except KeyboardInterrupt:
         return 0
     rospy.init_node("mesh_bridge")
@@ -233,14 +269,14 @@ def main() -> int:
     daemon = DaemonClient(given.socket, [*received, Receive(CONDITIONS_TOPIC)])
     own: list[str] = []
 
-    def named() -> bool:
+    def daemon_problem() -> str:
         try:
             own[:] = [daemon.node_name()]
-        except MeshError:
-            return bool(rospy.is_shutdown())
-        return True
+        except MeshError as error:
+            return "" if rospy.is_shutdown() else str(error)
+        return ""
 
-    _wait_for(named, "daemon")
+    _wait_for(daemon_problem, "daemon")
     if not own:
         return 0
     bridge = Ros1Bridge(daemon, given.hostname or own[0], given, options)
@@ -260,11 +296,21 @@ def main() -> int:
     return 0 if rospy.is_shutdown() else 1
 
 
-def _wait_for(condition: Callable[[], bool], what: str) -> None:
-    """Polls once a second until the condition is true; logs once that it waits."""
+def _master_problem() -> str:
+    """Why there is no master to connect to; "" if there is one."""
+    if rosgraph.is_master_online():
+        return ""
+    return "none answers at ROS_MASTER_URI={}".format(rosgraph.get_master_uri())
+
+
+def _wait_for(problem: Callable[[], str], what: str) -> None:
+    """Polls once a second until there is no problem; logs once that it waits, and why."""
     logged = False
-    while not condition():
+    while True:
+        text = problem()
+        if not text:
+            return
         if not logged:
-            log.info("waiting-for what=%s", what)
+            log.info("waiting-for what=%s %s", what, text)
             logged = True
         time.sleep(1.0)

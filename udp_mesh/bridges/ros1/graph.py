@@ -172,9 +172,11 @@ class Graph:
         if len(message._buff) == 1:
             on_window(message._buff[0])
 
-    def published(self) -> list[str]:
-        """Names with publishers, according to the master. Raises one of MASTER_ERRORS."""
-        return [name for name, _ in _master().getPublishedTopics("")]
+    def published(self) -> dict[str, list[str]]:
+        """Names with publishers beside this node, and these, according to the master. Raises one of MASTER_ERRORS."""
+        ours = rospy.get_name()
+        listed = {name: [node for node in nodes if node != ours] for name, nodes in _master().getSystemState()[0]}
+        return {name: nodes for name, nodes in listed.items() if nodes}
 
     # Publish
 
@@ -275,6 +277,23 @@ def parameters(default_socket: str) -> Parameters:
         str(rospy.get_param("~config", "")),
         _receive_parameter(),
     )
+
+
+def unknown_arguments(arguments: Sequence[str]) -> str:
+    """What is wrong with the command line; "" if nothing. rospy takes any `name:=value` and ignores all else.
+
+    The launch file gives the bridge a path, too, which means nothing.
+    """
+    for argument in arguments:
+        name, assigned, _ = argument.partition(":=")
+        if not assigned and argument.startswith("-"):
+            return "{}: expected _NAME:=VALUE with one of {}".format(argument, ", ".join(_PARAMETERS))
+        if assigned and name[:1] == "_" and name[1:2] != "_" and name[1:] not in _PARAMETERS:
+            return "{}: expected one of {}".format(argument, ", ".join("_" + known for known in _PARAMETERS))
+    return ""
+
+
+_PARAMETERS = Parameters._fields
 
 
 def _receive_parameter() -> list[Receive]:

@@ -116,6 +116,8 @@ class Ros1Calls(MeshCalls):
             found = self._server(name)
             if found is not None:
                 offers.append(Offer(name, found.name, found.md5sum, options.timeout_s))
+        offered = {offer.name for offer in offers}
+        self.note_missing("service", [name for name in self._services if name not in offered])
         self._take(lambda: self._calls.offer(offers))
         while self._changes:
             change = self._changes.popleft()

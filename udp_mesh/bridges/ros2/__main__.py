@@ -29,16 +29,17 @@ from udp_mesh.bridges.configuration import (
 from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, DaemonClient
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.mixed_team import ros2_type
-from udp_mesh.bridges.names import Route, ros_word, routes
+from udp_mesh.bridges.names import Route, own_prefix, ros_word, routes
 from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
 from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, common, in_order_of_arrival, quality_text, ros2_name
-from udp_mesh.bridges.ros2.shared_graph import other_bridges, shared_graph
+from udp_mesh.bridges.ros2.shared_graph import DoubleBridge, other_bridges, shared_graph
 from udp_mesh.bridges.runtime import BridgeRuntime
+from udp_mesh.bridges.settings_check import SettingsLog, settings_without_effect, unread_names
 from udp_mesh.bridges.transforms import DEFINITION, TF, TF_STATIC, TOPIC_SETTINGS, TransformGatherer
-from udp_mesh.bridges.types import TypeKey
+from udp_mesh.bridges.types import MeshTopic, TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
 try:
@@ -46,7 +47,7 @@ try:
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
     from rclpy.node import Node
 
-    from udp_mesh.bridges.ros2.interfaces import interface_class
+    from udp_mesh.bridges.ros2.interfaces import interface_class, unknown_type
     from udp_mesh.bridges.ros2.publishers import Ros2Publishers, profile, quality_of, steady_timer
     from udp_mesh.bridges.ros2.services import Ros2Calls
 except ModuleNotFoundError as error:
@@ -86,7 +87,8 @@ class Ros2Bridge:
         self._subscriptions: dict[str, tuple[TypeKey, Any]] = {}
         self._publishers = Ros2Publishers(node, self._class, self._warn_once)
         self._came_last: dict[str, dict[bytes, str]] = {}
-        self._graph = shared_graph(own, (), ())
+        self._graph, self._double = shared_graph(own, (), ()), DoubleBridge(NODE, node.get_namespace())
+        self._log = SettingsLog()
         self._warned: set[str] = set()
         self._has_conditions_package = importlib.util.find_spec(PACKAGE) is not None
         self._wake = node.create_guard_condition(self.publish_arrived)
@@ -178,10 +180,32 @@ class Ros2Bridge:
         self._came_last = {name: known for name, known in self._came_last.items() if name in table}
         for name, route in table.items():
             self._refresh_subscription(name, route)
+        self._check(found, topics, peers)
+
+    def _check(self, routed: Mapping[str, Route], topics: Mapping[str, MeshTopic], peers: Iterable[str]) -> None:
+        """Logs what is published or configured without effect."""
+        read = {ros2_name(name) for name in routed}
+        space, start = self._node.get_namespace(), ros2_name(own_prefix(self._own)) + "/"
+        published = [
+            name
+            for name, _ in self._node.get_topic_names_and_types()
+            # other publishers than this bridge, which offers peers' actions under these names
+            if name.startswith(start)
+            and name not in read
+            and self._graph.may_read(name)
+            and any(
+                (info.node_name, info.node_namespace) != (NODE, space)
+                for info in self._node.get_publishers_info_by_topic(name)
+            )
+        ]
+        self._log.warn(unread_names(start, published, read, topics, peers))
+        self._log.warn(settings_without_effect(self._options.topics, self._options.reductions, topics))
 
     def _refresh_graph(self, peers: Iterable[str]) -> None:
         """Updates which robots' bridges are in this robot's graph."""
         nodes, namespace = self._node.get_node_names_and_namespaces(), self._node.get_namespace()
+        if self._double.is_new(nodes):
+            log.error("two-bridges: another bridge of this robot is in its graph: each message arrives twice")
         known, self._graph = self._graph, shared_graph(self._own, other_bridges(nodes, NODE, namespace), peers)
         if self._graph.is_shared and self._graph != known:
             log.error(
@@ -239,7 +263,7 @@ class Ros2Bridge:
         try:
             return interface_class(name, "msg")
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            self._warn_once(name, "type-unknown type={} {}".format(name, error))
+            self._warn_once(name, unknown_type(name, error))
             return None
 
     def _warn_once(self, about: str, text: str) -> None:
@@ -262,6 +286,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--config", default="", metavar="FILE", help="the bridge's file (docs/bridges.md)")
     options, ros_arguments = parser.parse_known_args(argv)
+    # rclpy ignores what it does not know, so that a misspelled option would have no effect and no message
+    if ros_arguments and ros_arguments[0] != "--ros-args":
+        parser.error("unrecognized arguments: {} (those for ROS follow --ros-args)".format(ros_arguments[0]))
     try:
         configuration = load_configuration(options.config) if options.config else EMPTY
     except BridgeConfigurationError as error:

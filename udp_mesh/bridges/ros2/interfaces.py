@@ -33,6 +33,17 @@ def interface_class(name: str, *kinds: str) -> Any:
     return getattr(known.Impl, _PARTS[found[4]]) if found[4] else known
 
 
+def unknown_type(name: str, error: Exception) -> str:
+    """The line for the log when `interface_class` fails."""
+    advice = ""
+    if isinstance(error, (ModuleNotFoundError, AttributeError)):
+        package = name.partition("/")[0]
+        advice = ": install {} on this robot, or source the workspace that has it, and restart the bridge".format(
+            package
+        )
+    return "type-unknown type={} {}{}".format(name, error, advice)
+
+
 def failed_response(type_name: str, response: Any, text: str) -> Optional[Any]:
     """`response` as the error of a call that got none; None for a service that has no way to say so.
 

@@ -22,7 +22,7 @@ from udp_mesh.bridges.configuration import BridgeConfiguration
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.mesh_calls import MeshCalls
 from udp_mesh.bridges.names import inbound_name
-from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class
+from udp_mesh.bridges.ros2.interfaces import failed_response, interface_class, unknown_type
 from udp_mesh.bridges.ros2.publishers import steady_timer
 from udp_mesh.bridges.ros2.quality import ros2_name
 
@@ -150,6 +150,9 @@ class Ros2Calls(MeshCalls):
                 ]
                 events += [(name + FEEDBACK, name + SEND_GOAL), (name + STATUS, name + SEND_GOAL)]
                 self._watch(name, found[name + SEND_GOAL])
+        offered = {offer.name for offer in offers}
+        self.note_missing("service", [name for name in self._options.services if name not in offered])
+        self.note_missing("action", [name for name in self._options.actions if name + SEND_GOAL not in offered])
         self._execute(self._calls.offer(offers, events))
 
     def _client(self, name: str, type_name: str) -> Any:
@@ -214,7 +217,7 @@ class Ros2Calls(MeshCalls):
             if offer.name.endswith(SEND_GOAL):
                 self._publish_events(peer, offer)
         except (AttributeError, ModuleNotFoundError, ValueError) as error:
-            self._warn_once("type-unknown type={} service={} {}".format(offer.type, name, error))
+            self._warn_once("{} (service {})".format(unknown_type(offer.type, error), name))
             return
         self._proxies[peer, offer.name] = proxy
 

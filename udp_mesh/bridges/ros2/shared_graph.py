@@ -60,5 +60,24 @@ def other_bridges(nodes: Iterable[Tuple[str, str]], node: str, namespace: str) -
     return {space for name, space in nodes if name == node and space != namespace}
 
 
+class DoubleBridge:
+    """Finds a second bridge of this robot: every message would be sent and published twice.
+
+    A bridge that was killed stays in the graph for the 20 s of DDS's lease, so that one counts only after
+    `PATIENCE` looks, one a second.
+    """
+
+    PATIENCE = 30
+
+    def __init__(self, node: str, namespace: str) -> None:
+        self._own = (node, namespace)
+        self._looks = 0
+
+    def is_new(self, nodes: Iterable[Tuple[str, str]]) -> bool:
+        """Whether this look at all nodes (name, namespace) of the graph is the first that confirms it."""
+        self._looks = self._looks + 1 if sum(each == self._own for each in nodes) > 1 else 0
+        return self._looks == self.PATIENCE
+
+
 def _segment(name: str) -> str:
     return ros2_name(ros_word(name))
