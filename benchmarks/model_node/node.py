@@ -91,7 +91,7 @@ def takes_input(command: str) -> bool:
 
 
 _KINDS = (
-    ("watch", r"^mkdir -p /tmp/meshctl; \[ ! -f \S*/tmp/meshctl/forget\."),
+    ("watch", r"^mkdir -p /tmp/meshctl; pid=\$\(cat \S*/tmp/meshctl/forget\."),
     ("flush", r"(?m)^flush_(stale|restarted) "),
     ("uptime", r"^cat /proc/uptime /proc/sys/kernel/random/boot_id$"),
     ("observe", r"(?m)^\t?section done true$"),

@@ -17,7 +17,7 @@ from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
 from meshctl.inventory.csv_table import COLUMNS, NodeEdit, Row, checked, edits, read
-from meshctl.inventory.edit import Editor, FileEdit, save, set_node
+from meshctl.inventory.edit import Editor, FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
@@ -118,8 +118,7 @@ def _take_over(
 
 def _changes(inventory: Path, found: tuple[NodeEdit, ...], file: str) -> tuple[FileEdit, ...]:
     editor = Editor.open(inventory, environ=os.environ)
-    for each in found:
-        set_node(editor, each.node, dict(each.values))
+    editor.set_nodes({each.node: each.values for each in found})
     try:
         return editor.changes()
     except InvalidInput as reason:

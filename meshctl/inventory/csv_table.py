@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -41,9 +43,18 @@ _GETTERS: Mapping[str, Callable[[Node], str]] = {
 }
 COLUMNS = (NODE, *_GETTERS)
 _LISTS = ("groups",)
+# of Python's reader, for a cell that begins with a quotation mark and goes to the end of the file
+_UNCLOSED = "unexpected end of data"
 # no two devices have the same one
 _UNIQUE = (NODE, "label", "serial", "mac")
 _DELIMITERS = ",;\t"
+# as inventories, labels, barcodes and switches write it
+_MAC = re.compile(r"[0-9a-f]{2}(?:[:-]?[0-9a-f]{2}){5}|[0-9a-f]{4}(?:\.[0-9a-f]{4}){2}", re.IGNORECASE)
+# a formula, the error of one, and a number of many digits as spreadsheets shorten it
+_FORMULA, _SHORTENED = (
+    re.compile(r"=.*|#(?:REF!|N/A|NAME\?|VALUE!|DIV/0!|NULL!|NUM!)"),
+    re.compile(r"\d(?:[.,]\d+)?E\+\d+"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,20 +153,25 @@ def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) ->
             )
             errors.append(_wrong(place, key, "a node of the inventory", f"'{printable(word)}'", hint))
     if errors:
-        raise InvalidInput(errors)
+        raise InvalidInput(errors[: codes.MAX_DIAGNOSTICS])
     return tuple(found)
 
 
 def _records(text: str, file: str) -> Iterator[tuple[int, list[str]]]:
     """Each record with the line on which it starts, without empty ones."""
-    first = text.partition("\n")[0]
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=max(_DELIMITERS, key=first.count), strict=True)
+    first, newline, rest = text.partition("\n")
+    # Excel writes and reads a line that names the delimiter
+    named = re.fullmatch(r"sep=([,;\t])\r?", first, re.IGNORECASE)
+    content = rest if named and newline else text
+    delimiter = named[1] if named else max(_DELIMITERS, key=first.count)
+    reader = csv.reader(io.StringIO(content, newline=""), delimiter=delimiter, strict=True)
     while True:
-        line = reader.line_num + 1
+        line = reader.line_num + (2 if named else 1)
         try:
             cells = next(reader, None)
         except csv.Error as reason:
-            raise InvalidInput([_wrong(Position(file, line), "", "CSV", str(reason))]) from None
+            found = "a quotation mark without its end" if str(reason) == _UNCLOSED else str(reason)
+            raise InvalidInput([_wrong(Position(file, line), "", "CSV", found)]) from None
         if cells is None:
             return
         if any(cell.strip() for cell in cells):
@@ -176,16 +192,22 @@ def _columns(
         if heading in skipped or not heading:
             columns.append("")
         elif column not in COLUMNS:
-            hint = (
-                did_you_mean(column, COLUMNS) or "map it with --column COLUMN=HEADING, or skip it with --ignore HEADING"
-            )
+            meant = did_you_mean(column, COLUMNS)
+            ways = "map it with --column COLUMN=HEADING, or skip it with --ignore HEADING"
+            hint = f"{meant} If not, {ways}" if meant else ways
             errors.append(_wrong(place, "", f"a column of {', '.join(COLUMNS)}", f"'{printable(cell.strip())}'", hint))
         elif column in columns:
             errors.append(_wrong(place, column, "one column", "two"))
         else:
             columns.append(column)
-    if not errors and not {NODE, "label"} & set(columns):
-        errors.append(_wrong(place, "", "a header with a column 'node' or 'label'", "none"))
+    if not {NODE, "label"} & set(columns):
+        written = ", ".join(f"'{printable(cell.strip())}'" for cell in header if cell.strip())
+        hint = "the first line is the header; --column node=HEADING or label=HEADING names the column of the nodes"
+        expected = "a header with a column 'node' or 'label'"
+        if not any(columns):
+            # a title above the table, or no table
+            errors = []
+        errors.append(_wrong(place, "", expected, written or "none", hint if written else ""))
     if errors:
         raise InvalidInput(errors)
     return tuple(columns)
@@ -194,7 +216,10 @@ def _columns(
 def _normalized(column: str, cell: str) -> str:
     if column in _LISTS:
         return " ".join(cell.split())
-    return cell.lower().replace("-", ":") if column == "mac" else cell
+    if column == "mac" and _MAC.fullmatch(cell):
+        digits = re.sub("[:.-]", "", cell).lower()
+        return ":".join(digits[at : at + 2] for at in range(0, len(digits), 2))
+    return cell
 
 
 def _parsed(values: Mapping[str, str]) -> dict[str, Value]:
@@ -205,6 +230,9 @@ def _parsed(values: Mapping[str, str]) -> dict[str, Value]:
 def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnostic]:
     """What the inventory's format says about the values of a row."""
     for column, value in values.items():
+        if odd := _not_as_on_the_device(value):
+            yield _wrong(place, column, "the text that is on the device", *odd)
+            continue
         try:
             if column == NODE:
                 TypeAdapter(Name).validate_python(Plain(value))
@@ -214,6 +242,18 @@ def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnosti
         except ValidationError as reason:
             (error, *_) = reason.errors(include_url=False, include_input=False)
             yield _wrong(place, column, expected_value(error), f"'{printable(value)}'")
+
+
+def _not_as_on_the_device(value: str) -> tuple[str, str] | None:
+    """What a spreadsheet or a copy from a page made of a value, and what to do; None if it may be as it was."""
+    shown = f"'{printable(value)}'"
+    if _FORMULA.fullmatch(value):
+        return f"{shown}, a formula or its error", "save the sheet with values instead of formulas"
+    if _SHORTENED.fullmatch(value):
+        return f"{shown}, a number that a spreadsheet shortened", "make the column text, and enter the value again"
+    if hidden := next((each for each in value if unicodedata.category(each) == "Cf"), ""):
+        return f"{shown} with the invisible character U+{ord(hidden):04X}", "type the value instead of copying it"
+    return None
 
 
 def _repeated(rows: Iterable[Row], file: str) -> Iterator[Diagnostic]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import unified_diff
 from itertools import takewhile
@@ -91,8 +91,20 @@ class Editor:
         self._replace(
             file,
             _with_value(plain_data(root), path, parsed_data(value)),
-            self._set_text(file, root, path, value, after),
+            self._set_text(file, self._text(file), path, value, after),
         )
+
+    def set_nodes(self, values: Mapping[str, Mapping[str, Value]]) -> None:
+        """Set values of many nodes, as `set_node` does of one. A file is parsed once for each key and not for each
+        node, so that the time grows with the nodes and not with their square."""
+        known = [node for node in values if self.has(("nodes", node))]
+        added = [node for node in values if node not in set(known)]
+        while added and not self._has_entries_beside(added[0]):
+            set_node(self, added[0], values[added.pop(0)])
+        ranges = self._ranges()
+        self._set_each([(("nodes", node), dict(values[node]), _last_of(ranges, node)) for node in added])
+        for key in dict.fromkeys(key for node in known for key in values[node]):
+            self._set_each([(("nodes", node, key), values[node][key], "") for node in known if key in values[node]])
 
     def remove(self, path: tuple[str, ...]) -> None:
         """Remove the entry at `path`. Raises InputError if there is none, or the layout does not allow it."""
@@ -125,15 +137,43 @@ class Editor:
     def sibling_of(self, node: str) -> str:
         """The entry after which `node`'s own entry belongs: the range that contains it, or the last entry of a node of
         that range right below it; an empty string if no range contains it."""
-        for file in self._texts:
-            nodes = self._roots[file].values.get("nodes")
+        return _last_of(self._ranges(), node)
+
+    def _ranges(self) -> list[tuple[frozenset[str], str]]:
+        """The names of each range, and the entry after which an own entry of one of them belongs."""
+        found = []
+        for root in self._roots.values():
+            nodes = root.values.get("nodes")
             patterns = list(nodes.keys) if isinstance(nodes, MappingNode) else []
             for number, pattern in enumerate(patterns):
-                names = set(_names(pattern)) if is_range(pattern) else set()
-                if node in names:
+                if is_range(pattern):
+                    names = frozenset(_names(pattern))
                     own = takewhile(names.__contains__, patterns[number + 1 :])
-                    return [pattern, *own][-1]
-        return ""
+                    found.append((names, [pattern, *own][-1]))
+        return found
+
+    def _has_entries_beside(self, node: str) -> bool:
+        """Whether the file that gets the entry of this new node has entries of others."""
+        nodes = descend(self._roots[self._file_of(("nodes", node))], ("nodes",))
+        return isinstance(nodes, MappingNode) and bool(nodes.keys)
+
+    def _set_each(self, edits: Sequence[tuple[tuple[str, ...], Value, str]]) -> None:
+        """Set each path, in an entry of its own below `nodes`, or in a new one after the entry that is given."""
+        for file in self._texts:
+            root = self._roots[file]
+            here = [each for each in edits if self._file_of(each[0]) == file]
+            nodes = root.values.get("nodes")
+            if not here or not isinstance(nodes, MappingNode):
+                continue
+            number = {name: place for place, name in enumerate(nodes.keys)}
+            end = len(number) - 1
+            ordered = sorted(here, key=lambda each: number.get(each[2], number.get(each[0][1], end)))
+            text, meant = self._text(file), plain_data(root)
+            # from the last entry to the first: the positions of those before it stay true
+            for path, value, after in reversed(ordered):
+                meant = _with_value(meant, path, parsed_data(value))
+                text = self._set_text(file, text, path, value, after)
+            self._replace(file, meant, text)
 
     def _read(self, path: Path) -> bytes:
         text = self._texts.get(path)
@@ -151,8 +191,8 @@ class Editor:
 
         return max(self._texts, key=depth)
 
-    def _set_text(self, file: Path, root: MappingNode, path: tuple[str, ...], value: Value, after: str) -> str:
-        text = self._text(file)
+    def _set_text(self, file: Path, text: str, path: tuple[str, ...], value: Value, after: str) -> str:
+        root = self._roots[file]
         old = descend(root, path)
         if old is not None:
             parent = descend(root, path[:-1])
@@ -195,6 +235,10 @@ def set_node(editor: Editor, node: str, values: Mapping[str, Value]) -> None:
         return
     for key, value in values.items():
         editor.set(("nodes", node, key), value)
+
+
+def _last_of(ranges: Sequence[tuple[frozenset[str], str]], node: str) -> str:
+    return next((last for names, last in ranges if node in names), "")
 
 
 def set_state(editor: Editor, node: str, state: NodeState) -> None:

@@ -7,6 +7,7 @@ into known_hosts (`robot.NAME` for a robot's computer).
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -127,17 +128,18 @@ def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path:
     """A static YAML inventory (JSON is YAML). OpenWrt has no Python: the module `raw` works there, others do not."""
     groups: dict[str, dict[str, dict[str, object]]] = {}
     for entry in entries:
-        options = [f"-o HostKeyAlias={entry.alias}", f"-o UserKnownHostsFile={_quoted(known_hosts)}"]
+        options = [f"HostKeyAlias={entry.alias}", f"UserKnownHostsFile={_quoted(known_hosts)}"]
         # one private key has a variable of its own
-        options += [f"-o IdentityFile={_quoted(key_path(text))}" for text in entry.ssh.key_files[1:]]
-        options += [f"-o ProxyJump={entry.ssh.jump}"] if entry.ssh.jump else []
-        options += [f"-o {name}=+ssh-rsa" for name in _SHA1_RSA] if entry.has_sha1_rsa_only else []
+        options += [f"IdentityFile={_quoted(key_path(text))}" for text in entry.ssh.key_files[1:]]
+        options += [f"ProxyJump={entry.ssh.jump}"] if entry.ssh.jump else []
+        options += [f"{name}=+ssh-rsa" for name in _SHA1_RSA] if entry.has_sha1_rsa_only else []
         variables: dict[str, object] = {
             "ansible_host": entry.address,
             "ansible_port": entry.ssh.port,
             **({"ansible_user": entry.ssh.user} if entry.ssh.user else {}),
             **({"ansible_ssh_private_key_file": str(key_path(entry.ssh.key_files[0]))} if entry.ssh.key_files else {}),
-            "ansible_ssh_common_args": " ".join(options),
+            # Ansible splits them like a shell; the quotation marks inside are for ssh, which splits a path at blanks
+            "ansible_ssh_common_args": " ".join(f"-o {shlex.quote(option)}" for option in options),
             # `raw` asks for a terminal, which a program on a router does not need and which ends its lines with CR
             **({"ansible_ssh_use_tty": False} if entry.is_openwrt else {}),
         }

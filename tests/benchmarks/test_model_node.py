@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks.model_node.fleet import ModelFleet
 from benchmarks.model_node.node import Node, UnknownCommand, recorded_costs, recorded_sections, takes_input
+from meshctl.apply.stale_stations import StationEntry, flush_script, reconnect_script, watch_script
 
 
 def model_node() -> Node:
@@ -22,6 +23,17 @@ def model_node() -> Node:
 def test_an_unknown_command_has_no_answer() -> None:
     with pytest.raises(UnknownCommand):
         model_node().answer("rm -rf /", b"", 0.0)
+
+
+def test_what_meshctl_says_to_a_neighbor_is_known() -> None:
+    """A benchmark of chains lost these commands without a word when their scripts changed."""
+    entries = [StationEntry("n001", "wlan0", "02:00:00:00:00:01")]
+    scripts = (
+        watch_script("n002", entries, for_s=60.0),
+        flush_script(entries, older_than_s=9.0),
+        reconnect_script(entries, caught_up=1, logins={}),
+    )
+    assert all(model_node().answer(script, b"", 0.0).busy_s > 0 for script in scripts)
 
 
 def test_an_answer_takes_as_long_as_recorded_on_a_router() -> None:

@@ -11,8 +11,10 @@ from typer.testing import CliRunner, Result
 
 from meshctl.cli.main import build
 from meshctl.diagnostics import InvalidInput
-from meshctl.inventory import load_fleet
+from meshctl.inventory import edit, load_fleet
+from meshctl.inventory.codes import MAX_DIAGNOSTICS
 from meshctl.inventory.csv_table import edits, read, write
+from meshctl.inventory.tree import MappingNode
 from tests.meshctl.inventory.inventories import SHIPPED
 
 EXAMPLE = SHIPPED / "subt-final"
@@ -138,10 +140,21 @@ def test_all_wrong_values_are_reported_at_their_lines() -> None:
     ("table", "line", "text"),
     [
         ("", 1, "expected a header with a column 'node' or 'label', found none"),
-        ("serial,mac\nSN-1,\n", 1, "expected a header with a column 'node' or 'label', found none"),
+        ("serial,mac\nSN-1,\n", 1, "expected a header with a column 'node' or 'label', found 'serial', 'mac'"),
+        ("Our boxes,\nnode,serial\n", 1, "expected a header with a column 'node' or 'label', found 'Our boxes'"),
         ("node,seral\nbase,1\n", 1, "expected a column of node, label, serial"),
         ("node,serial,Serial\nbase,1,2\n", 1, "serial: expected one column, found two"),
-        ('node,serial\n"base,1\n', 2, "expected CSV, found"),
+        ('node,serial\n"base,1\n', 2, "expected CSV, found a quotation mark without its end"),
+        ('sep=;\nnode;serial\n"base;1\n', 3, "expected CSV, found a quotation mark without its end"),
+        ("node,mac\nbase,02:00:5E:00:00\n", 2, "found '02:00:5E:00:00'"),
+        (
+            'node,serial\nbase,"=""0012"""\n',
+            2,
+            """serial: expected the text that is on the device, found '="0012"', a""",
+        ),
+        ("node,mac\nbase,#N/A\n", 2, "mac: expected the text that is on the device, found '#N/A', a formula or its"),
+        ("node,serial\nbase,1.23E+11\n", 2, "found '1.23E+11', a number that a spreadsheet shortened"),
+        ("node,serial\nbase,SN\u200b1\n", 2, "with the invisible character U+200B"),
         ('node,label\n\n"base\n",\nbose,\n', 5, "node: expected a node of the inventory, found 'bose'"),
         ("node,label,serial\n,,SN-1\n", 2, "node: expected a name or a label, found neither"),
         ("label\nZZ\n", 2, "label: expected a node of the inventory, found 'ZZ'"),
@@ -166,3 +179,53 @@ def test_a_wrong_column_option_is_an_error(inventory: Path, option: str) -> None
     done = run(inventory, "node\nbase\n", "--column", option)
     assert done.exit_code == 2
     assert f"--column {option}" in done.stderr
+
+
+def test_a_heading_that_resembles_a_column_may_be_skipped(inventory: Path) -> None:
+    done = run(inventory, "node,Notes\nbase,x\n")
+    assert "did you mean 'node'? If not, map it with --column COLUMN=HEADING, or skip it" in done.stderr
+
+
+@pytest.mark.parametrize("written", ["02005E000001", "0200.5e00.0001", "02-00-5e-00-00-01"])
+def test_mac_addresses_are_read_as_labels_barcodes_and_switches_write_them(inventory: Path, written: str) -> None:
+    assert run(inventory, f"node,mac\nbase,{written}\n").exit_code == 0
+    assert load_fleet(inventory).nodes["base"].mac == "02:00:5e:00:00:01"
+
+
+def test_the_line_that_names_the_delimiter_is_no_header(inventory: Path) -> None:
+    """Excel writes it, and shows the others as a table because of it."""
+    assert run(inventory, "sep=;\r\nnode;serial\r\nbase;a,b,c\r\n").exit_code == 0
+    assert load_fleet(inventory).nodes["base"].serial == "a,b,c"
+
+
+@pytest.mark.parametrize("written", ["on", "0x10", "1e3", "00123", "~", "null", "1_000", "12:30:00", "NaN"])
+def test_what_yaml_would_read_as_something_else_stays_text(inventory: Path, written: str) -> None:
+    assert run(inventory, f"node,serial\nbase,{written}\n").exit_code == 0
+    assert load_fleet(inventory).nodes["base"].serial == written
+
+
+def test_the_errors_of_a_table_for_another_fleet_are_bounded() -> None:
+    found = errors_of("node\n" + "".join(f"x{number}\n" for number in range(5000)))
+    assert len(found) == MAX_DIAGNOSTICS
+
+
+def test_the_text_is_parsed_for_each_column_and_not_for_each_row(
+    inventory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, 5,000 rows took more than ten minutes."""
+    parsed: list[Path] = []
+
+    def counting(file: Path, text: str) -> MappingNode | None:
+        parsed.append(file)
+        return compose(file, text)
+
+    compose = edit._compose
+    monkeypatch.setattr(edit, "_compose", counting)
+    rows = "".join(f"x{number},beacon,10.42.7.{number},S{number}\n" for number in range(1, 201))
+    done = run(inventory, f"node,hardware,address,serial\nbase,,,S0\nhusky1-b01,,,S201\n{rows}", "--add")
+    assert done.exit_code == 0, done.output
+    assert len(parsed) < 10
+    nodes = load_fleet(inventory).nodes
+    assert [nodes[f"x{number}"].serial for number in range(1, 201)] == [f"S{number}" for number in range(1, 201)]
+    added = [name for name in nodes if name.startswith("x")]
+    assert added == [f"x{number}" for number in range(1, 201)]

@@ -395,3 +395,28 @@ def test_an_edit_in_any_layout_is_applied_correctly_or_rejected(
         if not what.startswith("-"):
             assert getattr(after[node], what) in ("n: w", ("r",), NodeState.SPARE)
         meant = dict(after)
+
+
+@given(
+    entries=st.lists(st.sampled_from(_ENTRIES), unique=True, max_size=8),
+    values=st.dictionaries(
+        st.sampled_from([*"abcdefhijklmno", "g1", "g2", "new1", "new2"]),
+        st.fixed_dictionaries({"label": st.just("n: w")}, optional={"state": st.just("spare")}),
+        max_size=6,
+    ),
+    tail=st.sampled_from(["", "\n  ", "topics: {}\n"]),
+)
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_many_nodes_are_set_as_one_after_the_other(
+    entries: list[str], values: dict[str, dict[str, Value]], tail: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(HEAD + "defaults: {hardware: rocket, address: 10.42.0.1}\nnodes:\n" + "".join(entries) + tail)
+    singly, together = Editor.open(tmp_path), Editor.open(tmp_path)
+    try:
+        for node, fields in values.items():
+            set_node(singly, node, fields)
+    except InputError:
+        return
+    together.set_nodes(values)
+    assert plain_data(together._roots[path]) == plain_data(singly._roots[path])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -71,6 +72,17 @@ def test_ansible_logs_in_like_openssh() -> None:
     assert {f"-o {option}" for option in options} <= set(
         host["ansible_ssh_common_args"].replace(" -o", "\n-o").split("\n")
     )
+
+
+def test_ansible_gives_ssh_a_path_with_a_blank_as_one() -> None:
+    """Before, ssh read two names of files that are not there, and knew no host."""
+    entry = HostEntry("u", "u", "10.60.0.1", SshSettings(key_files=("ed25519", "rsa")), (), is_openwrt=True)
+    text = ansible_inventory([entry], Path("/my fleet/known_hosts"), lambda name: Path("/my fleet") / name)
+    # Ansible splits the arguments with this function
+    words = shlex.split(json.loads(text)["all"]["children"]["openwrt"]["hosts"]["u"]["ansible_ssh_common_args"])
+    assert 'UserKnownHostsFile="/my fleet/known_hosts"' in words
+    done = subprocess.run(["ssh", "-F", "none", *words, "-G", "u"], capture_output=True, text=True, check=True)
+    assert "identityfile /my fleet/rsa" in done.stdout.splitlines()
 
 
 @pytest.mark.parametrize("kind", ["ssh-config", "ansible"])
