@@ -85,7 +85,7 @@ def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[st
         if by_mac and by_mac[0].name != node.name:
             raise NodeError(
                 f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}",
-                hint="exchange the cables, or name no nodes: devices are then identified by MAC",
+                hint="swap the cables, or omit the node names: devices are then identified by MAC",
             )
         if _macs(node) and not by_mac:
             expected = ", ".join(sorted(_macs(node)))

@@ -161,7 +161,7 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
 def _off(expected: Expectation, after: Observation) -> tuple[str, ...]:
     """25.12's scripts leave an interface in its cell that netifd reports as down (scripts/reload.sh, settle_radios)."""
     left = [link.ifname for link in after.links or () if link.ifname in expected.off]
-    return tuple(f"{name} is turned off, but still there" for name in left)
+    return tuple(f"{name} should be off, but still exists" for name in left)
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:

@@ -106,7 +106,7 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
 
 
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
-    rows = [("RUN", "BEGAN", "COMMAND", "FLEET", "BY", "RESULT")]
+    rows = [("RUN", "STARTED", "COMMAND", "FLEET", "BY", "RESULT")]
     rows += [
         (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.owner, one.state)
         for one in records

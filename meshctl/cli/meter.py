@@ -278,7 +278,7 @@ class _ReadingSource:
 
 def _draw(source: _ReadingSource, reading: Reading | None, size: os.terminal_size) -> list[str]:
     if reading is None:
-        return ["asking the robot's radio ... (Ctrl-C to quit)"]
+        return ["querying the robot's radio ... (Ctrl-C to quit)"]
     lines = page(source.robot, reading, size.columns, source.footer)
     paint = paint_of()
     return [

@@ -107,7 +107,7 @@ def _figures(reading: Reading) -> str:
     if reading.beacons is not None:
         parts.append(f"beacons {reading.beacons}")
     if reading.depth_left_m is not None:
-        parts.append(f"the stock carries {reading.depth_left_m:.0f} m")
+        parts.append(f"the remaining beacons cover {reading.depth_left_m:.0f} m")
     return "   ".join(parts)
 
 

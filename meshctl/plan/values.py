@@ -150,7 +150,7 @@ class StageKind(Enum):
 
     @property
     def is_simultaneous(self) -> bool:
-        """Whether its nodes change at one moment, and all of them roll back without a quorum."""
+        """Whether its nodes change simultaneously, and all of them roll back without a quorum."""
         return self in (StageKind.SWITCH, StageKind.TOGETHER)
 
 

@@ -226,7 +226,7 @@ def test_an_interface_that_is_turned_off_must_be_gone() -> None:
     before = with_a_second_interface()
     expected = expectation(wanted(fleet(), "b01"), before, [BASE])
     after = replace(before, neighbours=good().neighbours)
-    assert unmet(expected, after) == ("mesh1 is turned off, but still there",)
+    assert unmet(expected, after) == ("mesh1 should be off, but still exists",)
     assert unmet(expected, replace(after, links=good().links)) == ()
 
 
