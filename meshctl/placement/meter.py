@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from types import MappingProxyType
 
 from meshctl.placement.margin import (
     UNMEASURED_FADE_DB,
@@ -334,6 +333,3 @@ def _depth_left_m(left_m: float | None, look: Look) -> float | None:
     if look.beacons is None or look.spacing_m is None:
         return None
     return (left_m or 0.0) + look.beacons * look.spacing_m
-
-
-NO_PATHS: Mapping[str, PathBeyond] = MappingProxyType({})
