@@ -1,4 +1,4 @@
-"""What `status`, `preflight` and `topology` share: the fleet opened for reading, its radios and its robots.
+"""The read-only view of the fleet that `status`, `preflight` and `topology` share: its radios and its robots.
 
 `with_fleet_view` adds the shared options to a command; `open_fleet_view` opens the connections; `collect` takes one
 snapshot, with progress on a terminal.

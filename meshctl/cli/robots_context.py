@@ -1,4 +1,4 @@
-"""What every `meshctl robots` command opens first: a `RobotsContext` with the selected robots, connections and options.
+"""`RobotsContext`: the selected robots, connections and options that every `meshctl robots` command opens first.
 
 `with_robots_context` adds the shared options to a command and opens the context. `run_on_each` works on all robots in
 parallel; `run_journaled` also shows progress and writes the journal that `meshctl resume` reads.

@@ -1,4 +1,4 @@
-"""What the journal needs of the database that keeps it: rows out, transactions in.
+"""The interface between the journal and its database: rows out, transactions in.
 
 `SqliteFile` (one laptop, the default) and `SharedStore` (PostgreSQL, several operators) are such stores. Statements are
 written once, for both: placeholders `?` or `?1`, and only SQL that SQLite and PostgreSQL understand alike.

@@ -39,7 +39,7 @@ _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
 _PRINTED = ("label", "serial", "mac")
 
 Attributes = Mapping[str, Collection[str]]
-"""What a candidate can be selected by besides its name: attribute -> values."""
+"""Attributes that select a candidate, besides its name: attribute -> values."""
 
 K = TypeVar("K", bound=Hashable)
 

@@ -41,7 +41,7 @@ TURN_RAD = math.radians(20.0)
 TURN_WINDOW_M = 6.0
 BEHIND_TURN_M = 8.0
 FIRST_TURN_LOSS_DB = 20.0
-"""What a bend costs until the first one has been measured: the order of a rock corner at 2.4 and 5 GHz."""
+"""Assumed loss of a bend until the first one has been measured: typical of a rock corner at 2.4 and 5 GHz."""
 SLOPE_WINDOW_M = 20.0
 MIN_SLOPE_M = 5.0
 LOST_S = 2.0

@@ -1,4 +1,4 @@
-"""What a radio's chip and driver can do, as the device says, against what the inventory asks of it. Pure.
+"""Checks the abilities of a radio's chip and driver, as the device reports them, against the inventory. Pure.
 
 The inventory does not know which chip sits in a PCI slot, and ath10k differs from ath10k-ct by its firmware alone, so
 the kernel's own list decides (`iw phy`).

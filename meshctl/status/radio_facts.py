@@ -1,4 +1,4 @@
-"""What each radio measures: observation -> noise, busy time, queue, SNR and MCS of the nodes it hears. Pure."""
+"""Measurements of each radio: observation -> noise, busy time, queue, SNR and MCS of the nodes it hears. Pure."""
 
 from __future__ import annotations
 
