@@ -81,7 +81,7 @@ Options = Mapping[str, tuple[Any, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What a command works with. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
+    """The resources of a command. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
 
     fleet: Fleet
     renderer: Renderer

@@ -110,7 +110,7 @@ def open_fleet_view(
 
 
 def site_observer(opened: Session, inventory: Path) -> SiteObserver | None:
-    """What observes the nodes of sites with a worker; None if no site has one."""
+    """The observer of sites with a worker; None if no site has one."""
     if not any(site.worker_key for site in opened.fleet.sites.values()):
         return None
     # with what only sites need

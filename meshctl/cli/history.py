@@ -173,7 +173,7 @@ def _echo_wrapped(text: str) -> None:
 
 
 def _changes(journal: Journal, run_id: int) -> dict[str, tuple[FileChange, ...]]:
-    """What the run planned to change on each node; empty for runs of other commands and versions."""
+    """Planned changes of each node; empty for runs of other commands and versions."""
     saved = RunFiles(journal.path).load(run_id, CHANGES) or {}
     return {
         node: tuple(FileChange(str(path), str(kind), str(diff)) for path, kind, diff in files)

@@ -331,7 +331,7 @@ class _Watch:
             self._say({"event": "problem", "at_s": round(time.time(), 3), "text": text}, f"warning: {text}")
 
     def _report(self, frame: Frame, began: Iterable[LoggedAlarm]) -> None:
-        """What is new: the verdict when it changes, and alarms when they begin."""
+        """Changes since the previous frame: the verdict, and alarms that began."""
         self._feed.notify()
         self._warn(f"not stored: {self._sampler.store.problem}" if self._sampler.store.problem else "")
         verdict = frame.document.get("verdict") or {}

@@ -221,7 +221,7 @@ def robots_context(
 
 
 def _radios(opened: Session) -> RadioKnowledge:
-    """What is known of radios from the fleet's pins and the journal, for the robots' collectors."""
+    """Known facts about radios, from the fleet's pins and the journal, for the robots' collectors."""
 
     def names() -> dict[str, str]:
         return known_macs(opened.fleet, opened.journal.last_known(opened.fleet.name))

@@ -99,7 +99,7 @@ class WirelessLink:
 
 @dataclass(frozen=True, slots=True)
 class RadioChip:
-    """What a radio can do, whatever it is configured for (`iw phy`, /sys/class/ieee80211)."""
+    """The abilities of a radio, regardless of its configuration (`iw phy`, /sys/class/ieee80211)."""
 
     phy: str
     """By its number, as `WirelessLink.phy`: `phy0`."""

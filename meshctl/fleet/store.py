@@ -54,7 +54,7 @@ class Store(Protocol):
 
     @property
     def notice(self) -> str:
-        """What the operator has to know about the entries of this process; empty: all are where they belong."""
+        """A note for the operator about the entries of this process; empty if all are in the database."""
 
     def read(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """The rows of a query. Raises MeshctlError."""

@@ -46,7 +46,7 @@ K = TypeVar("K", bound=Hashable)
 
 @dataclass(frozen=True, slots=True)
 class _Subject:
-    """What is selected: `what` names a candidate in messages, `hint` follows the error for an unknown name, and
+    """The kind of candidates: `what` names one in messages, `hint` follows the error for an unknown name, and
     `unmanaged` are nodes that a user may name although they are no candidates, with their states."""
 
     what: str

@@ -89,7 +89,7 @@ def _sighting(one: Sighting) -> str:
 def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
 ) -> dict[str, LastSeen]:
-    """What the other nodes' observations and the journal say about each of `names`."""
+    """Last known facts about each of `names`, from the other nodes' observations and the journal."""
     missing = tuple(names)
     others = {name: seen for name, seen in observations.items() if name not in missing}
     reports = [report_of(name, seen) for name, seen in others.items()]

@@ -55,7 +55,7 @@ Position = tuple[float, float, float]
 
 
 class Advice(Enum):
-    """What the operator should do; the value is what the display says."""
+    """The advice to the operator; the value is the displayed text."""
 
     GO = "GO"
     DROP_SOON = "DROP SOON"
@@ -121,7 +121,7 @@ class Reading:
     last_good: Position | None = None
     back_m: float | None = None
     turn_loss_db: float = FIRST_TURN_LOSS_DB
-    """What the bends of this mine have cost so far."""
+    """The loss at bends of this mine so far."""
     beacons: int | None = None
     depth_left_m: float | None = None
     """How much deeper the stock of beacons carries: the meters left plus one spacing for each beacon."""
@@ -135,7 +135,7 @@ class _Hop:
     link_margin_db: float
     path_margin_db: float
     fresh_db: float
-    """What the last two samples have above the needed ratio, without allowance."""
+    """The excess of the last two samples over the needed ratio, without allowance."""
     hops: int
     least_snr_db: float
 

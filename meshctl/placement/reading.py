@@ -120,7 +120,7 @@ def line(robot: str, reading: Reading) -> str:
 
 
 def words(reading: Reading) -> str:
-    """What is spoken."""
+    """The text to speak."""
     if reading.advice is Advice.TURN_BACK:
         back = "" if not reading.back_m else f", {reading.back_m:.0f} meters"
         return f"turn back{back}"

@@ -22,7 +22,7 @@ _NAMES = {"adhoc": "ad-hoc mode", "mesh": "802.11s", "ap": "access point mode", 
 def lacking_abilities(
     node: Node, seen: Observation, before: Package | None, desired: Package | None
 ) -> tuple[str, ...]:
-    """What the desired wireless configuration asks of the node's radios and they cannot do: one text each.
+    """Requirements of the desired wireless configuration that the node's radios cannot meet: one text each.
 
     A radio that the device does not describe is left out; `before` is its present configuration.
     """

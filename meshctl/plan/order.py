@@ -25,7 +25,7 @@ _LAST_OF_SEVERAL = "last, because each is the entry to its own mesh"
 
 @dataclass(frozen=True, slots=True)
 class MeshContext:
-    """What the order depends on besides the plans: the observed meshes, their entry nodes, the policy, the robots."""
+    """Inputs of the order besides the plans: the observed meshes, their entry nodes, the policy, the robots."""
 
     graph: Graph
     entries: tuple[str, ...]

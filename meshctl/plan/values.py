@@ -18,7 +18,7 @@ class Verdict(Enum):
 
 
 class Cut(IntEnum):
-    """What a change interrupts while it takes effect, the least first."""
+    """The interruption that a change causes while it takes effect, the least first."""
 
     NOTHING = 0
     # new SSH logins, for about a second

@@ -28,7 +28,7 @@ STEEP_DB = 20.0
 
 
 class Need(NamedTuple):
-    """What the mission needs of the link."""
+    """The mission's requirements of the link."""
 
     bits_per_s: float
     priority: int

@@ -198,7 +198,7 @@ def _generation(htmode: str) -> str:
 
 
 def _limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
-    """What keeps the node's radio from the htmode: its driver, its release."""
+    """The reason why the node's radio cannot use the htmode: its driver, its release."""
     wanted = _generation(htmode)
     if wanted not in _GENERATIONS:
         return

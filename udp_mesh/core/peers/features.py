@@ -1,4 +1,4 @@
-"""Features that peers accept: whether one may be used, and a message without those that its receiver does not accept."""
+"""Features that peers accept: whether one may be used, and messages without those that a receiver does not accept."""
 
 from __future__ import annotations
 
