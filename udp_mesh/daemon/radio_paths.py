@@ -130,8 +130,8 @@ class RadioReport:
         }
 
 
-def _age_s(one: RadioPath | RadioNeighbor, now: float) -> float:
-    return round(max(0.0, now - one.measured_at), 3)
+def _age_s(entry: RadioPath | RadioNeighbor, now: float) -> float:
+    return round(max(0.0, now - entry.measured_at), 3)
 
 
 def with_radio(conditions: Json, report: RadioReport | None, now: float) -> Json:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import asked
+from meshctl.inventory.suggest import suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.openwrt_names import one_edit_apart
@@ -106,7 +106,7 @@ def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if near or radio.driver.isdigit():
                 path = ("hardware", profile.name, "radios", radio.name, "driver")
                 expected = " or ".join(near) or "a driver such as ath9k"
-                yield Finding(path, "unknown driver", expected, radio.driver, asked(near))
+                yield Finding(path, "unknown driver", expected, radio.driver, suggestion(near))
 
 
 @fleet_rule(

@@ -184,6 +184,6 @@ def as_set(ranges: Ranges | list[tuple[int, int]]) -> RangeSet:
     return result
 
 
-def intersection(one: RangeSet, other: RangeSet) -> RangeSet:
+def intersection(a: RangeSet, b: RangeSet) -> RangeSet:
     """The numbers in both sets."""
-    return as_set(one.without(as_set(one.without(other))))
+    return as_set(a.without(as_set(a.without(b))))
