@@ -227,26 +227,20 @@ class StationFlush:
         holders = self._possible_holders(now, self.radios)
         holders = {name: entries for name, entries in holders.items() if name not in self._watching | self._restarting}
         answers = self._flush(holders, since_s)
-        unverified = [name for name, answer in answers.items() if UNKNOWN in answer.split()]
+        unverified = {name: holders[name] for name, answer in answers.items() if UNKNOWN in answer.split()}
         if unverified and now is not None:
-            self._flush_seen(unverified, holders, now, since_s)
+            self._flush_seen(unverified, now, since_s)
         self._unanswered = {name: entries for name, entries in holders.items() if name not in answers}
         if self._unanswered:
             self.unfinished.append(self)
 
-    def _flush_seen(
-        self,
-        unverified: Sequence[str],
-        holders: Mapping[str, tuple[StationEntry, ...]],
-        now: Observation,
-        since_s: float,
-    ) -> None:
+    def _flush_seen(self, unverified: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float) -> None:
         """Holders that cannot verify their entries remove those of the radios that were observed to restart."""
         restarted = observed_restarts(self.ctx.before, now, time.monotonic() - since_s)
         if not restarted:
             return
         macs = frozenset(radio_macs(self.ctx.before, restarted)) | frozenset(radio_macs(now, restarted))
-        entries = {name: tuple(e for e in holders[name] if e.mac.lower() in macs) for name in unverified}
+        entries = {name: tuple(e for e in held if e.mac.lower() in macs) for name, held in unverified.items()}
         self._flush({name: matching for name, matching in entries.items() if matching}, since_s, has_restarted=True)
 
     def _possible_holders(self, now: Observation | None, radios: Radios) -> dict[str, tuple[StationEntry, ...]]:

@@ -306,8 +306,7 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             name = written.removeprefix("-")
             if name not in judged:
                 judged[name] = suggest_packages(name)
-            meant = judged[name]
-            if meant:
+            if meant := judged[name]:
                 yield Finding(
                     packages_path(node, written), "unknown package", " or ".join(meant), name, suggestion(meant)
                 )
