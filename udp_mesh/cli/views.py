@@ -229,7 +229,7 @@ def relays_view(relaying: Json) -> list[str]:
         by_cause = f" ({_listed(causes)})" if dropped else ""
         lines += [
             "",
-            f"relay: {counted(counters['passed_on'], 'datagram')} passed on ({size(counters['passed_on_bytes'])}), "
+            f"relay: {counted(counters['passed_on'], 'datagram')} forwarded ({size(counters['passed_on_bytes'])}), "
             f"{dropped} dropped{by_cause}, {size(relaying['queued_bytes'])} queued",
         ]
     return lines
