@@ -1,4 +1,4 @@
-"""What `udp-mesh sim sweep` and `meshctl lab sweep` have in common, from parsed options to the exit code."""
+"""The common part of `udp-mesh sim sweep` and `meshctl lab sweep`, from parsed options to the exit code."""
 
 from __future__ import annotations
 

@@ -4,4 +4,4 @@ from __future__ import annotations
 
 
 class SweepError(ValueError):
-    """What is wrong and what to do, one line per problem. Raised by a case, it stops the whole sweep."""
+    """A problem and its remedy, one line each. Raised by a case, it stops the whole sweep."""

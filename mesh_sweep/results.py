@@ -24,7 +24,7 @@ NOTHING: Figures = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What all results of one file have in common: the scenario, and the code that simulated it."""
+    """The header of a results file: the scenario, and the code that simulated it."""
 
     scenario: str
     scenario_sha256: str

@@ -1,4 +1,4 @@
-"""What the parts of a running fleet share: the state of its nodes, and the calls that act on a node.
+"""Shared state of a running fleet: its nodes, and the calls that act on a node.
 
 The supervisor owns both. Link state, port forwarding, fault injection and the control socket get them as arguments, so
 that none of these needs the supervisor itself.

@@ -50,7 +50,7 @@ class FadingField:
 
 @dataclass(slots=True)
 class RobotTotals:
-    """What arrived of one robot. `silent_since_s` is when its last report arrived."""
+    """The reports received from one robot. `silent_since_s` is when its last report arrived."""
 
     sent: int = 0
     arrived: int = 0

@@ -1,4 +1,4 @@
-"""What each OpenWrt release looks like from a shell: versions, package tool, packages of its image.
+"""Each OpenWrt release as seen from a shell: versions, package manager, packages of its image.
 
 Version and revision strings are those of the release builds on downloads.openwrt.org; batman-adv's are from
 docs/facts/openwrt-facts.md section 10. Packages of a virtual image have the release's version: nothing depends on it.

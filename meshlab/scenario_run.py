@@ -23,7 +23,7 @@ STATION_EXPIRY_S = 20.0
 
 
 class ScenarioTarget(Protocol):
-    """What a scenario needs from a fleet."""
+    """The interface that a scenario needs from a fleet."""
 
     @property
     def names(self) -> tuple[str, ...]:

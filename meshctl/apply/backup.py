@@ -103,7 +103,7 @@ def unconfirmed(node: str, before: ChangeStatus | None, after: ChangeStatus) -> 
         return ""
     owner = after.owner or ("" if before is None else before.owner)
     who = f"{owner} changes it" if owner else "it was changed"
-    return f"{node}: {who} while it is backed up, and may take that back: nothing was saved"
+    return f"{node}: {who} while it is backed up, and may roll that back: nothing was saved"
 
 
 def with_info(archive: bytes, info: Mapping[str, object], extra: Mapping[str, bytes] = MappingProxyType({})) -> bytes:

@@ -66,38 +66,38 @@ class FoundDevice:
     old_pins: tuple[HostKey, ...] = ()
 
 
-def identify(fleet: Fleet, seen: Observation, said: str, identified: Iterable[str] = ()) -> Node:
-    """The node this device is: by MAC, or by the name that the operator gave (`said`) where the inventory has no MAC.
+def identify(fleet: Fleet, seen: Observation, requested_name: str, identified: Iterable[str] = ()) -> Node:
+    """The node this device is: by MAC, or by `requested_name`, the operator's, where the inventory has no MAC.
 
-    Raises NodeError for a device that is another node than `said`, or that cannot be identified.
+    Raises NodeError for a device that is another node than `requested_name`, or that cannot be identified.
     """
     macs = {mac.lower() for mac in (seen.macs or {}).values()}
     if seen.board is not None and seen.board.label_mac:
         macs.add(seen.board.label_mac.lower())
     # a radio may be recorded by its address in the mesh, which differs from the factory one
-    others = {other for link in seen.links or () for other in alternate_macs(link.mac)}
-    by_mac = [node for node in fleet.managed() if _macs(node) & (macs | others)]
-    shown = ", ".join(sorted(macs)) or "none"
+    alternates = {other for link in seen.links or () for other in alternate_macs(link.mac)}
+    by_mac = [node for node in fleet.managed() if _macs(node) & (macs | alternates)]
+    macs_text = ", ".join(sorted(macs)) or "none"
     if len(by_mac) > 1:
-        raise NodeError(f"its MACs ({shown}) belong to several nodes: {', '.join(node.name for node in by_mac)}")
-    if said:
-        node = fleet.nodes[said]
+        raise NodeError(f"its MACs ({macs_text}) belong to several nodes: {', '.join(node.name for node in by_mac)}")
+    if requested_name:
+        node = fleet.nodes[requested_name]
         if by_mac and by_mac[0].name != node.name:
             raise NodeError(
                 f"wrong device: expected {node.name}, its MAC belongs to {by_mac[0].name}",
-                hint="exchange the cables, or name no nodes: devices are then identified by MAC",
+                hint="swap the cables, or omit the node names: devices are then identified by MAC",
             )
         if _macs(node) and not by_mac:
             expected = ", ".join(sorted(_macs(node)))
             raise NodeError(
-                f"wrong device: {node.name} has MAC {expected}, this one has {shown}",
+                f"wrong device: {node.name} has MAC {expected}, this one has {macs_text}",
                 hint=f"connect {node.name}, or correct its `mac` in the inventory",
             )
     elif by_mac:
         node = by_mac[0]
     else:
         raise NodeError(
-            f"cannot identify the node: no node of the inventory has one of its MACs ({shown})",
+            f"cannot identify the node: no node of the inventory has one of its MACs ({macs_text})",
             hint="name the node (`meshctl bootstrap NODE`), or add its MAC to the inventory",
         )
     if node.name in set(identified):

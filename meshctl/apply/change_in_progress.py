@@ -195,7 +195,7 @@ def await_first_boot(ctx: NodeContext, connection: SshConnection) -> None:
                 raise NodeError(
                     f"{ctx.name}: its first boot has not ended within {FIRST_BOOT_TIMEOUT_S / 60:.0f} minutes; "
                     "nothing was changed",
-                    hint="power-cycle it, then run again; if it stays so, an init script of its image hangs",
+                    hint="power-cycle it, then run again; if that does not help, an init script of its image hangs",
                 )
             backoff.pause()
 

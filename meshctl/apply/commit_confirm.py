@@ -167,7 +167,7 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
         with suppress(NodeError):
             abort(change, connection)
         unlock(change, connection)
-        return Outcome(name, Result.FAILED, f"its link breaks before the change is armed: {change.last_error}")
+        return Outcome(name, Result.FAILED, f"its link fails before the change is armed: {change.last_error}")
     try:
         if move is Action.START:
             arm(change, connection)

@@ -23,7 +23,7 @@ from meshctl.topology import mesh_macs
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """What all nodes of a run share, complete before the first node is changed.
+    """Shared by all nodes of a run, complete before the first node is changed.
 
     `owner` identifies this process in the nodes' locks. `new_listener` makes the listener of a change on one node that
     restarts the given radios. `observations` were made before any change, of the plan's nodes and their meshes.

@@ -35,7 +35,7 @@ _UNKNOWN_PROTOCOL = "INVALID_PROTO"
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What must hold after the change. `neighbors` are the MACs heard before, `base_macs` the MACs of the base's mesh
+    """Conditions after the change. `neighbors` are the MACs heard before, `base_macs` the MACs of the base's mesh
     radios, both empty on the bench; `off` are radio interfaces that the change turns off; `needs` are packages, for a
     change of packages."""
 
@@ -52,7 +52,7 @@ class Expectation:
 
 
 def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[str] = ()) -> Expectation:
-    """What this node must have after the change; the base only if it was reachable through the mesh before."""
+    """Conditions for this node after the change; the base only if it was reachable through the mesh before."""
     trees = {file.package.name: file.package for file in desired.files if file.package is not None}
     originators = {entry.mac.lower() for entry in before.originators or ()}
     wireless = trees.get("wireless")
@@ -161,7 +161,7 @@ def _radios(expected: Expectation, after: Observation) -> tuple[str, ...]:
 def _off(expected: Expectation, after: Observation) -> tuple[str, ...]:
     """25.12's scripts leave an interface in its cell that netifd reports as down (scripts/reload.sh, settle_radios)."""
     left = [link.ifname for link in after.links or () if link.ifname in expected.off]
-    return tuple(f"{name} is turned off, but still there" for name in left)
+    return tuple(f"{name} should be off, but still exists" for name in left)
 
 
 def _radio(iface: Section, channel: str, after: Observation) -> list[str]:

@@ -22,7 +22,7 @@ def checked_image(profile: HardwareProfile) -> Path:
 
 
 class CheckedImages:
-    """What is wrong with images, each read once."""
+    """Faults of firmware images, each of which is read once."""
 
     def __init__(self) -> None:
         self._faults: dict[str, str] = {}

@@ -308,7 +308,7 @@ def _confirmed_outcome(participant: Participant) -> Outcome:
     )
 
 
-def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
+def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
     """Roll the reachable nodes back, then poll them all. Nodes that go back to another cell do so the farthest first,
     so that the path to the others lasts."""
     unmet = {
@@ -345,16 +345,16 @@ def _roll_back(commit: _MeshCommit, why: str) -> dict[str, Outcome]:
         participant.name: _rolled_back_outcome(
             ended.get(participant.name),
             participant.name,
-            f"{'all nodes were' if commit.is_together else 'the whole mesh was'} rolled back: {why}",
+            f"{'all nodes were' if commit.is_together else 'the whole mesh was'} rolled back: {reason}",
             unmet.get(participant.name, ""),
         )
         for participant in commit.participants
     }
 
 
-def _rolled_back_outcome(outcome: Outcome | None, name: str, why: str, gap: str) -> Outcome:
+def _rolled_back_outcome(outcome: Outcome | None, name: str, reason: str, gap: str) -> Outcome:
     if outcome is None:
-        return Outcome(name, Result.PENDING, why)
+        return Outcome(name, Result.PENDING, reason)
     if outcome.result is Result.ROLLED_BACK:
-        return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (why, gap))))
+        return Outcome(name, Result.ROLLED_BACK, "; ".join(filter(None, (reason, gap))))
     return outcome

@@ -71,7 +71,7 @@ def with_full_flash(outcome: Outcome, flash: Space | None, needed_bytes: int) ->
 
 
 def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) -> list[str]:
-    there = []
+    paths = []
     # files of an earlier attempt would only fill the memory
     names = "|".join(f"{quoted(file.name)}|.{quoted(file.name)}.*.part" for file in files)
     connection.run(
@@ -80,15 +80,15 @@ def _upload(ctx: NodeContext, connection: SshConnection, files: Sequence[Path]) 
     for file in files:
         path = f"{DIRECTORY}/{file.name}"
         upload(connection, file, path, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress)
-        there.append(path)
-    return there
+        paths.append(path)
+    return paths
 
 
 def _new_change(
     ctx: NodeContext, connection: SshConnection, script: str, *, has_other_supplicant: bool
 ) -> ChangeInProgress:
     """A change of packages alone: the node keeps its address, and must hear its neighbors again."""
-    here = replace(connection.endpoint, identity=ctx.name)
+    endpoint = replace(connection.endpoint, identity=ctx.name)
     expected = Expectation(neighbors=ctx.expected.neighbors, base_macs=ctx.expected.base_macs, needs=ctx.desired.needs)
     reload = _RELOAD + (_RESTART_RADIOS if has_other_supplicant else "exit 0\n")
     return ChangeInProgress(
@@ -96,8 +96,8 @@ def _new_change(
         Change(new_change_id(), {}, reload, extra=script, covered=_configuration(ctx.before)),
         new_nonce(),
         ctx.node.confirm_window_s,
-        here,
-        (here,),
+        endpoint,
+        (endpoint,),
         extra_s=INSTALL_TIMEOUT_S,
         radios=EVERY_RADIO if has_other_supplicant else NO_RADIOS,
     )

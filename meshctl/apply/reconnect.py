@@ -102,7 +102,7 @@ def repaired(
     unreachable: Iterable[str],
     owners: Mapping[str, str],
 ) -> Reconnected:
-    """What the holders' answers say. One that has not answered may have done its part and lost its own link meanwhile,
+    """The holders' results. One that has not answered may have done its part and lost its own link meanwhile,
     if it has restarted: its nodes are tried again, too. Pure."""
     without_mac = set(unreachable) - set(owners.values())
     by_text: dict[tuple[str, str], list[str]] = {}

@@ -155,7 +155,7 @@ def require_off(connections: ConnectionPool, trust: TrustStore, old: Node, spare
 
 def still_on(old: Node, where: str) -> NodeError:
     return NodeError(
-        f"{old.name} still answers at {where}: two nodes with one address conflict",
+        f"{old.name} still answers at {where}: two nodes must not have the same address",
         hint="switch the old device off first",
     )
 

@@ -1,4 +1,4 @@
-"""What became of the nodes an earlier run left uncertain: its outcomes and a new plan -> one line per node."""
+"""The current state of nodes that an earlier run left uncertain: its outcomes and a new plan -> one line per node."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class EarlierState:
 
 
 def before_state(plan: NodePlan, desired: DesiredState, seen: Observation) -> EarlierState:
-    """What the node's managed files are before its plan is executed."""
+    """The contents of the node's managed files before its plan is executed."""
     files: list[EarlierFile] = []
     for file in desired.files:
         info, text = file_info(file.path, seen), text_of(file.path, seen)

@@ -224,32 +224,30 @@ class StationFlush:
         if since_s is None or not self.radios:
             return
         self._since_s = since_s
-        asked = self._possible_holders(now, self.radios)
-        asked = {name: entries for name, entries in asked.items() if name not in self._watching | self._restarting}
-        answers = self._flush(asked, since_s)
-        unsure = [name for name, said in answers.items() if UNKNOWN in said.split()]
-        if unsure and now is not None:
-            self._flush_seen(unsure, asked, now, since_s)
-        self._unanswered = {name: entries for name, entries in asked.items() if name not in answers}
+        holders = self._possible_holders(now, self.radios)
+        holders = {name: entries for name, entries in holders.items() if name not in self._watching | self._restarting}
+        answers = self._flush(holders, since_s)
+        unverified = {name: holders[name] for name, answer in answers.items() if UNKNOWN in answer.split()}
+        if unverified and now is not None:
+            self._flush_seen(unverified, now, since_s)
+        self._unanswered = {name: entries for name, entries in holders.items() if name not in answers}
         if self._unanswered:
             self.unfinished.append(self)
 
-    def _flush_seen(
-        self, unsure: Sequence[str], asked: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float
-    ) -> None:
+    def _flush_seen(self, unverified: Mapping[str, tuple[StationEntry, ...]], now: Observation, since_s: float) -> None:
         """Holders that cannot verify their entries remove those of the radios that were observed to restart."""
         restarted = observed_restarts(self.ctx.before, now, time.monotonic() - since_s)
         if not restarted:
             return
         macs = frozenset(radio_macs(self.ctx.before, restarted)) | frozenset(radio_macs(now, restarted))
-        entries = {name: tuple(e for e in asked[name] if e.mac.lower() in macs) for name in unsure}
-        self._flush({name: some for name, some in entries.items() if some}, since_s, has_restarted=True)
+        entries = {name: tuple(e for e in held if e.mac.lower() in macs) for name, held in unverified.items()}
+        self._flush({name: matching for name, matching in entries.items() if matching}, since_s, has_restarted=True)
 
     def _possible_holders(self, now: Observation | None, radios: Radios) -> dict[str, tuple[StationEntry, ...]]:
         """Nodes known to hold a station entry of these radios, then nodes that may hold one on any interface: those not
         observed, and new neighbors."""
         run_context, ctx = self.ctx.run, self.ctx
-        asked = by_holder(entries_of(self.node, run_context.observations, radios))
+        holders = by_holder(entries_of(self.node, run_context.observations, radios))
         observed_macs = {
             mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
         }
@@ -264,12 +262,12 @@ class StationFlush:
         macs = tuple(dict.fromkeys(mac for some in own for mac in some))
         for name in others:
             if name != self.node and name in run_context.fleet.nodes:
-                asked.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
-        return {name: asked[name] for name in list(asked)[:MAX_QUERIED] if asked[name]}
+                holders.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
+        return {name: holders[name] for name in list(holders)[:MAX_QUERIED] if holders[name]}
 
     def _flush(
         self,
-        asked: Mapping[str, Sequence[StationEntry]],
+        holders: Mapping[str, Sequence[StationEntry]],
         since_s: float,
         *,
         has_restarted: bool = False,
@@ -278,7 +276,7 @@ class StationFlush:
         """Have these holders remove stale entries; returns the answers."""
         scripts = {
             name: partial(_flush_since, entries, since_s, has_restarted=has_restarted, login=login)
-            for name, entries in asked.items()
+            for name, entries in holders.items()
         }
         answers = self._query("flush neighbor station entries", scripts)
         self.report(answers)
@@ -290,10 +288,10 @@ class StationFlush:
             (GONE, "removed a stale entry of its radio"),
             (KEPT, "cannot remove its stale entry" + MAY_LOSE),
         ):
-            news = [name for name, said in answers.items() if word in said.split() and name not in self._reported]
-            if news:
-                self._reported.update(news)
-                self.ctx.run.note(f"{_listed(news)} {text}", self.node)
+            nodes = [name for name, answer in answers.items() if word in answer.split() and name not in self._reported]
+            if nodes:
+                self._reported.update(nodes)
+                self.ctx.run.note(f"{_listed(nodes)} {text}", self.node)
 
     def own_lines(self, answer: str) -> str:
         """The lines of an answer that concern this node's radios."""
@@ -371,7 +369,7 @@ def _query_all(run_context: RunContext, scripts: Mapping[str, Script]) -> dict[s
     """The output of each node that answered in time."""
     with ThreadPoolExecutor(max_workers=min(len(scripts), MAX_QUERIED), thread_name_prefix="flush") as pool:
         answers = pool.map(lambda name: _query_one(run_context, name, scripts[name]), scripts)
-        return {name: said for name, said in zip(scripts, answers, strict=True) if said is not None}
+        return {name: answer for name, answer in zip(scripts, answers, strict=True) if answer is not None}
 
 
 def _query_one(run_context: RunContext, name: str, script: Script) -> str | None:

@@ -168,11 +168,11 @@ def not_back(name: str, hardware: HardwareProfile, last_error: str, *, interrupt
     return Outcome(name, Result.UNCERTAIN, reason, hint=f"{hint}{recovery}")
 
 
-def why_not_flashed(upgrade: openwrt.Upgrade, said: str, *, after_s: float) -> str | None:
+def why_not_flashed(upgrade: openwrt.Upgrade, output: str, *, after_s: float) -> str | None:
     """Why a node that has not booted since sysupgrade began will not be flashed. None: it may yet be, however long that
     takes on a slow processor."""
     if upgrade is openwrt.Upgrade.ENDED:
-        return f"its sysupgrade has failed{f': {said}' if said else ''}"
+        return f"its sysupgrade has failed{f': {output}' if output else ''}"
     if upgrade is openwrt.Upgrade.NOT_STARTED and after_s > START_TIMEOUT_S:
         return "no sysupgrade runs on it"
     return None

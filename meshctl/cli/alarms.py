@@ -137,7 +137,7 @@ def silence_alarm(
     code: Code,
     reason: Annotated[str, typer.Option("--reason", help="Why; shown with the alarm.")],
     for_time: Annotated[
-        str | None, typer.Option("--for", metavar="TIME", help="How long, such as 30m, 2h or 1d; default: for good.")
+        str | None, typer.Option("--for", metavar="TIME", help="Duration, such as 30m, 2h or 1d; default: forever.")
     ] = None,
     by: By = None,
     inventory: InventoryPath = Path(),

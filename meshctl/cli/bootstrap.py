@@ -199,7 +199,10 @@ def replace(
     at_site: AtSite = "",
     inventory: InventoryPath = Path(),
     old_is_off: Annotated[
-        bool, typer.Option("--old-is-off", help="Do not look whether the old device answers: its site is out of reach.")
+        bool,
+        typer.Option(
+            "--old-is-off", help="Do not check whether the old device still answers: its site is unreachable."
+        ),
     ] = False,
     dry_run: DryRun = False,
     yes: Yes = False,
@@ -312,7 +315,7 @@ def _require_off(opened: Session, inventory: Path, old: Node, spare: Node | None
     except NodeError as error:
         if error.gateway_of:
             hint = f"pass --old-is-off if you know that it is{f'; {error.hint}' if error.hint else ''}"
-            raise NodeError(f"whether {old.name} is off is not known: {error}", hint=hint) from error
+            raise NodeError(f"cannot determine whether {old.name} is off: {error}", hint=hint) from error
         raise
 
 

@@ -1,4 +1,4 @@
-"""What every command that talks to nodes opens first, and the options that commands share.
+"""The context that every command opens to reach nodes, and the options that commands share.
 
 `session` opens the fleet, its secrets, host keys and journal; `chosen` selects nodes by name or pattern; `progress_for`
 selects how a run is shown; `exit_for` turns outcomes into an exit code.
@@ -81,7 +81,7 @@ Options = Mapping[str, tuple[Any, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What a command works with. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
+    """The resources of a command. `owner` names this process in the nodes' locks; `lab` is set for a virtual fleet."""
 
     fleet: Fleet
     renderer: Renderer

@@ -282,7 +282,7 @@ def _secret_files(target: ImportTarget, made: DeviceImport) -> dict[Path, Secret
 
 
 def _lint_errors(target: ImportTarget, made: DeviceImport) -> tuple[Diagnostic, ...]:
-    """What `meshctl lint` will call an error, and the inventory did not have before."""
+    """New errors that `meshctl lint` will report."""
     context = LintContext(load_regdb(), DiskFiles())
     errors = tuple(each for each in lint(made.fleet, context) if each.severity is Severity.ERROR)
     if not errors or target.fleet is None:

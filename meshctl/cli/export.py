@@ -103,7 +103,7 @@ def _write_labels(
     if paper not in SHEETS:
         raise InputError(f"--sheet {paper}: no such label paper", hint=f"expected one of {', '.join(SHEETS)}")
     if out is None and sys.stdout.isatty():
-        raise InputError("a PDF on a terminal is of no use", hint="give --out labels.pdf")
+        raise InputError("not writing a PDF to a terminal", hint="give --out labels.pdf")
     trust = trust_of(fleet)
     found = labels(chosen, lambda name: tuple(key.fingerprint for key in trust.pinned(name)))
     content = draw(found, SHEETS[paper], skip=skip, outlines=outlines)

@@ -1,4 +1,4 @@
-"""What `status`, `preflight` and `topology` share: the fleet opened for reading, its radios and its robots.
+"""The read-only view of the fleet that `status`, `preflight` and `topology` share: its radios and its robots.
 
 `with_fleet_view` adds the shared options to a command; `open_fleet_view` opens the connections; `collect` takes one
 snapshot, with progress on a terminal.
@@ -110,7 +110,7 @@ def open_fleet_view(
 
 
 def site_observer(opened: Session, inventory: Path) -> SiteObserver | None:
-    """What observes the nodes of sites with a worker; None if no site has one."""
+    """The observer of sites with a worker; None if no site has one."""
     if not any(site.worker_key for site in opened.fleet.sites.values()):
         return None
     # with what only sites need

@@ -106,7 +106,7 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
 
 
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
-    rows = [("RUN", "BEGAN", "COMMAND", "FLEET", "BY", "RESULT")]
+    rows = [("RUN", "STARTED", "COMMAND", "FLEET", "BY", "RESULT")]
     rows += [
         (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.owner, one.state)
         for one in records
@@ -173,7 +173,7 @@ def _echo_wrapped(text: str) -> None:
 
 
 def _changes(journal: Journal, run_id: int) -> dict[str, tuple[FileChange, ...]]:
-    """What the run planned to change on each node; empty for runs of other commands and versions."""
+    """Planned changes of each node; empty for runs of other commands and versions."""
     saved = RunFiles(journal.path).load(run_id, CHANGES) or {}
     return {
         node: tuple(FileChange(str(path), str(kind), str(diff)) for path, kind, diff in files)

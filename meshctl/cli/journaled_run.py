@@ -93,7 +93,7 @@ def _claim(opened: Session, entry: Run, command: str, names: Sequence[str]) -> N
     )
     raise NodesClaimed(
         f"nothing was changed: {text}",
-        hint="wait for the end of that run (`meshctl history --follow`), or leave these out",
+        hint="wait until that run ends (`meshctl history --follow`), or exclude these nodes",
     )
 
 

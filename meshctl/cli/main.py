@@ -99,7 +99,7 @@ def user_defaults(environ: MutableMapping[str, str]) -> Defaults | None:
 
 
 def default_map(defaults: Defaults | None, requested: str, command: Any) -> dict[str, Any] | None:
-    """What the user's file says about the requested command, for click."""
+    """Defaults of the requested command from the user's file, for click."""
     if defaults is None or requested not in COMMANDS:
         return None
     return {requested: defaults.for_command(requested, command.commands[requested])}

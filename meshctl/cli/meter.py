@@ -236,7 +236,7 @@ class _ReadingSource:
 
     @property
     def footer(self) -> str:
-        """What the looks cost, and what is wrong."""
+        """The airtime cost of the queries, and the latest problem."""
         cost = "?" if self.bytes_per_s is None else f"{self.bytes_per_s / 1000:.1f}"
         problem = self.watch.problem() or self._note or self.sound_problem
         return f"queries cost {cost} kB/s on the air; Ctrl-C to quit{f'; {problem}' if problem else ''}"
@@ -278,7 +278,7 @@ class _ReadingSource:
 
 def _draw(source: _ReadingSource, reading: Reading | None, size: os.terminal_size) -> list[str]:
     if reading is None:
-        return ["asking the robot's radio ... (Ctrl-C to quit)"]
+        return ["querying the robot's radio ... (Ctrl-C to quit)"]
     lines = page(source.robot, reading, size.columns, source.footer)
     paint = paint_of()
     return [

@@ -101,11 +101,11 @@ def monitor(
     keep_days: Annotated[
         float,
         typer.Option(
-            "--keep-days", min=0.01, max=36_500, metavar="DAYS", help="Remove what is older from the history."
+            "--keep-days", min=0.01, max=36_500, metavar="DAYS", help="Remove older snapshots from the history."
         ),
     ] = DEFAULT_DAYS,
     max_mb: Annotated[
-        int, typer.Option("--max-mb", min=16, metavar="MB", help="Largest size of the history.")
+        int, typer.Option("--max-mb", min=16, metavar="MB", help="Maximum size of the history.")
     ] = DEFAULT_MB,
     once: Annotated[bool, typer.Option("--once", help="Take one snapshot, store and print it, and exit.")] = False,
     replay: Annotated[
@@ -331,7 +331,7 @@ class _Watch:
             self._say({"event": "problem", "at_s": round(time.time(), 3), "text": text}, f"warning: {text}")
 
     def _report(self, frame: Frame, began: Iterable[LoggedAlarm]) -> None:
-        """What is new: the verdict when it changes, and alarms when they begin."""
+        """Changes since the previous frame: the verdict, and alarms that began."""
         self._feed.notify()
         self._warn(f"not stored: {self._sampler.store.problem}" if self._sampler.store.problem else "")
         verdict = frame.document.get("verdict") or {}

@@ -20,7 +20,7 @@ _HINTS = {
     401: "check NETBOX_TOKEN",
     403: "check NETBOX_TOKEN and what it permits",
     404: "give the address of NetBox's start page, without /api",
-    429: "wait a while, then repeat the command",
+    429: "try again later",
 }
 
 
@@ -51,7 +51,7 @@ def fetch(
             interfaces += _records(api, url, "interfaces", query)
     except pynetbox.RequestError as error:
         status = error.req.status_code
-        hint = _HINTS.get(status, "look into NetBox's log, or that of the proxy in front of it")
+        hint = _HINTS.get(status, "check the log of NetBox, or of the proxy in front of it")
         raise InputError(f"{url}: NetBox refused the request: {_reason(error)}", hint=hint) from error
     except pynetbox.ContentError as error:
         raise InputError(f"{url}: the answer is not JSON: is this NetBox?") from error

@@ -62,7 +62,8 @@ AcceptCut = Annotated[
 Together = Annotated[
     bool,
     typer.Option(
-        "--together", help="Change all nodes of running meshes at one moment; all roll back unless a quorum is healthy."
+        "--together",
+        help="Change all nodes of running meshes simultaneously; all roll back unless a quorum is healthy.",
     ),
 ]
 Brief = Annotated[bool, typer.Option("--brief/--full", help="Hide file diffs.")]
@@ -210,7 +211,10 @@ def resume(
     yes: Yes = False,
     together: Annotated[
         bool | None,
-        typer.Option("--together/--in-order", help="All at one moment, or stage by stage; default: as the run was."),
+        typer.Option(
+            "--together/--in-order",
+            help="All nodes simultaneously, or stage by stage; default: as in the original run.",
+        ),
     ] = None,
     leave_behind: LeaveBehind = "",
     accept_cut: AcceptCut = "",

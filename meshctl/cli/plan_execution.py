@@ -92,7 +92,7 @@ def saved_plan(opened: Session, prepared: Prepared, choices: PlanOptions) -> Sav
 
 
 def prepare_agreed(opened: Session, saved: SavedPlan, *, reconnects: bool) -> Prepared:
-    """What still applies of a saved plan."""
+    """The part of a saved plan that still applies."""
     fresh = prepare_plan(
         opened, list(saved.plan.nodes), PlanOptions(saved.with_firmware), saved.salt, reconnects=reconnects
     )

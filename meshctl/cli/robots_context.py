@@ -1,4 +1,4 @@
-"""What every `meshctl robots` command opens first: a `RobotsContext` with the selected robots, connections and options.
+"""`RobotsContext`: the selected robots, connections and options that every `meshctl robots` command opens first.
 
 `with_robots_context` adds the shared options to a command and opens the context. `run_on_each` works on all robots in
 parallel; `run_journaled` also shows progress and writes the journal that `meshctl resume` reads.
@@ -221,7 +221,7 @@ def robots_context(
 
 
 def _radios(opened: Session) -> RadioKnowledge:
-    """What is known of radios from the fleet's pins and the journal, for the robots' collectors."""
+    """Known facts about radios, from the fleet's pins and the journal, for the robots' collectors."""
 
     def names() -> dict[str, str]:
         return known_macs(opened.fleet, opened.journal.last_known(opened.fleet.name))

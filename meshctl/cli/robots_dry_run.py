@@ -52,7 +52,7 @@ def exit_for_dry_run(context: RobotsContext, work: RobotTask) -> typer.Exit:
 
 
 def deploy_differences(context: RobotsContext) -> RobotTask:
-    """What a deploy would change."""
+    """The changes that a deploy would make."""
 
     def work(host: Host, robot: str) -> Outcome:
         plan = plan_deploy(host, robot, context.options)
@@ -65,7 +65,7 @@ def deploy_differences(context: RobotsContext) -> RobotTask:
 
 
 def command_differences(command: str, *, purge: bool = False) -> RobotTask:
-    """What `restart`, `stop`, `rollback` or `uninstall` would change."""
+    """The changes that `restart`, `stop`, `rollback` or `uninstall` would make."""
     describe: Callable[[RobotFacts], tuple[str, ...]] = {
         "restart": lambda facts: _service_changes(facts, "restart"),
         "stop": lambda facts: _service_changes(facts, "stop"),

@@ -1,4 +1,4 @@
-"""What `plan` and `apply` at a site exchange with the worker that starts them: files beside its part of the inventory.
+"""Files that `plan` and `apply` at a site exchange with the worker that starts them, next to its part of the inventory.
 
 They have the nodes' keys. Like the part itself, they are deleted when the run is over, so a gateway keeps no key of a
 node: the operator's computer has what a run replaced, and sends it along with a rollback.

@@ -141,7 +141,7 @@ def prepare_everywhere(
 
 
 def prepare_saved(opened: Session, inventory: Path, saved: SavedSitePlans, file: str, *, reconnects: bool) -> WholePlan:
-    """What still applies of saved plans; the workers check those of their sites. Raises InputError."""
+    """The parts of saved plans that still apply; the workers check those of their sites. Raises InputError."""
     check_placement(saved, opened.fleet, file)
     nodes = {name: tuple(plan.plan.nodes) for name, plan in saved.sites.items()}
     _check_meshes(opened, nodes)

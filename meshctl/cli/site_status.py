@@ -33,7 +33,7 @@ _SHOWN_LEVELS = ("error", "warning")
 
 @dataclass(frozen=True, slots=True)
 class SiteStatus:
-    """What one site said: its worker's `greeting`, or the `error` instead; `nodes` is a status as JSON."""
+    """One site's answer: its worker's `greeting`, or the `error` instead; `nodes` is a status as JSON."""
 
     site: Site
     greeting: Greeting | None = None

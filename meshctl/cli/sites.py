@@ -209,7 +209,7 @@ def cancel_command(
             if uplink.cancel(run):
                 echo(f"{site}: the order of run {run} is deleted; nothing was changed")
                 return
-    echo(f"{site}: no order of run {run} waits: the site has fetched it, or it was never given")
+    echo(f"{site}: no order of run {run} waits: the site has fetched it, or it was never sent")
     raise typer.Exit(ExitCode.FINDINGS)
 
 

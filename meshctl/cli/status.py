@@ -118,7 +118,7 @@ class _StatusQuery:
         return snapshot
 
     def answers(self) -> dict[str, object]:
-        """What the nodes say, for the operator that asked a site's worker."""
+        """The nodes' answers, for the operator that queried a site's worker."""
         from meshctl.status.site_observer import answers_json
 
         collector = self._fleet_view.collector

@@ -50,7 +50,7 @@ class CommandEnded(ConnectionLost):
 
 
 class IncompatibleServer(NodeError):
-    """What answered is not an SSH server, or has no algorithm in common with us."""
+    """The peer is not an SSH server, or supports no algorithm that we do."""
 
 
 class HostKeyUnknown(NodeError):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class FileState:
-    """What changes when a file is replaced or written: identity, size, time of the last change."""
+    """Identity, size and time of the last change of a file: differs once the file is replaced or written."""
 
     device: int
     inode: int

@@ -99,7 +99,7 @@ class WirelessLink:
 
 @dataclass(frozen=True, slots=True)
 class RadioChip:
-    """What a radio can do, whatever it is configured for (`iw phy`, /sys/class/ieee80211)."""
+    """The abilities of a radio, regardless of its configuration (`iw phy`, /sys/class/ieee80211)."""
 
     phy: str
     """By its number, as `WirelessLink.phy`: `phy0`."""
@@ -121,8 +121,6 @@ class Station:
     mac: str
     signal_dbm: int | None = None
     inactive_ms: int | None = None
-    rx_bytes: int | None = None
-    tx_bytes: int | None = None
     tx_packets: int | None = None
     tx_retries: int | None = None
     tx_failed: int | None = None
@@ -134,7 +132,6 @@ class Station:
     signal_avg_dbm: int | None = None
     chain_signals_dbm: tuple[int, ...] = ()
     """Of the last frame, by receive chain."""
-    rx_packets: int | None = None
     tx_mcs: str = ""
     """As iw writes it: `MCS 15`, `VHT-MCS 8 NSS 2`; empty for a rate without one."""
     rx_mcs: str = ""
@@ -157,8 +154,6 @@ class ChannelSurvey:
     noise_dbm: int | None = None
     active_ms: int | None = None
     busy_ms: int | None = None
-    receive_ms: int | None = None
-    transmit_ms: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +171,9 @@ class NetInterface:
     name: str
     up: bool
     pending: bool
-    proto: str
     device: str = ""
     addresses: tuple[str, ...] = ()
-    """IPv4 with prefix length: `10.42.0.11/24`."""
+    """With prefix length, IPv4 first: `10.42.0.11/24`."""
     errors: tuple[str, ...] = ()
 
 

@@ -44,7 +44,7 @@ OBSERVE_TIMEOUT_S = 90.0
 
 @dataclass(frozen=True, slots=True)
 class RawObservation:
-    """What observe.sh printed on a node, before it is parsed: sections between lines with `nonce`."""
+    """Output of observe.sh on a node, before it is parsed: sections between lines with `nonce`."""
 
     nonce: str
     output: bytes = field(repr=False)

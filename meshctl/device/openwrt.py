@@ -178,7 +178,7 @@ def start_sysupgrade(connection: Connection, image_path: str, config_path: str) 
 
 
 class Upgrade(Enum):
-    """What has become of a `sysupgrade` that was started, on a node that still runs the previous firmware."""
+    """State of a `sysupgrade` that was started, on a node that still runs the previous firmware."""
 
     NOT_STARTED = "not started"
     RUNNING = "running"

@@ -176,7 +176,7 @@ def _handshake(
                 raise IncompatibleServer(f"{endpoint.label}: {error}") from error
             except paramiko.SSHException as error:
                 if any(word in str(error) for word in ("protocol version", "SSH banner", "codec can't decode")):
-                    raise IncompatibleServer(f"{endpoint.label}: what answers is not an SSH server") from error
+                    raise IncompatibleServer(f"{endpoint.label}: not an SSH server") from error
                 raise
         remote = transport.get_remote_server_key()
         trust.check(endpoint, HostKey(remote.get_name(), remote.asbytes()))

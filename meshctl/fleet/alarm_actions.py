@@ -1,4 +1,4 @@
-"""What operators do about alarms, passed to the monitors of the others through a shared journal.
+"""Operators' actions on alarms, shared with other operators' monitors through a shared journal.
 
 An action goes into the database, or into the spool while that is out of reach; every monitor takes the actions of its
 fleet that it has not seen. Their order in the database decides, not the clocks of the computers.

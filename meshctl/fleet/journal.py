@@ -151,7 +151,7 @@ class Journal:
 
     @property
     def notice(self) -> str:
-        """What the operator has to know about entries that are not where they belong."""
+        """A note for the operator about entries that are not in the journal's database; empty if all are."""
         return self._store.notice
 
     def wait_for_change(self, timeout_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""What a run changed, beside the journal: one directory per run, `$XDG_STATE_HOME/meshctl/runs/RUN`.
+"""The files that a run changed, stored next to the journal: one directory per run, `$XDG_STATE_HOME/meshctl/runs/RUN`.
 
 `changes` are the differences per node, with secrets masked; `before` are the files that the run replaced, which
 `meshctl rollback` writes back. The latter hold the nodes' keys: they are readable by their owner only, and removed

@@ -52,7 +52,7 @@ _MERGE_BATCH = 500
 
 
 class Spool:
-    """What this computer keeps for databases that were out of reach; `target` is the label of one."""
+    """Entries kept on this computer for unreachable databases; `target` is the label of one."""
 
     def __init__(self, journal: Path) -> None:
         self._path = journal.with_name("shared.sqlite")

@@ -219,7 +219,7 @@ class SqliteFile:
             self._database.close()
 
     def _hint(self, error: Exception) -> str:
-        """What to do if the file cannot be used; empty if its content is at fault."""
+        """A hint if the file cannot be used; empty if its content is at fault."""
         if _is_locked(error):
             return "another process has locked it: run `fuser` with its path to find that process"
         if isinstance(error, OSError) or _primary(error) in _UNWRITABLE:

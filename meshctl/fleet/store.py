@@ -1,4 +1,4 @@
-"""What the journal needs of the database that keeps it: rows out, transactions in.
+"""The interface between the journal and its database: rows out, transactions in.
 
 `SqliteFile` (one laptop, the default) and `SharedStore` (PostgreSQL, several operators) are such stores. Statements are
 written once, for both: placeholders `?` or `?1`, and only SQL that SQLite and PostgreSQL understand alike.
@@ -54,7 +54,7 @@ class Store(Protocol):
 
     @property
     def notice(self) -> str:
-        """What the operator has to know about the entries of this process; empty: all are where they belong."""
+        """A note for the operator about the entries of this process; empty if all are in the database."""
 
     def read(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """The rows of a query. Raises MeshctlError."""

@@ -53,7 +53,7 @@ _ROUTES = frozenset({("network", "route"), ("network", "route6")})
 
 
 class Fate(Enum):
-    """What becomes of an option or section when the node is provisioned."""
+    """The effect of provisioning on an option or section."""
 
     CHANGED = "changed"
     REMOVED = "removed"

@@ -219,7 +219,7 @@ def _holding(meshes: Mapping[str, str], draft: _Draft, address: IpInterface) -> 
 
 
 def _identity(draft: _Draft, name: str) -> dict[str, Value]:
-    """What names the device, and what the operator said of it."""
+    """The device's identity, and the operator's choices for it."""
     device, options, fleet = draft.device, draft.options, draft.fleet
     section = next(device.package("system").of_type("system"), Section("system"))
     label = options.label or section.get("description")

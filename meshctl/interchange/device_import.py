@@ -23,7 +23,7 @@ Load = Callable[[Mapping[Path, Value]], Fleet]
 
 @dataclass(frozen=True, slots=True)
 class DeviceImport:
-    """What to write for one device, and what becomes of its configuration."""
+    """The edits for one device, and the fate of its configuration."""
 
     name: str
     values: Mapping[Path, Value]
@@ -33,7 +33,7 @@ class DeviceImport:
     differences: tuple[Difference, ...]
     untouched: tuple[str, ...]
     unreadable: tuple[str, ...]
-    """What is wrong with a file that is not UCI and that meshctl does not write."""
+    """The error of a file that is not UCI and that meshctl does not write."""
     assumed: tuple[str, ...]
 
     def of(self, fate: Fate) -> tuple[Difference, ...]:

@@ -67,7 +67,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class NodeEdit:
-    """What a row sets on a node; `is_new` for a node that the inventory does not have."""
+    """The values that a row sets on a node; `is_new` for a node that the inventory does not have."""
 
     node: str
     line: int
@@ -126,7 +126,7 @@ def checked(rows: Iterable[Row], file: str) -> tuple[Row, ...]:
 
 
 def edits(rows: Iterable[Row], fleet: Fleet, file: str, *, add: bool = False) -> tuple[NodeEdit, ...]:
-    """What to set on each node, where it differs from the inventory. A row names its node by `node`, else by `label`.
+    """The edits of each node that differs from the inventory. A row names its node by `node`, else by `label`.
 
     `add` allows nodes that the inventory does not have. Raises InvalidInput with all rows that name no node.
     """
@@ -228,7 +228,7 @@ def _parsed(values: Mapping[str, str]) -> dict[str, Value]:
 
 
 def _errors_of(values: Mapping[str, str], place: Position) -> Iterator[Diagnostic]:
-    """What the inventory's format says about the values of a row."""
+    """Errors of a row's values by the inventory's format."""
     for column, value in values.items():
         if odd := _not_as_on_the_device(value):
             yield _wrong(place, column, "the text that is on the device", *odd)

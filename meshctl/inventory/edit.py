@@ -337,14 +337,14 @@ def _without_key(old: object, path: tuple[str, ...]) -> object:
     return {key: _without_key(item, path[1:]) if key == path[0] else item for key, item in old.items()}
 
 
-def _equal_data(one: object, other: object) -> bool:
+def _equal_data(left: object, right: object) -> bool:
     """Whether two values are equal, ignoring key order; text that could be a number must be quoted in both."""
-    match one, other:
+    match left, right:
         case dict(), dict():
-            return one.keys() == other.keys() and all(_equal_data(one[key], other[key]) for key in one)
+            return left.keys() == right.keys() and all(_equal_data(left[key], right[key]) for key in left)
         case list(), list():
-            return len(one) == len(other) and all(map(_equal_data, one, other))
+            return len(left) == len(right) and all(map(_equal_data, left, right))
         case str(), str():
-            return one == other and (isinstance(one, Plain) == isinstance(other, Plain) or is_bare(one))
+            return left == right and (isinstance(left, Plain) == isinstance(right, Plain) or is_bare(left))
         case _:
-            return one is None and other is None
+            return left is None and right is None

@@ -165,26 +165,28 @@ class _FileMerger:
     def _merge(self, root: MappingNode, below: MappingNode) -> None:
         """Add the keys of an included file; mappings in both are merged key by key."""
         for key, value in below.values.items():
-            here = root.values.get(key)
-            if key == "include" or (key == "meshctl" and here is not None and _same_text(here, value)):
+            existing = root.values.get(key)
+            if key == "include" or (key == "meshctl" and existing is not None and _same_text(existing, value)):
                 continue
-            if here is None or (isinstance(here, Scalar) and here.is_null):
+            if existing is None or (isinstance(existing, Scalar) and existing.is_null):
                 root.keys[key], root.values[key] = below.keys[key], value
-            elif isinstance(here, MappingNode) and isinstance(value, MappingNode):
-                joined = MappingNode(here.file, here.line, here.column, here.start, here.end, here.is_flow)
-                joined.keys.update(here.keys)
-                joined.values.update(here.values)
+            elif isinstance(existing, MappingNode) and isinstance(value, MappingNode):
+                joined = MappingNode(
+                    existing.file, existing.line, existing.column, existing.start, existing.end, existing.is_flow
+                )
+                joined.keys.update(existing.keys)
+                joined.values.update(existing.values)
                 self._join(key, joined, value)
                 root.values[key] = joined
             elif not (isinstance(value, Scalar) and value.is_null):
                 self._clash(key, root.keys[key], below.keys[key])
 
-    def _join(self, section: str, here: MappingNode, other: MappingNode) -> None:
+    def _join(self, section: str, existing: MappingNode, other: MappingNode) -> None:
         for key, value in other.values.items():
-            if key in here.values:
-                self._clash(f"{section}.{key}", here.keys[key], other.keys[key])
+            if key in existing.values:
+                self._clash(f"{section}.{key}", existing.keys[key], other.keys[key])
             else:
-                here.keys[key], here.values[key] = other.keys[key], value
+                existing.keys[key], existing.values[key] = other.keys[key], value
 
     def _clash(self, path: str, first: Scalar, second: Scalar) -> None:
         self.diagnostics.append(
@@ -199,5 +201,5 @@ class _FileMerger:
         )
 
 
-def _same_text(one: Tree, other: Tree) -> bool:
-    return isinstance(one, Scalar) and isinstance(other, Scalar) and one.text == other.text
+def _same_text(left: Tree, right: Tree) -> bool:
+    return isinstance(left, Scalar) and isinstance(right, Scalar) and left.text == right.text

@@ -39,14 +39,14 @@ _MAC = re.compile(r"(?:[0-9a-f]{2}:){5}[0-9a-f]{2}", re.IGNORECASE)
 _PRINTED = ("label", "serial", "mac")
 
 Attributes = Mapping[str, Collection[str]]
-"""What a candidate can be selected by besides its name: attribute -> values."""
+"""Attributes that select a candidate, besides its name: attribute -> values."""
 
 K = TypeVar("K", bound=Hashable)
 
 
 @dataclass(frozen=True, slots=True)
 class _Subject:
-    """What is selected: `what` names a candidate in messages, `hint` follows the error for an unknown name, and
+    """The kind of candidates: `what` names one in messages, `hint` follows the error for an unknown name, and
     `unmanaged` are nodes that a user may name although they are no candidates, with their states."""
 
     what: str

@@ -12,16 +12,16 @@ _MIN_SIMILARITY = 0.65
 _MAX_NAMES = 3
 
 
-def nearest(wrong: str, known: Iterable[str]) -> tuple[str, ...]:
-    """The known names most similar to `wrong`, all that are equally near; none if they are more than three."""
+def nearest(word: str, known: Iterable[str]) -> tuple[str, ...]:
+    """The known names most similar to `word`, all that are equally near; none if they are more than three."""
     # Longer names are not typos, and the comparison is quadratic in their length.
-    return () if len(wrong) > 64 else _nearest(wrong, tuple(known))
+    return () if len(word) > 64 else _nearest(word, tuple(known))
 
 
 @lru_cache(maxsize=256)
-def _nearest(wrong: str, names: tuple[str, ...]) -> tuple[str, ...]:
+def _nearest(word: str, names: tuple[str, ...]) -> tuple[str, ...]:
     lowered = {name.lower(): name for name in names}
-    written = wrong.lower()
+    written = word.lower()
     exact = lowered.get(written.replace("-", "_"))
     if exact is not None:
         return (exact,)
@@ -32,12 +32,12 @@ def _nearest(wrong: str, names: tuple[str, ...]) -> tuple[str, ...]:
     return near if len(near) <= _MAX_NAMES else ()
 
 
-def did_you_mean(wrong: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known: Iterable[str]) -> str:
     """`did you mean 'channel'?`, or an empty string."""
-    return asked(nearest(wrong, known))
+    return suggestion(nearest(word, known))
 
 
-def asked(names: Sequence[str]) -> str:
+def suggestion(names: Sequence[str]) -> str:
     """`did you mean 'b01', 'b02' or 'b03'?`; empty without names."""
     quoted = [f"'{name}'" for name in names]
     return f"did you mean {' or '.join(filter(None, (', '.join(quoted[:-1]), quoted[-1])))}?" if quoted else ""

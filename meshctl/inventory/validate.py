@@ -151,7 +151,7 @@ def _place(root: MappingNode, path: tuple[int | str, ...], *, is_key: bool) -> P
 
 
 def expected_value(error: ErrorDetails) -> str:
-    """What one of pydantic's errors expected, for `expected ...` in a message."""
+    """The expected value of a pydantic error, for `expected ...` in a message."""
     kind = error["type"]
     context: Mapping[str, Any] = error.get("ctx", {})
     if kind == "model_type" and context.get("class_name") == SecretDocument.__name__:

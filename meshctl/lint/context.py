@@ -1,4 +1,4 @@
-"""What rules may use besides the fleet: the regulatory database, files, secrets."""
+"""Inputs of rules besides the fleet: the regulatory database, files, secrets."""
 
 from __future__ import annotations
 

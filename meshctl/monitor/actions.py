@@ -1,4 +1,4 @@
-"""What the page may start with --allow-actions: meshctl's own commands, each prepared, shown, and confirmed.
+"""Actions that the page may start with --allow-actions: meshctl's own commands, each prepared, shown, and confirmed.
 
 `prepare` runs the command that changes nothing (`plan`, `--dry-run`); `confirm` carries out exactly what was shown if
 the operator typed the device's name. A command runs as its own process, so a job survives neither more nor less than

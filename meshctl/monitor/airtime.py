@@ -1,4 +1,4 @@
-"""What watching costs on the air: bytes by device and a status document -> share of the channel's time. Pure.
+"""Airtime cost of monitoring: bytes by device and a status document -> share of the channel's time. Pure.
 
 A byte to a node three hops away is sent three times on one channel. Its time there follows from the rate that the node
 expects of its next hop (minstrel's expected throughput: losses and medium access are in it), else from the bit rate.

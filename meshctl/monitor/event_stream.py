@@ -99,7 +99,7 @@ class EventStreams:
             news = await run_in_threadpool(self._news)
 
     def _missed(self, sent_s: float, latest: Frame | None) -> tuple[Frame, ...]:
-        """What a browser that has seen `sent_s` has missed before `latest`."""
+        """The frames between `sent_s`, the last one a browser has seen, and `latest`."""
         if latest is None or not math.isfinite(sent_s):
             return ()
         return tuple(

@@ -49,7 +49,7 @@ class Airtime:
 
 @dataclass(frozen=True, slots=True)
 class FrameSummary:
-    """What the store indexes, so that a timeline needs no document. `go` is None if it was not assessed."""
+    """The indexed values, so that a timeline needs no document. `go` is None if it was not assessed."""
 
     go: bool | None
     errors: int

@@ -71,11 +71,19 @@ def _frame(document: Document) -> Iterator[MetricFamily]:
     fleet = document.get("fleet")
     rows: tuple[tuple[str, str, object], ...] = (
         ("meshctl_frame_timestamp_seconds", "When the fleet was last queried (Unix time).", document.get("time_s")),
-        ("meshctl_frame_duration_seconds", "How long that took.", document.get("took_s")),
-        ("meshctl_go", "1 for go, 0 for no-go.", verdict.get("go")),
-        ("meshctl_watch_bytes_per_second", "Bytes that watching sends and receives.", airtime.get("bytes_per_s")),
-        ("meshctl_watch_airtime_ratio", "Share of the channel's time that watching takes.", airtime.get("share")),
-        ("meshctl_watch_interval_seconds", "Time between two looks.", airtime.get("interval_s")),
+        ("meshctl_frame_duration_seconds", "Duration of the latest query of the fleet.", document.get("took_s")),
+        ("meshctl_go", "1 if preflight says go, 0 for no-go.", verdict.get("go")),
+        (
+            "meshctl_watch_bytes_per_second",
+            "Bytes per second that monitoring sends and receives.",
+            airtime.get("bytes_per_s"),
+        ),
+        (
+            "meshctl_watch_airtime_ratio",
+            "Share of the channel's airtime that monitoring takes, 0 to 1.",
+            airtime.get("share"),
+        ),
+        ("meshctl_watch_interval_seconds", "Interval between queries of the fleet.", airtime.get("interval_s")),
     )
     for name, text, value in rows:
         family = MetricFamily(name, "gauge", text)
@@ -89,15 +97,19 @@ def _nodes(nodes: Iterable[_Device], status: Document) -> Iterator[MetricFamily]
     age = MetricFamily("meshctl_fact_age_seconds", "gauge", "Age of the facts about a device.")
     quality = MetricFamily("meshctl_path_quality_ratio", "gauge", "Quality of the whole path to the base, 0 to 1.")
     hops = MetricFamily("meshctl_path_hops", "gauge", "Hops to the base.")
-    cut = MetricFamily("meshctl_node_cut_vertex", "gauge", "1 if others reach the base only through it.")
+    cut = MetricFamily("meshctl_node_cut_vertex", "gauge", "1 if other radios reach the base only through this one.")
     load = MetricFamily("node_load1", "gauge", "Load average over one minute.")
-    boot = MetricFamily("node_boot_time_seconds", "gauge", "When it booted (Unix time).")
+    boot = MetricFamily("node_boot_time_seconds", "gauge", "Boot time of the radio (Unix time).")
     info = MetricFamily("node_openwrt_info", "gauge", "Always 1; the OpenWrt release.")
     free = MetricFamily("meshctl_node_memory_free_ratio", "gauge", "Share of memory available, 0 to 1.")
     flash = MetricFamily("meshctl_node_flash_free_bytes", "gauge", "Free flash.")
-    temperature = MetricFamily("meshctl_node_temperature_celsius", "gauge", "The highest that the board reports.")
+    temperature = MetricFamily(
+        "meshctl_node_temperature_celsius", "gauge", "Highest temperature that the board reports."
+    )
     filtered = MetricFamily(
-        "meshctl_node_lan_filter_dropped_packets_total", "counter", "Frames of its wired ports kept out of the mesh."
+        "meshctl_node_lan_filter_dropped_packets_total",
+        "counter",
+        "Frames from its wired ports that the LAN filter dropped.",
     )
     for node in nodes:
         name = node.name
@@ -145,8 +157,13 @@ def _air(nodes: Iterable[_Device]) -> Iterator[MetricFamily]:
             ("tx_bitrate_kbit_s", "transmit_kilobits_per_second", "gauge", "Bit rate to the neighbor."),
             ("rx_bitrate_kbit_s", "receive_kilobits_per_second", "gauge", "Bit rate from the neighbor."),
             ("tx_packets", "transmit_packets_total", "counter", "Frames sent to the neighbor."),
-            ("tx_retries", "transmit_retries_total", "counter", "Frames sent again to the neighbor."),
-            ("tx_failed", "transmit_failed_total", "counter", "Frames given up that were sent to the neighbor."),
+            ("tx_retries", "transmit_retries_total", "counter", "Frames retransmitted to the neighbor."),
+            (
+                "tx_failed",
+                "transmit_failed_total",
+                "counter",
+                "Frames to the neighbor dropped after all retries.",
+            ),
         )
     }
     for node in nodes:
@@ -218,9 +235,9 @@ def _robots(status: Document) -> Iterator[MetricFamily]:
     queue = {
         key: MetricFamily(f"meshctl_robot_queue_{name}", "gauge", text)
         for key, name, text in (
-            ("messages", "messages", "Messages that wait, by priority."),
-            ("bytes", "bytes", "Bytes that wait, by priority."),
-            ("oldest_s", "oldest_seconds", "Age of the oldest message that waits, by priority."),
+            ("messages", "messages", "Queued messages, by priority."),
+            ("bytes", "bytes", "Queued bytes, by priority."),
+            ("oldest_s", "oldest_seconds", "Age of the oldest queued message, by priority."),
         )
     }
     topic = MetricFamily("meshctl_robot_topic_age_seconds", "gauge", "Time since a topic's last message.")

@@ -177,7 +177,7 @@ class FrameSampler:
         return frame
 
     def _airtime(self, document: Mapping[str, object], began_s: float) -> Airtime:
-        """What this round cost; sets the time until the next one."""
+        """The cost of this round; sets the time until the next one."""
         total = self.traffic()
         sent = {device: count - self._seen_bytes.get(device, 0) for device, count in total.items()}
         self._seen_bytes = total

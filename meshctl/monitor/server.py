@@ -139,7 +139,7 @@ class MonitorServer:
         at_s = _number(request, "at", None)
         frame = await run_in_threadpool(self._frame_at, at_s)
         if frame is None:
-            return error_response(404, "nothing was recorded up to then")
+            return error_response(404, "nothing was recorded before that time")
         return _json_text(frame.json_text)
 
     def _frame_at(self, at_s: float | None) -> Frame | None:
@@ -268,7 +268,7 @@ def _text(body: Mapping[str, Any], name: str, default: str | None = None) -> str
     try:
         value.encode()
     except UnicodeEncodeError as error:
-        raise BadRequest(f"{name}: expected a text, found half a character") from error
+        raise BadRequest(f"{name}: expected text, found an unpaired surrogate") from error
     return value
 
 

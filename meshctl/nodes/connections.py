@@ -153,7 +153,7 @@ class ConnectionPool:
                     raise
 
     def _site_hint(self, node: Node) -> str:
-        """What to do about a node that is not reached from here because its site has no login."""
+        """The hint for a node that cannot be reached from here because its site has no login."""
         site = self.fleet.worker_site(node)
         if site is None or site.has_gateway or node.ssh.jump or node.ssh.host or node.name in self.on_bench:
             return ""

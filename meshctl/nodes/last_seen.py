@@ -80,16 +80,16 @@ class LastSeen:
         return {key: value for key, value in facts.items() if value}
 
 
-def _sighting(one: Sighting) -> str:
-    age_s = one.age_ms / 1000
-    signal = f" ({one.signal_dbm} dBm)" if one.signal_dbm is not None else ""
-    return f"{one.by} {age_s:.1f} s ago{signal}" if age_s < 10 else f"{one.by} {duration(age_s)} ago{signal}"
+def _sighting(sighting: Sighting) -> str:
+    age_s = sighting.age_ms / 1000
+    signal = f" ({sighting.signal_dbm} dBm)" if sighting.signal_dbm is not None else ""
+    return f"{sighting.by} {age_s:.1f} s ago{signal}" if age_s < 10 else f"{sighting.by} {duration(age_s)} ago{signal}"
 
 
 def last_seen_of(
     fleet: Fleet, names: Iterable[str], observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
 ) -> dict[str, LastSeen]:
-    """What the other nodes' observations and the journal say about each of `names`."""
+    """Last known facts about each of `names`, from the other nodes' observations and the journal."""
     missing = tuple(names)
     others = {name: seen for name, seen in observations.items() if name not in missing}
     reports = [report_of(name, seen) for name, seen in others.items()]

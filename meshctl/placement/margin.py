@@ -59,7 +59,7 @@ def required_snr_db(load_mbit_s: float, hops: int = 1) -> float:
 
 
 def rate_mbit_s(snr_db: float) -> float:
-    """What a link of this ratio carries of user data; 0 below the slowest modulation."""
+    """User data rate of a link with this ratio; 0 below the slowest modulation."""
     usable = [rate for rate, sensitivity_dbm in _MCS if snr_db >= sensitivity_dbm - _STANDARD_NOISE_DBM]
     return _GOODPUT * usable[-1] if usable else 0.0
 

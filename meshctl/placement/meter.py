@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from types import MappingProxyType
 
 from meshctl.placement.margin import (
     UNMEASURED_FADE_DB,
@@ -42,7 +41,7 @@ TURN_RAD = math.radians(20.0)
 TURN_WINDOW_M = 6.0
 BEHIND_TURN_M = 8.0
 FIRST_TURN_LOSS_DB = 20.0
-"""What a bend costs until the first one has been measured: the order of a rock corner at 2.4 and 5 GHz."""
+"""Assumed loss of a bend until the first one has been measured: typical of a rock corner at 2.4 and 5 GHz."""
 SLOPE_WINDOW_M = 20.0
 MIN_SLOPE_M = 5.0
 LOST_S = 2.0
@@ -56,7 +55,7 @@ Position = tuple[float, float, float]
 
 
 class Advice(Enum):
-    """What the operator should do; the value is what the display says."""
+    """The advice to the operator; the value is the displayed text."""
 
     GO = "GO"
     DROP_SOON = "DROP SOON"
@@ -122,7 +121,7 @@ class Reading:
     last_good: Position | None = None
     back_m: float | None = None
     turn_loss_db: float = FIRST_TURN_LOSS_DB
-    """What the bends of this mine have cost so far."""
+    """The loss at bends of this mine so far."""
     beacons: int | None = None
     depth_left_m: float | None = None
     """How much deeper the stock of beacons carries: the meters left plus one spacing for each beacon."""
@@ -136,7 +135,7 @@ class _Hop:
     link_margin_db: float
     path_margin_db: float
     fresh_db: float
-    """What the last two samples have above the needed ratio, without allowance."""
+    """The excess of the last two samples over the needed ratio, without allowance."""
     hops: int
     least_snr_db: float
 
@@ -334,6 +333,3 @@ def _depth_left_m(left_m: float | None, look: Look) -> float | None:
     if look.beacons is None or look.spacing_m is None:
         return None
     return (left_m or 0.0) + look.beacons * look.spacing_m
-
-
-NO_PATHS: Mapping[str, PathBeyond] = MappingProxyType({})

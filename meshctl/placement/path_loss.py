@@ -193,11 +193,6 @@ def walls_between(walls: Sequence[Wall], a: Point, b: Point, *, touching: bool =
     )
 
 
-def wall_loss_db(walls: Sequence[Wall], a: Point, b: Point) -> float:
-    """The attenuation of the walls on the straight line between two points, in dB."""
-    return sum(wall.loss_db for wall in walls_between(walls, a, b))
-
-
 def _side(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 

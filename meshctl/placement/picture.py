@@ -35,7 +35,7 @@ _DIGIT_SIDE = 3
 
 @dataclass(frozen=True, slots=True)
 class MapView:
-    """What is drawn below the plan: walls, or an occupancy map."""
+    """The background of the plan: walls, or an occupancy map."""
 
     walls: tuple[Wall, ...] = ()
     occupancy: OccupancyMap | None = None

@@ -22,7 +22,7 @@ MIN_STEP_M = 1.0
 
 
 class Terrain(Protocol):
-    """What is between two places."""
+    """The obstacles between two places."""
 
     def walls(self, a: Point, b: Point) -> Sequence[Wall]: ...
 

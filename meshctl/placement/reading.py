@@ -107,7 +107,7 @@ def _figures(reading: Reading) -> str:
     if reading.beacons is not None:
         parts.append(f"beacons {reading.beacons}")
     if reading.depth_left_m is not None:
-        parts.append(f"the stock carries {reading.depth_left_m:.0f} m")
+        parts.append(f"the remaining beacons cover {reading.depth_left_m:.0f} m")
     return "   ".join(parts)
 
 
@@ -120,7 +120,7 @@ def line(robot: str, reading: Reading) -> str:
 
 
 def words(reading: Reading) -> str:
-    """What is spoken."""
+    """The text to speak."""
     if reading.advice is Advice.TURN_BACK:
         back = "" if not reading.back_m else f", {reading.back_m:.0f} meters"
         return f"turn back{back}"

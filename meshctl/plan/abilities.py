@@ -1,4 +1,4 @@
-"""What a radio's chip and driver can do, as the device says, against what the inventory asks of it. Pure.
+"""Checks the abilities of a radio's chip and driver, as the device reports them, against the inventory. Pure.
 
 The inventory does not know which chip sits in a PCI slot, and ath10k differs from ath10k-ct by its firmware alone, so
 the kernel's own list decides (`iw phy`).
@@ -22,7 +22,7 @@ _NAMES = {"adhoc": "ad-hoc mode", "mesh": "802.11s", "ap": "access point mode", 
 def lacking_abilities(
     node: Node, seen: Observation, before: Package | None, desired: Package | None
 ) -> tuple[str, ...]:
-    """What the desired wireless configuration asks of the node's radios and they cannot do: one text each.
+    """Requirements of the desired wireless configuration that the node's radios cannot meet: one text each.
 
     A radio that the device does not describe is left out; `before` is its present configuration.
     """

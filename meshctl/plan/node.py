@@ -127,7 +127,7 @@ def node_plan(
             *_tagged_ports(node, seen, after.get("network")),
             *_lacking_scripts(node, seen, basis, firmware),
             *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
-            *(f"{text}; the new firmware must bring another driver" for text in lacking),
+            *(f"{text}; the new firmware must include another driver" for text in lacking),
             *_other_target(node, seen),
             *(other_versions(seen, desired.package_files) if firmware is None else ()),
         ),

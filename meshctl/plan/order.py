@@ -20,12 +20,12 @@ from meshctl.wording import counted
 
 # A stage of more independent meshes does not repeat the reason of each.
 _MAX_REASONS = 3
-_LAST_OF_SEVERAL = "last, because their meshes are reached through them, each its own"
+_LAST_OF_SEVERAL = "last, because each is the entry to its own mesh"
 
 
 @dataclass(frozen=True, slots=True)
 class MeshContext:
-    """What the order depends on besides the plans: the observed meshes, their entry nodes, the policy, the robots."""
+    """Inputs of the order besides the plans: the observed meshes, their entry nodes, the policy, the robots."""
 
     graph: Graph
     entries: tuple[str, ...]
@@ -143,7 +143,7 @@ def _step(
     reasons = [_batch_reason(batch, cuts.get(batch[0], ()), paths, batch[0] in stays_up) for batch in batches]
     reason = reasons[0]
     if len(reasons) > _MAX_REASONS:
-        reason = f"{len(batches)} independent meshes at the same time, in each from its far end"
+        reason = f"{len(batches)} independent meshes at the same time, each starting at its far end"
     elif len(reasons) > 1:
         reason = f"independent meshes at the same time: {'; '.join(reasons)}"
     nodes = tuple(name for batch in batches for name in batch)

@@ -91,7 +91,7 @@ def _radio_paths(case: _Checked) -> FailedPrecondition | None:
         found = "" if section is None else section.get("path")
         if found and radio.hardware.path and found != radio.hardware.path:
             return FailedPrecondition(
-                f"wrong path of {radio.name}: expected {radio.hardware.path}, found {found}",
+                f"wrong device path of {radio.name}: expected {radio.hardware.path}, found {found}",
                 "copy the path from the device into its hardware profile",
             )
     return None

@@ -136,7 +136,7 @@ def check_version(document: Mapping[str, Any], version: int, what: str, file: st
 
 
 def damaged(file: str, error: Exception) -> InputError:
-    """What is reported for a document with this fault."""
+    """The error for a document with this fault."""
     what = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
     return InputError(f"{file}: damaged plan: {what}", hint="make a new plan")
 

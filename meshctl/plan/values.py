@@ -18,7 +18,7 @@ class Verdict(Enum):
 
 
 class Cut(IntEnum):
-    """What a change interrupts while it takes effect, the least first."""
+    """The interruption that a change causes while it takes effect, the least first."""
 
     NOTHING = 0
     # new SSH logins, for about a second
@@ -150,7 +150,7 @@ class StageKind(Enum):
 
     @property
     def is_simultaneous(self) -> bool:
-        """Whether its nodes change at one moment, and all of them roll back without a quorum."""
+        """Whether its nodes change simultaneously, and all of them roll back without a quorum."""
         return self in (StageKind.SWITCH, StageKind.TOGETHER)
 
 

@@ -15,7 +15,7 @@ from meshctl.regdb.values import NO_FLAGS, Country, Flag, FrequencyRule
 
 @dataclass(frozen=True, slots=True)
 class Legality:
-    """What a country allows on a range of frequencies.
+    """A country's rule for a range of frequencies.
 
     `covered` is False if part of the range is outside every rule (`flags` and `max_eirp_dbm` are then meaningless).
     `max_bandwidth_khz` is the widest channel allowed there, `max_eirp_dbm` the lowest limit of the rules.

@@ -19,7 +19,7 @@ Problem = tuple[tuple[str, ...], str, str]
 
 
 def thin_problems(fleet: Fleet, robot: str) -> Iterator[Problem]:
-    """What the daemon would reject."""
+    """Settings that the daemon would reject."""
     own = fleet.robots[robot].thin
     links = fleet.udp_mesh.thin_links
     for name in own.ports if own is not None else ():

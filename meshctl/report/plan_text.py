@@ -220,7 +220,7 @@ def question(plan: Plan) -> str:
     flashed = sum(1 for node in plan.nodes.values() if node.firmware is not None)
     extra = [
         f"{switched} change cell together" if switched else "",
-        f"{at_once} at one moment" if at_once else "",
+        f"{at_once} simultaneously" if at_once else "",
         f"{flashed} get new firmware" if flashed else "",
     ]
     more = "; ".join(part for part in extra if part)

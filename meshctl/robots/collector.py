@@ -84,7 +84,7 @@ def load(path: Path) -> Configuration:
 
 
 class LinkSource(Protocol):
-    """What is asked for a radio's links."""
+    """A source of a radio's link tables."""
 
     def ask(self) -> LinkTable:
         """Raises RadioError."""

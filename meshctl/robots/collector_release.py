@@ -1,4 +1,4 @@
-"""What a robot's computer gets for its collector: a wheel with its modules, a configuration, a unit. Pure.
+"""The collector's part of a robot's release: a wheel with its modules, a configuration, a unit. Pure.
 
 Only the key's public part, the pinned host keys of the robot's own radios, the addresses of these, and names of nodes
 and robots are involved: nothing with which a stolen computer could change a radio.

@@ -78,7 +78,7 @@ class Wheelhouse:
 
 @dataclass(frozen=True, slots=True)
 class DeployOptions:
-    """What all robots of one deploy share.
+    """Shared by all robots of one deploy.
 
     `now_s` returns our clock (Unix time); `wait_s` is the time a daemon has to become healthy; `only_configuration`
     refuses robots that would get other code; `radios` is for their collectors; `step` is entered with robot, step name

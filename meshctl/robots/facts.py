@@ -169,7 +169,7 @@ class RobotFacts:
 
     @property
     def remark(self) -> str:
-        """What is wrong, in one line; empty if nothing is."""
+        """The problems, in one line; empty if there are none."""
         if self.error:
             return self.error
         if not self.is_installed:

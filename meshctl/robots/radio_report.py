@@ -25,7 +25,7 @@ from meshctl.placement.margin import (
 )
 
 KEPT_S = 30.0
-"""Older tables and samples say nothing."""
+"""Older tables and samples are ignored."""
 MIN_TREND_S = 10.0
 MIN_TREND_SAMPLES = 6
 MIN_CHANGE_DB_PER_S = 0.1

@@ -148,7 +148,7 @@ class RadioSession:
         return bytes(output)
 
     def _reason(self, otherwise: str) -> str:
-        """What ssh says, or this."""
+        """The last line of ssh's error output, or this text."""
         process = self._process
         said = process.stderr.read() if process is not None and process.stderr is not None else None
         lines = [line.strip() for line in (said or b"").decode("utf-8", "replace").splitlines()]

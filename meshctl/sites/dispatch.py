@@ -161,7 +161,7 @@ class SiteRun:
 
 @dataclass(frozen=True, slots=True)
 class SiteExecution:
-    """What the runs of all sites share. `entry` is the operator's journal, `observer` shows events."""
+    """Shared by the runs of all sites. `entry` is the operator's journal, `observer` shows events."""
 
     fleet: Fleet
     access: ConnectionPool

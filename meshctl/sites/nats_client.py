@@ -373,7 +373,7 @@ async def _cancel_all() -> None:
 
 
 async def _ignore(error: Exception) -> None:
-    """What the client does about it shows in `is_connected`."""
+    """Nothing to do: `is_connected` shows the client's state."""
 
 
 def stream_settings(days: int, max_bytes: int) -> dict[str, Any]:

@@ -267,7 +267,7 @@ class NatsUplink(Uplink):
         self._check_heard(heard_s)
 
     def _events_there(self, run: str, offset: int) -> dict[str, Any]:
-        """What the worker has of a run beyond `offset`; empty if there is nothing."""
+        """The worker's output of a run from `offset` on; empty if there is none."""
         try:
             return self.ask({"do": "events", "run": run, "offset": offset})
         except WorkerError:

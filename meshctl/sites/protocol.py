@@ -22,7 +22,7 @@ MAX_EVENTS_BYTES = 256 << 10
 
 
 class WorkerError(MeshctlError):
-    """What the worker says against a request."""
+    """A refusal of a request by the worker."""
 
 
 def encode(message: Mapping[str, object]) -> bytes:

@@ -30,7 +30,7 @@ class RemoteRun:
 
 @dataclass(frozen=True, slots=True)
 class Greeting:
-    """What a worker says about itself: its version, the fingerprints of the keys that may sign, its runs."""
+    """A worker's greeting: its version, the fingerprints of the keys that may sign, its runs."""
 
     version: str
     directory: str
@@ -65,7 +65,7 @@ class Uplink(ABC):
     @property
     @abstractmethod
     def greeting(self) -> Greeting:
-        """What the worker said of itself. Raises Unreachable if it has not yet, and does not now."""
+        """The worker's greeting. Raises Unreachable if none has arrived."""
 
     @abstractmethod
     def ask(self, request: Mapping[str, object]) -> dict[str, Any]:

@@ -266,7 +266,7 @@ def _file_name(text: object) -> str:
 
 
 def _failure(done: subprocess.CompletedProcess[bytes]) -> WorkerError:
-    """What a command said before it failed, as its error."""
+    """The last output of a failed command, as its error."""
     said = done.stderr.decode("utf-8", "replace").strip().splitlines()
     errors = [line.removeprefix("error: ") for line in said if not line.startswith("hint: ")][:_MAX_ERROR_LINES]
     hints = [line.removeprefix("hint: ") for line in said if line.startswith("hint: ")]

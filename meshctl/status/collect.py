@@ -207,7 +207,7 @@ class Collector:
         self.close()
 
     def answers(self, nodes: Iterable[Node]) -> dict[str, RawObservation | NoAnswer]:
-        """What these radios say, for another meshctl to read (`site_observer`)."""
+        """The answers of these radios, for another meshctl to read (`site_observer`)."""
         found = run_parallel({node.name: partial(self._observe_raw, node) for node in nodes}, MAX_PARALLEL)
         answers: dict[str, RawObservation | NoAnswer] = {}
         for name, answer in found.items():
@@ -322,7 +322,7 @@ def run_parallel(
     *,
     stall_timeout_s: float = STALL_TIMEOUT_S,
 ) -> dict[K, object]:
-    """What each job returned, or the NodeError it raised, in the jobs' order. Raises any other exception.
+    """Each job's result, or the NodeError it raised, in the jobs' order. Raises any other exception.
 
     `parallel` jobs run at once, and `parallel` more whenever none has ended for `stall_timeout_s`. Threads are daemons,
     so an interrupt need not wait for them.

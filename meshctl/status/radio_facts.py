@@ -1,4 +1,4 @@
-"""What each radio measures: observation -> noise, busy time, queue, SNR and MCS of the nodes it hears. Pure."""
+"""Measurements of each radio: observation -> noise, busy time, queue, SNR and MCS of the nodes it hears. Pure."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def snr_of(seen: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, i
 def neighbors_of(
     node: Node | None, seen: Observation, heard: Mapping[str, HeardNeighbor], snr_there: Mapping[str, int | None]
 ) -> tuple[Neighbor, ...]:
-    """What a node reports of the nodes it hears, best first; `snr_there` is the SNR at which they report to hear it."""
+    """A node's reports of the nodes it hears, best first; `snr_there` is the SNR at which they report to hear it."""
     stations: dict[str, Station] = {}
     for station in seen.stations or ():
         stations.setdefault(station.mac.lower(), station)

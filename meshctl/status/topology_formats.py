@@ -18,7 +18,7 @@ from meshctl.wording import counted
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """What one end reports of a link; all None if it did not answer."""
+    """One end's report of a link; all None if it did not answer."""
 
     quality: float | None = None
     signal_dbm: int | None = None
@@ -64,7 +64,7 @@ class TopologyView:
 
 
 def directions(reports: Mapping[str, Report], macs: Mapping[str, str]) -> dict[tuple[str, str], Direction]:
-    """What each reporting node reports of the neighbors it heard recently."""
+    """Each reporting node's reports of the neighbors it heard recently."""
     return {
         (name, other): Direction(heard.quality, heard.signal_dbm, heard.last_seen_ms)
         for name, report in reports.items()

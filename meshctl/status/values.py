@@ -139,7 +139,7 @@ class NodeStatus:
     """None: it has no LAN filter, or has not loaded it."""
     radios: tuple[RadioStatus, ...] = ()
     temperature_c: float | None = None
-    """The highest that the board reports."""
+    """Highest temperature that the board reports."""
     mesh_statistics: Mapping[str, Mapping[str, int]] | None = None
     """batman-adv's counters by its interface."""
     mesh_tables: Mapping[str, MeshTableSizes] | None = None

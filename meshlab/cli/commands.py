@@ -77,7 +77,7 @@ def up(
 
 
 def next_steps(fleet: Fleet) -> list[str]:
-    """What to run after `lab up`. The nodes of a mesh that the lab cannot route stay on the bench."""
+    """The commands to run after `lab up`. The nodes of a mesh that the lab cannot route stay on the bench."""
     unrouted = [mesh.name for mesh in fleet.meshes.values() if mesh.backend is Backend.MESHMERIZE]
     if not unrouted:
         return ["next:      meshctl bootstrap --yes; meshctl lab unplug; meshctl topology"]

@@ -128,7 +128,7 @@ def _known(value: Optional[float]) -> float:
 
 
 def to_ros(conditions: Mapping[str, Any], namespace: str, ros_version: int, stamp: Tuple[int, int]) -> List[ToRos]:
-    """What a bridge publishes: everything as JSON in a std_msgs/String, and the typed message."""
+    """A bridge's two messages: all conditions as JSON in a std_msgs/String, and the typed message."""
     text: Message = {"data": json.dumps(conditions, sort_keys=True)}
     found = {
         TEXT_TOPIC: (TYPES["std_msgs/String"], text),

@@ -30,7 +30,7 @@ class TypeKey(NamedTuple):
 
 
 class MeshTopic(NamedTuple):
-    """What a bridge knows of a topic of the daemon. No destinations: all. A shared log has none; its items go to its
+    """A topic of the daemon, as a bridge knows it. No destinations: all. A shared log has none; its items go to its
     readers."""
 
     destinations: tuple[str, ...] = ()

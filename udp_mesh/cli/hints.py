@@ -1,4 +1,4 @@
-"""What to do about an error of the daemon."""
+"""Hints for errors that the daemon reports."""
 
 from udp_mesh.client.mesh_client import MeshError
 

@@ -198,7 +198,11 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ("peers", inspect.peers, "show peers and their queues"),
         ("topics", inspect.topics, "show topics and their settings"),
         ("logs", inspect.logs, "show shared logs and which nodes have their items"),
-        ("subscriptions", inspect.subscriptions, "show what programs read here and at peers, and what that saves"),
+        (
+            "subscriptions",
+            inspect.subscriptions,
+            "show what local and remote programs read, and the traffic that this saves",
+        ),
     ):
         parser = _command(commands, name, command, text, example=f"udp-mesh {name} --watch 2")
         parser.add_argument(
@@ -329,7 +333,9 @@ def _add_traffic(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     echo.add_argument("--count", type=count, help="exit after this many messages")
     echo.add_argument("--timeout", type=positive, metavar="SECONDS", help="exit after this long without a message")
     echo.add_argument("--rate", type=positive, metavar="HZ", help="at most this many messages per second and source")
-    echo.add_argument("--max-age", type=positive, metavar="SECONDS", help="leave out what waited longer at its sender")
+    echo.add_argument(
+        "--max-age", type=positive, metavar="SECONDS", help="skip messages that waited longer at their sender"
+    )
     echo.add_argument("--raw", action="store_true", help="write only the payloads' bytes")
     ping = _command(
         commands, "ping", traffic.ping, "measure round-trip times to a peer", example="udp-mesh ping base --count 5"

@@ -45,7 +45,7 @@ def thin_view(thin: Json) -> list[str]:
 
 
 def alarms(thin: Json) -> list[str]:
-    """What needs an operator: a name, what is wrong, what to do."""
+    """Problems that need an operator: a name, the problem, the remedy."""
     found = [f"{name} FAILED: {reason}" for name, reason in thin["failures"].items()]
     # A daemon of an earlier version has none.
     found += [f"{name}: the RADIO REFUSES frames: {reason}" for name, reason in thin.get("refusals", {}).items()]

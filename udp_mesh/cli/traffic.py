@@ -243,7 +243,7 @@ def _backlog(size_bytes: int, delivered_per_s: float) -> int:
 
 @dataclass(slots=True)
 class _BenchRun:
-    """What a benchmark sent, and what was delivered until when."""
+    """Messages that a benchmark sent, and the deliveries with their times."""
 
     begun: float
     ended: float

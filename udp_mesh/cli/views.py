@@ -88,7 +88,7 @@ def _available(peer: Json) -> list[tuple[str, str]]:
 
 
 def _radio(peer: str, radio: Json) -> list[str]:
-    """What a collector reports of the path to a peer."""
+    """A collector's report of the path to a peer."""
     return [
         peer,
         radio["radio"],
@@ -229,7 +229,7 @@ def relays_view(relaying: Json) -> list[str]:
         by_cause = f" ({_listed(causes)})" if dropped else ""
         lines += [
             "",
-            f"relay: {counted(counters['passed_on'], 'datagram')} passed on ({size(counters['passed_on_bytes'])}), "
+            f"relay: {counted(counters['passed_on'], 'datagram')} forwarded ({size(counters['passed_on_bytes'])}), "
             f"{dropped} dropped{by_cause}, {size(relaying['queued_bytes'])} queued",
         ]
     return lines
@@ -297,7 +297,7 @@ def logs_view(reply: Json) -> str:
 
 
 def subscriptions_view(reply: Json) -> str:
-    """What is read here, then one line per peer and pattern, then what was not sent."""
+    """Local subscriptions, then one line per peer and pattern, then the traffic that was not sent."""
     lines = [] if reply["selective"] else ["NOT SELECTIVE: peers are sent everything (selective = false)"]
     rows = [["here", entry["topics"], *_bounds(entry)] for entry in reply["read_here"]] or [["here", "nothing", "", ""]]
     for peer in reply["peers"]:

@@ -28,7 +28,7 @@ STEEP_DB = 20.0
 
 
 class Need(NamedTuple):
-    """What the mission needs of the link."""
+    """The mission's requirements of the link."""
 
     bits_per_s: float
     priority: int
@@ -123,12 +123,18 @@ def decisions(mesh: MeshClient, name: str, need: Need) -> Iterator[Decision]:
 def main(arguments: Optional[Sequence[str]] = None) -> int:
     parser = argparse.ArgumentParser(description="Say when a robot should turn back before it loses its link.")
     parser.add_argument("peer", help="the robot or base that must stay in reach")
-    parser.add_argument("--bits-per-s", type=float, default=100e3, help="what must reach it (default: 100000)")
-    parser.add_argument("--priority", type=int, default=9, choices=range(16), metavar="N", help="of it (default: 9)")
+    parser.add_argument("--bits-per-s", type=float, default=100e3, help="rate that it must receive (default: 100000)")
     parser.add_argument(
-        "--reserve", type=float, default=60.0, metavar="SECONDS", help="turn so long before (default: 60)"
+        "--priority", type=int, default=9, choices=range(16), metavar="N", help="priority of that rate (default: 9)"
     )
-    parser.add_argument("--margin", type=float, metavar="DB", help="turn with less radio margin, where it is known")
+    parser.add_argument(
+        "--reserve",
+        type=float,
+        default=60.0,
+        metavar="SECONDS",
+        help="turn this long before the rate is lost (default: 60)",
+    )
+    parser.add_argument("--margin", type=float, metavar="DB", help="turn below this radio margin, where it is known")
     parser.add_argument("--socket", default=DEFAULT_SOCKET, help="the daemon's socket (default: %(default)s)")
     given = parser.parse_args(arguments)
     said: Optional[bool] = None

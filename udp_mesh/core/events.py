@@ -21,7 +21,6 @@ class RejectReason(Enum):
     TOO_LARGE = "too large"
     QUEUE_FULL = "queue full"
     LOG_FULL = "log full"
-    RATE_LIMIT = "rate limit"
     CLOSED = "closed"
 
 

@@ -1,4 +1,4 @@
-"""What the daemon and its command line agree on: paths, reserved topics, limits.
+"""Constants shared by the daemon and its command line: paths, reserved topics, limits.
 
 Apart from `configuration`, which imports the transport, so that a command that only talks to the daemon starts fast.
 """

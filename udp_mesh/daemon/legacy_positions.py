@@ -1,4 +1,4 @@
-"""What was received from each legacy peer, in a file, for the next run of the daemon.
+"""Saves the receive positions of legacy peers in a file, for the next run of the daemon.
 
 A legacy sender never retransmits: what was in flight to a daemon that stopped would occupy its slots for 10 s. The file
 is only useful after a restart within that time, so nothing waits until it is on disk, and it is overwritten in place:

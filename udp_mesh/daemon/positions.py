@@ -24,7 +24,7 @@ MAX_FRAME_BYTES = 64
 MAX_POSITIONS = 1024
 """As many as peers; a holder of the key could invent names without bound."""
 MAX_AGE_S = 4_000_000.0
-"""What 32 bits of milliseconds hold: 46 days."""
+"""46 days, which fits into a 32-bit count of milliseconds."""
 DEFAULT_FRAME = "map"
 
 _HEAD = struct.Struct(">BBIfff")

@@ -1,4 +1,4 @@
-"""What a collector reports of the robot's radio: signal, margin and bottleneck of the radio path to each peer. Pure.
+"""A collector's report of the robot's radio: signal, margin and bottleneck of the radio path to each peer. Pure.
 
 The report is the payload of `set-radio` (docs/local-api.md). Its ages become times on the daemon's clock, so that the
 conditions show how old each value is; values older than `MAX_AGE_S` are left out.
@@ -130,8 +130,8 @@ class RadioReport:
         }
 
 
-def _age_s(one: RadioPath | RadioNeighbor, now: float) -> float:
-    return round(max(0.0, now - one.measured_at), 3)
+def _age_s(entry: RadioPath | RadioNeighbor, now: float) -> float:
+    return round(max(0.0, now - entry.measured_at), 3)
 
 
 def with_radio(conditions: Json, report: RadioReport | None, now: float) -> Json:

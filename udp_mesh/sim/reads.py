@@ -1,4 +1,4 @@
-"""What the programs of each robot read, in a scenario.
+"""Subscriptions of each robot's programs, in a scenario.
 
     reads:
       base: {map: {}, video: {rate_hz: 1, max_age_s: 2}, "artifact/*": {}}

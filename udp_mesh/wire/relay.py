@@ -1,4 +1,4 @@
-"""What relays and the nodes next to them tell each other: hellos, carried datagrams, acknowledgements of one hop.
+"""Messages between relays and their neighbors: hellos, carried datagrams, acknowledgements of one hop.
 
 A relay datagram is the byte `RELAY_BYTE` and a sealed datagram of kind HELLO or DATA under a relay key (`core.relaying`
 derives it); what is sealed is one of the values below. A `Carry` holds a datagram that is sealed end to end, so a relay
@@ -30,7 +30,7 @@ PROOF_BYTES = 8
 _HELLO, _CARRY, _HOP_ACK = 1, 2, 3
 _CARRY_FIELDS = struct.Struct(">BB8s8sB")
 CARRY_BYTES = _CARRY_FIELDS.size
-"""What a `Carry` adds to its datagram, without the relays visited."""
+"""Overhead of a `Carry` around its datagram, without the relays visited."""
 _HOP_ACK_FIELDS = struct.Struct(">B6s3s")
 _HELLO_FIELDS = struct.Struct(">BBHI")
 _HEARD_FIELDS = struct.Struct(">8sIBB")

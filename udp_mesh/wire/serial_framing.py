@@ -14,7 +14,7 @@ from udp_mesh.wire.limits import MAX_THIN_FRAME_BYTES
 DELIMITER = b"\0"
 CRC_BYTES = 2
 FRAMING_BYTES = 2 + CRC_BYTES + 2
-"""What a frame costs on the line at most, besides its own bytes: code bytes, CRC, delimiters."""
+"""Maximum overhead of a frame on the line: code bytes, CRC, delimiters."""
 
 _MAX_ENCODED_BYTES = MAX_THIN_FRAME_BYTES + FRAMING_BYTES
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))

@@ -39,9 +39,9 @@ _INTRODUCTION = struct.Struct(f">BBH{HEARD_TAG_BYTES}sH")
 
 SHORT_HEADER_BYTES = _SHORT.size
 THIN_OVERHEAD_BYTES = SHORT_HEADER_BYTES + THIN_TAG_BYTES
-"""What a frame has in addition to its items."""
+"""Overhead of a frame, besides its items."""
 INTRODUCTION_BYTES = _INTRODUCTION.size - _SHORT.size
-"""What an introduction has more than that."""
+"""Additional overhead of an introduction."""
 
 _PRESENCE, _COMPLETE, _INCOMPLETE = 0x01, 0x02, 0x03
 _PART = 0x80

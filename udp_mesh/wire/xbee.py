@@ -30,7 +30,7 @@ _MAX_CONTENT_BYTES = 18 + 256
 """Explicit Receive Indicator (0x91) with the largest payload of any XBee; a longer one is damage."""
 
 AIR_OVERHEAD_BYTES = 60
-"""What the radio adds on the air at most: an IEEE 802.15.4 frame of 127 B has 73 B of payload with DigiMesh, and 6 B
+"""Maximum overhead of the radio on the air: an IEEE 802.15.4 frame of 127 B has 73 B of payload with DigiMesh, and 6 B
 of preamble, delimiter and length come first."""
 USUAL_FRAME_BYTES = 72
 """Payload that every XBee carries, in one frame to all."""

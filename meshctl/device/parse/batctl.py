@@ -30,7 +30,7 @@ def parse_statistics(text: str) -> Mapping[str, int]:
 
 
 def parse_transglobal(text: str) -> tuple[int, int] | None:
-    """What observe.sh counts in `transglobal`: entries of unicast and of multicast addresses."""
+    """Counts of `transglobal` by observe.sh: entries of unicast and of multicast addresses."""
     found = re.fullmatch(r"unicast (\d{1,9})\nmulticast (\d{1,9})\n*", text)
     return (int(found[1]), int(found[2])) if found else None
 

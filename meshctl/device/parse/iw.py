@@ -93,8 +93,6 @@ def _station(heading: str, lines: list[str]) -> Station:
         mac=mac,
         signal_dbm=_integer(fields.get("signal")),
         inactive_ms=_integer(fields.get("inactive time")),
-        rx_bytes=_integer(fields.get("rx bytes")),
-        tx_bytes=_integer(fields.get("tx bytes")),
         tx_packets=_integer(fields.get("tx packets")),
         tx_retries=_integer(fields.get("tx retries")),
         tx_failed=_integer(fields.get("tx failed")),
@@ -104,7 +102,6 @@ def _station(heading: str, lines: list[str]) -> Station:
         connected_s=_integer(fields.get("connected time")),
         signal_avg_dbm=_integer(fields.get("signal avg")),
         chain_signals_dbm=_chains(fields.get("signal", "")),
-        rx_packets=_integer(fields.get("rx packets")),
         tx_mcs=_mcs(fields.get("tx bitrate", "")),
         rx_mcs=_mcs(fields.get("rx bitrate", "")),
         mesh_link=fields.get("mesh plink", "").strip(),
@@ -136,8 +133,6 @@ def parse_survey(text: str) -> ChannelSurvey | None:
             noise_dbm=_integer(fields.get("noise")),
             active_ms=_integer(fields.get("channel active time")),
             busy_ms=_integer(fields.get("channel busy time")),
-            receive_ms=_integer(fields.get("channel receive time")),
-            transmit_ms=_integer(fields.get("channel transmit time")),
         )
     return None
 

@@ -15,7 +15,7 @@ _GZIP_WBITS = 16 + zlib.MAX_WBITS
 
 @dataclass(frozen=True, slots=True)
 class OutputSection:
-    """What one command printed and its exit status; -1 when the output ends inside it."""
+    """Output and exit status of one command; -1 when the output ends inside it."""
 
     body: bytes
     status: int
@@ -50,7 +50,7 @@ def split_sections(output: bytes, nonce: str) -> dict[str, OutputSection]:
 
 
 def _inflated(packed: bytes) -> bytes:
-    """What can be read of it: all, or the beginning of an answer that was cut short."""
+    """The readable part: all, or the beginning of an answer that was cut short."""
     try:
         return zlib.decompressobj(_GZIP_WBITS).decompress(packed, MAX_INFLATED_BYTES)
     except zlib.error:

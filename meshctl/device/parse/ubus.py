@@ -63,7 +63,6 @@ def parse_interfaces(text: str) -> tuple[NetInterface, ...] | None:
             name=string(item.get("interface")),
             up=truth(item.get("up")),
             pending=truth(item.get("pending")),
-            proto=string(item.get("proto")),
             device=string(item.get("l3_device")) or string(item.get("device")),
             addresses=tuple(
                 f"{string(address.get('address'))}/{integer(address.get('mask'))}"

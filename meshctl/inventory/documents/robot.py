@@ -86,7 +86,7 @@ class RobotDocument(Document):
     """Subnet of the robot's own LAN; its first radio in service routes it. Default: its radios bridge the mesh to its
     switch."""
     relay: tuple[Text, ...] = ()
-    """Robots whose datagrams its daemon passes on, to and from them; `all` for all."""
+    """Robots to and from which its daemon forwards datagrams; `all` for all."""
     position: PositionDocument = NOT_WRITTEN
     """Where it stands, if it does not move, as a base station."""
     thin: ThinPortsDocument = NOT_WRITTEN
@@ -133,7 +133,7 @@ class ApplyDocument(Document):
     quorum: Real = Field(default=0.8, gt=0, le=1)
     """Share of the mesh that must rejoin after a change of the whole cell."""
     parallel: Whole | None = Field(default=None, ge=1, le=1024)
-    """Maximum number of nodes in work at the same time; default: as many as their meshes and this machine carry."""
+    """Maximum number of nodes in progress. Default: as many as their meshes and this machine can handle."""
 
 
 class UdpMeshDocument(Document):
@@ -158,16 +158,16 @@ class UdpMeshDocument(Document):
     relay_hops: Whole = Field(default=4, ge=1, le=8)
     """Maximum number of links between two robots with relays between them; 1 turns relays off."""
     relay_keys: tuple[SecretDocument, ...] = ()
-    """Keys of the hops of relays, as `keys`: with them, relays without a fleet key pass on what they cannot read.
+    """Keys of the hops of relays, as `keys`: with them, relays without a fleet key cannot read what they forward.
     Default: the fleet keys."""
     thin_links: dict[Name, ThinLinkDocument] = Field(default_factory=dict)
     """Thin links by name: slow radios on serial ports, for topics with `thin`."""
     thin_presence_s: Real = Field(default=45.0, ge=1, le=170)
-    """About how often a robot shows on thin links that it is there."""
+    """Approximate interval of a robot's presence messages on thin links."""
     etc_hosts: Flag = False
     """Keep the peers' names in /etc/hosts of the robots' computers, for `ssh husky1`."""
     selective: Flag = True
-    """Send robots only what their programs read, and no faster than they want it."""
+    """Send robots only the topics that their programs read, no faster than requested."""
 
 
 class TopicLogDocument(Document):
@@ -198,7 +198,7 @@ class ReductionDocument(Document):
     """What the ROS bridge sends of a topic instead of everything that is published."""
 
     rate_hz: Real = Field(default=NOT_WRITTEN, ge=0.001, le=1000)
-    """Maximum number of messages per second; the others are left out."""
+    """Maximum number of messages per second; the others are dropped."""
     encode: JpegDocument = NOT_WRITTEN
     """Send images as JPEG, as sensor_msgs/CompressedImage. `{}` for the defaults."""
     voxel_m: Real = Field(default=NOT_WRITTEN, ge=0.001, le=100)
@@ -247,9 +247,9 @@ class TopicDocument(Document):
     repair: Flag = False
     """Let receivers request lost broadcasts again."""
     delta: Flag = False
-    """Send a message as the difference to the last one that its receiver has (maps, grids, images, states)."""
+    """Send a message as the difference from the last one that its receiver has (maps, grids, images, states)."""
     delta_bytes: Whole = Field(default=16_777_216, ge=1, le=1_073_741_824)
-    """Maximum size of a message for that; a larger one is sent whole."""
+    """Maximum size of a message to send as a difference; a larger one is sent whole."""
     always: Flag = False
     """Send the topic also to robots whose programs do not read it."""
     thin: Flag = False
@@ -259,6 +259,6 @@ class TopicDocument(Document):
     thin_period_s: Real = Field(default=NOT_WRITTEN, gt=0, le=86_400)
     """Minimum seconds between two messages on thin links; the newest one is sent."""
     log: TopicLogDocument = NOT_WRITTEN
-    """Make the topic a shared log: other robots, too, pass its messages on. `{}` for the defaults."""
+    """Make the topic a shared log, whose messages other robots also carry. `{}` for the defaults."""
     reduce: ReductionDocument = NOT_WRITTEN
     """Send fewer or smaller messages than are published; done by the ROS bridge."""

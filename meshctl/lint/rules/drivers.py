@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import asked
+from meshctl.inventory.suggest import suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
 from meshctl.lint.openwrt_names import one_edit_apart
@@ -106,7 +106,7 @@ def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if near or radio.driver.isdigit():
                 path = ("hardware", profile.name, "radios", radio.name, "driver")
                 expected = " or ".join(near) or "a driver such as ath9k"
-                yield Finding(path, "unknown driver", expected, radio.driver, asked(near))
+                yield Finding(path, "unknown driver", expected, radio.driver, suggestion(near))
 
 
 @fleet_rule(
@@ -198,7 +198,7 @@ def _generation(htmode: str) -> str:
 
 
 def _limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
-    """What keeps the node's radio from the htmode: its driver, its release."""
+    """The reason why the node's radio cannot use the htmode: its driver, its release."""
     wanted = _generation(htmode)
     if wanted not in _GENERATIONS:
         return

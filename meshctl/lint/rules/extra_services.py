@@ -1,4 +1,4 @@
-"""What nodes do besides the mesh, by extra_uci: access points, uplinks, address servers (MC911 to MC913)."""
+"""Services that extra_uci adds to nodes: access points, uplinks, DHCP servers (MC911 to MC913)."""
 
 from __future__ import annotations
 

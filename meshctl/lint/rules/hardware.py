@@ -8,7 +8,7 @@ from pathlib import PurePath
 
 from meshctl import firmware
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import asked, nearest
+from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import SUBTARGETS, TARGETS, chip_target, suggest_packages
 from meshctl.lint.rule import Example, Finding, fleet_rule
@@ -306,9 +306,10 @@ def package_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             name = written.removeprefix("-")
             if name not in judged:
                 judged[name] = suggest_packages(name)
-            meant = judged[name]
-            if meant:
-                yield Finding(packages_path(node, written), "unknown package", " or ".join(meant), name, asked(meant))
+            if meant := judged[name]:
+                yield Finding(
+                    packages_path(node, written), "unknown package", " or ".join(meant), name, suggestion(meant)
+                )
 
 
 @fleet_rule(
@@ -335,7 +336,7 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
             near = [f"{target}/{one}" for one in nearest(subtarget, sorted(SUBTARGETS[target]))]
             if near:
-                yield Finding(path, "unknown subtarget", " or ".join(near), profile.target, asked(near))
+                yield Finding(path, "unknown subtarget", " or ".join(near), profile.target, suggestion(near))
 
 
 @fleet_rule(

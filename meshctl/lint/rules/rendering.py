@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
 from meshctl.file_access import located
-from meshctl.inventory.suggest import asked, did_you_mean
+from meshctl.inventory.suggest import did_you_mean, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Example, Finding, fleet_rule
@@ -233,7 +233,7 @@ def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding
             near = one_edit_apart(package, _OWNED)
             if near:
                 path = ("nodes", node.name, "extra_uci", key)
-                yield Finding(path, "no program reads this package", " or ".join(near), package, asked(near))
+                yield Finding(path, "no program reads this package", " or ".join(near), package, suggestion(near))
     for node, packages in with_extra(fleet, context):
         for key, value in node.extra_uci.items():
             package, _, section = key.partition(".")

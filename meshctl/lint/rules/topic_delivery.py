@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import asked, nearest
+from meshctl.inventory.suggest import nearest, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.ros_types import MESSAGES
 from meshctl.lint.rule import Finding, fleet_rule
@@ -274,5 +274,5 @@ def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         name = rest.removeprefix("msg/")
         if known and "/" not in name and _TYPE.fullmatch(topic.type_name) is not None and name not in known:
             near = [topic.type_name.removesuffix(name) + one for one in nearest(name, sorted(known))]
-            expected, hint = " or ".join(near) or f"a message of {package}", asked(near)
+            expected, hint = " or ".join(near) or f"a message of {package}", suggestion(near)
             yield Finding(_path(topic, "type"), f"{package} has no such message", expected, topic.type_name, hint)

@@ -1,4 +1,4 @@
-"""What Prometheus and Grafana need: alert rules, a dashboard, targets, and the textfile of node_exporter."""
+"""Files for Prometheus and Grafana: alert rules, a dashboard, targets, and the textfile of node_exporter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report of findings is made of."""
+"""The parts of a report of findings."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def test_an_unknown_device_must_be_named_by_the_operator() -> None:
 def test_a_device_with_the_wrong_mac_is_rejected_even_if_named_by_the_operator() -> None:
     with pytest.raises(NodeError, match="expected b02, its MAC belongs to b01") as caught:
         identify(labelled(), device(MAC), "b02")
-    assert caught.value.hint == "exchange the cables, or name no nodes: devices are then identified by MAC"
+    assert caught.value.hint == "swap the cables, or omit the node names: devices are then identified by MAC"
     with pytest.raises(NodeError, match="b01 has MAC 02:4d:00:00:00:01, this one has 02:00:00:00:00:42"):
         identify(labelled(), device("02:00:00:00:00:42"), "b01")
 

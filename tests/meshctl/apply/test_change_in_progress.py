@@ -49,7 +49,7 @@ def a_change() -> ChangeInProgress:
 
 
 def looked_at(change: ChangeInProgress, monkeypatch: pytest.MonkeyPatch, status: ChangeStatus, address: str) -> Action:
-    lan = NetInterface("lan", up=True, pending=False, proto="static", addresses=(address,))
+    lan = NetInterface("lan", up=True, pending=False, addresses=(address,))
     seen = Observation(0.0, 0.1, interfaces=(lan,), bridges=(), change=status)
     monkeypatch.setattr(change_in_progress, "observe", lambda _, **__: seen)
     return observe_and_decide(change, CONNECTION, is_opened_after_reload=True)

@@ -155,7 +155,7 @@ def test_a_node_that_is_unreachable_although_it_must_answer_logins_is_logged_in_
     """Once, even if they were queried a moment ago; not if the change gives it another address: it has its old one."""
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    interfaces = (NetInterface("lan", up=True, pending=False, proto="static", addresses=(f"{had}/24",)),)
+    interfaces = (NetInterface("lan", up=True, pending=False, addresses=(f"{had}/24",)),)
     near = Neighbours({"b02": replace(node("b02"), interfaces=interfaces), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.started()

@@ -34,7 +34,7 @@ def said(capfd: pytest.CaptureFixture[str], *words: str) -> str:
 @pytest.mark.usefixtures("journal")
 def test_runs_are_listed_newest_first_below_a_header(capfd: pytest.CaptureFixture[str]) -> None:
     lines = said(capfd).splitlines()
-    assert lines[0].split() == ["RUN", "BEGAN", "COMMAND", "FLEET", "BY", "RESULT"]
+    assert lines[0].split() == ["RUN", "STARTED", "COMMAND", "FLEET", "BY", "RESULT"]
     assert [line.split()[0] for line in lines[1:]] == ["4", "3", "2", "1"]
     assert "mine (lab)" in lines[3]
 

@@ -135,7 +135,10 @@ def test_another_sites_page_reads_nothing(server: Served) -> None:
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
-        (b'{"device": "b02", "code": "unreachable", "by": "\\ud800"}', "by: expected a text, found half a character"),
+        (
+            b'{"device": "b02", "code": "unreachable", "by": "\\ud800"}',
+            "by: expected text, found an unpaired surrogate",
+        ),
         (b"[" * 16_000, "expected JSON: "),
         (b'{"device": "\xff"}', "expected JSON: "),
         (b"[]", "expected a JSON object, found list"),

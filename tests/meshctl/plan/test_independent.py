@@ -83,7 +83,7 @@ def test_each_mesh_has_its_cut_vertices_and_its_own_pace() -> None:
     )
     notes = [note.partition(" of ")[0] for note in plan.notes if "m01-n2" in note]
     assert notes[0].startswith("stage 3: m01-n2 is a cut vertex: m01-n3")
-    assert planned(*chains(4)).stages[0].reason == "4 independent meshes at the same time, in each from its far end"
+    assert planned(*chains(4)).stages[0].reason == "4 independent meshes at the same time, each starting at its far end"
 
 
 def _in_order(plan: Plan) -> bool:

@@ -72,8 +72,8 @@ def test_a_change_of_another_file_takes_it_down_too() -> None:
 def test_it_must_be_gone_before_the_change_is_confirmed() -> None:
     before = with_links(ON_THE_AIR)
     expected = expectation(wanted(fleet(), "b01"), before)
-    assert "mesh1 is turned off, but still there" in unmet(expected, before)
-    assert "mesh1 is turned off, but still there" not in unmet(expected, with_links())
+    assert "mesh1 should be off, but still exists" in unmet(expected, before)
+    assert "mesh1 should be off, but still exists" not in unmet(expected, with_links())
 
 
 def test_a_saved_plan_keeps_it() -> None:

@@ -127,7 +127,7 @@ def test_a_radio_at_another_path_is_refused() -> None:
     assert seen.uci is not None
     moved = {**seen.uci, "wireless": seen.uci["wireless"].replace("18100000", "18200000")}
     plan = planned(fleet(), "b01", replace(seen, uci=moved))
-    assert "wrong path of radio0: expected platform/ahb/18100000.wmac" in plan.reason
+    assert "wrong device path of radio0: expected platform/ahb/18100000.wmac" in plan.reason
 
 
 def test_our_own_lock_does_not_block_the_plan() -> None:

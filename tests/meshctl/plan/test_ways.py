@@ -77,7 +77,7 @@ def test_both_plans_show_both_ways_and_the_one_that_fits_the_mesh() -> None:
         assert "  recommended: together, because each node is interrupted at most once, not 6 times" in text(plan)
     assert "in order  this plan: 6 stages, about 60 s" in text(in_order)
     assert "together  this plan: 1 stage, about 26 s" in text(together)
-    assert question(together) == "Change 6 nodes (6 at one moment)?"
+    assert question(together) == "Change 6 nodes (6 simultaneously)?"
 
 
 def test_where_no_node_cuts_off_others_the_order_is_recommended() -> None:

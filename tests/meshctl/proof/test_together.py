@@ -1,4 +1,4 @@
-"""`provision --together`: all nodes change at one moment, and none keeps the change unless a quorum is healthy.
+"""`provision --together`: all nodes change simultaneously, and none keeps the change unless a quorum is healthy.
 
 Only the case of a power cut runs in every `make test`; the others are proofs.
 """

@@ -104,7 +104,7 @@ def test_status_and_monitor_see_the_nodes_through_their_workers(rig: NatsRig, mo
         assert backup.code == 3
         assert "site north is reached over NATS only" in backup.out
         spare = rig.run("replace", "s-base", "bench", "--at", "127.0.0.1:1", "--yes")
-        assert "whether s-base is off is not known" in spare.err
+        assert "cannot determine whether s-base is off" in spare.err
         assert "pass --old-is-off" in spare.err
         alive = rig.run("replace", "n1", "bench", "--at", "127.0.0.1:1", "--yes")
         assert "n1 still answers at site north" in alive.err

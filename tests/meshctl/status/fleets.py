@@ -103,7 +103,7 @@ def seen(name: str, hears: Mapping[str, int], **other: Any) -> Observation:
         macs={"mesh0": MACS[name]},
         radios=(RadioState("radio0", True, False, False, False, {}, (("mesh0", "mesh0"),)),),
         links=(WirelessLink("mesh0", "IBSS", MACS[name], "trio", channel=6, joined=True, phy="phy0"),),
-        surveys=(ChannelSurvey("mesh0", 2437, -95, 100_000, 30_000, 20_000, 5_000),),
+        surveys=(ChannelSurvey("mesh0", 2437, -95, 100_000, 30_000),),
         sensors=Sensors({"phy0": 2}, {}),
         bridges=(Bridge("br-lan", ("eth0", "bat0")),),
         stations=tuple(Station("mesh0", MACS[n], signal_dbm=-60, tx_mcs="MCS 15", rx_mcs="MCS 12") for n in hears),

@@ -114,4 +114,4 @@ def test_the_view_of_a_relay_names_the_causes_of_dropped_datagrams() -> None:
         relays=True, active=True, neighbours=(), routes=(), counters=counters, queued_bytes=12_000
     )
     lines = relays_view(relaying_json(conditions))
-    assert lines == ["", "relay: 378 datagrams passed on (227 kB), 4 dropped (3 queue, 1 loop), 12 kB queued"]
+    assert lines == ["", "relay: 378 datagrams forwarded (227 kB), 4 dropped (3 queue, 1 loop), 12 kB queued"]

@@ -109,7 +109,7 @@ def test_a_robot_is_reached_through_the_relay() -> None:
             udp_mesh(base, guide.command("pub estop"))
             messages = collect(program, 2)
         assert sorted((message.topic, len(message.payload)) for message in messages) == [("estop", 4), ("map", 50_000)]
-        passed_on = re.search(r"^relay: (\d+) datagrams passed on", udp_mesh(husky, "status"), re.MULTILINE)
+        passed_on = re.search(r"^relay: (\d+) datagrams forwarded", udp_mesh(husky, "status"), re.MULTILINE)
         assert passed_on is not None
         assert int(passed_on[1]) > 30
 

@@ -69,7 +69,7 @@ def mesh_topic(action: str, part: str) -> str:
 
 
 def offer_of(action: str, types: Mapping[str, TypeKey], lost_s: float) -> Offer:
-    """What tells peers of an action: the types of feedback and result, which a client's subscriptions must match."""
+    """Announces an action to peers: the types of feedback and result, which a client's subscriptions must match."""
     text = json.dumps({part: list(types[part]) for part in (FEEDBACK, RESULT)}, separators=(",", ":"))
     return Offer(action, "{} {}".format(OFFER_TYPE, text), "", 0.0, lost_s)
 

@@ -21,7 +21,7 @@ SCHEME = "rosrpc://"
 HEADER_BYTES = 4096
 _LENGTH = struct.Struct("<I")
 MAX_RESPONSE_BYTES = 1 << 26
-"""What a server may make us allocate: the daemon's limit for messages."""
+"""Maximum size of a server's response: the daemon's limit for messages."""
 
 
 class ServiceType(NamedTuple):

@@ -83,7 +83,7 @@ class _Publisher:
 
 
 class Ros2Publishers:
-    """What the mesh brings, published in ROS. `message_class` returns None for a type that is not installed."""
+    """Publishes messages from the mesh in ROS. `message_class` returns None for a type that is not installed."""
 
     def __init__(self, node: Any, message_class: Callable[[str], Any], warn: Warn) -> None:
         self._node, self._message_class, self._warn = node, message_class, warn

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 TOPIC = "bridge/ros2-calls"
 BAD_BYTES = (RuntimeError, TypeError, ValueError)
-"""What rclpy raises for bytes that are not of the type."""
+"""Exceptions that rclpy raises for bytes that are not of the type."""
 TICK_S = 0.2
 REFRESH_TICKS = 5
 LINGER_S = 5.0

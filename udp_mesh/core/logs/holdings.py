@@ -46,8 +46,6 @@ class Holdings:
     ) -> None:
         self.logs: dict[LogKey, LogState] = {}
         self.shelves = shelves
-        self.dropped_items = 0
-        """Items dropped before all their readers were known to have them."""
         self._store = store
         self._policy = policy
         self._announcements = announcements
@@ -179,7 +177,6 @@ class Holdings:
         """Remove an item, for good."""
         state, shelf = self.logs[item.log], self.shelves[item.log.topic]
         if not self.is_read(item):
-            self.dropped_items += 1
             self._emit(LogItemDropped(item.log.topic, item.log.source, item.number, reason))
         shelf.remove(item)
         state.held.remove(item.number)

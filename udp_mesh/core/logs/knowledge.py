@@ -1,4 +1,4 @@
-"""What is known of one log here: what this node holds, what it has had, and which readers have what.
+"""Knowledge of one log: the items this node holds, those it has had, and those each reader has.
 
 `LogState` is one per log and node, `PeerView` what one online peer says it holds. Numbers are kept as ranges, because a
 peer may claim any numbers; every collection is bounded.
@@ -184,6 +184,6 @@ def as_set(ranges: Ranges | list[tuple[int, int]]) -> RangeSet:
     return result
 
 
-def intersection(one: RangeSet, other: RangeSet) -> RangeSet:
+def intersection(a: RangeSet, b: RangeSet) -> RangeSet:
     """The numbers in both sets."""
-    return as_set(one.without(as_set(one.without(other))))
+    return as_set(a.without(as_set(a.without(b))))

@@ -1,4 +1,4 @@
-"""What the settings say about each log at this node: who reads it, who carries it, and whether there is room."""
+"""Policy of each log at this node, from the settings: its readers, its carriers, and its limits."""
 
 from __future__ import annotations
 

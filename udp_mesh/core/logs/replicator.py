@@ -71,7 +71,6 @@ class Replicator:
         self._run_soon = False
         self.rejected_items = 0
         """Items that were malformed, not signed by their source, or of no log here."""
-        self.duplicate_items = 0
         self.apply(settings, now)
 
     def apply(self, settings: Settings, now: float) -> None:
@@ -250,7 +249,6 @@ class Replicator:
             return
         number = item.id.number
         if number in state.received or number in state.storing:
-            self.duplicate_items += 1
             return
         dropped = self.holdings.shelves[topic].make_room(len(payload), own=False, wanted=wanted)
         if dropped is None:

@@ -1,4 +1,4 @@
-"""What the store held when the node started, taken over topic by topic: a topic may become a log at run time."""
+"""Restores the items that the store held at the start, topic by topic: a topic may become a log at run time."""
 
 from __future__ import annotations
 

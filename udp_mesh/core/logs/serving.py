@@ -60,7 +60,6 @@ class Serving:
         self._defer = defer
         self._peers: dict[str, _Service] = {}
         self._messages: dict[MessageId, tuple[str, ItemId]] = {}
-        self.sent_items = 0
 
     def request(self, peer: str, item: ItemId) -> bool:
         """A peer requests an item that is held here. Returns whether it may request more."""
@@ -140,7 +139,6 @@ class Serving:
             return
         service.sending[item] = len(data)
         self._messages[outcome] = (peer, item)
-        self.sent_items += 1
 
     @property
     def next_at(self) -> float:

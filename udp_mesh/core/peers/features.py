@@ -1,4 +1,4 @@
-"""What peers accept: whether a feature may be used, and a message without what its receiver does not accept."""
+"""Features that peers accept: whether one may be used, and messages without those that a receiver does not accept."""
 
 from __future__ import annotations
 

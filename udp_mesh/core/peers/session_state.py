@@ -1,4 +1,4 @@
-"""What is proven about a session, and whether its peer hears us, each as one transition table.
+"""The state of a session's proof, and of whether its peer hears us, each as one transition table.
 
 NEW, RESTORED or RETURNED -> VERIFIED once it proves that it hears our current boot.
 

@@ -1,4 +1,4 @@
-"""What a node knows of relays: its neighbors there, whom it reaches through whom, and what it passes on."""
+"""A node's view of relays: its neighbors, the routes to other nodes, and counters of forwarded datagrams."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What seals relay datagrams: keys derived for hops, one channel to all and one to each neighbor's boot.
+"""Seals relay datagrams: keys derived for hops, one channel to all and one to each neighbor's boot.
 
 A hop key is derived from the fleet key, or from a relay key that relays outside the fleet may hold too; it never seals
 what the ends of a path seal. A proof of membership shows the holders of a fleet key that another node holds it, so that

@@ -1,4 +1,4 @@
-"""What is remembered of small messages that share datagrams (`send_quota.pack_until` decides by it)."""
+"""State for packing small messages into shared datagrams (`send_quota.pack_until` decides by it)."""
 
 
 class Packing:

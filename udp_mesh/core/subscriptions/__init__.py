@@ -1,4 +1,4 @@
-"""What the programs of each node read: a node sends its peers only that, and no faster than they want it.
+"""Subscriptions: a node sends its peers only the topics that their programs read, no faster than requested.
 
 1. `own`: what the programs here read, for the peers that asked for it.
 2. `table`: what the programs of one peer read, as it answered.

@@ -1,4 +1,4 @@
-"""What is known of subscriptions, and what they saved."""
+"""A snapshot of the known subscriptions, and of the traffic they saved."""
 
 from dataclasses import dataclass
 

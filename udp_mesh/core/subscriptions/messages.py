@@ -57,8 +57,8 @@ class Bounds(NamedTuple):
 UNBOUNDED = Bounds()
 
 
-def _larger(one: float | None, other: float | None) -> float | None:
-    return None if one is None or other is None else max(one, other)
+def _larger(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else max(a, b)
 
 
 class Subscription(NamedTuple):

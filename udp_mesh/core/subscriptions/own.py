@@ -1,4 +1,4 @@
-"""What the programs of this node read, and which peers want to know it.
+"""Subscriptions of this node's programs, and the peers that follow them.
 
 A peer that asked gets the table, and a new one after each change. What programs start to read is announced at once,
 what they stop reading after `LINGER_S`, since many of them come back. Nothing is announced in the first `STARTING_S`:

@@ -1,4 +1,4 @@
-"""What the programs of one peer read, as the peer announced it."""
+"""Subscriptions of one peer's programs, as the peer announced them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was sent and received as versions, per topic: the decisions and the gain."""
+"""Counters of versions sent and received per topic: the decisions and the savings."""
 
 from dataclasses import dataclass
 
