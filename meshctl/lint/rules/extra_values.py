@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from ipaddress import IPv4Network, ip_interface
 
 from meshctl.diagnostics import Severity
-from meshctl.inventory.suggest import asked, did_you_mean
+from meshctl.inventory.suggest import did_you_mean, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
@@ -33,7 +33,7 @@ def _not_misspelled(*words: str) -> _Check:
 
     def check(value: str) -> tuple[str, str] | None:
         near = () if value in words else one_edit_apart(value, words)
-        return (" or ".join(near), asked(near)) if near else None
+        return (" or ".join(near), suggestion(near)) if near else None
 
     return check
 

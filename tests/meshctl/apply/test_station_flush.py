@@ -180,7 +180,7 @@ def test_neighbors_log_in_to_a_node_that_would_notice_if_they_removed_an_entry_b
     exit_status: int, login: str
 ) -> None:
     """A change of the network may drop logins, and so may a stale entry that passes echo replies."""
-    interfaces = (NetInterface("lan", up=True, pending=False, proto="static", addresses=("10.42.0.102/24",)),)
+    interfaces = (NetInterface("lan", up=True, pending=False, addresses=("10.42.0.102/24",)),)
     near = Neighbours({"b02": replace(node("b02", "b01"), interfaces=interfaces), "b01": node("b01", "b02")})
     flush = near.flushes.listener(near.job, EVERY_RADIO)
     flush.armed(watching([], exit_status), for_s=100.0)
