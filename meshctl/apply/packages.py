@@ -61,12 +61,12 @@ def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> O
 
 
 def with_full_flash(outcome: Outcome, flash: Space | None, needed_bytes: int) -> Outcome:
-    """The outcome of an installation, with the free flash if the package files, compressed as flash is, had not
-    fitted into it: neither package tool's failure nor the node's refusal says so."""
+    """The outcome of an installation, with both sizes if the package files, compressed as flash is, had not fitted into
+    the free flash: a package tool does not always name that reason, and the node's refusal gives no size."""
     if outcome.result not in (Result.REFUSED, Result.ROLLED_BACK) or flash is None or flash.free >= needed_bytes:
         return outcome
     free, needed = flash.free >> 10, -(-needed_bytes >> 10)
-    why = f"{outcome.reason}; its flash is too full: {free} KiB were free, the package files have {needed} KiB"
+    why = f"{outcome.reason} ({free} KiB of flash were free; the package files have {needed} KiB)"
     return replace(outcome, reason=why, hint=outcome.hint or FLASH_HINT)
 
 

@@ -19,7 +19,7 @@ def flash(free_kib: int) -> Space:
 def test_an_installation_for_which_there_was_no_flash_says_so(result: Result) -> None:
     outcome = with_full_flash(Outcome("b02", result, WHY), flash(200), (300 << 10) + 1)
     assert outcome.result is result
-    assert outcome.reason == f"{WHY}; its flash is too full: 200 KiB were free, the package files have 301 KiB"
+    assert outcome.reason == f"{WHY} (200 KiB of flash were free; the package files have 301 KiB)"
     assert "du -ak /overlay" in outcome.hint
 
 
