@@ -40,9 +40,9 @@ class Interrupt:
         """Request once to stop, twice to leave."""
         if self._stop.is_set():
             self._leave.set()
+            # how to go on depends on the command: its last line says so
             self._report(
-                "leaving: armed changes roll back by themselves; run `meshctl resume` later "
-                "(Ctrl-C again to exit without closing connections)"
+                "leaving: armed changes roll back by themselves (Ctrl-C again to exit without closing connections)"
             )
         else:
             self._stop.set()
