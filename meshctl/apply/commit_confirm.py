@@ -200,4 +200,6 @@ def _uncertain(change: ChangeInProgress) -> Outcome:
         why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:
         why = f"unreachable since its change started ({change.last_error}); its timer has rolled it back"
-    return Outcome(change.ctx.name, Result.UNCERTAIN, why, hint="when it answers again, `meshctl status` shows its state")
+    return Outcome(
+        change.ctx.name, Result.UNCERTAIN, why, hint="when it answers again, `meshctl status` shows its state"
+    )
