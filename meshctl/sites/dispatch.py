@@ -186,7 +186,7 @@ class SiteExecution:
         return {name: outcome for run in runs for name, outcome in run.outcomes.items()}
 
     def _execute_site(self, run: SiteRun) -> None:
-        wait_s, contact_s, said = _FIRST_WAIT_S, time.monotonic(), ""
+        wait_s, contact_s, noted, reason = _FIRST_WAIT_S, time.monotonic(), "", ""
         while not run.is_over and not self._leaves(run) and time.monotonic() - contact_s < GIVE_UP_S:
             try:
                 offset = run.offset
@@ -196,13 +196,14 @@ class SiteExecution:
                     contact_s = time.monotonic()
                 if run.offset != offset:
                     wait_s = _FIRST_WAIT_S
-                text = f"site {run.site.name}: {error}; connecting again" + (
+                reason = str(error)
+                text = f"site {run.site.name}: {reason}; connecting again" + (
                     ", the site continues on its own" if run.is_started else ""
                 )
-                # the same reason again and again is said once
-                if text != said:
+                # a reason that repeats is noted once
+                if text != noted:
                     self._note(f"{text}; {_LEAVING}" + (f"\nhint: {error.hint}" if error.hint else ""))
-                    said = text
+                    noted = text
                 self.interrupt.wait(wait_s)
                 wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             except MeshctlError as error:
@@ -217,6 +218,7 @@ class SiteExecution:
                 text += ", or its order still waits for it"
             if not run.is_started:
                 text = "it has not started, or the uplink was lost just then"
+                text += f"; the last attempt failed: {reason}" if reason else ""
             run.is_unknown = True
             self._finish_all(run, Result.PENDING, text, "run `meshctl resume` to see how it ended")
 
