@@ -18,7 +18,8 @@ from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.path import IP_UDP_BYTES
 from udp_mesh.core.sender.pending import Outcome
-from udp_mesh.core.sender.sender import PROBE_INTERVAL_S, Sender
+from udp_mesh.core.sender.probing import PROBE_INTERVAL_S
+from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address
 from udp_mesh.wire.legacy import (
     LAST_SEQUENCE as LAST_SEQUENCE,

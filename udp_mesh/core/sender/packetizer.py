@@ -126,8 +126,8 @@ def send_level(
             used += _send_datagram(sender, path, run, urgent, snapshot, out)
         if bucket is not None:
             bucket.consume(used - before)
-        if sender.probe_credit:
-            sender.probe_credit = max(0, sender.probe_credit - count)
+        if sender.probing.credit:
+            sender.probing.credit = max(0, sender.probing.credit - count)
         if urgent:
             sender.urgent_sent_at = now
         else:

@@ -59,7 +59,7 @@ def cwnd_room(sender: Sender, now: float) -> int:
 def send_quota(sender: Sender, room: int, now: float, packets_per_s: float | None, *, urgent: bool) -> int:
     """Packets that may be sent now. `packets_per_s` is the pacing rate, which urgent fragments ignore."""
     if sender.state is SendState.UNRESPONSIVE:
-        return sender.probe_credit
+        return sender.probing.credit
     packets = room
     if urgent:
         packets += sender.rates.urgent_excess_packets
@@ -68,7 +68,7 @@ def send_quota(sender: Sender, room: int, now: float, packets_per_s: float | Non
             packets = 1
     else:
         packets = min(packets, sender.pacer.packets_allowed(now, packets_per_s))
-    return max(packets, sender.probe_credit)
+    return max(packets, sender.probing.credit)
 
 
 def urgent_wait_until(sender: Sender) -> float:

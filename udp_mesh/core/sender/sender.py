@@ -22,19 +22,13 @@ from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.packing import Packing
 from udp_mesh.core.sender.pending import PendingMessages
 from udp_mesh.core.sender.pmtu import PathMtu
+from udp_mesh.core.sender.probing import PROBE_INTERVAL_S, Probing
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
-from udp_mesh.core.sender.resume_backoff import FAST_PROBE_FOR_S, RESUME_BURST_PACKETS, STALE_AFTER_S, ResumeBackoff
 from udp_mesh.core.sender.scheduler import Scheduler
 from udp_mesh.core.sender.send_state import TRANSITIONS, SendEvent, SendState
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
 from udp_mesh.wire.frames import Ack
-
-FAST_PROBE_INTERVAL_S = 0.025
-"""Probe interval in the first second: most outages of a moving robot are that short."""
-
-PROBE_INTERVAL_S = 0.25
-"""Probe interval later: the time lost when the link returns, at four packets a second to a dead peer."""
 
 UNRESPONSIVE_AFTER_PTOS = 3
 UNRESPONSIVE_AFTER_S = 0.25
@@ -52,6 +46,9 @@ EXPIRE_INTERVAL_S = 0.005
 
 NON_URGENT_RTT_VALID_S = 1.0
 """While a round trip sample of a packet that is not urgent is younger than this, urgent ones do not count."""
+
+STALE_AFTER_S = 1.0
+"""After an outage, messages that are not urgent and have waited longer than this share their level with new ones."""
 
 
 class Sender(PendingMessages):
@@ -79,15 +76,11 @@ class Sender(PendingMessages):
         self.wake_at = float("inf")
         """When pacing permits the next quantum."""
         self.state = SendState.ACTIVE
-        self.unresponsive_since = float("-inf")
-        """When the state last became UNRESPONSIVE."""
         self.timed_out: list[Packet] = []
         """Packets that timed out and are neither acknowledged nor retransmitted."""
         self.expired_at = float("-inf")
         self.urgent_sent_at = float("-inf")
-        self.probe_credit = 0
-        self.probed_at = float("-inf")
-        self._resume_backoff = ResumeBackoff()
+        self.probing = Probing()
         self.pmtu = PathMtu()
         self.last_progress = 0.0
         self.non_urgent_progress = 0.0
@@ -265,7 +258,7 @@ class Sender(PendingMessages):
         at: float | None = None
         if self.state is SendState.UNRESPONSIVE:
             if self.pending or self.in_flight.outstanding:
-                at = self.probed_at + self._probe_interval_s()
+                at = self.probing.next_at()
         elif self.in_flight.outstanding:
             at = self._expiry_at()
         elif self._is_timed_out_due():
@@ -291,7 +284,7 @@ class Sender(PendingMessages):
             self.wake_at = float("inf")
         if self.state is SendState.UNRESPONSIVE:
             awaited = self.pending or self.in_flight.outstanding
-            if awaited and now >= self.probed_at + self._probe_interval_s():
+            if awaited and now >= self.probing.next_at():
                 self.allow_probe(now)
         elif self.in_flight.outstanding:
             timeout = self.pto_s()
@@ -344,34 +337,27 @@ class Sender(PendingMessages):
     def become_unresponsive(self, now: float) -> None:
         """Requeue everything in flight and send only probes from now on."""
         self._transition(SendEvent.NO_PROGRESS)
-        self.unresponsive_since = now
+        self.probing.begin(now)
         self.allow_probe(now)
 
     def _transition(self, event: SendEvent) -> None:
         self.state = TRANSITIONS[self.state, event]
 
-    def _probe_interval_s(self) -> float:
-        fast = self.probed_at - self.unresponsive_since < FAST_PROBE_FOR_S
-        return FAST_PROBE_INTERVAL_S if fast else PROBE_INTERVAL_S
-
     def allow_probe(self, now: float) -> None:
-        """Let the most urgent fragment probe an unresponsive peer, at most once per `FAST_PROBE_INTERVAL_S`."""
-        if now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
-            return
-        self.probed_at = now
-        self.probe_credit = 1
-        self._demote_in_flight()
+        """Let the most urgent fragment probe an unresponsive peer, unless another probe was just allowed."""
+        if self.probing.allow_probe(now):
+            self._demote_in_flight()
 
     def consume_small_probe(self, now: float) -> bool:
         """Whether a ping is sent as the probe just allowed: nothing waits, or full fragments may be too large for the
         path (then with one probe in a few, and later in its place)."""
-        if self.state is not SendState.UNRESPONSIVE or not self.probe_credit:
+        if self.state is not SendState.UNRESPONSIVE or not self.probing.credit:
             return False
         if self.scheduler.waiting:
             if not self.pmtu.next_probe_is_small():
                 return False
-            if now - self.unresponsive_since > FAST_PROBE_FOR_S:
-                self.probe_credit = 0
+            if self.probing.is_slow(now):
+                self.probing.credit = 0
         self.pmtu.on_small_probe_sent()
         return True
 
@@ -386,15 +372,11 @@ class Sender(PendingMessages):
     def on_activity(self, now: float) -> None:
         """Record that an authentic datagram arrived. To an unresponsive peer a first burst is sent; the rest waits for
         an acknowledgement."""
-        if self.state is not SendState.UNRESPONSIVE or now < self.probed_at + FAST_PROBE_INTERVAL_S * 0.99:
-            return
-        if self._resume_backoff.due(now):
-            self.allow_probe(now)
-            self.probe_credit = min(RESUME_BURST_PACKETS, int(self.congestion.cwnd))
+        if self.state is SendState.UNRESPONSIVE and self.probing.allow_burst(now, int(self.congestion.cwnd)):
+            self._demote_in_flight()
 
     def _on_responsive(self, now: float) -> None:
-        self._resume_backoff.reset()
-        self.probe_credit = 0
+        self.probing.end()
         self.scheduler.demote_stale(self.rates.urgent_priority)
         self.scheduler.alternate_stale(self.rates.urgent_priority + 1, now - STALE_AFTER_S)
 
@@ -416,7 +398,7 @@ class Sender(PendingMessages):
         self.next_wire_id = 0
         self.epoch += 1
         self._transition(SendEvent.RESTARTED)
-        self.probe_credit = 0
+        self.probing.credit = 0
         self.last_progress = now
         messages = list(self.pending)
         self.pending.clear()
