@@ -1,4 +1,4 @@
-"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC137)."""
+"""Sites: nodes, their meshes and the worker that provisions them (MC131 to MC138)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.sshkey import BadKey, parse_authorized_key
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Node, Role
 from meshctl.wording import join_limited
 
+_FAR = """\
+meshes: {far: {ssid: far, bssid: 02:ca:fe:00:00:02, band: 5g, channel: 36, network: 10.43.0.0/24,
+               encryption: psk2+ccmp, key: {env: FAR_KEY}}}
+nodes:
+  far1: {role: base, address: 10.43.0.1, label: F1, radios: {radio0: {mesh: null}, radio1: {mesh: far}}%s}
+  far2: {role: beacon, address: 10.43.0.2, label: F2, radios: {radio0: {mesh: null}, radio1: {mesh: far}}%s}
+"""
 _KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIAECAwQFBgcICQoLDA0ODxAREhMUFRYXGBkaGxwdHh8g worker"
 _NORTH = f"{{ssh: {{host: north.example.org}}, worker_key: {_KEY}}}"
 _SOUTH = f"{{ssh: {{host: south.example.org}}, worker_key: {_KEY}}}"
@@ -180,3 +187,34 @@ def nats_without_hub(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for name, site in fleet.sites.items():
         if site.nats is not None and fleet.nats is None:
             yield Finding(("sites", name, "nats"), "the fleet has no NATS hub", "`nats.url` in the inventory", "none")
+
+
+@fleet_rule(
+    "MC138",
+    Severity.WARNING,
+    "A base leads to a mesh of its own without a site",
+    why="""Of several bases, status and plans start from the first one of each site. Nodes in a mesh that this base does
+    not reach are reported without a path, and plans cannot determine what a change disconnects.""",
+    fix="Define a site for each such base in `sites`, and set it for the nodes of its meshes.",
+    failing=_FAR % ("", ""),
+    passing="sites: {far: {}}\n" + _FAR % (", site: far", ", site: far"),
+)
+def base_of_another_mesh(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    for first in fleet.base_nodes:
+        reached = _joined_meshes(fleet, first)
+        for node in fleet.managed():
+            is_other = node.role is Role.BASE and node.site == first.site and bool(node.meshes)
+            if is_other and not reached.intersection(node.meshes):
+                found = f"{first.name} is the base, and does not reach {join_limited(node.meshes)}"
+                yield Finding(("nodes", node.name, "role"), found, "a site of its own", node.site or "no site")
+
+
+def _joined_meshes(fleet: Fleet, base: Node) -> set[str]:
+    """The meshes that the base reaches: those of its radios, and any that a node or a robot's nodes join to these."""
+    groups = [set(node.meshes) for node in fleet.managed()]
+    for robot in fleet.robots.values():
+        groups.append({mesh for name in robot.nodes if name in fleet.nodes for mesh in fleet.nodes[name].meshes})
+    reached = set(base.meshes)
+    while new := {mesh for group in groups if group & reached for mesh in group} - reached:
+        reached |= new
+    return reached
