@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple
 
 from meshctl.device.framing import quoted
 from meshctl.device.observation import Observation
@@ -44,12 +44,19 @@ MAX_QUERIED = 16
 GONE, KEPT, UNKNOWN = "gone", "kept", "unknown"
 # What a holder prints once a neighbor answers it again because the holder has sent enough.
 CAUGHT_UP = "caught-up"
+# The batman-adv interface of rendered configurations. Its MAC is another after each boot.
+_MESH = "bat0"
 # all wireless interfaces, for sh; Linux allows no blank in an interface name
 _EVERY_INTERFACE = "\"$(iw dev 2>/dev/null | sed -n 's/^[[:space:]]*Interface //p')\""
 
 
-# The address and port of a node's SSH server.
-Login: TypeAlias = tuple[str, int]
+class LoginPlace(NamedTuple):
+    """Address and port of a node's SSH server. `mesh_mac`: of its batman-adv interface before a change that restarts
+    no radio. While the mesh announces it, the node has not rebooted, and no entry makes a server silent."""
+
+    address: str
+    port: int
+    mesh_mac: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,16 +94,21 @@ def entries_of(
     )
 
 
-def login_of(node: Node, before: Observation) -> Login | None:
-    """Where a node's neighbors can log in to it, unless its change gives it another address than it had `before`."""
+def login_of(node: Node, before: Observation, radios: Radios) -> LoginPlace | None:
+    """Where a node's neighbors can log in to it, unless its change, which restarts these radios, gives it another
+    address than it had `before`."""
     had = {address.partition("/")[0] for interface in before.interfaces or () for address in interface.addresses}
     login = inventory_login(node)
-    return login if login[0] in had else None
+    if login.address not in had:
+        return None
+    if radios:
+        return login
+    return login._replace(mesh_mac=next((mac for ifname, mac in (before.macs or {}).items() if ifname == _MESH), ""))
 
 
-def inventory_login(node: Node) -> Login:
+def inventory_login(node: Node) -> LoginPlace:
     """Where a node accepts logins according to the inventory."""
-    return str(node.address.ip), node.ssh.port
+    return LoginPlace(str(node.address.ip), node.ssh.port)
 
 
 def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
@@ -179,7 +191,7 @@ def flush_script(
     *,
     older_than_s: float,
     has_restarted: bool = False,
-    login: Login | None = None,
+    login: LoginPlace | None = None,
 ) -> str:
     """POSIX sh that removes a holder's entries that are at least that old and stale; with `has_restarted` all that are
     that old. `login`: where the entries' node accepts logins, if no other answer of it counts.
@@ -195,11 +207,14 @@ def flush_script(
     return "".join((script("stale_station.sh"), *calls))
 
 
-def _where(login: Login | None) -> str:
-    return "" if login is None else f" {quoted(login[0])} {login[1]}"
+def _where(login: LoginPlace | None) -> str:
+    if login is None:
+        return ""
+    announced = f" {quoted(login.mesh_mac)}" if login.mesh_mac else ""
+    return f" {quoted(login.address)} {login.port}{announced}"
 
 
-def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int, logins: Mapping[str, Login]) -> str:
+def reconnect_script(entries: Sequence[StationEntry], *, caught_up: int, logins: Mapping[str, LoginPlace]) -> str:
     """POSIX sh that repairs a holder's links to these neighbors: it removes stale entries, then sends to the first
     `caught_up` of those that still do not answer. It prints a line for each of both. `logins`: lower-case MAC -> where
     its node accepts logins."""

@@ -30,7 +30,7 @@ from meshctl.apply.stale_stations import (
     KEPT,
     MAX_QUERIED,
     UNKNOWN,
-    Login,
+    LoginPlace,
     StationEntry,
     by_holder,
     current_neighbors,
@@ -94,7 +94,7 @@ class StationFlush:
     _watches_itself: bool = False
     _queried_s: list[float] = field(default_factory=list)
     # where the node has to answer logins, since the queries in `_queried_s`
-    _login: Login | None = None
+    _login: LoginPlace | None = None
     # nodes whose radios restart at the same moment and keep no entry from before
     _restarting: frozenset[str] = frozenset()
     # once each, although a node that is flashed is queried for many times
@@ -199,7 +199,7 @@ class StationFlush:
         now_s = time.monotonic()
         # there, an entry that is removed by mistake costs seconds
         is_login_due |= self._watches_itself
-        if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before)):
+        if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before, self.radios)):
             self._login = login
             self._queried_s.clear()
         if self._started_s is None or now_s < next_query_s(self._queried_s):
@@ -271,7 +271,7 @@ class StationFlush:
         since_s: float,
         *,
         has_restarted: bool = False,
-        login: Login | None = None,
+        login: LoginPlace | None = None,
     ) -> dict[str, str]:
         """Have these holders remove stale entries; returns the answers."""
         scripts = {
@@ -356,7 +356,7 @@ class StationFlushes:
 
 
 def _flush_since(
-    entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False, login: Login | None = None
+    entries: Sequence[StationEntry], since_s: float, *, has_restarted: bool = False, login: LoginPlace | None = None
 ) -> str:
     return flush_script(entries, older_than_s=time.monotonic() - since_s, has_restarted=has_restarted, login=login)
 

@@ -96,9 +96,13 @@ try_login() {
 	rm -f /tmp/meshctl/login.$$
 }
 
-# flush_stale DEVICES MAC SECONDS [ADDRESS PORT]: removes the entry if it is that old and stale; prints `gone`, `kept` (it
+# is_announced MAC: the mesh still knows it as a client of its own. A node's batman-adv interface has another MAC after each
+# boot, and the table that says so travels in the class of the echo requests.
+is_announced() { [ -n "$1" ] && batctl $interface_option "$mesh" tg 2>/dev/null | grep -qiF " $1 "; }
+
+# flush_stale DEVICES MAC SECONDS [ADDRESS PORT [MESH_MAC]]: removes the entry if it is that old and stale; prints `gone`, `kept` (it
 # cannot be removed), `answers`, or `unknown` MAC. With ADDRESS and PORT of the neighbor's dropbear, a neighbor that answers
-# echo requests has to let something come back from there, too.
+# echo requests has to let something come back from there, too, unless it announces MESH_MAC: then it has not restarted.
 flush_stale() {
 	for dev in $1; do
 		look "$dev" "$2"
@@ -106,7 +110,7 @@ flush_stale() {
 		echo_state "$dev" "$2"
 		if [ $ECHO = answered ] && [ -n "$4" ]; then
 			try_login "$4" "$5"
-			[ $LOGIN != silent ] || ECHO=lost
+			[ $LOGIN != silent ] || is_announced "$6" || ECHO=lost
 		fi
 		case $ECHO in
 		answered) echo "answers $2" ;;

@@ -16,6 +16,7 @@ from meshctl.apply.stale_stations import (
     FIRST_PAUSE_S,
     MAX_PAUSE_S,
     MAX_QUERIED,
+    LoginPlace,
     StationEntry,
     by_holder,
     current_neighbors,
@@ -193,6 +194,7 @@ get)
 del) echo "$now $2 $5" >>"$HERE/deleted"; [ ! -f "$HERE/renews" ] || : >"$HERE/renewed"; [ "$5" != unknown ] ;;
 esac""",
     "batctl": """echo "$@" >>"$HERE/asked"
+[ "$3" != tg ] || { cat "$HERE/table" 2>/dev/null; exit 0; }
 [ ! -f "$HERE/renewed" ] || { echo "20 bytes from x"; exit 0; }
 if [ -f "$HERE/numbers" ] && [ "$(grep -c -- '-c 52 ' "$HERE/asked")" -ge "$(cat "$HERE/numbers")" ]; then
     echo "20 bytes from x"
@@ -326,7 +328,7 @@ def test_a_neighbor_that_answers_echo_requests_has_to_answer_logins_too(
     (tmp_path / "connections").write_text(connections)
     (tmp_path / "arp").write_text(arp)
     (tmp_path / "memory").mkdir()
-    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=LoginPlace("10.42.0.11", 22))
     assert deletions(tmp_path, [Second(100, 50, ANSWERED)] * 9, text)[0] == printed
     assert (tmp_path / "called").read_text() == "10.42.0.11 22\n"
     assert list((tmp_path / "memory").iterdir()) == []
@@ -334,13 +336,13 @@ def test_a_neighbor_that_answers_echo_requests_has_to_answer_logins_too(
 
 @pytest.mark.parametrize(("echo", "printed"), [(LOST, f"gone {MAC}\n"), (UNREACHABLE, f"unknown {MAC}\n")])
 def test_no_login_is_tried_where_no_echo_request_is_answered(tmp_path: Path, echo: str, printed: str) -> None:
-    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=LoginPlace("10.42.0.11", 22))
     assert deletions(tmp_path, [Second(100, 50, echo)] * 9, text)[0] == printed
     assert not (tmp_path / "called").exists()
 
 
 def test_without_nc_echo_requests_decide(tmp_path: Path) -> None:
-    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=("10.42.0.11", 22))
+    text = flush_script([StationEntry("b01", "mesh0", MAC)], older_than_s=11.2, login=LoginPlace("10.42.0.11", 22))
     # the host of the tests may have it
     text = text.replace("command -v nc", "command -v absent")
     assert deletions(tmp_path, [Second(100, 50, ANSWERED)], text)[0] == f"answers {MAC}\n"
@@ -366,7 +368,7 @@ def test_a_neighbor_that_drops_frames_until_their_numbers_catch_up_is_sent_enoug
 
 def test_only_where_the_node_of_a_radio_is_known_its_ssh_server_is_tried() -> None:
     entries = [StationEntry("b01", "mesh0", MAC.upper()), StationEntry("b01", "mesh0", OTHER)]
-    text = reconnect_script(entries, caught_up=0, logins={MAC: ("10.42.0.11", 2222)})
+    text = reconnect_script(entries, caught_up=0, logins={MAC: LoginPlace("10.42.0.11", 2222)})
     calls = [line for line in text.splitlines() if line.startswith("flush_stale ")]
     assert calls == [f"flush_stale mesh0 {MAC.upper()} 0 10.42.0.11 2222", f"flush_stale mesh0 {OTHER} 0"]
 

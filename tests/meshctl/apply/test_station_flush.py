@@ -148,16 +148,26 @@ def test_neighbors_that_the_plan_did_not_observe_are_queried_for_a_node_that_may
     assert script.endswith(f"{MAC} 25\n")
 
 
-@pytest.mark.parametrize(("had", "login"), [("10.42.0.102", " 10.42.0.102 22"), ("10.42.0.99", "")])
+@pytest.mark.parametrize(
+    ("had", "radios", "login"),
+    [
+        ("10.42.0.102", EVERY_RADIO, " 10.42.0.102 22"),
+        # no radio restarts: only a boot explains a stale entry, and changes this MAC
+        ("10.42.0.102", NO_RADIOS, " 10.42.0.102 22 76:9f:08:ba:c9:d5"),
+        ("10.42.0.99", EVERY_RADIO, ""),
+    ],
+)
 def test_a_node_that_is_unreachable_although_it_must_answer_logins_is_logged_in_to_by_its_neighbors(
-    monkeypatch: pytest.MonkeyPatch, had: str, login: str
+    monkeypatch: pytest.MonkeyPatch, had: str, radios: Radios, login: str
 ) -> None:
     """Once, even if they were queried a moment ago; not if the change gives it another address: it has its old one."""
     now_s = [1000.0]
     monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
     interfaces = (NetInterface("lan", up=True, pending=False, addresses=(f"{had}/24",)),)
-    near = Neighbours({"b02": replace(node("b02"), interfaces=interfaces), "b01": node("b01", "b02")})
-    flush = near.flushes.listener(near.job, EVERY_RADIO)
+    before = replace(node("b02"), interfaces=interfaces)
+    before = replace(before, macs={**(before.macs or {}), "bat0": "76:9f:08:ba:c9:d5"})
+    near = Neighbours({"b02": before, "b01": node("b01", "b02")})
+    flush = near.flushes.listener(near.job, radios)
     flush.started()
     now_s[0] += 100
     flush.unreachable()

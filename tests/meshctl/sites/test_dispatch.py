@@ -1,4 +1,4 @@
-"""What the operator is told of a run at a site that was never reached."""
+"""The outcome of a run at a site that was never reached."""
 
 from __future__ import annotations
 
