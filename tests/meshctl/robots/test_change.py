@@ -112,6 +112,7 @@ def test_key_rotation_restarts_nothing_and_waits_for_unreachable_robots(fleet: R
     fleet.machines["husky2"].stop()
     output = fleet.meshctl("rotate-key", "file:keys.yaml#new", exit_code=3)
     assert "husky2 did not complete this one" in output
+    assert "run `meshctl robots rotate-key file:keys.yaml#new` for the unfinished robots" in output
     assert [key.key for key in load_fleet(fleet.file).udp_mesh.keys] == ["old", "new"]
 
     fleet.machines["husky2"].start()
