@@ -256,9 +256,9 @@ def _cache() -> Path:
     return root / "meshctl" / "wheels"
 
 
-def finish(context: RobotsContext, journaled: JournaledRun) -> typer.Exit:
-    """Print the totals; returns the exit to raise."""
-    return print_totals(context.opened, journaled, as_json=context.as_json, unfinished="robots")
+def finish(context: RobotsContext, journaled: JournaledRun, retry: str = "meshctl resume") -> typer.Exit:
+    """Print the totals, and the command `retry` if something is left; returns the exit to raise."""
+    return print_totals(context.opened, journaled, as_json=context.as_json, unfinished="robots", retry=retry)
 
 
 def run_command(context: RobotsContext, command: str, **parameters: Any) -> JournaledRun:

@@ -36,7 +36,7 @@ takes_over() {
 	# the others read none of them
 	[ "$1" = "$unit" ] || return 0
 	changes=$(mesh reload 2>&1) || return 1
-	case $changes in *"takes effect with the next start"*) return 1 ;; esac
+	case $changes in *"takes effect after a restart"*) return 1 ;; esac
 }
 
 # well HOW: bring up the current release and wait until it is healthy; `reason` is why it is not.
