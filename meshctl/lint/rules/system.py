@@ -11,7 +11,8 @@ from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.addresses import as_address, networks, stations
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Node
+from meshctl.model.ip import IpAddress
 from meshctl.wording import counted
 
 
@@ -87,12 +88,12 @@ def zone_disagrees(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     passing="system: {log_host: 10.42.0.100}",
 )
 def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    known = {str(address) for address, _ in stations(fleet)}
+    known = {address for address, _ in stations(fleet)}
     places: list[tuple[tuple[str, ...], str]] = [(("system", "log_host"), fleet.system.log_host)]
     places += [(("system", "ntp_servers", str(index)), host) for index, host in enumerate(fleet.system.ntp_servers)]
     for path, host in places:
         address = as_address(host)
-        if address is None or host in known:
+        if address is None or address in known:
             continue
         if any(address in network for _, network in networks(fleet)):
             yield Finding(path, "no station in the inventory has this address", "the address of a computer", host)
@@ -113,15 +114,15 @@ def server_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def server_is_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    radios = {
-        str(address.ip): node for node in fleet.managed() for address in (node.address, node.lan_address) if address
+    radios: dict[IpAddress | None, Node] = {
+        address.ip: node for node in fleet.managed() for address in (node.address, node.lan_address) if address
     }
-    node = radios.get(fleet.system.log_host)
+    node = radios.get(as_address(fleet.system.log_host))
     if node is not None and not any(package in _LOG_SERVERS for package in (*node.hardware.packages, *node.packages)):
         message = f"{node.name} is a radio, which receives no logs"
         yield Finding(("system", "log_host"), message, "the address of a computer", fleet.system.log_host)
     for index, host in enumerate(fleet.system.ntp_servers):
-        node = radios.get(host)
+        node = radios.get(as_address(host))
         if node is not None and node.extra_uci.get("system.ntp.enable_server") != "1":
             message = f"{node.name} is a radio, whose time server is off"
             yield Finding(("system", "ntp_servers", str(index)), message, "the address of a computer", host)

@@ -9,6 +9,7 @@ from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.places import first_written
 from meshctl.lint.rule import Finding, fleet_rule
+from meshctl.lint.rules.addresses import as_address
 from meshctl.model import Fleet, Mesh, NodeState, Topic, TopicClass
 from meshctl.regdb import width_mhz
 from meshctl.resolve import has_routed_lans
@@ -243,8 +244,8 @@ def port_taken(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     """,
 )
 def log_port_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    hosts = {str(robot.computer.address.ip) for robot in fleet.robots.values() if robot.computer is not None}
-    if fleet.system.log_host in hosts and fleet.system.log_port == fleet.udp_mesh.port:
+    hosts = {robot.computer.address.ip for robot in fleet.robots.values() if robot.computer is not None}
+    if as_address(fleet.system.log_host) in hosts and fleet.system.log_port == fleet.udp_mesh.port:
         path = first_written(fleet, ("system", "log_port"), ("udp_mesh", "port"))
         yield Finding(path, "also the udp_mesh port of that computer", "another port", str(fleet.system.log_port))
 

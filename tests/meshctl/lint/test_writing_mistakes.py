@@ -108,3 +108,13 @@ def test_a_router_named_by_its_address_in_its_lan_is_a_radio(tmp_path: Path) -> 
     robots = "robots: {base-station: {lan: {network: 10.43.0.0/24}, computer: {address: 10.43.0.10/24}}}"
     found = [one for one in _found(f"system: {{log_host: 10.43.0.1}}\n{robots}", tmp_path) if one.code == "MC235"]
     assert [(one.path, one.found) for one in found] == [("system.log_host", "10.43.0.1")]
+
+
+def test_a_server_is_known_by_its_address_however_it_is_written(tmp_path: Path) -> None:
+    robots = "robots: {base-station: {lan: {network: 'fd43::/64'}, computer: {address: 'fd43::10/64'}}}"
+    computer = _found(f"system: {{log_host: 'fd43:0::10'}}\n{robots}", tmp_path)
+    assert "MC234" not in {one.code for one in computer}
+    radio = _found(f"system: {{log_host: 'fd43:0::1', ntp_servers: ['FD43::1']}}\n{robots}", tmp_path)
+    assert [one.path for one in radio if one.code == "MC235"] == ["system.log_host", "system.ntp_servers.0"]
+    port = "udp_mesh: {port: 5140}\nsystem: {log_host: 'fd43:0::10', log_port: 5140}\n"
+    assert "MC737" in {one.code for one in _found(port + robots, tmp_path)}
