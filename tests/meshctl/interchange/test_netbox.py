@@ -161,7 +161,7 @@ PAGE = {"count": 3, "next": None, "previous": None}
     [
         (401, {"detail": "No credentials."}, ("401 Unauthorized: No credentials.", "check NETBOX_TOKEN")),
         (404, HTML, ("404 Not Found", "without /api")),
-        (429, {"detail": "Throttled."}, ("429 Too Many Requests: Throttled.", "repeat the command")),
+        (429, {"detail": "Throttled."}, ("429 Too Many Requests: Throttled.", "try again later")),
         (502, HTML, ("502 Bad Gateway", "the proxy in front of it")),
         (200, HTML, ("the answer is not JSON: is this NetBox?",)),
         (200, b"", ("the answer is not JSON: is this NetBox?",)),

@@ -17,7 +17,9 @@ from meshctl.monitor.scratch import MARK, PREFIX, remove_leftovers, scratch_dire
 
 # short sleeps: a signal that comes right before a long one would be handled after it
 HOLD = """
-import sys, time
+import signal, sys, time
+# as in a terminal, also if the tests themselves run under nohup
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from pathlib import Path
 from meshctl.monitor.scratch import scratch_directory
 with scratch_directory(Path(sys.argv[1])) as directory:
