@@ -33,6 +33,7 @@ from meshctl.apply.change_in_progress import (
 from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum, unmet_of
+from meshctl.device.errors import NodeRefused
 from meshctl.device.openwrt import measure_uptime
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
@@ -165,6 +166,9 @@ def _schedule(commit: _MeshCommit) -> None:
             participant.is_scheduled = True
         except NodeError as error:
             participant.failure = Outcome(participant.name, Result.FAILED, str(error), hint=error.hint)
+            if not isinstance(error, NodeRefused):
+                # only its answer may be lost
+                participant.change.last_error = str(error)
 
     commit.each(commit.participants, start_one)
     if all(participant.is_scheduled for participant in commit.participants):
@@ -187,12 +191,13 @@ def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
                 unlock(change, connection)
         except NodeError as error:
             change.last_error = str(error)
-        if participant.is_scheduled or change.last_error:
+        is_unknown = bool(change.last_error)
+        if participant.is_scheduled or is_unknown:
             # it may have started before it was aborted
-            outcome = poll(change)
-            if not outcome.result.is_good:
-                why = f"{reason}; {outcome.reason}"
-                participant.failure = participant.failure or replace(outcome, reason=why)
+            outcome, failure = poll(change), participant.failure
+            if not outcome.result.is_good and (failure is None or is_unknown):
+                why = f"{reason if failure is None else failure.reason}; {outcome.reason}"
+                participant.failure = replace(outcome, reason=why)
 
     commit.each(commit.participants, cancel_one)
     return {

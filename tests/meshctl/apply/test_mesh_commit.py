@@ -17,8 +17,10 @@ from meshctl.apply.context import NodeContext, RunContext
 from meshctl.apply.mesh_commit import commit_mesh
 from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
+from meshctl.device.errors import NodeRefused
 from meshctl.device.observation import Observation
-from meshctl.errors import NodeError
+from meshctl.device.openwrt import UptimeSample
+from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Interrupt, Outcome, Result
 
 
@@ -155,3 +157,43 @@ def test_a_node_that_was_scheduled_names_the_one_for_which_it_is_called_off(monk
         ended = mesh_commit._cancel(commit, canceled_because(participants, "scheduled"))
     why = "the mesh change was canceled: b03 could not be scheduled: the connection broke; it was aborted"
     assert ended == {"b01": Outcome("b01", Result.ROLLED_BACK, why), "b03": lost}
+
+
+@pytest.mark.parametrize(
+    ("cause", "expected"),
+    [
+        # the order may have arrived: what the node itself says counts
+        (
+            Unreachable("the connection broke"),
+            (Result.ROLLED_BACK, "the connection broke; it was not confirmed in time"),
+        ),
+        (NodeRefused("moved on", code="moved-on", exit_status=3), (Result.FAILED, "moved on")),
+    ],
+)
+def test_a_node_whose_answer_to_the_start_was_lost_may_have_changed(
+    monkeypatch: pytest.MonkeyPatch, cause: NodeError, expected: tuple[Result, str]
+) -> None:
+    """Seen on real OpenWrt: b02's power cut took b03's answer along, and b03, which its timer restored, "failed"."""
+
+    @contextmanager
+    def borrow(_: object) -> Iterator[None]:
+        yield None
+
+    def lost(*_: object, **__: object) -> None:
+        raise cause
+
+    monkeypatch.setattr(mesh_commit, "start", lost)
+    monkeypatch.setattr(mesh_commit, "abort", lambda *change: None)
+    monkeypatch.setattr(mesh_commit, "unlock", lambda *change: None)
+    back = Outcome("b03", Result.ROLLED_BACK, "it was not confirmed in time")
+    monkeypatch.setattr(mesh_commit, "poll", lambda change: back)
+    change = cast("ChangeInProgress", SimpleNamespace(is_abandoned=False, last_error=""))
+    clock = cast("UptimeSample", SimpleNamespace(error_s=0.1, uptime_at=lambda moment: moment))
+    ctx = cast("NodeContext", SimpleNamespace(name="b03", node=None))
+    run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow)))
+    with ThreadPoolExecutor(1) as pool:
+        participants = [Participant(ctx, change=change, clock=clock)]
+        commit = mesh_commit._MeshCommit(run, participants, 60, 1, (), is_together=False, pool=pool)
+        mesh_commit._schedule(commit)
+        ended = mesh_commit._cancel(commit, canceled_because(participants, "scheduled"))
+    assert (ended["b03"].result, ended["b03"].reason) == expected
