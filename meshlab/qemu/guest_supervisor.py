@@ -27,6 +27,7 @@ from meshlab.qemu.guest_agent import GuestAgent
 from meshlab.qemu.guest_protocol import ADDRESS, PORT, READY
 from meshlab.qemu.link_state import QemuLinkState
 from meshlab.qemu.port_forwarder import QemuPortForwarder
+from meshlab.qemu.static_keys import hold_time_stamps
 from meshlab.spec import FleetSpec, load
 from meshlab.state import NodeState
 from meshlab.supervisor import Supervisor, fork_node_runner
@@ -102,6 +103,7 @@ def main(arguments: Sequence[str]) -> int:
     directory = Path(arguments[1])
     logging.basicConfig(level=logging.INFO, format="%(relativeCreated)d %(name)s %(message)s")
     spec = load((directory / "spec.json").read_text(encoding="utf-8"))
+    held = hold_time_stamps()
     hwsim_devices.ip([f"addr add {ADDRESS}/24 dev eth0", "link set eth0 up"])
     hwsim_devices.prepare(spec)
     (directory / "mnt").mkdir(exist_ok=True)
@@ -122,6 +124,8 @@ def main(arguments: Sequence[str]) -> int:
     except LabError as error:
         log.error("failed reason=%s", error)
         return 1
+    finally:
+        held.close()
     return 0
 
 
