@@ -3,46 +3,66 @@
 The lab's example fleet is provisioned on the kernel's 802.11 radios with a LAN filter on rover2's radio, and the base's
 link is limited to a tenth of what the lidar sends, as a channel at the multicast rate would be. Then, in each run:
 
-    lidar to a device on the robot, filter on -> lidar to 255.255.255.255, filter on -> the same, filter off
+    no lidar -> lidar to a device on the robot, filter on -> lidar to 255.255.255.255, filter on -> the same, filter off
 
-and in each of the three, rover2's computer pings the operator's with the mark of urgent messages, over four hops. The
-first is the reference: the machine works as hard for the same packets, and none is a broadcast.
+and in each of the four, rover2's computer pings the operator's with the mark of urgent messages, over four hops. The
+second is the reference: the machine works as hard for the same packets, and none is a broadcast. Every other run has a
+load on the mesh: rover1's computer sends to the operator's, over the limited link, too. A run begins with another
+scene than the one before, so that none is always first.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import statistics
 import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.page import fill
+from benchmarks.page import append_result, fill, read_results
 from benchmarks.practice_fleet import ROOT, PracticeFleet, log, practice_fleet
 from meshlab.qemu import control
 
 RESULTS = ROOT / "benchmarks" / "results" / "lan_filter.jsonl"
 NODE, ROBOT, ROBOT_DEVICE = "rover2", "rover2", "10.42.0.12"
-LINK_KBPS = 1000
+OPERATOR_ADDRESS, LOADING_ROBOT = "10.42.0.2", "rover1"
+LINK_KBPS, LOAD_KBPS = 1000, 400
 LIDAR_MBIT_S = 10.0
 # of a VLP-16, to its factory destination
-PACKET_BYTES = 1206
+PACKET_BYTES, LIDAR_PORT = 1206, 2368
 PINGS, PING_EVERY_S = 100, 0.1
-SCENES = {"unicast on the robot": True, "broadcast, filtered": True, "broadcast, not filtered": False}
+BROADCAST = "255.255.255.255"
 
-_LIDAR = f"""
-cat >/run/lidar.py <<'END'
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    lidar_to: str | None
+    is_filtered: bool = True
+
+
+SCENES = {
+    "none": Scene(None),
+    "unicast on the robot": Scene(ROBOT_DEVICE),
+    "broadcast, filtered": Scene(BROADCAST),
+    "broadcast, not filtered": Scene(BROADCAST, is_filtered=False),
+}
+
+_SENDER = f"""
+cat >/run/sender.py <<'END'
 import socket, sys, time
+address, port, device, bits_per_s = sys.argv[1], int(sys.argv[2]), sys.argv[3], float(sys.argv[4])
 out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 out.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-out.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"eth0")
+out.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, device.encode())
 start, sent = time.monotonic(), 0
 while True:
-    while sent < (time.monotonic() - start) * {LIDAR_MBIT_S * 1e6 / 8 / PACKET_BYTES}:
-        out.sendto(bytes({PACKET_BYTES}), (sys.argv[1], 2368))
+    while sent < (time.monotonic() - start) * bits_per_s / 8 / {PACKET_BYTES}:
+        out.sendto(bytes({PACKET_BYTES}), (address, port))
         sent += 1
     time.sleep(0.005)
 END
@@ -58,7 +78,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.tables:
         measure(arguments.results, arguments.runs)
-    text = table([json.loads(line) for line in arguments.results.read_text(encoding="utf-8").splitlines()])
+    text = table(read_results(arguments.results))
     print(text)
     if arguments.fill:
         fill("lan filter", text)
@@ -70,43 +90,65 @@ def measure(results: Path, runs: int) -> None:
         "rover2: {role: robot, address: 10.42.0.12}": "rover2: {role: robot, address: 10.42.0.12, lan_filter: {}}"
     }
     with tempfile.TemporaryDirectory() as folder, practice_fleet(Path(folder), filtered) as lab:
-        lab.machine(_LIDAR)
+        lab.machine(_SENDER)
         lab.settle()
         lab.fleet.link("base", "b01", rate_kbps=LINK_KBPS)
-        for run in range(runs):
-            for scene, is_filtered in SCENES.items():
-                words = "sh /etc/meshctl/lan-filter.sh" if is_filtered else "nft delete table bridge meshctl_lan"
-                lab.on(NODE, words)
-                found = round_trips_ms(lab, "255.255.255.255" if "broadcast" in scene else ROBOT_DEVICE)
-                line: dict[str, Any] = {"run": run, "scene": scene, "sent": PINGS, "round_trips_ms": found}
-                with results.open("a", encoding="utf-8") as file:
-                    file.write(f"{json.dumps(line | {'load': round(os.getloadavg()[0], 1)})}\n")
-                log(f"run {run + 1}, {scene}: {len(found)} of {PINGS} answered")
+        for run, load_kbps in ((run, load) for run in range(runs) for load in (0, LOAD_KBPS)):
+            names = list(SCENES)
+            for name in names[run % len(names) :] + names[: run % len(names)]:
+                found = _measured(lab, SCENES[name], load_kbps)
+                line = {"run": run, "scene": name, "load_kbps": load_kbps, "sent": PINGS, "round_trips_ms": found}
+                append_result(results, line | {"load": round(os.getloadavg()[0], 1)})
+                log(f"run {run + 1}, lidar {name}, load {load_kbps} kbit/s: {len(found)} of {PINGS} answered")
 
 
-def round_trips_ms(lab: PracticeFleet, destination: str) -> list[float]:
-    """Of each answered ping, in milliseconds, while the lidar sends to `destination`."""
-    program = f"python3 /run/lidar.py {destination} >/dev/null 2>&1 </dev/null"
-    lab.machine(f"ip netns exec pc.{ROBOT} {program} & echo $! >/run/lidar.pid")
+def _measured(lab: PracticeFleet, scene: Scene, load_kbps: int) -> list[float]:
+    lab.on(NODE, "sh /etc/meshctl/lan-filter.sh" if scene.is_filtered else "nft delete table bridge meshctl_lan")
+    with ExitStack() as senders:
+        if load_kbps:
+            senders.enter_context(_sending(lab, LOADING_ROBOT, OPERATOR_ADDRESS, 1e3 * load_kbps))
+        if scene.lidar_to is not None:
+            senders.enter_context(_sending(lab, ROBOT, scene.lidar_to, 1e6 * LIDAR_MBIT_S))
+        return round_trips_ms(lab)
+
+
+@contextmanager
+def _sending(lab: PracticeFleet, robot: str, destination: str, bits_per_s: float) -> Iterator[None]:
+    """The robot's computer sends datagrams; nothing has to receive them."""
+    program = f"python3 /run/sender.py {destination} {LIDAR_PORT} eth0 {bits_per_s}"
+    pid_file = f"/run/sender.{robot}.pid"
+    lab.machine(f"ip netns exec pc.{robot} {program} >/dev/null 2>&1 </dev/null & echo $! >{pid_file}")
     try:
-        words = f"ip netns exec pc.{ROBOT} ping -Q 0xb8 -c {PINGS} -i {PING_EVERY_S} -W 5 10.42.0.2"
-        # no answer at all is a result here
-        text = control.run(lab.fleet.directory, words, timeout_s=PINGS * PING_EVERY_S + 60.0).stdout
+        yield
     finally:
-        lab.machine("kill $(cat /run/lidar.pid)")
+        lab.machine(f"kill $(cat {pid_file})")
+
+
+def round_trips_ms(lab: PracticeFleet) -> list[float]:
+    """Of each answered ping, in milliseconds."""
+    words = f"ip netns exec pc.{ROBOT} ping -Q 0xb8 -c {PINGS} -i {PING_EVERY_S} -W 5 {OPERATOR_ADDRESS}"
+    # no answer at all is a result here
+    text = control.run(lab.fleet.directory, words, timeout_s=PINGS * PING_EVERY_S + 60.0).stdout
     return [float(one) for one in re.findall(r"time=([\d.]+) ms", text)]
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """One row for each scene: medians over the runs."""
-    lines = ["| lidar at 10 Mbit/s | runs | answered | p50, ms | p99, ms |", "| --- | --- | --- | --- | --- |"]
-    for scene in SCENES:
-        runs = [one for one in results if one["scene"] == scene]
-        answered = statistics.median(len(one["round_trips_ms"]) / one["sent"] for one in runs)
-        p50, p99 = (
-            statistics.median(_percentile(one["round_trips_ms"], share) for one in runs) for share in (0.5, 0.99)
-        )
-        lines.append(f"| {scene} | {len(runs)} | {answered:.0%} | {p50:.1f} | {p99:.1f} |")
+    """One row for each load and scene that was measured: medians over the runs."""
+    lines = [
+        "| load, kbit/s | lidar at 10 Mbit/s | runs | answered | p50, ms | p90, ms | p99, ms |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for load_kbps in sorted({one["load_kbps"] for one in results}):
+        for scene in SCENES:
+            runs = [one for one in results if one["scene"] == scene and one["load_kbps"] == load_kbps]
+            if not runs:
+                continue
+            answered = statistics.median(len(one["round_trips_ms"]) / one["sent"] for one in runs)
+            quantiles = " | ".join(
+                f"{statistics.median(_percentile(one['round_trips_ms'], share) for one in runs):.1f}"
+                for share in (0.5, 0.9, 0.99)
+            )
+            lines.append(f"| {load_kbps} | {scene} | {len(runs)} | {answered:.0%} | {quantiles} |")
     return "\n".join(lines)
 
 
