@@ -195,7 +195,8 @@ class StationFlush:
             thread.join()
 
     def unreachable(self, among: Container[str] | None = None, *, is_login_due: bool = False) -> None:
-        """The node did not answer: query its neighbors if it is time to."""
+        """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable.
+        `is_login_due`: its SSH server has to answer a login, if only by a refusal."""
         now_s = time.monotonic()
         # there, an entry that is removed by mistake costs seconds
         is_login_due |= self._watches_itself
