@@ -79,9 +79,12 @@ def adopt(
         require_site(old, target)
         connection = connect_to_bench(connections, target, recorder)
         key = recorder.key
-    elif has_taken_over or spare is not None:
-        # checked against its own pin
-        connection = connections.open(old) if has_taken_over or spare is None else _open_spare(connections, spare, old)
+    # checked against its own pin
+    elif has_taken_over:
+        connection = connections.open(old)
+        key = connection.host_key
+    elif spare is not None:
+        connection = _open_spare(connections, spare, old)
         key = connection.host_key
     else:
         raise InputError("expected a spare of the inventory, or a device on the bench")

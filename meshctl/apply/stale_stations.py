@@ -103,7 +103,7 @@ def login_of(node: Node, before: Observation, radios: Radios) -> LoginPlace | No
         return None
     if radios:
         return login
-    return login._replace(mesh_mac=next((mac for ifname, mac in (before.macs or {}).items() if ifname == _MESH), ""))
+    return login._replace(mesh_mac=(before.macs or {}).get(_MESH, ""))
 
 
 def inventory_login(node: Node) -> LoginPlace:

@@ -51,10 +51,8 @@ _DELIMITERS = ",;\t"
 # as inventories, labels, barcodes and switches write it
 _MAC = re.compile(r"[0-9a-f]{2}(?:[:-]?[0-9a-f]{2}){5}|[0-9a-f]{4}(?:\.[0-9a-f]{4}){2}", re.IGNORECASE)
 # a formula, the error of one, and a number of many digits as spreadsheets shorten it
-_FORMULA, _SHORTENED = (
-    re.compile(r"=.*|#(?:REF!|N/A|NAME\?|VALUE!|DIV/0!|NULL!|NUM!)"),
-    re.compile(r"\d(?:[.,]\d+)?E\+\d+"),
-)
+_FORMULA = re.compile(r"=.*|#(?:REF!|N/A|NAME\?|VALUE!|DIV/0!|NULL!|NUM!)")
+_SHORTENED = re.compile(r"\d(?:[.,]\d+)?E\+\d+")
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,10 +97,12 @@ class Editor:
     def set_nodes(self, values: Mapping[str, Mapping[str, Value]]) -> None:
         """Set values of many nodes, as `set_node` does of one. A file is parsed once for each key and not for each
         node, so that the time grows with the nodes and not with their square."""
-        known = [node for node in values if self.has(("nodes", node))]
-        added = [node for node in values if node not in set(known)]
+        is_known = {node: self.has(("nodes", node)) for node in values}
+        known = [node for node in values if is_known[node]]
+        added = [node for node in values if not is_known[node]]
         while added and not self._has_entries_beside(added[0]):
-            set_node(self, added[0], values[added.pop(0)])
+            first = added.pop(0)
+            set_node(self, first, values[first])
         ranges = self._ranges()
         self._set_each([(("nodes", node), dict(values[node]), _last_of(ranges, node)) for node in added])
         for key in dict.fromkeys(key for node in known for key in values[node]):

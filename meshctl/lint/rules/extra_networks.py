@@ -89,7 +89,7 @@ def _has_server(dhcp: Package, served: Section) -> bool:
 def interface_overlaps(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         network = packages.get("network")
-        created = dict(created_sections(node.extra_uci, network, "network"))
+        created = dict(created_sections(node, packages, "network"))
         others = [] if network is None else list(_networks_of_the_fleet(network, created))
         for name, section in created.items():
             for option, found in _networks(section) if section.type == "interface" else ():
@@ -152,7 +152,7 @@ def _network(address: str, netmask: str) -> IpNetwork | None:
 def interface_not_attachable(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         network = packages.get("network")
-        for name, interface in created_sections(node.extra_uci, packages.get("wireless"), "wireless"):
+        for name, interface in created_sections(node, packages, "wireless"):
             path = ("nodes", node.name, "extra_uci", f"wireless.{name}.network")
             is_client = interface.get("mode") == "sta" and not _is_on(interface, "wds")
             for attached in interface.get("network").split() if interface.type == "wifi-iface" else ():
@@ -191,7 +191,7 @@ def _is_bridge(network: Package, interface: Section) -> bool:
 )
 def access_point_open(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in created_sections(node.extra_uci, packages.get("wireless"), "wireless"):
+        for name, interface in created_sections(node, packages, "wireless"):
             is_open = interface.get("encryption", "none").startswith(("none", "owe"))
             is_access_point = interface.type == "wifi-iface" and interface.get("mode") == "ap"
             if is_open and is_access_point and LAN in interface.get("network").split() and _reaches_robots(fleet, node):

@@ -36,7 +36,7 @@ _WITH_PASSPHRASE = ("psk", "sae", "wep")
 )
 def passphrase_missing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for name, interface in created_sections(node.extra_uci, packages.get("wireless"), "wireless"):
+        for name, interface in created_sections(node, packages, "wireless"):
             encryption = interface.get("encryption")
             given = any(interface.get(option) for option in ("key", "sae_password", "wpa_psk_file", "key1"))
             if interface.type == "wifi-iface" and encryption.startswith(_WITH_PASSPHRASE) and not given:
@@ -60,7 +60,7 @@ def port_used_twice(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         network = packages.get("network")
         taken = set(node.lan_ports) if network is None else {*node.lan_ports, *_bridged(node, network)}
-        for name, section in created_sections(node.extra_uci, network, "network"):
+        for name, section in created_sections(node, packages, "network"):
             for option in _PORT_OPTIONS.get(section.type, ()):
                 found = [port for port in section.get(option).split() if port in taken]
                 if found:

@@ -10,7 +10,7 @@ from meshctl.inventory.suggest import did_you_mean, suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.rendering import find_section, with_extra
+from meshctl.lint.rules.rendering import extra_entries, with_extra
 from meshctl.model import Fleet
 
 # what is wrong with a value: what was expected, and a hint; None if nothing is
@@ -108,13 +108,10 @@ _TYPES = {
 )
 def value_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for key, value in node.extra_uci.items():
-            package, _, rest = key.partition(".")
-            name, _, option = rest.rpartition(".")
-            section = find_section(packages.get(package), name)
-            check = (
-                _TYPES.get(package) if not name else _CHECKS.get((package, section.type, option)) if section else None
-            )
+        for key, value, package, section, option in extra_entries(node, packages):
+            check = None if option else _TYPES.get(package)
+            if section is not None:
+                check = _CHECKS.get((package, section.type, option))
             wrong = check(value) if check is not None and value else None
             if wrong is not None:
                 path = ("nodes", node.name, "extra_uci", key)

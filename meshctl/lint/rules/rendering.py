@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from meshctl import uci
 from meshctl.diagnostics import Diagnostic, InvalidInput, Severity
@@ -149,10 +150,7 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def extra_names_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
-        for key, value in node.extra_uci.items():
-            package, _, rest = key.partition(".")
-            name, _, option = rest.rpartition(".")
-            section = find_section(packages.get(package), name)
+        for key, value, package, section, option in extra_entries(node, packages):
             needed = None if section is None else _REFERENCES.get((package, section.type, option))
             if needed is None:
                 continue
@@ -164,7 +162,28 @@ def extra_names_nothing(fleet: Fleet, context: LintContext) -> Iterator[Finding]
                     yield Finding(path, f"no {needed[1]} of {needed[0]}", f"one of {join_limited(known)}", word, hint)
 
 
-def find_section(package: uci.Package | None, key: str) -> uci.Section | None:
+class ExtraEntry(NamedTuple):
+    """An entry of `extra_uci`: the option of a section, or, with an empty option and no section, a section's type."""
+
+    key: str
+    value: str
+    package: str
+    section: uci.Section | None
+    option: str
+
+
+def extra_entries(node: Node, packages: Mapping[str, uci.Package]) -> Iterator[ExtraEntry]:
+    """The entries of a node's `extra_uci`, with the section that each one belongs to as it is rendered."""
+    for key, value in node.extra_uci.items():
+        package, _, rest = key.partition(".")
+        name, _, option = rest.rpartition(".")
+        if name:
+            yield ExtraEntry(key, value, package, _section(packages.get(package), name), option)
+        else:
+            yield ExtraEntry(key, value, package, None, "")
+
+
+def _section(package: uci.Package | None, key: str) -> uci.Section | None:
     """The section with this name or `@type[index]`."""
     keys = () if package is None else package.keys()
     return None if package is None or key not in keys else package.sections[keys.index(key)]
@@ -192,11 +211,11 @@ def with_extra(fleet: Fleet, context: LintContext) -> Iterator[tuple[Node, dict[
 
 
 def created_sections(
-    extra: Mapping[str, str], package: uci.Package | None, name: str
+    node: Node, packages: Mapping[str, uci.Package], package: str
 ) -> Iterator[tuple[str, uci.Section]]:
     """The named sections that `extra_uci` creates in a package."""
-    for section in () if package is None else package.sections:
-        if section.name is not None and f"{name}.{section.name}" in extra:
+    for section in packages[package].sections if package in packages else ():
+        if section.name is not None and f"{package}.{section.name}" in node.extra_uci:
             yield section.name, section
 
 
