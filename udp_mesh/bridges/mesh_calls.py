@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Callable, Iterable, List, Set
+from typing import Callable, Iterable, List
 
 from udp_mesh.bridges.call_messages import SETTINGS
 from udp_mesh.bridges.calls import CallEffect, Calls
 from udp_mesh.bridges.daemon_client import DaemonClient
+from udp_mesh.bridges.once_log import OnceLog
 from udp_mesh.client.mesh_client import Frame, as_message
 
 log = logging.getLogger(__name__)
 
-MAX_WARNED = 1000
 PATIENCE_S = 20.0
 """For servers that start later than the bridge, before it reports that there is none."""
 
@@ -28,7 +28,7 @@ class MeshCalls:
     def __init__(self, daemon: DaemonClient, topic: str, run: str) -> None:
         self._daemon, self._topic = daemon, topic
         self._calls = Calls(run)
-        self._warned: Set[str] = set()
+        self._once = OnceLog(log)
         self._started_at = time.monotonic()
 
     def _take(self, work: Callable[[], List[CallEffect]]) -> None:
@@ -59,6 +59,4 @@ class MeshCalls:
                 self._warn_once("not-offered {}={} has no server on this robot".format(kind, name))
 
     def _warn_once(self, text: str) -> None:
-        if text not in self._warned and len(self._warned) < MAX_WARNED:
-            self._warned.add(text)
-            log.warning("%s", text)
+        self._once.warn([text])

@@ -1,4 +1,4 @@
-"""What a user publishes or configures without effect, as lines for the bridge's log. Pure, but for the log.
+"""What a user publishes or configures without effect, as lines for the bridge's log. Pure.
 
 To ROS, a name that is spelled differently from the daemon's topic is no error, but a topic that nothing reads.
 """
@@ -15,8 +15,6 @@ from udp_mesh.bridges.types import MeshTopic
 log = logging.getLogger(__name__)
 
 MAX_LISTED = 8
-MAX_LOGGED = 1000
-"""Distinct lines: a program can invent names without bound."""
 
 
 def unread_names(
@@ -50,19 +48,6 @@ def settings_without_effect(
         for topic in sorted(reductions)
         if reductions[topic].adapt and topic in topics and not topics[topic].is_adaptable
     ]
-
-
-class SettingsLog:
-    """Logs each line once."""
-
-    def __init__(self) -> None:
-        self._logged: set[str] = set()
-
-    def warn(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            if line not in self._logged and len(self._logged) < MAX_LOGGED:
-                self._logged.add(line)
-                log.warning("%s", line)
 
 
 def _listed(names: list[str]) -> str:

@@ -9,10 +9,11 @@ import pytest
 from udp_mesh.bridges import mesh_calls
 from udp_mesh.bridges.daemon_client import DaemonClient
 from udp_mesh.bridges.mesh_calls import MeshCalls
+from udp_mesh.bridges.once_log import MAX_LOGGED, OnceLog
 from udp_mesh.bridges.reduction import JpegOptions, Reduction
 from udp_mesh.bridges.ros2.interfaces import interface_class, unknown_type
 from udp_mesh.bridges.ros2.shared_graph import DoubleBridge
-from udp_mesh.bridges.settings_check import MAX_LOGGED, SettingsLog, settings_without_effect, unread_names
+from udp_mesh.bridges.settings_check import log, settings_without_effect, unread_names
 from udp_mesh.bridges.types import MeshTopic
 
 START = "/ugv1/mesh_comm/"
@@ -62,7 +63,7 @@ def test_nothing_is_said_about_a_topic_that_can_adapt() -> None:
 
 def test_each_line_is_logged_once_and_not_without_bound(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        lines = SettingsLog()
+        lines = OnceLog(log)
         for _ in range(2):
             lines.warn(f"line {number}" for number in range(MAX_LOGGED + 5))
     assert len(caplog.records) == MAX_LOGGED

@@ -17,6 +17,7 @@ from typing import Callable, Container, Iterable, Mapping
 import rosgraph
 import rospy
 
+from udp_mesh.bridges import settings_check
 from udp_mesh.bridges.call_messages import Offer
 from udp_mesh.bridges.configuration import (
     EMPTY,
@@ -35,6 +36,7 @@ from udp_mesh.bridges.names import (
     routes,
     undeclared_route,
 )
+from udp_mesh.bridges.once_log import OnceLog
 from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
@@ -50,7 +52,7 @@ from udp_mesh.bridges.ros1.graph import (
 )
 from udp_mesh.bridges.ros1.services import Ros1Calls
 from udp_mesh.bridges.runtime import BridgeRuntime
-from udp_mesh.bridges.settings_check import SettingsLog, settings_without_effect, unread_names
+from udp_mesh.bridges.settings_check import settings_without_effect, unread_names
 from udp_mesh.bridges.types import MeshTopic, TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
 
@@ -70,7 +72,7 @@ class Ros1Bridge:
         self._daemon = daemon
         self._own = own
         self._refresh_requested = threading.Event()
-        self._options, self._log = options, SettingsLog()
+        self._options, self._log = options, OnceLog(settings_check.log)
         self._hosts = {str(host) for host in given.host_list}
         listed, problems = parse_topic_list(given.topic_list)
         for problem in problems:

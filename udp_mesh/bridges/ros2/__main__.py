@@ -18,6 +18,7 @@ import time
 from collections import deque
 from typing import Any, Callable, Deque, Iterable, Mapping, Sequence
 
+from udp_mesh.bridges import settings_check
 from udp_mesh.bridges.conditions_message import PACKAGE, to_ros
 from udp_mesh.bridges.configuration import (
     EMPTY,
@@ -30,6 +31,7 @@ from udp_mesh.bridges.daemon_client import CONDITIONS_TOPIC, DaemonClient
 from udp_mesh.bridges.message_types import TYPES
 from udp_mesh.bridges.mixed_team import ros2_type
 from udp_mesh.bridges.names import Route, own_prefix, ros_word, routes
+from udp_mesh.bridges.once_log import OnceLog
 from udp_mesh.bridges.position_input import PositionInput
 from udp_mesh.bridges.receiving import Receive, with_needed
 from udp_mesh.bridges.reduction import Reducer
@@ -37,7 +39,7 @@ from udp_mesh.bridges.relay import PROTOCOL_TOPICS, Relay, ToRos
 from udp_mesh.bridges.ros2.quality import Quality, common, in_order_of_arrival, quality_text, ros2_name
 from udp_mesh.bridges.ros2.shared_graph import DoubleBridge, other_bridges, shared_graph
 from udp_mesh.bridges.runtime import BridgeRuntime
-from udp_mesh.bridges.settings_check import SettingsLog, settings_without_effect, unread_names
+from udp_mesh.bridges.settings_check import settings_without_effect, unread_names
 from udp_mesh.bridges.transforms import DEFINITION, TF, TF_STATIC, TOPIC_SETTINGS, TransformGatherer
 from udp_mesh.bridges.types import MeshTopic, TypeKey
 from udp_mesh.client.mesh_client import DEFAULT_SOCKET, Frame, MeshError
@@ -88,7 +90,7 @@ class Ros2Bridge:
         self._publishers = Ros2Publishers(node, self._class, self._warn_once)
         self._came_last: dict[str, dict[bytes, str]] = {}
         self._graph, self._double = shared_graph(own, (), ()), DoubleBridge(NODE, node.get_namespace())
-        self._log = SettingsLog()
+        self._log = OnceLog(settings_check.log)
         self._warned: set[str] = set()
         self._has_conditions_package = importlib.util.find_spec(PACKAGE) is not None
         self._wake = node.create_guard_condition(self.publish_arrived)
