@@ -50,6 +50,8 @@ log = logging.getLogger(__name__)
 
 MAX_COUNTED_TOPICS = 4096
 """Topics with counters of their own; a holder of the key could invent names without bound."""
+AFTER_RESTART = "takes effect after a restart"
+"""In the answer to `reload`. Scripts look for it, such as meshctl's `robots/scripts/switch.sh`."""
 
 
 class Service:
@@ -246,10 +248,10 @@ class Service:
         settings = fresh.settings
         for name in ("name", "port"):
             if getattr(settings, name) != getattr(running.settings, name):
-                notes.append(f"{name}: takes effect after a restart")
+                notes.append(f"{name}: {AFTER_RESTART}")
                 settings = replace(settings, **{name: getattr(running.settings, name)})
         if fresh.daemon != running.daemon:
-            notes.append("daemon: takes effect after a restart")
+            notes.append(f"daemon: {AFTER_RESTART}")
         changes = self.apply(settings)
         if fresh.links != running.links:
             self.driver.apply_links(fresh.links)

@@ -245,20 +245,23 @@ def _state(rig: Rig, name: str) -> str:
 
 def leftovers(rig: Rig, names: Iterable[str]) -> dict[str, str]:
     """Node -> what is left of changes once all have ended: files in its memory, a lock, a timer's process."""
-    limit_s = time.monotonic() + TIMER_TURN_S
-    while True:
-        found = {name: left for name in names if (left := _left_on(rig, name))}
-        if not found or time.monotonic() > limit_s:
-            return found
-        time.sleep(1.0)
+    return _remaining(lambda name: _left_on(rig, name), names)
 
 
 def uploads(rig: Rig, names: Iterable[str]) -> dict[str, str]:
     """Node -> the archives of changes in its memory. A node deletes what a killed operator has sent half."""
+
+    def archives(name: str) -> str:
+        return " ".join(rig.fleet.node(name).exec("ls -A /tmp/meshctl | grep 'tgz'").stdout.split())
+
+    return _remaining(archives, names)
+
+
+def _remaining(left_on: Callable[[str], str], names: Iterable[str]) -> dict[str, str]:
+    """Node -> what is left on it, once nothing is, or after the time in which timers end."""
     limit_s = time.monotonic() + TIMER_TURN_S
     while True:
-        listed = {name: rig.fleet.node(name).exec("ls -A /tmp/meshctl | grep 'tgz'").stdout for name in names}
-        found = {name: " ".join(files.split()) for name, files in listed.items() if files}
+        found = {name: left for name in names if (left := left_on(name))}
         if not found or time.monotonic() > limit_s:
             return found
         time.sleep(1.0)
