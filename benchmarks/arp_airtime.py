@@ -138,15 +138,16 @@ def recorded(path: Path) -> list[dict[str, Any]]:
 
 
 def runs_of(results: list[dict[str, Any]], scene: str, *, is_on: bool) -> list[dict[str, Any]]:
-    return [one for one in results if (one["scene"], one["table"]) == (scene, is_on)]
+    return [result for result in results if (result["scene"], result["table"]) == (scene, is_on)]
 
 
 def air_us(result: dict[str, Any], *kinds: str) -> float:
     """Airtime of frames of these kinds, in microseconds; unicast frames are acknowledged."""
     total_us: float = sum(
-        one["count"] * airtime_us(one["rate"], one["bytes"], "probe" if one["kind"] in ("unicast", "table") else "ogm")
-        for one in result["overheard"]
-        if one["kind"] in kinds
+        item["count"]
+        * airtime_us(item["rate"], item["bytes"], "probe" if item["kind"] in ("unicast", "table") else "ogm")
+        for item in result["overheard"]
+        if item["kind"] in kinds
     )
     return total_us
 
@@ -171,19 +172,19 @@ def table(results: list[dict[str, Any]]) -> str:
 
 def _cells(runs: list[dict[str, Any]]) -> str:
     def per_minute(count: Callable[[dict[str, Any]], float]) -> float:
-        each: list[float] = [count(one) * 60 / one["seconds"] for one in runs]
+        each: list[float] = [count(run) * 60 / run["seconds"] for run in runs]
         return statistics.median(each)
 
     def frames(*kinds: str) -> float:
-        return per_minute(lambda one: sum(item["count"] for item in one["overheard"] if item["kind"] in kinds))
+        return per_minute(lambda result: sum(item["count"] for item in result["overheard"] if item["kind"] in kinds))
 
     size = per_minute(
-        lambda one: sum(item["count"] * item["bytes"] for item in one["overheard"] if item["kind"] in ARP)
+        lambda result: sum(item["count"] * item["bytes"] for item in result["overheard"] if item["kind"] in ARP)
     )
     shares = (
-        statistics.median(air_us(one, *kinds) / (one["seconds"] * 1e6) for one in runs) for kinds in (ARP, ("ogm",))
+        statistics.median(air_us(run, *kinds) / (run["seconds"] * 1e6) for run in runs) for kinds in (ARP, ("ogm",))
     )
-    counts = (per_minute(lambda one: one["requests"]), frames("broadcast"), frames("unicast", "table"), size)
+    counts = (per_minute(lambda result: result["requests"]), frames("broadcast"), frames("unicast", "table"), size)
     return " | ".join((*(f"{count:.0f}" for count in counts), *(f"{share:.3%}" for share in shares)))
 
 

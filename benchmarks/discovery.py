@@ -227,13 +227,13 @@ def table(results: Sequence[dict[str, Any]]) -> str:
         "| busiest second of that |",
         "| --- " * 10 + "|",
     ]
-    for one in results:
-        idle, busy = one["idle"], one["busy"]
+    for result in results:
+        idle, busy = result["idle"], result["busy"]
         lines.append(
-            f"| {one['nodes']} | {_seconds(one['met_s'])} | {one['meeting_busiest_share']:.1%} "
+            f"| {result['nodes']} | {_seconds(result['met_s'])} | {result['meeting_busiest_share']:.1%} "
             f"| {idle['bytes_per_s']:.0f} | {idle['broadcast_channel_share']:.2%} | {busy['datagrams_per_s']:.2f} "
             f"| {busy['bytes_per_s']:.0f} | {busy['broadcast_channel_share']:.2%} "
-            f"| {_seconds(one['healed_s'])} | {one['healing_busiest_share']:.1%} |"
+            f"| {_seconds(result['healed_s'])} | {result['healing_busiest_share']:.1%} |"
         )
     return "\n".join(lines)
 
@@ -252,12 +252,12 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     arguments.results.parent.mkdir(parents=True, exist_ok=True)
-    results = {one["nodes"]: one for one in read_results(arguments.results)}
+    results = {read_result["nodes"]: read_result for read_result in read_results(arguments.results)}
     for word in arguments.nodes.split(","):
         if int(word) not in results:
-            results[int(word)] = one = measure(int(word))
-            append_result(arguments.results, one)
-    print(table([one for _, one in sorted(results.items())]))
+            results[int(word)] = measured = measure(int(word))
+            append_result(arguments.results, measured)
+    print(table([result for _, result in sorted(results.items())]))
 
 
 if __name__ == "__main__":

@@ -206,12 +206,15 @@ def table(results: Sequence[Mapping[str, Any]]) -> str:
         "| at rest: frames a minute | at rest: kB a minute | at rest: bytes per member and s |",
         "| --- " * 9 + "|",
     ]
-    for one in sorted(results, key=lambda one: (one["size"], one["spread_s"], list(KINDS).index(one["kind"]))):
-        known = f"not in {MAX_START_S:.0f}" if one["known_s"] is None else f"{one['known_s']:.1f}"
+    for result in sorted(
+        results, key=lambda result: (result["size"], result["spread_s"], list(KINDS).index(result["kind"]))
+    ):
+        known = f"not in {MAX_START_S:.0f}" if result["known_s"] is None else f"{result['known_s']:.1f}"
         lines.append(
-            f"| {one['size']} | {KINDS[one['kind']]} | {one['spread_s']:.0f} | {known} | {one['start_frames']:,} "
-            f"| {one['start_bytes'] / 1e3:,.0f} | {one['frames_per_minute']:,.0f} "
-            f"| {one['bytes_per_minute'] / 1e3:,.0f} | {one['bytes_per_minute'] / 60 / one['size']:,.0f} |"
+            f"| {result['size']} | {KINDS[result['kind']]} | {result['spread_s']:.0f} | {known} "
+            f"| {result['start_frames']:,} "
+            f"| {result['start_bytes'] / 1e3:,.0f} | {result['frames_per_minute']:,.0f} "
+            f"| {result['bytes_per_minute'] / 1e3:,.0f} | {result['bytes_per_minute'] / 60 / result['size']:,.0f} |"
         )
     return "\n".join(lines)
 
@@ -229,7 +232,10 @@ def main() -> None:
     results = [json.loads(line) for line in arguments.results.open()] if arguments.results.exists() else []
     for size in map(int, arguments.sizes.split(",")):
         for kind in arguments.kinds.split(","):
-            if any((one["kind"], one["size"], one["spread_s"]) == (kind, size, arguments.spread) for one in results):
+            if any(
+                (result["kind"], result["size"], result["spread_s"]) == (kind, size, arguments.spread)
+                for result in results
+            ):
                 continue
             print(f"{size} members: {KINDS[kind]}", file=sys.stderr, flush=True)
             results.append(measure(kind, size, arguments.spread))

@@ -129,7 +129,7 @@ def round_trips_ms(lab: PracticeFleet) -> list[float]:
     words = f"ip netns exec pc.{ROBOT} ping -Q 0xb8 -c {PINGS} -i {PING_EVERY_S} -W 5 {OPERATOR_ADDRESS}"
     # no answer at all is a result here
     text = control.run(lab.fleet.directory, words, timeout_s=PINGS * PING_EVERY_S + 60.0).stdout
-    return [float(one) for one in re.findall(r"time=([\d.]+) ms", text)]
+    return [float(milliseconds) for milliseconds in re.findall(r"time=([\d.]+) ms", text)]
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -138,14 +138,14 @@ def table(results: list[dict[str, Any]]) -> str:
         "| load, kbit/s | lidar at 10 Mbit/s | runs | answered | p50, ms | p90, ms | p99, ms |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for load_kbps in sorted({one["load_kbps"] for one in results}):
+    for load_kbps in sorted({result["load_kbps"] for result in results}):
         for scene in SCENES:
-            runs = [one for one in results if one["scene"] == scene and one["load_kbps"] == load_kbps]
+            runs = [result for result in results if result["scene"] == scene and result["load_kbps"] == load_kbps]
             if not runs:
                 continue
-            answered = statistics.median(len(one["round_trips_ms"]) / one["sent"] for one in runs)
+            answered = statistics.median(len(run["round_trips_ms"]) / run["sent"] for run in runs)
             quantiles = " | ".join(
-                f"{statistics.median(_percentile(one['round_trips_ms'], share) for one in runs):.1f}"
+                f"{statistics.median(_percentile(run['round_trips_ms'], share) for run in runs):.1f}"
                 for share in (0.5, 0.9, 0.99)
             )
             lines.append(f"| {load_kbps} | {scene} | {len(runs)} | {answered:.0%} | {quantiles} |")

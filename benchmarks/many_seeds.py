@@ -54,28 +54,30 @@ def measure(case: Case) -> dict[str, float | None]:
     loss = float(cell.get("loss", 0))
     match cell["set"]:
         case "hops":
-            one = one_channel.hops(loss, bulk=cell["bulk"] == "yes", seed=case.seed)
-            met = one["deviation_s"] < one["goal_deviation_s"]
+            measured = one_channel.hops(loss, bulk=cell["bulk"] == "yes", seed=case.seed)
+            met = measured["deviation_s"] < measured["goal_deviation_s"]
         case "teams":
             has_categories = cell["radio"] == RADIOS[0]
-            one = one_channel.team(int(cell["robots"]), loss, access_categories=has_categories, seed=case.seed)
-            met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= one_channel.MIN_FAIRNESS
+            measured = one_channel.team(int(cell["robots"]), loss, access_categories=has_categories, seed=case.seed)
+            met = (
+                measured["urgent_p99_s"] <= measured["goal_p99_s"] and measured["fairness"] >= one_channel.MIN_FAIRNESS
+            )
         case "guests":
-            one = one_channel.guest(int(cell["robots"]), loss, seed=case.seed)
-            met = one["urgent_p99_s"] <= one["goal_p99_s"]
+            measured = one_channel.guest(int(cell["robots"]), loss, seed=case.seed)
+            met = measured["urgent_p99_s"] <= measured["goal_p99_s"]
         case _:
-            one = shared_logs.play(cell["way"], case.seed, LOGS_S)
-            one["arrived_share"] = one["arrived"] / one["published"]
-            one["airtime_per_item_s"] = one["airtime_s"] / one["published"]
-            met = one["twice"] == 0
-    kept = {key: value for key, value in one.items() if key not in cell and isinstance(value, int | float | None)}
+            measured = shared_logs.play(cell["way"], case.seed, LOGS_S)
+            measured["arrived_share"] = measured["arrived"] / measured["published"]
+            measured["airtime_per_item_s"] = measured["airtime_s"] / measured["published"]
+            met = measured["twice"] == 0
+    kept = {key: value for key, value in measured.items() if key not in cell and isinstance(value, int | float | None)}
     return {**{key: None if value is None else float(value) for key, value in kept.items()}, "met": float(met)}
 
 
 def tables(results: Sequence[Result]) -> str:
     """One table per set, with a row per cell; the columns of a cell's settings are in the order of their names."""
     by_cell: dict[Settings, list[Result]] = {}
-    for result in sorted(results, key=lambda one: settings_order(one.case.settings)):
+    for result in sorted(results, key=lambda result: settings_order(result.case.settings)):
         if not result.failed:
             by_cell.setdefault(result.case.settings, []).append(result)
     parts = []
@@ -123,10 +125,10 @@ def median_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> 
     return Interval(median(ordered), ordered[outside - 1], ordered[-outside])
 
 
-def _shown(one: Interval) -> str:
-    if one.low is None or one.high is None:
-        return f"{one.estimate:.4g}"
-    return f"{one.estimate:.4g} ({one.low:.4g} to {one.high:.4g})"
+def _shown(interval: Interval) -> str:
+    if interval.low is None or interval.high is None:
+        return f"{interval.estimate:.4g}"
+    return f"{interval.estimate:.4g} ({interval.low:.4g} to {interval.high:.4g})"
 
 
 def _met(runs: Sequence[Result]) -> str:
@@ -155,8 +157,8 @@ def main() -> None:
             cell for cell in cells() if dict(cell)["set"] in arguments.sets and arguments.only in settings_text(cell)
         ]
         with ResultsFile(arguments.results, identity()) as file:
-            results = {one.case: one for one in file.stored.results}
-            missing = [one for one in cases_of(chosen, parse_seeds(arguments.seeds)) if one not in results]
+            results = {result.case: result for result in file.stored.results}
+            missing = [case for case in cases_of(chosen, parse_seeds(arguments.seeds)) if case not in results]
             try:
                 for number, result in enumerate(run_cases(missing, measure, ProcessWorkers(arguments.jobs)), 1):
                     file.append(result)

@@ -178,7 +178,7 @@ class TunnelRun:
             for radio in self._radios.values()
         ]
         robots = [self._robot(name, names, reachable, progress, now_s) for name in ("base", *names)]
-        alarms = [alarm for one in (*nodes, *robots) for alarm in one["alarms"]]
+        alarms = [alarm for device in (*nodes, *robots) for alarm in device["alarms"]]
         return {
             "version": 1,
             "fleet": "tunnel",
@@ -188,7 +188,7 @@ class TunnelRun:
             "exit_code": 0,
             "totals": {
                 kind: {
-                    health: sum(one["health"] == health for one in listed)
+                    health: sum(device["health"] == health for device in listed)
                     for health in ("ok", "degraded", "unreachable", "off")
                 }
                 for kind, listed in (("nodes", nodes), ("robots", robots))

@@ -69,7 +69,7 @@ class Meter:
 
     def used_s(self) -> float:
         metrics = self._session.send("Performance.getMetrics")["metrics"]
-        return float(next(one["value"] for one in metrics if one["name"] == "TaskDuration"))
+        return float(next(metric["value"] for metric in metrics if metric["name"] == "TaskDuration"))
 
 
 def row_of(what: str, times_ms: Sequence[float], cpu: str, longest_task_ms: float | None) -> dict[str, Any]:

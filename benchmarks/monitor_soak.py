@@ -297,13 +297,13 @@ def report(results: list[Mapping[str, object]]) -> str:
         " | newest, ms | timeline of 600, ms | 120 of all, ms |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    for one in results:
-        rss = one["rss_mib"]
+    for result in results:
+        rss = result["rss_mib"]
         assert isinstance(rss, list | tuple)
         cells = (
-            *(one["radios"], one["robots"], one["frames"], one["cpu_ms_per_frame"], one["frame_kib"]),
-            *(one["stored_kib_per_frame"], f"{rss[0]} / {rss[-1]}"),
-            *(one["latest_ms"], one["timeline_ms"], one["between_ms"]),
+            *(result["radios"], result["robots"], result["frames"], result["cpu_ms_per_frame"], result["frame_kib"]),
+            *(result["stored_kib_per_frame"], f"{rss[0]} / {rss[-1]}"),
+            *(result["latest_ms"], result["timeline_ms"], result["between_ms"]),
         )
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines)
@@ -323,7 +323,7 @@ def main() -> None:
             found = soak(Path(folder), radios, min(arguments.robots, radios // 2), rounds)
         results.append({name: getattr(found, name) for name in found.__dataclass_fields__})
         print(json.dumps(results[-1]), flush=True)
-    RESULTS.write_text("".join(json.dumps(one) + "\n" for one in results))
+    RESULTS.write_text("".join(json.dumps(result) + "\n" for result in results))
     machine = this_machine()
     cores = f"{machine['cores']} cores, {machine['machine']}, Python {machine['python']}"
     text = f"{report(results)}\n\n{cores}"

@@ -164,37 +164,37 @@ def rank(values: Sequence[float], share: float) -> float:
 
 def team(senders: int, loss: float, *, access_categories: bool, seed: int | None = None) -> dict[str, Any]:
     used = channel(access_categories=access_categories)
-    one = OneChannel(senders, channel=used, loss=loss, seed=senders if seed is None else seed)
-    one.run()
-    bulk = one.bulk_bits_per_s()
-    seen = list(one.seen.values())
+    world = OneChannel(senders, channel=used, loss=loss, seed=senders if seed is None else seed)
+    world.run()
+    bulk = world.bulk_bits_per_s()
+    seen = list(world.seen.values())
     return {
         "set": "teams",
         "robots": senders,
         "loss": loss,
         "access_categories": access_categories,
         "bulk_bits_per_s": sum(bulk),
-        "of_ceiling": sum(bulk) / (ceiling_bits_per_s(one) * (1 - loss)),
+        "of_ceiling": sum(bulk) / (ceiling_bits_per_s(world) * (1 - loss)),
         "fairness": sum(bulk) ** 2 / (len(bulk) * sum(rate * rate for rate in bulk)),
-        "urgent_p50_s": max(rank(one.latencies_s, 0.5) for one in seen),
-        "urgent_p99_s": max(rank(one.latencies_s, 0.99) for one in seen),
-        "urgent_arrived": min(len(one.latencies_s) / one.offered for one in seen),
-        "airtime_share": one.airtime_s / COUNT_S,
+        "urgent_p50_s": max(rank(sender.latencies_s, 0.5) for sender in seen),
+        "urgent_p99_s": max(rank(sender.latencies_s, 0.99) for sender in seen),
+        "urgent_arrived": min(len(sender.latencies_s) / sender.offered for sender in seen),
+        "airtime_share": world.airtime_s / COUNT_S,
         "goal_p99_s": GOAL_P99_S[loss],
     }
 
 
 def guest(senders: int, loss: float, *, seed: int | None = None) -> dict[str, Any]:
-    one = OneChannel(senders, 1, channel=channel(), loss=loss, seed=senders if seed is None else seed)
-    one.run()
-    latencies_s = one.seen["guest1"].latencies_s
+    world = OneChannel(senders, 1, channel=channel(), loss=loss, seed=senders if seed is None else seed)
+    world.run()
+    latencies_s = world.seen["guest1"].latencies_s
     return {
         "set": "guests",
         "robots": senders,
         "loss": loss,
         "urgent_p50_s": rank(latencies_s, 0.5),
         "urgent_p99_s": rank(latencies_s, 0.99),
-        "urgent_arrived": len(latencies_s) / one.seen["guest1"].offered,
+        "urgent_arrived": len(latencies_s) / world.seen["guest1"].offered,
         "goal_p99_s": GOAL_P99_S[loss],
     }
 
@@ -246,26 +246,26 @@ def hops(loss: float, *, bulk: bool, seed: int = 1) -> dict[str, Any]:
 
 
 def acknowledgements(every: int, rate: float) -> dict[str, Any]:
-    one = OneChannel(
+    world = OneChannel(
         1, channel=channel(rate=rate), loss=0.0, seed=1, rates=Rates(ack_every_packets=every), telemetry=False
     )
-    one.run()
-    (bulk,) = one.bulk_bits_per_s()
+    world.run()
+    (bulk,) = world.bulk_bits_per_s()
     return {
         "set": "acknowledgements",
         "every": every,
         "rate": rate,
         "default": every == Rates().ack_every_packets,
         "bulk_bits_per_s": bulk,
-        "of_ceiling": bulk / ceiling_bits_per_s(one),
-        "acknowledgements_airtime": one.base_airtime_s / COUNT_S,
+        "of_ceiling": bulk / ceiling_bits_per_s(world),
+        "acknowledgements_airtime": world.base_airtime_s / COUNT_S,
         "goal_of_ceiling": GOAL_OF_CEILING,
     }
 
 
-def ceiling_bits_per_s(one: OneChannel) -> float:
+def ceiling_bits_per_s(world: OneChannel) -> float:
     """The payload rate of full frames with back-off and no other traffic."""
-    used = one.channel
+    used = world.channel
     first, window = BEST_EFFORT_SLOTS
     backoff_s = (first + (window - 1) / 2) * SLOT_S
     return FRAGMENT_BYTES * 8 / (FULL_FRAME_BYTES * 8 / used.rate + used.overhead_s + backoff_s)
@@ -291,36 +291,37 @@ def tables(results: Sequence[dict[str, Any]]) -> str:
     head = ["robots", "loss", "radio", "bulk of all, Mbit/s", "of the ack-free ceiling", "fairness"]
     head += ["urgent p50, ms", "urgent p99 of the worst, ms", "goal, ms", ""]
     parts.append([row(head), row(["---"] * len(head))])
-    for one in (one for one in results if one["set"] == "teams"):
-        met = one["urgent_p99_s"] <= one["goal_p99_s"] and one["fairness"] >= MIN_FAIRNESS
+    for result in (result for result in results if result["set"] == "teams"):
+        met = result["urgent_p99_s"] <= result["goal_p99_s"] and result["fairness"] >= MIN_FAIRNESS
         parts[-1].append(
             row([
-                str(one["robots"]), f"{one['loss']:.0%}",
-                "access categories" if one["access_categories"] else "one queue",
-                f"{one['bulk_bits_per_s'] / 1e6:.2f}", f"{one['of_ceiling']:.3f}", f"{one['fairness']:.3f}",
-                f"{one['urgent_p50_s'] * 1e3:.0f}", f"{one['urgent_p99_s'] * 1e3:.0f}",
-                f"<= {one['goal_p99_s'] * 1e3:.0f}", verdict(met),
+                str(result["robots"]), f"{result['loss']:.0%}",
+                "access categories" if result["access_categories"] else "one queue",
+                f"{result['bulk_bits_per_s'] / 1e6:.2f}", f"{result['of_ceiling']:.3f}", f"{result['fairness']:.3f}",
+                f"{result['urgent_p50_s'] * 1e3:.0f}", f"{result['urgent_p99_s'] * 1e3:.0f}",
+                f"<= {result['goal_p99_s'] * 1e3:.0f}", verdict(met),
             ])
         )  # fmt: skip
     head = ["a guest beside", "loss", "its urgent p50, ms", "its urgent p99, ms", "goal, ms", ""]
     parts.append([row(head), row(["---"] * len(head))])
-    for one in (one for one in results if one["set"] == "guests"):
+    for result in (result for result in results if result["set"] == "guests"):
         parts[-1].append(
             row([
-                f"{one['robots']} robots with bulk", f"{one['loss']:.0%}", f"{one['urgent_p50_s'] * 1e3:.0f}",
-                f"{one['urgent_p99_s'] * 1e3:.0f}", f"<= {one['goal_p99_s'] * 1e3:.0f}",
-                verdict(one["urgent_p99_s"] <= one["goal_p99_s"]),
+                f"{result['robots']} robots with bulk", f"{result['loss']:.0%}", f"{result['urgent_p50_s'] * 1e3:.0f}",
+                f"{result['urgent_p99_s'] * 1e3:.0f}", f"<= {result['goal_p99_s'] * 1e3:.0f}",
+                verdict(result["urgent_p99_s"] <= result["goal_p99_s"]),
             ])
         )  # fmt: skip
     head = ["three hops, loss of each", "bulk besides", "arrived", "standard deviation, ms", "longest interval, s"]
     head += ["goal, ms", ""]
     parts.append([row(head), row(["---"] * len(head))])
-    for one in (one for one in results if one["set"] == "hops"):
+    for result in (result for result in results if result["set"] == "hops"):
         parts[-1].append(
             row([
-                f"{one['loss']:.0%}", "yes" if one["bulk"] else "no", f"{one['arrived']:.1%}",
-                f"{one['deviation_s'] * 1e3:.1f}", f"{one['longest_s']:.3f}", f"< {one['goal_deviation_s'] * 1e3:.0f}",
-                verdict(one["deviation_s"] < one["goal_deviation_s"]),
+                f"{result['loss']:.0%}", "yes" if result["bulk"] else "no", f"{result['arrived']:.1%}",
+                f"{result['deviation_s'] * 1e3:.1f}", f"{result['longest_s']:.3f}",
+                f"< {result['goal_deviation_s'] * 1e3:.0f}",
+                verdict(result["deviation_s"] < result["goal_deviation_s"]),
             ])
         )  # fmt: skip
     head = [
@@ -332,13 +333,14 @@ def tables(results: Sequence[dict[str, Any]]) -> str:
     ]
     head += [""]
     parts.append([row(head), row(["---"] * len(head))])
-    for one in (one for one in results if one["set"] == "acknowledgements"):
+    for result in (result for result in results if result["set"] == "acknowledgements"):
         parts[-1].append(
             row([
-                f"{one['every']}{' (default)' if one['default'] else ''}", f"{one['bulk_bits_per_s'] / 1e6:.2f}",
-                f"{one['of_ceiling']:.3f}", f"{one['acknowledgements_airtime']:.1%}",
-                f">= {one['goal_of_ceiling']}" if one["default"] else "",
-                verdict(one["of_ceiling"] >= one["goal_of_ceiling"]) if one["default"] else "",
+                f"{result['every']}{' (default)' if result['default'] else ''}",
+                f"{result['bulk_bits_per_s'] / 1e6:.2f}",
+                f"{result['of_ceiling']:.3f}", f"{result['acknowledgements_airtime']:.1%}",
+                f">= {result['goal_of_ceiling']}" if result["default"] else "",
+                verdict(result["of_ceiling"] >= result["goal_of_ceiling"]) if result["default"] else "",
             ])
         )  # fmt: skip
     return "\n\n".join("\n".join(lines) for lines in parts)
@@ -353,8 +355,8 @@ def main() -> None:
     if not arguments.tables:
         arguments.results.parent.mkdir(parents=True, exist_ok=True)
         with arguments.results.open("w") as file:
-            for one in results_of(quick=arguments.quick):
-                file.write(json.dumps(one) + "\n")
+            for result in results_of(quick=arguments.quick):
+                file.write(json.dumps(result) + "\n")
                 file.flush()
     print(tables([json.loads(line) for line in arguments.results.read_text().splitlines()]))
 

@@ -49,8 +49,8 @@ def timed() -> Iterator[dict[str, float]]:
 
 def cores() -> tuple[float, float]:
     """CPU shares of sender and receiver."""
-    one = OneChannel(1, channel=channel(), loss=0.0, seed=1)
-    agenda = one.team.event_queue
+    world = OneChannel(1, channel=channel(), loss=0.0, seed=1)
+    agenda = world.team.event_queue
     agenda.run_until(COUNT_FROM_S)
     with timed() as spent_s:
         agenda.run_until(COUNT_FROM_S + COUNT_S)

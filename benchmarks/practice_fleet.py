@@ -65,7 +65,9 @@ class PracticeFleet:
         robots = inventory.robots.values()
         self.operator = next(robot.name for robot in robots if robot.is_base)
         computers = [robot.computer.address.ip for robot in robots if robot.computer and not robot.is_base]
-        self.addresses = [str(one) for one in (*(inventory.nodes[name].address.ip for name in self.nodes), *computers)]
+        self.addresses = [
+            str(address) for address in (*(inventory.nodes[name].address.ip for name in self.nodes), *computers)
+        ]
 
     def provision(self) -> None:
         environment = {

@@ -103,10 +103,10 @@ def kind_of(process: Started, login_servers: frozenset[int]) -> tuple[str, str]:
     while chain[-1].parent is not None:
         chain.append(chain[-1].parent)
     part, kind = "login and observation", OURS
-    for one in reversed(chain):
-        for words in filter(None, one.command_lines):
+    for ancestor in reversed(chain):
+        for words in filter(None, ancestor.command_lines):
             part = next((name for name, pattern in _PARTS if pattern.search(" ".join(words))), part)
-            if one is not process and _is_tool(words):
+            if ancestor is not process and _is_tool(words):
                 kind = IN_TOOLS
     return part, kind
 

@@ -292,12 +292,18 @@ class Bench:
 
     def _next_hop(self, node: str, target: str) -> str:
         known = json.loads(self._on(node, "batctl meshif bat0 originators_json") or "[]")
-        hops = [one["neigh_address"] for one in known if one.get("best") and one["orig_address"] == _mac(target)]
+        hops = [
+            originator["neigh_address"]
+            for originator in known
+            if originator.get("best") and originator["orig_address"] == _mac(target)
+        ]
         return str(hops[0]) if hops else ""
 
     def _neighbors(self, name: str, case: Case) -> set[str]:
         known = json.loads(self._on(name, "batctl meshif bat0 neighbors_json") or "[]")
-        return {one["neigh_address"] for one in known if one["last_seen_msecs"] < 500 + 2 * case.interval_ms}
+        return {
+            neighbor["neigh_address"] for neighbor in known if neighbor["last_seen_msecs"] < 500 + 2 * case.interval_ms
+        }
 
     def _on(self, name: str, command: str) -> str:
         return self._fleet.node(name).exec(command, timeout_s=_COMMAND_S).check(f"{name}: {command}").stdout

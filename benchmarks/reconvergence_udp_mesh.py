@@ -133,7 +133,7 @@ class Measuring:
             last_s = time.monotonic() - begun_s
 
     def _done(self, case: Case) -> int:
-        return sum(is_of(one, case) and "pause_s" in one for one in recorded(self._results))
+        return sum(is_of(result, case) and "pause_s" in result for result in recorded(self._results))
 
     def _write(self, case: Case, **words: Any) -> None:
         line = json.dumps({"algorithm": case.algorithm, "interval_ms": case.interval_ms, **words})
@@ -170,7 +170,9 @@ def airtime_us(rate: int, length: int, kind: str) -> float:
 
 def share_of_air(overheard: list[dict[str, Any]]) -> float:
     """The share (0..1) of a common channel that batman-adv's own packets use."""
-    total_us: float = sum(one["count"] * airtime_us(one["rate"], one["bytes"], one["kind"]) for one in overheard)
+    total_us: float = sum(
+        frames["count"] * airtime_us(frames["rate"], frames["bytes"], frames["kind"]) for frames in overheard
+    )
     return total_us / (OVERHEARD_S * 1e6)
 
 
@@ -188,8 +190,8 @@ def is_of(result: dict[str, Any], case: Case) -> bool:
 
 def forget(path: Path, cases: list[Case]) -> None:
     """Remove all results of these cases."""
-    kept = [one for one in recorded(path) if not any(is_of(one, case) for case in cases)]
-    path.write_text("".join(f"{json.dumps(one)}\n" for one in kept), encoding="utf-8")
+    kept = [result for result in recorded(path) if not any(is_of(result, case) for case in cases)]
+    path.write_text("".join(f"{json.dumps(result)}\n" for result in kept), encoding="utf-8")
 
 
 def table(results: list[dict[str, Any]]) -> str:
@@ -199,12 +201,12 @@ def table(results: list[dict[str, Any]]) -> str:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for case in CASES:
-        of_case = [one for one in results if is_of(one, case)]
-        runs = [one for one in of_case if "pause_s" in one]
+        of_case = [result for result in results if is_of(result, case)]
+        runs = [result for result in of_case if "pause_s" in result]
         if runs:
-            pauses = [one["pause_s"] for one in runs]
-            rate = statistics.median(sum(item["count"] for item in one["overheard"]) / OVERHEARD_S for one in runs)
-            share = statistics.median(share_of_air(one["overheard"]) for one in runs)
+            pauses = [run["pause_s"] for run in runs]
+            rate = statistics.median(sum(item["count"] for item in run["overheard"]) / OVERHEARD_S for run in runs)
+            share = statistics.median(share_of_air(run["overheard"]) for run in runs)
             cells = f"{len(runs)} | {_median_and_range(pauses)} | {rate:.0f} | {share:.2%}"
         elif of_case:
             cells = f"0 | failed: {of_case[-1]['failed'].replace('|', '/')} | - | -"

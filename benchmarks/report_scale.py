@@ -76,7 +76,7 @@ class _Peer:
             capacity_bits_per_s=4e6 + 8e6 * draw(),
             window_packets=10 + 60 * draw(),
             queues=tuple(
-                replace(one, messages=waiting, bytes=300 * waiting, oldest_s=waiting / 2) for one in now.queues
+                replace(queue, messages=waiting, bytes=300 * waiting, oldest_s=waiting / 2) for queue in now.queues
             ),
             outbox_messages=waiting,
             outbox_bytes=300 * waiting,

@@ -76,9 +76,9 @@ def answered(command: Sequence[str], environ: Mapping[str, str], answering: int)
     """Wall and CPU seconds of a status. Raises RuntimeError unless exactly `answering` devices answered."""
     wall_s, cpu_s, document = run(command, environ)
     devices = [*document["nodes"], *document["robots"]]
-    count = sum(one["answers"] for one in devices)
+    count = sum(device["answers"] for device in devices)
     if count != answering:
-        why = {one["silent_because"] for one in devices if not one["answers"]}
+        why = {device["silent_because"] for device in devices if not device["answers"]}
         raise RuntimeError(f"{count} of {len(devices)} answered, expected {answering}: {why}")
     return wall_s, cpu_s
 
@@ -101,7 +101,7 @@ def watched(devices: Devices, command: Sequence[str], environ: Mapping[str, str]
         process.terminate()
         process.wait(60)
     asked = len(first["nodes"]) + len(first["robots"])
-    silent = [one["name"] for look in looks for one in (*look["nodes"], *look["robots"]) if not one["answers"]]
+    silent = [device["name"] for look in looks for device in (*look["nodes"], *look["robots"]) if not device["answers"]]
     if silent or not asked:
         raise RuntimeError(f"without an answer: {silent}")
     cpu_s, devices_cpu_s = ((late - early) / WATCH_ROUNDS for early, late in zip(before, after, strict=True))
@@ -132,7 +132,12 @@ def measure(radios: int, robots: int, checkouts: Mapping[str, str]) -> list[dict
             devices.stop()
     phases = {"alone": alone, "both": both, "again": again, "half": half}
     return [
-        {"radios": radios, "robots": robots, "checkout": label, **{name: one[label] for name, one in phases.items()}}
+        {
+            "radios": radios,
+            "robots": robots,
+            "checkout": label,
+            **{name: values[label] for name, values in phases.items()},
+        }
         for label in commands
     ]
 

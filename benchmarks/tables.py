@@ -86,15 +86,15 @@ def _comparisons(results: Sequence[Mapping[str, Any]]) -> str:
     lines += [
         row(
             [
-                one.set,
-                one.cell,
-                _COLUMNS[one.figure][0],
-                shown(one.figure, one.ours),
-                shown(one.figure, one.best),
-                one.best_peer or "none",
-                "ahead" if one.ahead else "**behind**",
+                result.set,
+                result.cell,
+                _COLUMNS[result.figure][0],
+                shown(result.figure, result.ours),
+                shown(result.figure, result.best),
+                result.best_peer or "none",
+                "ahead" if result.ahead else "**behind**",
             ]
         )
-        for one in compared(results)
+        for result in compared(results)
     ]
     return "\n".join(lines)

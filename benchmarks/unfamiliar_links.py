@@ -66,18 +66,18 @@ def _alone(name: str, seed: int, controller: Callable[[int], TcpController]) -> 
 
 def line(name: str, seeds: list[Figures]) -> str:
     def mean(figure: str) -> float:
-        return fmean(getattr(one, figure) for one in seeds)
+        return fmean(getattr(seed, figure) for seed in seeds)
 
     beside = CELLS[name].foreign is not None
     return row(
         [
             name,
             f"{mean('share'):.3f}",
-            f"{min(one.share for one in seeds):.3f}",
+            f"{min(seed.share for seed in seeds):.3f}",
             f"{mean('foreign_share'):.3f}" if beside else "",
             f"{mean('urgent_p50_ms'):.0f}",
             f"{mean('urgent_p99_ms'):.0f}",
-            f"{max(one.urgent_p99_ms for one in seeds):.0f}",
+            f"{max(seed.urgent_p99_ms for seed in seeds):.0f}",
             f"{mean('wire_ratio'):.3f}",
             f"{mean('cubic_share'):.3f}",
             f"{mean('bbr_share'):.3f}",

@@ -119,7 +119,7 @@ def combinations(parameters: Sequence[Parameter]) -> list[Settings]:
 def cases_of(settings: Sequence[Settings], seeds: range) -> list[Case]:
     """All cases, seed by seed, so that an interrupted sweep has something of every setting."""
     _check_count(len(settings) * len(seeds))
-    return [Case(one, seed) for seed in seeds for one in settings]
+    return [Case(setting, seed) for seed in seeds for setting in settings]
 
 
 def _check_count(count: int) -> None:

@@ -79,7 +79,7 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
     with ResultsFile(out, study.identity) as file:
         if file.repaired_bytes:
             _note(f"{out}: cut off an incomplete last line of {file.repaired_bytes} bytes; its case runs again")
-        results = {one.case: one for one in file.stored.results}
+        results = {stored_result.case: stored_result for stored_result in file.stored.results}
         missing = [case for case in cases if case not in results or results[case].failed]
         if len(missing) < len(cases):
             _note(f"{out}: {len(cases) - len(missing)} of {len(cases)} cases have a result already")
@@ -135,9 +135,9 @@ def _existing(patterns: Iterable[str], results: Sequence[Result]) -> list[str]:
 def _check_all(settings: Sequence[Settings], check: Callable[[Settings], None]) -> None:
     """Raises SweepError with each problem once, before anything runs."""
     problems: dict[str, None] = {}
-    for one in settings:
+    for setting in settings:
         try:
-            check(one)
+            check(setting)
         except SweepError as error:
             problems.update(dict.fromkeys(str(error).splitlines()))
     if problems:
@@ -147,8 +147,8 @@ def _check_all(settings: Sequence[Settings], check: Callable[[Settings], None]) 
 
 
 def _list_failures(comparison: Comparison) -> None:
-    for one in comparison.failed[:_SHOWN_FAILURES]:
-        _note(f"no result: {one.case}: {one.failed}")
+    for failure in comparison.failed[:_SHOWN_FAILURES]:
+        _note(f"no result: {failure.case}: {failure.failed}")
     if comparison.failed:
         count = len(comparison.failed)
         _note(f"{count} of {comparison.runs + count} cases have no result; the same command runs them again")

@@ -90,7 +90,7 @@ def compare(results: Sequence[Result], patterns: Sequence[str], goals: Sequence[
     names = sorted({name for result in good for name in result.figures})
     _check_names([*patterns, *(goal.figure for goal in goals)], names)
     by_setting: dict[Settings, list[Result]] = {}
-    for result in sorted(good, key=lambda one: (settings_order(one.case.settings), one.case.seed)):
+    for result in sorted(good, key=lambda result: (settings_order(result.case.settings), result.case.seed)):
         by_setting.setdefault(result.case.settings, []).append(result)
     chosen = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
     figures = [
@@ -136,14 +136,15 @@ def _goal_rows(by_setting: dict[Settings, list[Result]], goal: Goal) -> tuple[Co
 def as_json(comparison: Comparison) -> dict[str, Any]:
     """The comparison as JSON values."""
 
-    def interval(one: Interval | None) -> dict[str, float | None] | None:
-        return None if one is None else {"estimate": one.estimate, "low": one.low, "high": one.high}
+    def interval(bounds: Interval | None) -> dict[str, float | None] | None:
+        return None if bounds is None else {"estimate": bounds.estimate, "low": bounds.low, "high": bounds.high}
 
     return {
         "confidence": CONFIDENCE,
         "runs": comparison.runs,
         "failed": [
-            {"set": dict(one.case.settings), "seed": one.case.seed, "reason": one.failed} for one in comparison.failed
+            {"set": dict(result.case.settings), "seed": result.case.seed, "reason": result.failed}
+            for result in comparison.failed
         ],
         "figures": [
             {
@@ -194,16 +195,16 @@ def row_texts(figure: ComparedFigure, row: ComparedSetting) -> tuple[str, ...]:
     return (*cells, f"{difference.estimate:+.3g}{bounds}")
 
 
-def _estimate(one: Interval | None, figure: ComparedFigure) -> str:
-    return "none" if one is None else f"{one.estimate:.1%}" if figure.is_goal else number(one.estimate)
+def _estimate(interval: Interval | None, figure: ComparedFigure) -> str:
+    return "none" if interval is None else f"{interval.estimate:.1%}" if figure.is_goal else number(interval.estimate)
 
 
-def _bounds(one: Interval | None, figure: ComparedFigure) -> str:
-    if one is None or one.low is None or one.high is None:
+def _bounds(interval: Interval | None, figure: ComparedFigure) -> str:
+    if interval is None or interval.low is None or interval.high is None:
         return "needs more runs"
     if figure.is_goal:
-        return f"{one.low:.1%} to {one.high:.1%}"
-    return f"{number(one.low)} to {number(one.high)}"
+        return f"{interval.low:.1%} to {interval.high:.1%}"
+    return f"{number(interval.low)} to {number(interval.high)}"
 
 
 def number(value: float) -> str:

@@ -39,7 +39,9 @@ def page(identity: Identity, comparison: Comparison) -> str:
 def _failed(comparison: Comparison) -> str:
     if not comparison.failed:
         return ""
-    items = "".join(f"<li>{escape(str(one.case))}: {escape(one.failed)}</li>" for one in comparison.failed[:20])
+    items = "".join(
+        f"<li>{escape(str(result.case))}: {escape(result.failed)}</li>" for result in comparison.failed[:20]
+    )
     return f'<div class="failed"><p>{len(comparison.failed)} cases have no result:</p><ul>{items}</ul></div>'
 
 

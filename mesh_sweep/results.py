@@ -66,7 +66,7 @@ def encode(identity: Identity, result: Result) -> bytes:
 
 def encode_all(identity: Identity, results: Iterable[Result]) -> bytes:
     """The lines of all results, sorted: the same bytes in whatever order the cases ran."""
-    return b"".join(encode(identity, result) for result in sorted(results, key=lambda one: order(one.case)))
+    return b"".join(encode(identity, result) for result in sorted(results, key=lambda result: order(result.case)))
 
 
 def decode(raw: bytes, file: str, expected: Identity | None = None) -> StoredResults:

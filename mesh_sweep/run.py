@@ -39,7 +39,9 @@ def run_cases(
             is_broken = not _submit(dispatch, run, executor, workers, running)
             done, _ = wait(running, timeout=0.0 if is_broken else _TICK_S, return_when=FIRST_COMPLETED)
             tick()
-            if is_broken or any(isinstance(one.exception(), BrokenExecutor) for one in done if not one.cancelled()):
+            if is_broken or any(
+                isinstance(ended.exception(), BrokenExecutor) for ended in done if not ended.cancelled()
+            ):
                 # every future of a broken pool ends at once
                 done = wait(running).done
                 is_broken = True
@@ -86,7 +88,9 @@ def _submit(
             lost: Future[Figures] = Future()
             lost.set_exception(error)
             running[lost] = case
-    return not any(one.done() and isinstance(one.exception(), BrokenExecutor) for one in running if not one.cancelled())
+    return not any(
+        future.done() and isinstance(future.exception(), BrokenExecutor) for future in running if not future.cancelled()
+    )
 
 
 def _reason(error: BaseException) -> str:

@@ -139,7 +139,7 @@ def _inserted(edited: EditedText, node: yaml.MappingNode, entry: str) -> EditedT
         comma = ", " if node.value else ""
         return EditedText(f"{text[: start + 1]}{entry}{comma}{text[start + 1 :]}", edited.inserted_lines)
     line, indent = node.start_mark.line + 1, node.start_mark.column
-    moved = (*(one + (one >= line) for one in edited.inserted_lines), line)
+    moved = (*(inserted_line + (inserted_line >= line) for inserted_line in edited.inserted_lines), line)
     return EditedText(f"{text[:start]}{entry}\n{' ' * indent}{text[start:]}", tuple(sorted(moved)))
 
 

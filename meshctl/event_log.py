@@ -97,4 +97,4 @@ class Lines(logging.Formatter):
         fields = " ".join(f"{name}={value}" for name, value in _fields(record).items())
         # no control character of a device or a script reaches the terminal
         line = f"{at} {record.getMessage()}: {fields}"
-        return "".join(one if one.isprintable() else " " for one in line)
+        return "".join(character if character.isprintable() else " " for character in line)

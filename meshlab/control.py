@@ -232,7 +232,7 @@ def _release(state: NodeState) -> str:
 
 
 def _address(addresses: Any) -> str | None:
-    return next((one.address for one in addresses if one.over_wire or one.over_mesh), None)
+    return next((address.address for address in addresses if address.over_wire or address.over_mesh), None)
 
 
 async def _readable(connection: socket.socket) -> None:

@@ -84,7 +84,7 @@ def parse(text: str) -> FaultRequest:
         what = Fault(word)
     except ValueError:
         raise InputError(
-            f"unknown fault {word!r}", hint="known faults: " + ", ".join(one.value for one in Fault)
+            f"unknown fault {word!r}", hint="known faults: " + ", ".join(fault.value for fault in Fault)
         ) from None
     if step and what not in STEP_FAULTS:
         raise InputError(f"{word} takes effect immediately and takes no @STEP")

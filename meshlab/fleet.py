@@ -282,7 +282,11 @@ class VirtualFleet:
     def positions(self) -> dict[str, tuple[float, float]]:
         """Where its nodes are, in meters; empty without a radio environment."""
         path = self.directory / propagation_file.FLEET_FILE
-        return {name: one.at for name, one in propagation_file.load(path).positions.items()} if path.exists() else {}
+        return (
+            {name: position.at for name, position in propagation_file.load(path).positions.items()}
+            if path.exists()
+            else {}
+        )
 
     def bench_endpoint(self, name: str) -> Endpoint:
         """`VirtualNode.bench` of the node called `name`."""

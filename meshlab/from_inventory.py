@@ -35,7 +35,7 @@ def spec_of(
     if links is None:
         used = default_links(names, [[node.name for node in chosen if mesh in node.meshes] for mesh in fleet.meshes])
     else:
-        used = [one for one in links if one.a in names and one.b in names]
+        used = [link for link in links if link.a in names and link.b in names]
     return FleetSpec(
         name=fleet.name,
         nodes=tuple(_node_spec(node, number) for number, node in enumerate(chosen)),

@@ -100,16 +100,16 @@ class EffectiveState:
     def holds(self, address: str, *, over: str) -> bool:
         """Whether the node answers at `address` to packets that arrive over the `mesh` or a `wire`."""
         return any(
-            one.address == address and (one.over_mesh if over == "mesh" else one.over_wire) for one in self.addresses
+            own.address == address and (own.over_mesh if over == "mesh" else own.over_wire) for own in self.addresses
         )
 
     def admits(self, address: str) -> bool:
         """Whether the firewall accepts a new SSH connection to `address`."""
-        return any(one.address == address and one.admitted for one in self.addresses)
+        return any(own.address == address and own.admitted for own in self.addresses)
 
     @property
     def bridges_lan_and_mesh(self) -> bool:
-        return any(one.over_mesh and one.over_wire for one in self.addresses)
+        return any(address.over_mesh and address.over_wire for address in self.addresses)
 
     @property
     def routes_lan_and_mesh(self) -> bool:
@@ -126,8 +126,8 @@ class EffectiveState:
 
     def _routed(self) -> Iterator[tuple[Address, Address]]:
         """The pairs of an address on a wire only and one on the mesh only."""
-        wired = [one for one in self.addresses if one.over_wire and not one.over_mesh]
-        meshed = [one for one in self.addresses if one.over_mesh and not one.over_wire]
+        wired = [address for address in self.addresses if address.over_wire and not address.over_mesh]
+        meshed = [address for address in self.addresses if address.over_mesh and not address.over_wire]
         return itertools.product(wired, meshed)
 
 
@@ -251,11 +251,11 @@ def heard_text(
             for edge in graph.get(name, ())
         )
     lines = []
-    for one in stations:
-        rate = _BEST_RATE_MBIT_S * one.tq / TQ_MAX
+    for station in stations:
+        rate = _BEST_RATE_MBIT_S * station.tq / TQ_MAX
         lines.append(
-            f"S\t{one.interface}\t{one.mac}\t{one.signal_dbm}\t{_age_ms(name, one.mac)}\t{rate:.1f}"
-            f"\t{one.since_s}\t{one.silent_since_s}"
+            f"S\t{station.interface}\t{station.mac}\t{station.signal_dbm}\t{_age_ms(name, station.mac)}\t{rate:.1f}"
+            f"\t{station.since_s}\t{station.silent_since_s}"
         )
     for edge in graph.get(name, ()):
         own, peer = edge.own, edge.peer
@@ -282,9 +282,9 @@ def servers_text(
     for edge in graph.get(name, ()):
         if not edge.own.routes_with(edge.peer):
             continue
-        for one in nodes[edge.node].addresses:
-            if one.over_mesh and states.get(one.address) != "answers":
-                states[one.address] = "refused" if not one.admitted else "answers" if logs_in(name, edge) else "silent"
+        for own in nodes[edge.node].addresses:
+            if own.over_mesh and states.get(own.address) != "answers":
+                states[own.address] = "refused" if not own.admitted else "answers" if logs_in(name, edge) else "silent"
     return "".join(f"L\t{address}\t{state}\n" for address, state in states.items())
 
 

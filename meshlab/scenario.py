@@ -136,7 +136,7 @@ def snapshot(scenario: Scenario, t: float) -> Snapshot:
     for name, deployment in scenario.beacons.items():
         put(name, _carrier_at(scenario, deployment, min(t, deployment.at_s)))
     off = {name for name, drop in scenario.beacons.items() if t < drop.at_s}
-    for event in sorted(scenario.power_events, key=lambda one: one.at_s):
+    for event in sorted(scenario.power_events, key=lambda power_event: power_event.at_s):
         if event.at_s <= t and event.on and not _is_carried(scenario, event.node, t):
             off.discard(event.node)
         elif event.at_s <= t and not event.on:

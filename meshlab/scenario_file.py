@@ -131,7 +131,7 @@ def _trial(entry: YamlEntry) -> TrialSettings:
 
 def _deployment(name: str, entry: YamlEntry, carriers: tuple[str, ...]) -> Deployment | None:
     keys = entry.mapping(("carried_by", "drop_s"), required=("carried_by", "drop_s"))
-    by = keys["carried_by"].text(one_of=tuple(one for one in carriers if one != name))
+    by = keys["carried_by"].text(one_of=tuple(carrier for carrier in carriers if carrier != name))
     return Deployment(by, keys["drop_s"].number(0.0, 0.0, _MAX_DURATION_S)) if by else None
 
 

@@ -137,7 +137,7 @@ class Supervisor:
 
     def _boot_next(self) -> None:
         while self._waiting and sum(s.power is Power.BOOTING for s in self.fleet.nodes.values()) < _BOOTING_AT_ONCE:
-            name = next((one for one in self._waiting if not self.fleet.nodes[one].pid), None)
+            name = next((waiting for waiting in self._waiting if not self.fleet.nodes[waiting].pid), None)
             if name is None:
                 return
             self._waiting.remove(name)

@@ -145,16 +145,16 @@ def table(results: Sequence[dict[str, Any]]) -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
 
-    def kind(one: dict[str, Any]) -> tuple[int, float, int]:
-        return one["masters"], one["loss"], TRANSPORTS.index(one["transport"])
+    def kind(result: dict[str, Any]) -> tuple[int, float, int]:
+        return result["masters"], result["loss"], TRANSPORTS.index(result["transport"])
 
     for (masters, loss, transport), runs in itertools.groupby(sorted(results, key=kind), kind):
         same = list(runs)
-        firsts = [one["phases"][:1] for one in same]
-        homes = [[phase for phase in one["phases"] if phase["phase"] in HOMEWARD] for one in same]
-        items = statistics.median_low(one["items_at_base"] for one in same)
-        taken = sum(one["task_known_as_taken"] for one in same)
-        sent_bytes = statistics.median(one["bytes"] for one in same)
+        firsts = [result["phases"][:1] for result in same]
+        homes = [[phase for phase in result["phases"] if phase["phase"] in HOMEWARD] for result in same]
+        items = statistics.median_low(result["items_at_base"] for result in same)
+        taken = sum(result["task_known_as_taken"] for result in same)
+        sent_bytes = statistics.median(result["bytes"] for result in same)
         lines.append(
             f"| {masters} | {loss:.0%} | {TRANSPORTS[transport]} | {len(same)} | {_time(firsts)} | {_time(homes)} "
             f"| {items} of {same[0]['items']} | {taken} of {len(same)} | {sent_bytes / 1e6:.1f} |"
@@ -169,8 +169,8 @@ def _time(runs: Sequence[Sequence[dict[str, Any]]]) -> str:
     return f"{median_s:.0f} s" + (f", given up in {given_up} of {len(runs)}" if given_up else "")
 
 
-def _is_same(one: dict[str, Any], cell: tuple[str, int, float], cut_s: float) -> bool:
-    return (one["transport"], one["masters"], one["loss"], one["cut_s"]) == (*cell, cut_s)
+def _is_same(result: dict[str, Any], cell: tuple[str, int, float], cut_s: float) -> bool:
+    return (result["transport"], result["masters"], result["loss"], result["cut_s"]) == (*cell, cut_s)
 
 
 def main() -> None:
@@ -192,14 +192,14 @@ def main() -> None:
     # round by round, so that the runs of a cell are spread over time
     cells = list(itertools.product(chosen, masters, losses))
     for run, (transport, count, loss) in itertools.product(range(arguments.runs), cells):
-        if sum(_is_same(one, (transport, count, loss), arguments.cut) for one in results) > run:
+        if sum(_is_same(result, (transport, count, loss), arguments.cut) for result in results) > run:
             continue
-        one = measure(transport, count, loss, arguments.cut, arguments.limit)
-        results.append(one)
+        result = measure(transport, count, loss, arguments.cut, arguments.limit)
+        results.append(result)
         with path.open("a") as file:
-            file.write(json.dumps(one) + "\n")
-        print(json.dumps(one), flush=True)
-    shown = [one for one in results if (one["cut_s"], one["limit_s"]) == (arguments.cut, arguments.limit)]
+            file.write(json.dumps(result) + "\n")
+        print(json.dumps(result), flush=True)
+    shown = [result for result in results if (result["cut_s"], result["limit_s"]) == (arguments.cut, arguments.limit)]
     text = (
         f"Finds: artifacts of {ARTIFACT_BYTES / 1e3:.0f} kB and map differences of {MAP_BYTES / 1e3:.0f} kB. "
         f"Medians of the runs.\n\n{table(shown)}"

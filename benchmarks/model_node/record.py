@@ -88,7 +88,9 @@ def meshctl_change(rig: Rig, name: str, costs: dict[str, Cost]) -> str:
 def plain_text(output: bytes) -> str:
     """An observation's sections, not compressed."""
     sections = split_sections(output, "NONCE")
-    return "".join(f"NONCE begin {name}\n{one.text}\nNONCE end {one.status}\n" for name, one in sections.items())
+    return "".join(
+        f"NONCE begin {name}\n{section.text}\nNONCE end {section.status}\n" for name, section in sections.items()
+    )
 
 
 def scheduled_change(rig: Rig, name: str, costs: dict[str, Cost]) -> None:

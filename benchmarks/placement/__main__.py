@@ -60,8 +60,8 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
     draw = random.Random(0)
     lines: list[str] = []
     for model in MODELS:
-        for beacons in sorted({one["beacons"] for one in results}):
-            chosen = [one for one in results if one["model"] == model and one["beacons"] == beacons]
+        for beacons in sorted({result["beacons"] for result in results}):
+            chosen = [result for result in results if result["model"] == model and result["beacons"] == beacons]
             if not chosen:
                 continue
             lines += ["", f"{beacons} beacons, {NAMES[model]}, {len(chosen)} tunnels:", ""]
@@ -70,10 +70,10 @@ def report(results: Sequence[Mapping[str, Any]]) -> str:
             for name in RULES:
                 cells = [name]
                 for outage in OUTAGES:
-                    values = [one["reached"][name][f"{outage:g}"] for one in chosen]
+                    values = [result["reached"][name][f"{outage:g}"] for result in chosen]
                     low, high = interval(values, draw)
                     cells.append(f"{statistics.median(values):.0f} ({low:.0f}-{high:.0f})")
-                gains = [one["reached"]["meter"]["0.05"] - one["reached"][name]["0.05"] for one in chosen]
+                gains = [result["reached"]["meter"]["0.05"] - result["reached"][name]["0.05"] for result in chosen]
                 low, high = interval(gains, draw)
                 won = sum(gain > 0 for gain in gains)
                 gain_text = f"{statistics.median(gains):+.0f} m ({low:+.0f} to {high:+.0f}), {won} of {len(gains)}"
@@ -91,7 +91,7 @@ def main() -> None:
     arguments = parser.parse_args()
     file: Path = arguments.results
     results = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-    known = {(one["model"], one["seed"], one["beacons"]) for one in results}
+    known = {(result["model"], result["seed"], result["beacons"]) for result in results}
     if not arguments.tables:
         for seed in range(arguments.tunnels):
             for model in MODELS:

@@ -121,7 +121,7 @@ def _lan(expected: Expectation, after: Observation) -> tuple[str, ...]:
         if interface is None or not interface.up:
             return (f"{what} is down",)
         present = {_canonical(found) for found in interface.addresses}
-        if missing := [one for one in address_options(section) if _canonical(one) not in present]:
+        if missing := [option for option in address_options(section) if _canonical(option) not in present]:
             return (f"{what} has {', '.join(interface.addresses) or 'no address'}, not {missing[0]}",)
     lan = expected.network.section("lan")
     return () if lan is None else _bridge(expected.network, lan.get("device"), after)

@@ -161,7 +161,9 @@ def current_neighbors(seen: Observation, names: Mapping[str, str]) -> tuple[str,
 
 
 def _heard_macs(seen: Observation) -> frozenset[str]:
-    fresh = (one.mac.lower() for one in seen.neighbours or () if one.last_seen_ms <= NEIGHBOUR_FRESH_MS)
+    fresh = (
+        neighbour.mac.lower() for neighbour in seen.neighbours or () if neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS
+    )
     return frozenset((*fresh, *(station.mac.lower() for station in seen.stations or ())))
 
 

@@ -86,7 +86,7 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
     node = run_filter.node
     found = journal.runs(node=None if is_pattern(node) else node, limit=None)
     if is_pattern(node):
-        found = tuple(run for run in found if any(concerns(node, one.node) for one in journal.outcomes(run.id)))
+        found = tuple(run for run in found if any(concerns(node, outcome.node) for outcome in journal.outcomes(run.id)))
     records = tuple(islice((record for record in found if run_filter.matches(record)), limit))
     if as_json:
         echo_json(json.dumps([_run_object(record) for record in records], indent=1))
@@ -108,8 +108,15 @@ def _list_runs(journal: Journal, run_filter: _RunFilter, limit: int, *, as_json:
 def _list_group(journal: Journal, records: list[RunRecord], node: str | None) -> None:
     rows = [("RUN", "STARTED", "COMMAND", "FLEET", "BY", "RESULT")]
     rows += [
-        (str(one.id), _moment(one.began_s), one.command, _fleet_text(one.fleet, one.lab), one.owner, one.state)
-        for one in records
+        (
+            str(listed_record.id),
+            _moment(listed_record.began_s),
+            listed_record.command,
+            _fleet_text(listed_record.fleet, listed_record.lab),
+            listed_record.owner,
+            listed_record.state,
+        )
+        for listed_record in records
     ]
     widths = [max(len(row[column]) for row in rows) for column in range(5)]
     for row, record in zip(rows, [None, *records], strict=True):

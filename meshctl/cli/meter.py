@@ -166,8 +166,10 @@ class _Positions:
             known = positions_in(self.daemon.request("status"))
         except DaemonError:
             return None
-        recent = (one for one in known if one.name == self.robot and one.age_s <= _MAX_POSITION_AGE_S)
-        return next(((one.x_m, one.y_m, one.z_m or 0.0) for one in recent), None)
+        recent = (
+            position for position in known if position.name == self.robot and position.age_s <= _MAX_POSITION_AGE_S
+        )
+        return next(((position.x_m, position.y_m, position.z_m or 0.0) for position in recent), None)
 
 
 @dataclass(slots=True)

@@ -94,7 +94,7 @@ def _read(
     air = found.air
     if exponent is not None:
         raise InputError(f"--exponent: set air.exponent in {map_file}")
-    stops = tuple(_point(word, {name: one.at for name, one in found.positions.items()}) for word in route)
+    stops = tuple(_point(word, {name: placed.at for name, placed in found.positions.items()}) for word in route)
     return Walls(found.walls), air, stops, MapView(walls=found.walls)
 
 
@@ -122,12 +122,12 @@ def _json(found: PlacementPlan) -> dict[str, Any]:
         "beacons": [
             {
                 "number": number,
-                "depth_m": round(one.depth_m, 1),
-                "x_m": round(one.at[0], 2),
-                "y_m": round(one.at[1], 2),
-                "margin_db": round(one.margin_db, 1),
+                "depth_m": round(beacon.depth_m, 1),
+                "x_m": round(beacon.at[0], 2),
+                "y_m": round(beacon.at[1], 2),
+                "margin_db": round(beacon.margin_db, 1),
             }
-            for number, one in enumerate(found.beacons, 1)
+            for number, beacon in enumerate(found.beacons, 1)
         ],
     }
 
@@ -136,15 +136,15 @@ def _csv(found: PlacementPlan) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["number", "depth_m", "x_m", "y_m", "margin_db"])
-    writer.writerows([list(one.values()) for one in _json(found)["beacons"]])
+    writer.writerows([list(beacon.values()) for beacon in _json(found)["beacons"]])
     return out.getvalue()
 
 
 def _text(found: PlacementPlan) -> str:
     lines = [f"{'beacon':>6}  {'depth, m':>8}  {'x, m':>8}  {'y, m':>8}  {'margin, dB':>10}"]
     lines += [
-        f"{number:>6}  {one.depth_m:>8.0f}  {one.at[0]:>8.1f}  {one.at[1]:>8.1f}  {one.margin_db:>10.0f}"
-        for number, one in enumerate(found.beacons, 1)
+        f"{number:>6}  {beacon.depth_m:>8.0f}  {beacon.at[0]:>8.1f}  {beacon.at[1]:>8.1f}  {beacon.margin_db:>10.0f}"
+        for number, beacon in enumerate(found.beacons, 1)
     ]
     rows = lines if found.beacons else ["no beacon is needed"] if found.is_complete else []
     if not found.is_complete:

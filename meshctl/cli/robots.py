@@ -57,7 +57,7 @@ def diff_command(context: RobotsContext) -> None:
     """
     context = context.with_fleet(context.fleet)
     outcomes = print_differences(context, deploy_differences(context))
-    if any(one.result in (Result.PENDING, Result.REFUSED) for one in outcomes.values()):
+    if any(outcome.result in (Result.PENDING, Result.REFUSED) for outcome in outcomes.values()):
         raise typer.Exit(ExitCode.FINDINGS)
     raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
 
@@ -78,9 +78,9 @@ def status_command(context: RobotsContext) -> None:
         return Outcome(robot, Result.DONE if found[robot].is_healthy else Result.FAILED)
 
     outcomes = context.run_on_each(work)
-    rows = [found.get(name, RobotFacts(name, error=one.reason)) for name, one in outcomes.items()]
+    rows = [found.get(name, RobotFacts(name, error=outcome.reason)) for name, outcome in outcomes.items()]
     if context.as_json:
-        echo_json(json.dumps([facts_object(one) for one in rows], indent=2))
+        echo_json(json.dumps([facts_object(row) for row in rows], indent=2))
     else:
         echo(table(rows, line_width()))
     raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
@@ -129,11 +129,11 @@ def logs_command(
         return Outcome(robot, Result.DONE, facts={"log": text})
 
     outcomes = context.run_on_each(work)
-    for name, one in outcomes.items():
-        for line in one.facts.get("log", "").splitlines():
+    for name, outcome in outcomes.items():
+        for line in outcome.facts.get("log", "").splitlines():
             echo(f"{name}: {line}")
-        if not one.result.is_good:
-            echo(str(one), err=True)
+        if not outcome.result.is_good:
+            echo(str(outcome), err=True)
     raise typer.Exit(exit_for(outcomes.values(), context.opened.interrupt))
 
 
@@ -197,7 +197,7 @@ def _pin_key(context: RobotsContext, robot: str, *, change: bool, yes: bool, dry
         echo(f"{line}: pinned")
         return True
     if pinned and not change:
-        echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
+        echo(f"{line}: DIFFERS from the pinned {', '.join(host_key.fingerprint for host_key in pinned)}")
         echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
         return False
     if dry_run:

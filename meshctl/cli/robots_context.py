@@ -125,7 +125,7 @@ class RobotsContext:
         connections: list[Connection] = []
         ended = threading.Event()
 
-        def one(robot: str) -> Outcome:
+        def run_robot(robot: str) -> Outcome:
             try:
                 with self.connector.host(robot, opened=connections.append) as host:
                     return work(host, robot)
@@ -144,7 +144,7 @@ class RobotsContext:
             with interrupt.on_signals(say):
                 return run(
                     self.robots,
-                    one,
+                    run_robot,
                     parallel=transfers_at_once(self.fleet.apply.parallel),
                     interrupt=interrupt,
                     observer=observer,

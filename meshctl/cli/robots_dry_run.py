@@ -32,12 +32,13 @@ def print_differences(context: RobotsContext, work: RobotTask) -> dict[str, Outc
     outcomes = context.run_on_each(work)
     if context.as_json:
         objects = {
-            name: {"result": one.result.value, "differences": one.reason.splitlines()} for name, one in outcomes.items()
+            name: {"result": outcome.result.value, "differences": outcome.reason.splitlines()}
+            for name, outcome in outcomes.items()
         }
         echo_json(json.dumps(objects, indent=1))
     else:
-        for name, one in outcomes.items():
-            for line in (one.reason or "no changes").splitlines():
+        for name, outcome in outcomes.items():
+            for line in (outcome.reason or "no changes").splitlines():
                 echo(f"{name}: {line}")
     return outcomes
 
@@ -45,9 +46,9 @@ def print_differences(context: RobotsContext, work: RobotTask) -> dict[str, Outc
 def exit_for_dry_run(context: RobotsContext, work: RobotTask) -> typer.Exit:
     """Print the differences; returns the exit to raise: FINDINGS if a robot would refuse."""
     outcomes = print_differences(context, work)
-    if any(one.result is Result.REFUSED for one in outcomes.values()):
+    if any(outcome.result is Result.REFUSED for outcome in outcomes.values()):
         return typer.Exit(ExitCode.FINDINGS)
-    reached = [one for one in outcomes.values() if one.result is not Result.PENDING]
+    reached = [outcome for outcome in outcomes.values() if outcome.result is not Result.PENDING]
     return typer.Exit(exit_for(reached, context.opened.interrupt))
 
 

@@ -247,7 +247,7 @@ def _pin(opened: Session, site: Site, *, may_replace: bool, yes: bool) -> bool:
         echo(f"{line}: pinned")
         return True
     if pinned and not may_replace:
-        echo(f"{line}: DIFFERS from the pinned {', '.join(one.fingerprint for one in pinned)}")
+        echo(f"{line}: DIFFERS from the pinned {', '.join(host_key.fingerprint for host_key in pinned)}")
         echo("  hint: another computer, a new installation, or an attack: verify, then use --replace")
         return False
     if yes or (sys.stdin.isatty() and typer.confirm(f"{line}\n  Does this match the fingerprint on the gateway?")):

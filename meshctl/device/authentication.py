@@ -70,7 +70,11 @@ def login_attempts(credentials: Credentials, *, legacy_rsa_sha1: bool) -> Iterat
 def own_keys(credentials: Credentials) -> tuple[OwnKey, ...]:
     """The public parts of all keys that would be tried. Raises InputError for an unusable key file."""
     with login_attempts(credentials, legacy_rsa_sha1=False) as found:
-        return tuple(OwnKey(one.name, one.key.get_name(), one.key.asbytes()) for one in found if one.key is not None)
+        return tuple(
+            OwnKey(identity.name, identity.key.get_name(), identity.key.asbytes())
+            for identity in found
+            if identity.key is not None
+        )
 
 
 def sign(credentials: Credentials, fingerprints: Collection[str], data: bytes) -> tuple[OwnKey, bytes] | None:
@@ -78,15 +82,15 @@ def sign(credentials: Credentials, fingerprints: Collection[str], data: bytes) -
     such a key. The signature is that of RFC 4253 section 6.6, as in SSH's public key login. Raises InputError for an
     unusable key file."""
     with login_attempts(credentials, legacy_rsa_sha1=False) as found:
-        for one in found:
-            if one.key is None or fingerprint_of(one.key.asbytes()) not in fingerprints:
+        for identity in found:
+            if identity.key is None or fingerprint_of(identity.key.asbytes()) not in fingerprints:
                 continue
-            algorithm = _RSA_SIGNATURE if one.key.get_name() == "ssh-rsa" else None
+            algorithm = _RSA_SIGNATURE if identity.key.get_name() == "ssh-rsa" else None
             try:
-                signed = one.key.sign_ssh_data(data, algorithm)
+                signed = identity.key.sign_ssh_data(data, algorithm)
             except (paramiko.SSHException, OSError) as error:
-                raise InputError(f"{one.name} does not sign: {error}") from error
-            own = OwnKey(one.name, one.key.get_name(), one.key.asbytes())
+                raise InputError(f"{identity.name} does not sign: {error}") from error
+            own = OwnKey(identity.name, identity.key.get_name(), identity.key.asbytes())
             return own, signed if isinstance(signed, bytes) else signed.asbytes()
     return None
 

@@ -73,7 +73,7 @@ def run(
     in_work: dict[Future[Outcome], str] = {}
     bugs: list[BaseException] = []
 
-    def one(node: str) -> Outcome:
+    def run_node(node: str) -> Outcome:
         began = time.monotonic()
         observer(Event(EventKind.STARTED, node, time.time()))
         try:
@@ -89,7 +89,7 @@ def run(
         while waiting or in_work:
             while waiting and len(in_work) < parallel and not (signal.stopping or failure_budget.spent or bugs):
                 node = waiting.pop(0)
-                in_work[pool.submit(one, node)] = node
+                in_work[pool.submit(run_node, node)] = node
             if not in_work:
                 break
             finished, _ = wait(in_work, return_when=FIRST_COMPLETED)

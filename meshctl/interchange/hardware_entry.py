@@ -89,10 +89,10 @@ def _switch_vlans(network: Package) -> tuple[tuple[str, str], ...]:
     if switches != [{"name": "switch0", "reset": "1", "enable_vlan": "1"}]:
         return ()
     members = [dict(section.options) for section in network.of_type("switch_vlan")]
-    for one in members:
+    for member in members:
         # LuCI writes the VLAN's ID also where it is its number
-        if one.get("vid") == one.get("vlan"):
-            one.pop("vid", None)
-    if any(set(one) != {"device", "vlan", "ports"} or one["device"] != "switch0" for one in members):
+        if member.get("vid") == member.get("vlan"):
+            member.pop("vid", None)
+    if any(set(member) != {"device", "vlan", "ports"} or member["device"] != "switch0" for member in members):
         return ()
-    return tuple((str(one["vlan"]), str(one["ports"])) for one in members)
+    return tuple((str(member["vlan"]), str(member["ports"])) for member in members)

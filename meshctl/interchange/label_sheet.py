@@ -183,9 +183,9 @@ def _draw_text(canvas: Any, label: DeviceLabel, left: float, bottom: float, widt
 def _title(canvas: Any, label: DeviceLabel, width: float, height: float) -> list[tuple[str, str, float]]:
     """Label and name on one line, or, where that would be too small to read, the label above the name in two parts."""
     size = height * 0.2
-    one = f"{label.label}  {label.name}" if label.label else label.name
-    if size * width / max(canvas.stringWidth(_printable(one), TITLE_FONT, size), 1) >= MIN_TITLE_POINTS:
-        return [(one, TITLE_FONT, size)]
+    caption = f"{label.label}  {label.name}" if label.label else label.name
+    if size * width / max(canvas.stringWidth(_printable(caption), TITLE_FONT, size), 1) >= MIN_TITLE_POINTS:
+        return [(caption, TITLE_FONT, size)]
     half = (len(label.name) + 1) // 2
     parts = [(label.name[:half], TITLE_FONT, height * 0.1), (label.name[half:], TITLE_FONT, height * 0.1)]
     return [(label.label, TITLE_FONT, height * 0.12), *parts]

@@ -116,8 +116,8 @@ def _fitting(kind: Any, tree: Tree) -> Any:
         return dict[str, str]
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    kinds = [_fitting(one, tree) for one in get_args(kind) if one is not NoneType]
-    wanted = [one for one in kinds if _is_mapping(one) == isinstance(tree, MappingNode)]
+    kinds = [_fitting(argument, tree) for argument in get_args(kind) if argument is not NoneType]
+    wanted = [candidate for candidate in kinds if _is_mapping(candidate) == isinstance(tree, MappingNode)]
     return (wanted or kinds)[0]
 
 

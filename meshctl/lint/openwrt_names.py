@@ -75,14 +75,14 @@ def suggest_packages(name: str) -> tuple[str, ...]:
 
 def one_edit_apart(name: str, known: Iterable[str]) -> tuple[str, ...]:
     """The known names that are one edit away, sorted."""
-    return tuple(sorted(one for one in known if is_one_edit_apart(name, one)))
+    return tuple(sorted(candidate for candidate in known if is_one_edit_apart(name, candidate)))
 
 
-def is_one_edit_apart(one: str, other: str) -> bool:
+def is_one_edit_apart(name: str, other: str) -> bool:
     """Whether one letter is missing, added, wrong, or swapped with the next."""
-    if abs(len(one) - len(other)) > 1 or one == other:
+    if abs(len(name) - len(other)) > 1 or name == other:
         return False
-    start = next((i for i, (a, b) in enumerate(zip(one, other, strict=False)) if a != b), min(len(one), len(other)))
-    rest, other_rest = one[start:], other[start:]
+    start = next((i for i, (a, b) in enumerate(zip(name, other, strict=False)) if a != b), min(len(name), len(other)))
+    rest, other_rest = name[start:], other[start:]
     swapped = rest[1:2] + rest[:1] + rest[2:]
     return other_rest in (rest[1:], swapped) or rest == other_rest[1:] or rest[1:] == other_rest[1:]

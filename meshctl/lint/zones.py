@@ -37,9 +37,9 @@ def posix_of(name: str) -> str | None:
     return zones().get(name.replace(" ", "_"))
 
 
-def same_clock(one: str, other: str) -> bool:
+def same_clock(zone: str, other: str) -> bool:
     """Whether two POSIX strings describe the same local time, ignoring abbreviations."""
-    return _unnamed(one) == _unnamed(other)
+    return _unnamed(zone) == _unnamed(other)
 
 
 def _unnamed(posix: str) -> str:

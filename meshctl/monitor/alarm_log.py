@@ -103,13 +103,13 @@ def reported_alarms(status: Mapping[str, Any]) -> ReportedAlarms:
     found: dict[AlarmKey, tuple[str, str, str]] = {}
     unknown = set()
     for kind, prefix in (("nodes", ""), ("robots", ROBOT)):
-        for one in _maps(status.get(kind)):
-            if not isinstance(one.get("name"), str):
+        for entry in _maps(status.get(kind)):
+            if not isinstance(entry.get("name"), str):
                 continue
-            device = f"{prefix}{one['name']}"
-            if one.get("answers") is False:
+            device = f"{prefix}{entry['name']}"
+            if entry.get("answers") is False:
                 unknown.add(device)
-            _merge(found, device, one.get("alarms"))
+            _merge(found, device, entry.get("alarms"))
     _merge(found, FLEET, status.get("alarms"))
     return ReportedAlarms(found, frozenset(unknown))
 
@@ -117,10 +117,10 @@ def reported_alarms(status: Mapping[str, Any]) -> ReportedAlarms:
 def devices_of(status: Mapping[str, Any]) -> frozenset[str]:
     """The devices that an alarm of this status document could name, without the fleet."""
     return frozenset(
-        f"{prefix}{one['name']}"
+        f"{prefix}{entry['name']}"
         for kind, prefix in (("nodes", ""), ("robots", ROBOT))
-        for one in _maps(status.get(kind))
-        if isinstance(one.get("name"), str)
+        for entry in _maps(status.get(kind))
+        if isinstance(entry.get("name"), str)
     )
 
 
@@ -173,4 +173,4 @@ def advance(
             after[key] = alarm
         else:
             ended_now.append(replace(alarm, ended_s=now_s))
-    return AlarmChange(after, tuple(after[one.key] for one in began), tuple(ended_now))
+    return AlarmChange(after, tuple(after[new.key] for new in began), tuple(ended_now))

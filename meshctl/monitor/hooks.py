@@ -80,7 +80,7 @@ class AlarmHooks:
         if not self.settings.webhook and not self.settings.command:
             return
         least = LEVELS.index(self.settings.min_level)
-        loud = [one for one in alarms if LEVELS.index(one.level) >= least and one.silenced is None]
+        loud = [alarm for alarm in alarms if LEVELS.index(alarm.level) >= least and alarm.silenced is None]
         if not loud:
             return
         with self._wake:
@@ -193,6 +193,6 @@ def _environment(document: Mapping[str, Any]) -> dict[str, str]:
     """The alarm as variables, without control characters."""
     values = {}
     for key in ("fleet", "device", "code", "level", "text", "hint"):
-        text = "".join(one if one.isprintable() else " " for one in str(document.get(key) or ""))
+        text = "".join(character if character.isprintable() else " " for character in str(document.get(key) or ""))
         values[f"MESHCTL_ALARM_{key.upper()}"] = text.encode("utf-8", "replace").decode()[:MAX_TEXT]
     return values

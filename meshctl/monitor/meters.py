@@ -36,7 +36,7 @@ class MeterReadings:
         """Readings that are not older than `MAX_AGE_S`, by robot."""
         now_s = self.monotonic()
         with self._lock:
-            return {robot: one for robot, (at_s, one) in self._newest.items() if now_s - at_s <= MAX_AGE_S}
+            return {robot: meter for robot, (at_s, meter) in self._newest.items() if now_s - at_s <= MAX_AGE_S}
 
     def run(self) -> None:
         daemon = LocalDaemon(self.path)

@@ -245,17 +245,17 @@ def _robots(status: Document) -> Iterator[MetricFamily]:
         name = robot.get("name")
         up.add(robot.get("answers"), robot=name, state=robot.get("state"))
         daemon.add((robot.get("daemon") or {}).get("answers"), robot=name)
-        for one in robot.get("peers") or ():
+        for entry in robot.get("peers") or ():
             for key, family in peer.items():
                 # what the link to an offline peer was like last is not what it is now
-                if one.get("online") or key not in _OF_ONLINE_PEERS:
-                    family.add(one.get(key), robot=name, peer=one.get("name"))
-        for one in robot.get("queues") or ():
+                if entry.get("online") or key not in _OF_ONLINE_PEERS:
+                    family.add(entry.get(key), robot=name, peer=entry.get("name"))
+        for entry in robot.get("queues") or ():
             for key, family in queue.items():
-                family.add(one.get(key), robot=name, priority=one.get("priority"))
-        for one in robot.get("topics") or ():
-            topic.add(one.get("sent_ago_s"), robot=name, topic=one.get("name"), direction="sent")
-            topic.add(one.get("received_ago_s"), robot=name, topic=one.get("name"), direction="received")
+                family.add(entry.get(key), robot=name, priority=entry.get("priority"))
+        for entry in robot.get("topics") or ():
+            topic.add(entry.get("sent_ago_s"), robot=name, topic=entry.get("name"), direction="sent")
+            topic.add(entry.get("received_ago_s"), robot=name, topic=entry.get("name"), direction="received")
     yield from (up, daemon, *peer.values(), *queue.values(), topic)
 
 
@@ -290,12 +290,12 @@ def _alarms(status: Document, logged: Iterable[LoggedAlarm] | None) -> MetricFam
     for kind, prefix in (("nodes", ""), ("robots", "robot:")):
         devices += [(f"{prefix}{device.get('name')}", device) for device in status.get(kind) or ()]
     for name, device in devices:
-        for one in device.get("alarms") or ():
+        for open_alarm in device.get("alarms") or ():
             family.add(
                 1,
                 device=name,
-                code=one.get("code"),
-                level=one.get("level"),
+                code=open_alarm.get("code"),
+                level=open_alarm.get("level"),
                 acknowledged="false",
                 silenced="false",
             )

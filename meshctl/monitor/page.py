@@ -112,7 +112,9 @@ def recording_of(
             "recorded_frames": recorded,
         },
         "alarms": [alarm.as_json() for alarm in store.alarms(active_only=False, now_s=span[1])],
-        "timeline": {"buckets": [asdict(one) for one in store.timeline(span[0], span[1] + 0.001, TIMELINE_BUCKETS)]},
+        "timeline": {
+            "buckets": [asdict(bucket) for bucket in store.timeline(span[0], span[1] + 0.001, TIMELINE_BUCKETS)]
+        },
         "series": {device: {"charts": charts.of(device)} for device in charts.devices},
     }
     return PageRecording(values, reports, store.between(*span, limit))
@@ -153,7 +155,9 @@ def single_file(recording: PageRecording) -> Iterator[str]:
         text = ",".join(frame.json_text for frame in part)
         yield f'<script type="application/json" class="frames">{_packed(["[", text, "]"])}</script>\n'
     values = json.dumps({**recording.values, "times_s": times_s, "frames": counts}, **_JSON)
-    reports = (f"{',' if number else ''}{json.dumps(one, **_JSON)}" for number, one in enumerate(recording.reports))
+    reports = (
+        f"{',' if number else ''}{json.dumps(report, **_JSON)}" for number, report in enumerate(recording.reports)
+    )
     packed = _packed(itertools.chain([values[:-1], ',"report":['], reports, ["]}"]))
     yield f'<script type="application/json" id="recording">{packed}</script>\n{after}'
 

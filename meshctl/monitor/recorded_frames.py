@@ -140,16 +140,18 @@ def with_recorded(frame: Frame, robots: Mapping[str, RecordedRobot]) -> Frame:
     """The frame with what robots recorded that did not answer then, each marked `recorded`."""
     changed = False
     merged: list[Any] = []
-    for one in frame.status.get("robots") or ():
-        recorded = robots.get(str(one.get("name"))) if isinstance(one, dict) and one.get("answers") is False else None
+    for listed in frame.status.get("robots") or ():
+        recorded = (
+            robots.get(str(listed.get("name"))) if isinstance(listed, dict) and listed.get("answers") is False else None
+        )
         found = None if recorded is None else recorded.at(frame.time_s)
         if found is None:
-            merged.append(one)
+            merged.append(listed)
             continue
         changed = True
         seen_s, document = found
         facts = {key: document[key] for key in ("peers", "queues", "topics", "recorded")}
-        merged.append({**one, **facts, "age_s": round(frame.time_s - seen_s, 3)})
+        merged.append({**listed, **facts, "age_s": round(frame.time_s - seen_s, 3)})
     stated = frame.document.get("positions") or {}
     places = {
         name: place

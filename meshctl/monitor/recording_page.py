@@ -69,10 +69,10 @@ class PackedDocuments:
     """Documents, kept packed: those of a large team are hundreds of megabytes as Python's values."""
 
     def __init__(self, documents: Iterable[Mapping[str, Any]]) -> None:
-        self._packed = [zlib.compress(json.dumps(one).encode(), 1) for one in documents]
+        self._packed = [zlib.compress(json.dumps(document).encode(), 1) for document in documents]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (json.loads(zlib.decompress(one)) for one in self._packed)
+        return (json.loads(zlib.decompress(packed)) for packed in self._packed)
 
     def __len__(self) -> int:
         return len(self._packed)

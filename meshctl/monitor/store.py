@@ -307,7 +307,9 @@ class FrameStore:
         silences = self.silences(now_s)
         order = {"error": 0, "warning": 1}
         found = [alarm_of(row, silences) for row in rows]
-        return tuple(sorted(found, key=lambda one: (one.ended_s is not None, order.get(one.level, 2), -one.first_s)))
+        return tuple(
+            sorted(found, key=lambda alarm: (alarm.ended_s is not None, order.get(alarm.level, 2), -alarm.first_s))
+        )
 
     def silences(self, now_s: float) -> dict[AlarmKey, Silence]:
         """Those in force, by device and code; `*` stands for any."""

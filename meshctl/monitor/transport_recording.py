@@ -357,10 +357,10 @@ def joined_by_name(robots: Iterable[RecordedRobot]) -> dict[str, RecordedRobot]:
     for robot in robots:
         by_name[robot.name].append(robot)
     for name, same in by_name.items():
-        one = same[0]
+        first = same[0]
         for other in same[1:]:
-            one = one.joined(other)
-        found[name] = one
+            first = first.joined(other)
+        found[name] = first
     return found
 
 

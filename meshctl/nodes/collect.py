@@ -82,7 +82,7 @@ def known_macs(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, str]:
 def former_addresses(fleet: Fleet, known: Mapping[str, LastKnown]) -> dict[str, IpAddress]:
     """The management addresses at which nodes were last seen, where the inventory has another one by now: a node that
     was off, or that could not be changed, still answers there, on the mesh that it was in."""
-    taken = {one.ip for node in fleet.managed() for one in (node.address, node.lan_address) if one is not None}
+    taken = {own.ip for node in fleet.managed() for own in (node.address, node.lan_address) if own is not None}
     found = {}
     for name, last in known.items():
         with suppress(ValueError):

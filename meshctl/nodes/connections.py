@@ -88,7 +88,7 @@ class ConnectionPool:
         endpoints = [self.endpoint(node, address)]
         if address is None and node.lan_address is not None and not node.ssh.host:
             endpoints.append(self.endpoint(node, node.lan_address.ip))
-        by_routing_table = [replace(one, interface="") for one in endpoints if one.interface]
+        by_routing_table = [replace(candidate, interface="") for candidate in endpoints if candidate.interface]
         return (*endpoints, *by_routing_table)
 
     def credentials(self, node: Node, endpoint: Endpoint | None = None) -> Credentials:

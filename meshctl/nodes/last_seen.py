@@ -59,10 +59,10 @@ class LastSeen:
 
     def _heard_text(self) -> str:
         if self.heard:
-            return "heard by " + ", ".join(_sighting(one) for one in self.heard[:MAX_NAMED])
+            return "heard by " + ", ".join(_sighting(sighting) for sighting in self.heard[:MAX_NAMED])
         if self.routed:
             return "no reachable neighbor hears it; a route to it is known by " + ", ".join(
-                _sighting(one) for one in self.routed[:MAX_NAMED]
+                _sighting(sighting) for sighting in self.routed[:MAX_NAMED]
             )
         if not self.asked:
             return "no other node is reachable"
@@ -73,8 +73,8 @@ class LastSeen:
         """For scripts, beside an outcome."""
         facts = {
             "last_seen_s": "" if self.last is None else f"{self.last.seen_s:.0f}",
-            "heard_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.heard),
-            "routed_by": " ".join(f"{one.by}:{one.age_ms}ms" for one in self.routed),
+            "heard_by": " ".join(f"{sighting.by}:{sighting.age_ms}ms" for sighting in self.heard),
+            "routed_by": " ".join(f"{sighting.by}:{sighting.age_ms}ms" for sighting in self.routed),
             "asked": str(self.asked),
         }
         return {key: value for key, value in facts.items() if value}

@@ -72,7 +72,7 @@ def signal_of(mesh: MeshTables, hearer: str, heard: str) -> tuple[int, int | Non
     if table is None:
         return None
     found = [(dbm, table.noise_dbm.get(mac)) for mac, dbm in table.signals_dbm.items() if mesh.names.get(mac) == heard]
-    return max(found, key=lambda one: one[0], default=None)
+    return max(found, key=lambda reading: reading[0], default=None)
 
 
 def assemble(
@@ -94,7 +94,7 @@ def assemble(
         if name not in mesh.own and (found := _heard(mesh, name)) is not None
     }
     for name, (dbm, noise_dbm) in heard.items():
-        back = max((one for own in mesh.own if (one := signal_of(mesh, name, own))), default=(None, None))
+        back = max((reading for own in mesh.own if (reading := signal_of(mesh, name, own))), default=(None, None))
         links.append(LinkLook(name, dbm, noise_dbm, *back))
         beyond = path_beyond(mesh, margins, name)
         if beyond is not None:
@@ -118,7 +118,7 @@ def assemble(
 def _heard(mesh: MeshTables, name: str) -> tuple[int, int | None] | None:
     return max(
         (found for own in mesh.own if (found := signal_of(mesh, own, name)) is not None),
-        key=lambda one: one[0],
+        key=lambda reading: reading[0],
         default=None,
     )
 
@@ -130,7 +130,7 @@ def path_beyond(mesh: MeshTables, margins: HopMargins, relay: str) -> PathBeyond
     node, hops = relay, 0
 
     def path() -> PathBeyond:
-        margin_db, snr_db = (min((one[part] for one in found), default=None) for part in (0, 1))
+        margin_db, snr_db = (min((reading[part] for reading in found), default=None) for part in (0, 1))
         return PathBeyond(hops, margin_db, snr_db)
 
     while node != mesh.base:
@@ -182,13 +182,13 @@ class LinkWatch:
         """The tables that are recent enough."""
         now_s = self.clock()
         with self._lock:
-            recent = {name: one for name, one in self._tables.items() if now_s - one.taken_s <= MAX_TABLE_AGE_S}
+            recent = {name: table for name, table in self._tables.items() if now_s - table.taken_s <= MAX_TABLE_AGE_S}
         return MeshTables(recent, self.macs, tuple(node.name for node in self.own), self.base)
 
     def own_taken_s(self) -> float:
         """When the robot's newest table was taken; 0 before the first."""
         with self._lock:
-            return max((self._tables[one.name].taken_s for one in self.own if one.name in self._tables), default=0.0)
+            return max((self._tables[node.name].taken_s for node in self.own if node.name in self._tables), default=0.0)
 
     def problem(self) -> str:
         """Why the robot's radios do not answer; empty if one does."""

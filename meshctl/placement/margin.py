@@ -97,7 +97,7 @@ def filtered_snr_db(samples: Sequence[Sample]) -> float:
     its fading, the mean of the last two samples. Needs one sample."""
     newest, recent = samples[-1].at_s, samples[-_FILTER_SAMPLES:]
     weights = [math.exp((sample.at_s - newest) / FILTER_S) for sample in recent]
-    smooth_db = sum(weight * one.snr_db for weight, one in zip(weights, recent, strict=True)) / sum(weights)
+    smooth_db = sum(weight * sample.snr_db for weight, sample in zip(weights, recent, strict=True)) / sum(weights)
     last_db = fresh_snr_db(samples)
     return last_db if last_db < smooth_db - FALL_DB else smooth_db
 

@@ -176,7 +176,7 @@ class Meter:
         self._measure_turn(look, hops)
         best = max(hops.values(), key=lambda hop: (hop.path_margin_db, hop.relay))
         hop = hops.get(look.next_hop, best)
-        other_db = max((one.link_margin_db for one in hops.values() if one is not hop), default=-math.inf)
+        other_db = max((other.link_margin_db for other in hops.values() if other is not hop), default=-math.inf)
         slope = slope_db_per_m(tuple(self._samples[hop.relay]), SLOPE_WINDOW_M, MIN_SLOPE_M)
         left_m = _meters_left(hop.link_margin_db, slope)
         if max(hop.link_margin_db, other_db) >= 0.0 and not self._is_returning:

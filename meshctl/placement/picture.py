@@ -58,9 +58,12 @@ class _Scale:
 def _scale(view: MapView, plan: PlacementPlan) -> _Scale:
     places = [at for _, at, _ in plan.steps] + [end for wall in view.walls for end in (wall.a, wall.b)]
     if view.occupancy is not None:
-        one = view.occupancy
-        right, top = one.origin[0] + one.columns * one.cell_m, one.origin[1] + one.rows * one.cell_m
-        places += [one.origin, (right, top)]
+        occupancy = view.occupancy
+        right, top = (
+            occupancy.origin[0] + occupancy.columns * occupancy.cell_m,
+            occupancy.origin[1] + occupancy.rows * occupancy.cell_m,
+        )
+        places += [occupancy.origin, (right, top)]
     xs, ys = [x for x, _ in places], [y for _, y in places]
     wide, high = max(xs) - min(xs), max(ys) - min(ys)
     room = WIDTH - 2 * _EDGE
@@ -104,13 +107,13 @@ def svg(view: MapView, plan: PlacementPlan) -> str:
     x, y = scale.at(plan.steps[0][1])
     parts.append(f'<rect x="{x - 9:.1f}" y="{y - 9:.1f}" width="18" height="18" fill="{ink}"/>')
     parts.append(f'<text x="{x + 12:.1f}" y="{y - 14:.1f}" font-size="20" font-weight="bold">base</text>')
-    for number, one in enumerate(plan.beacons, 1):
-        x, y = scale.at(one.at)
+    for number, beacon in enumerate(plan.beacons, 1):
+        x, y = scale.at(beacon.at)
         corners = f"M{x:.1f} {y - _BEACON:.1f}l{_BEACON} {_BEACON}l-{_BEACON} {_BEACON}l-{_BEACON} -{_BEACON}z"
         parts.append(f'<path d="{corners}" fill="{ink}"/>')
         parts.append(
             f'<text x="{x + 12:.1f}" y="{y - 14:.1f}" font-size="20"><tspan font-weight="bold">{number}</tspan>'
-            f'<tspan dx="8" font-size="15">{one.margin_db:.0f} dB</tspan></text>'
+            f'<tspan dx="8" font-size="15">{beacon.margin_db:.0f} dB</tspan></text>'
         )
     parts.append(f'<text x="{_EDGE}" y="{_EDGE / 2 + 8:.0f}" font-size="18">{summary(plan)}</text>')
     bar_m, floor = _bar_m(scale), scale.height - _FOOT / 4
@@ -195,8 +198,8 @@ def png(view: MapView, plan: PlacementPlan) -> bytes:
 
     x, y = scale.at(plan.steps[0][1])
     block(x - 9, y - 9, 18, 18)
-    for number, one in enumerate(plan.beacons, 1):
-        x, y = scale.at(one.at)
+    for number, beacon in enumerate(plan.beacons, 1):
+        x, y = scale.at(beacon.at)
         dot(x, y, _BEACON, _COLORS["ink"])
         digits(str(number), x + 11, y - 26)
     bar_m, floor = _bar_m(scale), scale.height - _FOOT / 4

@@ -31,7 +31,7 @@ def lacking_abilities(
     for iface, device in enabled_interfaces(desired):
         hardware = node.hardware.radio(device.name or "")
         path = (hardware.path if hardware is not None else "") or paths.get(device.name, "")
-        chip = next((one for one in seen.chips or () if path and one.path == path), None)
+        chip = next((known_chip for known_chip in seen.chips or () if path and known_chip.path == path), None)
         if hardware is not None and chip is not None:
             found.update(dict.fromkeys(_lacking(chip, hardware.band, iface, device)))
     return tuple(found)

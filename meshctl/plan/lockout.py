@@ -70,7 +70,7 @@ def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None
     return FailedPrecondition(
         f"no login would be possible after its next boot: dropbear would wait for {option} {name}, "
         "which is not a network of the node with a static address",
-        f"name one of {', '.join(sorted(str(one) for one in steady - {'loopback'})) or 'its networks'}, "
+        f"name one of {', '.join(sorted(str(network) for network in steady - {'loopback'})) or 'its networks'}, "
         f"or remove {option} from extra_uci",
     )
 

@@ -76,7 +76,7 @@ def node_plan(
     basis = NodePlan(
         node.name,
         Verdict.SAME,
-        splits=tuple(f"{radio}: {one}" for radio, all_of_it in partition.items() for one in all_of_it),
+        splits=tuple(f"{radio}: {reason}" for radio, all_of_it in partition.items() for reason in all_of_it),
         parted_from=meshes_of(node, partition),
         departs=desired.departs,
         meshes=node.meshes,

@@ -275,7 +275,7 @@ def _position(fleet: Fleet, robot: str) -> Iterator[str]:
     """Where the robot or its first radio with a position stands."""
     own = fleet.robots[robot]
     nodes = (fleet.nodes[name].position for name in own.nodes if name in fleet.nodes)
-    place = own.position or next((one for one in nodes if one is not None), None)
+    place = own.position or next((node for node in nodes if node is not None), None)
     if place is not None:
         yield from ("", "[position]", f"x_m = {_number(place.x_m)}", f"y_m = {_number(place.y_m)}")
         if place.z_m is not None:

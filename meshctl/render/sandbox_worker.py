@@ -44,7 +44,11 @@ def _answer(templates: TemplateSet, file: Any, context: Any) -> dict[str, object
     try:
         text = templates.text(file, context)
     except InvalidInput as error:
-        return {"diagnostics": [{**asdict(one), "severity": one.severity.value} for one in error.diagnostics]}
+        return {
+            "diagnostics": [
+                {**asdict(diagnostic), "severity": diagnostic.severity.value} for diagnostic in error.diagnostics
+            ]
+        }
     if len(text) > OUTPUT_BYTES:
         return {"exceeded": f"the template's output of {len(text)} characters exceeds {OUTPUT_BYTES}"}
     return {"text": text}

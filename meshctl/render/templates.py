@@ -69,8 +69,14 @@ class Templates:
             raise InvalidInput([Diagnostic(TEMPLATE, Severity.ERROR, place, str(answer["exceeded"]))])
         if "diagnostics" in answer:
             raise InvalidInput(
-                Diagnostic(**{**one, "severity": Severity(one["severity"]), "position": Position(**one["position"])})
-                for one in answer["diagnostics"]
+                Diagnostic(
+                    **{
+                        **diagnostic,
+                        "severity": Severity(diagnostic["severity"]),
+                        "position": Position(**diagnostic["position"]),
+                    }
+                )
+                for diagnostic in answer["diagnostics"]
             )
         return str(answer["text"])
 

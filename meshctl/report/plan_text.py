@@ -100,7 +100,7 @@ def _closing_summary(plan: Plan, nodes: Iterable[NodePlan]) -> Iterator[Line]:
         who = "" if node.reason.startswith(node.node) else f"{node.node}, "
         text = f"{who}{node.reason}"
         if len(group) > 1:
-            text = f"{node_list([one.node for one in group])}: {common}"
+            text = f"{node_list([member.node for member in group])}: {common}"
         yield Line(f"  {verdict.value}: {text}", "yellow" if verdict is Verdict.AWAY else "red")
 
 
@@ -156,7 +156,10 @@ def _effect_key(node: NodePlan, *, with_diffs: bool) -> object:
         return node.verdict, node.reason, node.hint, node.notes if node.verdict is Verdict.SAME else ()
     return (
         *(node.cut, node.splits, node.firmware, node.packages, node.effects, node.notes),
-        tuple((one.path, one.kind, changed_lines(one) if with_diffs else summary(one)) for one in node.files),
+        tuple(
+            (change.path, change.kind, changed_lines(change) if with_diffs else summary(change))
+            for change in node.files
+        ),
     )
 
 
@@ -166,7 +169,7 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
         case Verdict.SAME:
             if node.notes:
                 yield Line("")
-                yield Line(f"{', '.join(one.node for one in group)}  up to date")
+                yield Line(f"{', '.join(member.node for member in group)}  up to date")
                 yield from (Line(f"  note: {note}", "dim") for note in node.notes)
             return
         case Verdict.AWAY | Verdict.REFUSED:
@@ -175,7 +178,7 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
             style = "yellow" if node.verdict is Verdict.AWAY else "red"
             yield Line(f"{who}  {node.verdict.value}: {node.reason}", style)
             if len(group) > 1:
-                yield Line(f"  {', '.join(one.node for one in group)}")
+                yield Line(f"  {', '.join(member.node for member in group)}")
             if node.hint:
                 yield Line(f"  hint: {node.hint}")
             return
@@ -186,7 +189,7 @@ def _node(group: tuple[NodePlan, ...], *, with_diffs: bool) -> Iterator[Line]:
         yield Line(f"{node.node}  cuts {node.cut.text}", "bold" if node.cut > Cut.LOGIN else "")
     else:
         yield Line(f"{len(group)} nodes  each cuts {node.cut.text}", "bold" if node.cut > Cut.LOGIN else "")
-        yield Line(f"  {', '.join(one.node for one in group)}")
+        yield Line(f"  {', '.join(member.node for member in group)}")
     for split in node.splits:
         yield Line(f"  leaves its mesh: {split}", "yellow")
     if node.firmware is not None:

@@ -25,7 +25,9 @@ def clean(text: str, *, keep: str = "\n\t") -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(one if one in keep or _is_harmless(one) else _replacement(one) for one in text)
+    return "".join(
+        character if character in keep or _is_harmless(character) else _replacement(character) for character in text
+    )
 
 
 def one_line(text: str) -> str:
@@ -43,21 +45,23 @@ def json_safe(text: str) -> str:
     """JSON text with the same characters escaped, which keeps its value: JSON has them only within strings."""
     if text.isascii() and "\x7f" not in text:
         return text
-    return "".join(one if one == "\n" or _is_harmless(one) else _escaped(one) for one in text)
+    return "".join(
+        character if character == "\n" or _is_harmless(character) else _escaped(character) for character in text
+    )
 
 
-def _is_harmless(one: str) -> bool:
+def _is_harmless(character: str) -> bool:
     # str.isprintable() excludes these spaces
-    return one.isprintable() or one in "\xa0\u3000\u202f"
+    return character.isprintable() or character in "\xa0\u3000\u202f"
 
 
-def _replacement(one: str) -> str:
-    code = ord(one)
+def _replacement(character: str) -> str:
+    code = ord(character)
     if code < ord(" "):
         return chr(_CONTROL_PICTURES + code)
     return _DELETE_PICTURE if code == _DELETE else _REPLACEMENT
 
 
-def _escaped(one: str) -> str:
-    units = one.encode("utf-16-be", "surrogatepass")
+def _escaped(character: str) -> str:
+    units = character.encode("utf-16-be", "surrogatepass")
     return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))

@@ -65,8 +65,8 @@ def load(path: Path) -> Configuration:
         return Configuration(
             robot=str(document["robot"]),
             radios=tuple(
-                OwnRadio(str(one["name"]), str(one["host"]), int(one["port"]), str(one["user"]))
-                for one in document["radios"]
+                OwnRadio(str(radio["name"]), str(radio["host"]), int(radio["port"]), str(radio["user"]))
+                for radio in document["radios"]
             ),
             robots={str(robot): tuple(map(str, nodes)) for robot, nodes in document["robots"].items()},
             login=RadioLogin(path.parent / document["key"], path.parent / document["known_hosts"]),

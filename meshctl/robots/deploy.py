@@ -251,19 +251,19 @@ def switch(host: Host, robot: str, release: str, how: str, wait_s: int) -> Outco
 def parse_switch(robot: str, release: str, output: str) -> Outcome:
     """Parse the output of `scripts/switch.sh`."""
     lines = [line.partition("=") for line in output.splitlines()]
-    one = {name: value for name, _, value in lines}
+    fields = {name: value for name, _, value in lines}
     log = "\n".join(value for name, _, value in lines if name == "log" and value)
-    reason = one.get("reason", "")
+    reason = fields.get("reason", "")
     hint = f"last log lines:\n{log}" if log else ""
-    match one.get("result"):
+    match fields.get("result"):
         case "switched":
-            peers = one.get("online", "")
+            peers = fields.get("online", "")
             peer_text = f", {counted(len(peers.split()), 'peer')} online" if peers else ""
             return Outcome(robot, Result.DONE, f"runs {release}{peer_text}", facts={"peers": peers})
         case "rolled-back":
             return Outcome(robot, Result.ROLLED_BACK, f"{reason}; the previous release runs again", hint)
         case "rolled-back-ill":
-            still = one.get("still", "") or "it does not become healthy"
+            still = fields.get("still", "") or "it does not become healthy"
             why = f"{reason}; the previous release is not healthy either: {still}"
             return Outcome(robot, Result.ROLLED_BACK, why, hint)
         case "removed":

@@ -180,7 +180,7 @@ class RobotFacts:
         if self.service.is_up and not self.answers:
             problems.append("the daemon does not answer")
         others = {"ROS bridge": self.bridge, "service for /etc/hosts": self.hosts, "collector": self.collector}
-        down = {name: one for name, one in others.items() if one is not None and not one.is_up}
+        down = {name: other for name, other in others.items() if other is not None and not other.is_up}
         problems += [f"the {name} is {service.active or 'absent'}" for name, service in down.items()]
         problems += [f"{count} differ from the inventory" for count in [len(self.drift)] if count]
         away = [peer.name for peer in self.peers if not peer.online]
@@ -383,18 +383,18 @@ def _computer(values: Mapping[str, list[str]], now_s: float) -> ComputerFacts:
     def numbers(name: str) -> list[float]:
         return [number for word in _last(values, name).split() if (number := _number(word)) is not None]
 
-    def one(name: str, at: int = 0) -> float:
+    def number_at(name: str, at: int = 0) -> float:
         found = numbers(name)
         return found[at] if len(found) > at else 0.0
 
     load = numbers("load")
     return ComputerFacts(
-        one("uptime") if numbers("uptime") else None,
+        number_at("uptime") if numbers("uptime") else None,
         (load[0], load[1], load[2]) if len(load) >= 3 else None,
-        int(one("cpus")),
-        int(one("MemTotal")),
-        int(one("MemAvailable")),
-        int(one("disk")),
-        int(one("disk", 1)),
-        one("now") - now_s if numbers("now") else 0.0,
+        int(number_at("cpus")),
+        int(number_at("MemTotal")),
+        int(number_at("MemAvailable")),
+        int(number_at("disk")),
+        int(number_at("disk", 1)),
+        number_at("now") - now_s if numbers("now") else 0.0,
     )

@@ -24,7 +24,7 @@ def positions_in(status: Mapping[str, Any]) -> tuple[PositionFacts, ...]:
     """The daemon's own position first; none for older daemons. Entries of other forms are left out."""
     entries = status.get("positions")
     found = (_position(entry) for entry in (entries if isinstance(entries, list) else ()))
-    return tuple(one for one in found if one is not None)
+    return tuple(position for position in found if position is not None)
 
 
 def _position(entry: object) -> PositionFacts | None:

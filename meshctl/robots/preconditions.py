@@ -83,41 +83,41 @@ class HostFacts:
 
 def parse_facts(text: str) -> HostFacts:
     """Parse the output of `scripts/probe.sh`; unknown lines are ignored."""
-    one: dict[str, str] = {}
+    value_of: dict[str, str] = {}
     many: dict[str, list[str]] = {}
     for line in text.splitlines():
         name, equals, value = line.partition("=")
         if equals:
-            one[name] = value
+            value_of[name] = value
             many.setdefault(name, []).append(value)
-    libc, libc_version = _libc(one.get("libc", ""))
+    libc, libc_version = _libc(value_of.get("libc", ""))
     return HostFacts(
-        arch=one.get("arch", ""),
-        now_s=float(_number(one.get("now", ""))),
-        uid=_number(one.get("uid", "-1"), -1),
-        has_systemd=one.get("systemd") == "yes",
-        missing_tools=tuple(one.get("missing", "").split()),
-        missing_ros=one.get("no_ros", ""),
-        python=_version(one.get("python", "")),
-        implementation=one.get("implementation", ""),
-        bits=_number(one.get("bits", "")),
+        arch=value_of.get("arch", ""),
+        now_s=float(_number(value_of.get("now", ""))),
+        uid=_number(value_of.get("uid", "-1"), -1),
+        has_systemd=value_of.get("systemd") == "yes",
+        missing_tools=tuple(value_of.get("missing", "").split()),
+        missing_ros=value_of.get("no_ros", ""),
+        python=_version(value_of.get("python", "")),
+        implementation=value_of.get("implementation", ""),
+        bits=_number(value_of.get("bits", "")),
         libc=libc,
         libc_version=libc_version,
-        executable=one.get("executable", ""),
+        executable=value_of.get("executable", ""),
         missing_modules=tuple(many.get("no_module", ())),
-        free_kib=_number(one.get("free_kib", "")),
-        is_writable=one.get("writable") == "yes",
-        runs_programs=one.get("noexec") != "yes",
-        current=one.get("current", ""),
-        previous=one.get("previous", ""),
+        free_kib=_number(value_of.get("free_kib", "")),
+        is_writable=value_of.get("writable") == "yes",
+        runs_programs=value_of.get("noexec") != "yes",
+        current=value_of.get("current", ""),
+        previous=value_of.get("previous", ""),
         releases=tuple(many.get("release", ())),
         trees=tuple(many.get("tree", ())),
         files=tuple((path, digest) for digest, _, path in (row.partition("  ") for row in many.get("file", ()))),
         damaged=tuple(many.get("damaged", ())),
-        is_proven=one.get("proven") == "yes",
+        is_proven=value_of.get("proven") == "yes",
         services=tuple(_service(row) for row in many.get("unit", ())),
         no_route=tuple(many.get("no_route", ())),
-        has_ssh="no_ssh" not in one,
+        has_ssh="no_ssh" not in value_of,
     )
 
 

@@ -162,11 +162,11 @@ def slope_db_per_s(samples: tuple[Sample, ...]) -> float | None:
     if len(samples) < MIN_TREND_SAMPLES or samples[-1].at_s - samples[0].at_s < MIN_TREND_S:
         return None
     count = len(samples)
-    center_s = sum(one.at_s for one in samples) / count
-    mean_db = sum(one.snr_db for one in samples) / count
-    spread = sum((one.at_s - center_s) ** 2 for one in samples)
-    slope = sum((one.at_s - center_s) * (one.snr_db - mean_db) for one in samples) / spread
-    rest = sum((one.snr_db - mean_db - slope * (one.at_s - center_s)) ** 2 for one in samples)
+    center_s = sum(sample.at_s for sample in samples) / count
+    mean_db = sum(sample.snr_db for sample in samples) / count
+    spread = sum((sample.at_s - center_s) ** 2 for sample in samples)
+    slope = sum((sample.at_s - center_s) * (sample.snr_db - mean_db) for sample in samples) / spread
+    rest = sum((sample.snr_db - mean_db - slope * (sample.at_s - center_s)) ** 2 for sample in samples)
     error = math.sqrt(rest / (count - 2) / spread)
     return slope if abs(slope) > TREND_ERRORS * error else 0.0
 

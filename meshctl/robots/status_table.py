@@ -23,11 +23,11 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
     Columns are dropped to fit `width`.
     """
     robots = list(rows)
-    lines = [_HEADINGS, *(_row(one) for one in robots)]
+    lines = [_HEADINGS, *(_row(robot) for robot in robots)]
     widths = {name: max(len(line[at]) for line in lines) for at, name in enumerate(_HEADINGS)}
     shown = list(_HEADINGS)
     for name in _DROP_ORDER:
-        if width is None or sum(widths[one] + len(_GAP) for one in shown) - len(_GAP) <= width:
+        if width is None or sum(widths[column] + len(_GAP) for column in shown) - len(_GAP) <= width:
             break
         shown.remove(name)
     drawn = [
@@ -36,13 +36,13 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
         ).rstrip()
         for line in lines
     ]
-    for one in robots:
-        if one.error or one.remark:
+    for robot in robots:
+        if robot.error or robot.remark:
             drawn += textwrap.wrap(
-                f"{one.robot}: {one.error or one.remark}", width or sys.maxsize, subsequent_indent=_GAP
+                f"{robot.robot}: {robot.error or robot.remark}", width or sys.maxsize, subsequent_indent=_GAP
             )
-        if one.reached_through:
-            relayed = f"{one.robot}: reaches {', '.join(one.reached_through)}"
+        if robot.reached_through:
+            relayed = f"{robot.robot}: reaches {', '.join(robot.reached_through)}"
             drawn += textwrap.wrap(relayed, width or sys.maxsize, subsequent_indent=_GAP)
     if len(shown) < len(_HEADINGS):
         left_out = ", ".join(name for name in _HEADINGS if name not in shown)
@@ -50,31 +50,31 @@ def table(rows: Iterable[RobotFacts], width: int | None = None) -> str:
     return "\n".join(drawn)
 
 
-def _row(one: RobotFacts) -> tuple[str, ...]:
-    if one.error:
-        return (one.robot, "?", *["-"] * (len(_HEADINGS) - 2))
-    load = one.computer.load
+def _row(facts: RobotFacts) -> tuple[str, ...]:
+    if facts.error:
+        return (facts.robot, "?", *["-"] * (len(_HEADINGS) - 2))
+    load = facts.computer.load
     return (
-        one.robot,
-        one.service.active or "absent",
-        one.release or "-",
-        one.version or "-",
-        "-" if one.daemon_uptime_s is None else duration(one.daemon_uptime_s),
-        f"{len(one.online)}/{len(one.peers)}" if one.answers else "-",
-        _queued(one) if one.answers else "-",
-        _last_message(one),
+        facts.robot,
+        facts.service.active or "absent",
+        facts.release or "-",
+        facts.version or "-",
+        "-" if facts.daemon_uptime_s is None else duration(facts.daemon_uptime_s),
+        f"{len(facts.online)}/{len(facts.peers)}" if facts.answers else "-",
+        _queued(facts) if facts.answers else "-",
+        _last_message(facts),
         f"{load[0]:.1f}" if load else "-",
-        "UNKEYED" if one.unkeyed else " ".join(key[:8] for key in one.keys) or "-",
+        "UNKEYED" if facts.unkeyed else " ".join(key[:8] for key in facts.keys) or "-",
     )
 
 
-def _queued(one: RobotFacts) -> str:
+def _queued(facts: RobotFacts) -> str:
     """Queued messages by priority, most urgent first: `p0: 3, p9: 120`."""
-    return ", ".join(f"p{queue.priority}: {queue.messages}" for queue in one.queues if queue.messages) or "0"
+    return ", ".join(f"p{queue.priority}: {queue.messages}" for queue in facts.queues if queue.messages) or "0"
 
 
-def _last_message(one: RobotFacts) -> str:
-    ages = {topic.name: topic.last_ago_s for topic in one.topics}
+def _last_message(facts: RobotFacts) -> str:
+    ages = {topic.name: topic.last_ago_s for topic in facts.topics}
     heard = {name: age for name, age in ages.items() if age is not None}
     if not heard:
         return "-"

@@ -186,7 +186,7 @@ def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting
         first_contact_hint=f"if it is not set up yet: meshctl bootstrap {node.name}",
     )
     lost_relay = lost_relay_alarm(node, why, last, now)
-    found = tuple(one for one in (lost_relay, alarm) if one is not None)
+    found = tuple(text for text in (lost_relay, alarm) if text is not None)
     return NodeStatus(
         node=node,
         health=Health.UNREACHABLE if is_required else Health.DEGRADED if found else Health.OFF,

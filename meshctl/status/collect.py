@@ -110,7 +110,7 @@ class Collector:
             assert isinstance(of_site, Mapping)
             answers |= {("node", name): of_site[name] for name in at_sites[site]}
         observations = {key[1]: seen for key, seen in answers.items() if isinstance(seen, Observation)}
-        facts = {key[1]: one for key, one in answers.items() if isinstance(one, RobotFacts)}
+        facts = {key[1]: robot for key, robot in answers.items() if isinstance(robot, RobotFacts)}
         no_answer: dict[str, dict[str, NoAnswer]] = {"node": {}, "robot": {}}
         for (kind, name), answer in answers.items():
             if isinstance(answer, NodeError):
@@ -120,7 +120,7 @@ class Collector:
         # a report is made of all paths that a node knows: once
         reports = reports_of(observations)
         self.journal.remember_all(
-            self.fleet.name, {name: facts_of(one) for name, one in observations.items()}, self.clock()
+            self.fleet.name, {name: facts_of(observation) for name, observation in observations.items()}, self.clock()
         )
         macs = known_macs(self.fleet, known)
         for report in reports.values():

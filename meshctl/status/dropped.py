@@ -38,10 +38,11 @@ def _reason(beacon: NodeStatus, radios: Iterable[NodeStatus]) -> str:
     if not answering or not beacon.neighbors:
         # a robot that does not answer says nothing about where its beacons are
         return ""
-    heard = [one for one in beacon.neighbors if one.name in own]
+    heard = [neighbor for neighbor in beacon.neighbors if neighbor.name in own]
     if not heard:
-        return f"hears {join_limited(tuple(one.name for one in beacon.neighbors))}, not its robot's {_names(own)}"
-    signals = [one.signal_dbm for one in heard if one.signal_dbm is not None]
+        names = join_limited(tuple(neighbor.name for neighbor in beacon.neighbors))
+        return f"hears {names}, not its robot's {_names(own)}"
+    signals = [neighbor.signal_dbm for neighbor in heard if neighbor.signal_dbm is not None]
     if signals and max(signals) < RACK_DBM:
         return f"hears its robot's {_names(own)} with {max(signals)} dBm only"
     return ""

@@ -50,8 +50,10 @@ class Filter:
         """The status with the selected devices alone."""
         return replace(
             status,
-            nodes=tuple(one for one in status.nodes if self.selects_node(one.name) and self._has_alarm(one.alarms)),
-            robots=tuple(one for one in status.robots if self.selects_robot(one.name) and self._has_alarm(one.alarms)),
+            nodes=tuple(node for node in status.nodes if self.selects_node(node.name) and self._has_alarm(node.alarms)),
+            robots=tuple(
+                robot for robot in status.robots if self.selects_robot(robot.name) and self._has_alarm(robot.alarms)
+            ),
         )
 
     def apply(self, status: FleetStatus) -> FleetStatus:
@@ -98,7 +100,7 @@ def select_devices(
         restrictions[0],
         {**radios, **computers},
         read_file,
-        [",".join(one) for one in restrictions[1:]],
+        [",".join(restriction) for restriction in restrictions[1:]],
         what=f"node or robot of {fleet.name}",
         hint=LIST_HINT,
         unmanaged=unmanaged_states(fleet),

@@ -21,7 +21,7 @@ VERSION = 1
 
 def as_json(status: FleetStatus) -> dict[str, Any]:
     """All facts, including those the table has no room for."""
-    everywhere = [*status.alarms, *(alarm for one in status for alarm in one.alarms)]
+    everywhere = [*status.alarms, *(alarm for device in status for alarm in device.alarms)]
     return {
         "version": VERSION,
         "fleet": status.fleet,
@@ -30,8 +30,8 @@ def as_json(status: FleetStatus) -> dict[str, Any]:
         "entry": status.entry,
         "exit_code": int(status.exit_code),
         "totals": {
-            "nodes": {health.value: sum(one.health is health for one in status.nodes) for health in Health},
-            "robots": {health.value: sum(one.health is health for one in status.robots) for health in Health},
+            "nodes": {health.value: sum(node.health is health for node in status.nodes) for health in Health},
+            "robots": {health.value: sum(robot.health is health for robot in status.robots) for health in Health},
             "alarms": {level.text: sum(alarm.level is level for alarm in everywhere) for level in Level},
         },
         "alarms": _alarms(status.alarms),
@@ -151,8 +151,12 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
         "state": None if robot.state is None else robot.state.value,
         "radios": list(robot.robot.nodes),
         "computers": [
-            {"name": name, "address": str(one.address.ip), "answers": _answers(robot.facts, str(one.address.ip))}
-            for name, one in robot.robot.computers.items()
+            {
+                "name": name,
+                "address": str(of_robot.address.ip),
+                "answers": _answers(robot.facts, str(of_robot.address.ip)),
+            }
+            for name, of_robot in robot.robot.computers.items()
         ],
         "address": None if robot.robot.computer is None else str(robot.robot.computer.address.ip),
         "health": robot.health.value,
@@ -195,8 +199,8 @@ def _robot(robot: RobotStatus) -> dict[str, Any]:
             "unkeyed": facts.unkeyed,
         },
         "bridge": None if facts.bridge is None else {"service": facts.bridge.active or None},
-        "position": next((_position(one) for one in facts.positions if one.name == robot.name), None),
-        "positions": [_position(one) for one in facts.positions],
+        "position": next((_position(position) for position in facts.positions if position.name == robot.name), None),
+        "positions": [_position(position) for position in facts.positions],
         "peers": [
             {
                 "name": peer.name,

@@ -80,7 +80,7 @@ def merge_by_device(known: Mapping[str, LastKnown]) -> dict[str, LastKnown]:
         if other is None:
             found[name] = LastKnown(name, last.seen_s, last.facts)
         else:
-            older, newer = sorted((other, last), key=lambda one: one.seen_s)
+            older, newer = sorted((other, last), key=lambda record: record.seen_s)
             found[name] = LastKnown(name, newer.seen_s, {**older.facts, **newer.facts})
     return found
 

@@ -150,9 +150,9 @@ def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
 def _air(seen: NodeAlarmInput) -> Iterator[Alarm]:
     """The signal to the next hop, the channel, and the radio's queue."""
     via = seen.path.via if seen.path is not None and seen.path.hops else ""
-    for one in seen.neighbors:
-        snr_db = one.worse_snr_db
-        if one.name == via and snr_db is not None and snr_db < LOW_SNR_DB:
+    for neighbor in seen.neighbors:
+        snr_db = neighbor.worse_snr_db
+        if neighbor.name == via and snr_db is not None and snr_db < LOW_SNR_DB:
             text = f"the signal between it and {via} is {snr_db} dB above the noise"
             yield Alarm(Level.WARNING, "snr", text, f"move closer, or drop a beacon between {seen.node.name} and {via}")
     for radio in seen.radios:

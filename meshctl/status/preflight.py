@@ -110,8 +110,8 @@ def _check(name: str, bad: Iterable[str], good: str, answers: _Answers | None = 
 
 def _answered(devices: Sequence[NodeStatus | RobotStatus], none: str) -> _Answers:
     """Of the devices that are on or should be."""
-    expected = [one for one in devices if one.health is not Health.OFF]
-    return _Answers(sum(not one.no_answer_reason for one in expected), len(expected), none)
+    expected = [device for device in devices if device.health is not Health.OFF]
+    return _Answers(sum(not device.no_answer_reason for device in expected), len(expected), none)
 
 
 def _answered_radios(status: FleetStatus) -> _Answers:
@@ -148,7 +148,7 @@ def _alarm_check(
 
     def check(fleet: Fleet, status: FleetStatus) -> Check:
         devices: Sequence[NodeStatus | RobotStatus] = status.nodes if answered is _answered_radios else status.robots
-        bad = [_alarm_text(one.name, one.alarms, codes) for one in devices]
+        bad = [_alarm_text(device.name, device.alarms, codes) for device in devices]
         everywhere = [alarm.text for alarm in status.alarms if is_fleetwide and alarm.code in codes]
         return _check(name, [*everywhere, *(text for text in bad if text)], good, answered(status))
 
@@ -204,8 +204,8 @@ def _beacons(fleet: Fleet, status: FleetStatus) -> Check:
     return _check("beacons", [*never_seen, *(_no_answer_text(node) for node in missed)], good)
 
 
-def _no_answer_text(one: NodeStatus | RobotStatus) -> str:
-    return f"{one.name}: {one.no_answer_reason}"
+def _no_answer_text(device: NodeStatus | RobotStatus) -> str:
+    return f"{device.name}: {device.no_answer_reason}"
 
 
 def _quality(fleet: Fleet, status: FleetStatus) -> Check:

@@ -74,9 +74,9 @@ def snr_of(seen: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, i
     noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
     at = {station.mac.lower(): noise.get(station.ifname) for station in seen.stations or ()}
     return {
-        name: one.signal_dbm - noise_dbm
-        for name, one in heard.items()
-        if one.signal_dbm is not None and (noise_dbm := at.get(one.mac.lower())) is not None
+        name: neighbor.signal_dbm - noise_dbm
+        for name, neighbor in heard.items()
+        if neighbor.signal_dbm is not None and (noise_dbm := at.get(neighbor.mac.lower())) is not None
     }
 
 
@@ -90,10 +90,12 @@ def neighbors_of(
     noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
     meshes = {} if node is None else node.mesh_interfaces
     found = [
-        _neighbor(name, one, stations.get(one.mac.lower(), _NO_STATION), noise, meshes, snr_there.get(name))
-        for name, one in heard.items()
+        _neighbor(name, neighbor, stations.get(neighbor.mac.lower(), _NO_STATION), noise, meshes, snr_there.get(name))
+        for name, neighbor in heard.items()
     ]
-    return tuple(sorted(found, key=lambda one: (-(one.quality or 0.0), -(one.signal_dbm or -200), one.name)))
+    return tuple(
+        sorted(found, key=lambda neighbor: (-(neighbor.quality or 0.0), -(neighbor.signal_dbm or -200), neighbor.name))
+    )
 
 
 def _neighbor(

@@ -48,7 +48,7 @@ class RobotAlarmInput:
     @property
     def daemons(self) -> dict[str, RobotFacts]:
         """The other robots whose daemon answers."""
-        return {name: one for name, one in self.robots.items() if one.answers and name != self.robot.name}
+        return {name: other for name, other in self.robots.items() if other.answers and name != self.robot.name}
 
 
 def urgent_bytes(fleet: Fleet, facts: RobotFacts) -> int:
@@ -121,7 +121,7 @@ def _drift(seen: RobotAlarmInput) -> Iterator[Alarm]:
         text = "; ".join(facts.drift[:MAX_DRIFT_LINES]) + (f"; and {more} more" if more > 0 else "")
         hint = f"meshctl robots diff {name}; meshctl robots deploy {name} fixes it"
         yield Alarm(Level.WARNING, "drift", text, hint)
-    versions = Counter(one.version for one in (*seen.daemons.values(), facts) if one.answers)
+    versions = Counter(daemon.version for daemon in (*seen.daemons.values(), facts) if daemon.answers)
     if facts.answers and len(versions) > 1:
         usual = max(versions, key=lambda version: (versions[version], version))
         if facts.version != usual:
@@ -136,7 +136,7 @@ def _keys(seen: RobotAlarmInput) -> Iterator[Alarm]:
         hint = f"meshctl robots deploy {seen.robot.name}" if seen.fleet.udp_mesh.keys else "set udp_mesh.keys"
         yield Alarm(level, "unkeyed", "its daemon neither encrypts nor authenticates", hint)
     elif facts.keys:
-        lacking = [name for name, one in seen.daemons.items() if one.keys and facts.keys[0] not in one.keys]
+        lacking = [name for name, daemon in seen.daemons.items() if daemon.keys and facts.keys[0] not in daemon.keys]
         if lacking:
             text = f"its messages cannot be decrypted by {', '.join(lacking)}"
             yield Alarm(Level.ERROR, "key", text, "meshctl robots deploy, or continue with meshctl robots rotate-key")

@@ -107,4 +107,4 @@ def _heard_by(answers: RobotAnswers, robot: str) -> tuple[Sighting, ...]:
         for peer in facts.peers
         if peer.name == robot and peer.online and peer.heard_ago_s is not None
     ]
-    return tuple(sorted(seen, key=lambda one: (one.age_ms, one.by)))
+    return tuple(sorted(seen, key=lambda sighting: (sighting.age_ms, sighting.by)))

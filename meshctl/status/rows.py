@@ -63,9 +63,9 @@ COLUMNS = (
 )
 
 
-def row(one: NodeStatus | RobotStatus) -> dict[str, TableCell]:
+def row(device: NodeStatus | RobotStatus) -> dict[str, TableCell]:
     """The cells of a device by column key."""
-    return _node_row(one) if isinstance(one, NodeStatus) else _robot_row(one)
+    return _node_row(device) if isinstance(device, NodeStatus) else _robot_row(device)
 
 
 def _node_row(node: NodeStatus) -> dict[str, TableCell]:

@@ -45,7 +45,7 @@ def text(
     notes and hints."""
     devices = list(status)
     lines = [*summary_lines(status, width, paint, brief=brief), ""]
-    lines += table_lines([row(one) for one in devices], width, paint) or ["no device matches"]
+    lines += table_lines([row(device) for device in devices], width, paint) or ["no device matches"]
     if topics:
         lines += ["", *topic_lines(status, width)]
     if len(devices) > MAX_SCREEN_ROWS:
@@ -80,7 +80,7 @@ def _totals(status: FleetStatus) -> Iterator[str]:
     )
     for what, devices in groups:
         if devices:
-            counts = [(health, sum(one.health is health for one in devices)) for health in Health]
+            counts = [(health, sum(device.health is health for device in devices)) for health in Health]
             text = ", ".join(f"{count} {health.value}" for health, count in counts if count)
             yield f"{counted(len(devices), what)}: {text}"
 
@@ -92,8 +92,8 @@ def _all_alarms(status: FleetStatus) -> list[tuple[str, Alarm]]:
         count = len(status.strangers)
         text = f"{join_limited(status.strangers)} {'are' if count > 1 else 'is'} in the mesh but not in the inventory"
         found.append(("", Alarm(Level.WARNING, "stranger", text, "if it is yours, add its `mac:` to the inventory")))
-    for one in status:
-        found += [(one.title, alarm) for alarm in one.alarms]
+    for device in status:
+        found += [(device.title, alarm) for alarm in device.alarms]
     return sorted(found, key=lambda pair: -pair[1].level)
 
 

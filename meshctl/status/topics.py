@@ -45,9 +45,9 @@ def topic_statuses(fleet: Fleet, robots: Mapping[str, RobotFacts], robot: str) -
     known = [_status(topic, here.get(topic.name), robots, facts) for topic in wanted]
     names = {topic.name for topic in wanted}
     others = [
-        TopicStatus(one.name, one.priority, one.sent_ago_s, one.received_ago_s)
-        for one in facts.topics
-        if one.name not in names
+        TopicStatus(topic.name, topic.priority, topic.sent_ago_s, topic.received_ago_s)
+        for topic in facts.topics
+        if topic.name not in names
     ]
     return (*known, *others)
 
@@ -96,7 +96,11 @@ def _live_sources(topic: Topic, robots: Mapping[str, RobotFacts], facts: RobotFa
         other = robots.get(name)
         if other is None or not _sends(topic, name):
             continue
-        ages = [one.sent_ago_s for one in other.topics if one.name == topic.name and one.sent_ago_s is not None]
+        ages = [
+            other_topic.sent_ago_s
+            for other_topic in other.topics
+            if other_topic.name == topic.name and other_topic.sent_ago_s is not None
+        ]
         if ages and ages[0] <= limit and _sends_to(topic, facts.robot):
             yield name
 

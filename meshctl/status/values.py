@@ -173,7 +173,8 @@ class NodeStatus:
     def next_hop(self) -> Neighbor | None:
         """The neighbor on its path to the base, else the best one."""
         return next(
-            (one for one in self.neighbors if one.name == self.via), self.neighbors[0] if self.neighbors else None
+            (neighbor for neighbor in self.neighbors if neighbor.name == self.via),
+            self.neighbors[0] if self.neighbors else None,
         )
 
 
@@ -255,7 +256,7 @@ class FleetStatus:
 
     def count(self, health: Health) -> int:
         """The number of radios and robots with this health."""
-        return sum(one.health is health for one in self)
+        return sum(device.health is health for device in self)
 
     @property
     def exit_code(self) -> ExitCode:

@@ -140,7 +140,7 @@ def shell(
 _BREAK_HELP = "\n\n".join(
     (
         "Inject a fault, now or at a step; `meshctl lab mend` repairs it.",
-        *(f"{one.value}: {text}" for one, text in FAULTS.items()),
+        *(f"{fault.value}: {text}" for fault, text in FAULTS.items()),
         "Example: meshctl lab break b03 'power-cut@reload_config'",
         "Example: meshctl lab break b01-b02 link-down",
     )

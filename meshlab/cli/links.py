@@ -91,9 +91,9 @@ def move(
     """
     fleet = VirtualFleet.attach(lab_directory(directory))
     placement.move(fleet, node, (x, y))
-    for one in links_of(placement.current_environment(fleet)):
-        if node in one.ends and one.ends <= set(fleet.spec.names):
-            echo(_link_line(one.seen_from(node)))
+    for link_spec in links_of(placement.current_environment(fleet)):
+        if node in link_spec.ends and link_spec.ends <= set(fleet.spec.names):
+            echo(_link_line(link_spec.seen_from(node)))
 
 
 def ground(
@@ -158,18 +158,18 @@ def _print_environment(now: RadioEnvironment, names: tuple[str, ...]) -> None:
     for name in names:
         place = now.positions.get(name)
         echo(f"{name} at {place.at[0]:g}, {place.at[1]:g} m" if place else f"{name} has no position")
-    for one in links_of(now):
-        if one.ends <= set(names):
-            echo(_link_line(one))
+    for link_spec in links_of(now):
+        if link_spec.ends <= set(names):
+            echo(_link_line(link_spec))
 
 
-def _link_line(one: LinkSpec) -> str:
+def _link_line(spec: LinkSpec) -> str:
     """`b01 - b02: loss 3% there, 5% back; TQ 247 there, 242 back, of 255`"""
-    if not one.up:
-        return f"{one.a} - {one.b}: down"
-    there, back = one.loss_to(one.b), one.loss_to(one.a)
-    loss, qualities = _loss_text(there, back), f"{one.tq_to(one.b)} there, {one.tq_to(one.a)} back"
-    return f"{one.a} - {one.b}: loss {loss}; TQ {qualities}, of 255"
+    if not spec.up:
+        return f"{spec.a} - {spec.b}: down"
+    there, back = spec.loss_to(spec.b), spec.loss_to(spec.a)
+    loss, qualities = _loss_text(there, back), f"{spec.tq_to(spec.b)} there, {spec.tq_to(spec.a)} back"
+    return f"{spec.a} - {spec.b}: loss {loss}; TQ {qualities}, of 255"
 
 
 def _loss_text(there: float, back: float) -> str:

@@ -164,19 +164,23 @@ def _parse(text: str, ground: str | None, file: str, settings: Settings) -> Scen
         top = steps_of(path)[:1]
         return ground is not None and bool(top) and top[0] in _GROUND and top[0] not in own
 
-    mission = with_settings(text, tuple(one for one in settings if not is_of_ground(one[0])), file, _NAMED)
+    mission = with_settings(text, tuple(setting for setting in settings if not is_of_ground(setting[0])), file, _NAMED)
     terrain: EditedText | None = None
     if ground is not None:
-        terrain = with_settings(ground, tuple(one for one in settings if is_of_ground(one[0])), str(place), _NAMED)
+        terrain = with_settings(
+            ground, tuple(setting for setting in settings if is_of_ground(setting[0])), str(place), _NAMED
+        )
     try:
         return scenario_file.parse(mission.text, Path(file), None if terrain is None else terrain.text)
     except InvalidInput as error:
         words = " ".join(f"--set {path}={value}" for path, value in settings)
         lines = {file: mission.original_line, str(place): terrain.original_line if terrain else mission.original_line}
-        raise SweepError("\n".join(f"{_problem(one, lines)} ({words})" for one in error.diagnostics)) from None
+        raise SweepError(
+            "\n".join(f"{_problem(diagnostic, lines)} ({words})" for diagnostic in error.diagnostics)
+        ) from None
 
 
-def _problem(one: Diagnostic, lines: Mapping[str, Callable[[int], int]]) -> str:
-    place = one.position
+def _problem(diagnostic: Diagnostic, lines: Mapping[str, Callable[[int], int]]) -> str:
+    place = diagnostic.position
     line = lines[place.file](place.line) if place.file in lines else place.line
-    return f"{place.file}:{line}: {one.text}"
+    return f"{place.file}:{line}: {diagnostic.text}"

@@ -125,10 +125,10 @@ class QemuPortForwarder(PortForwarder):
     def _is_on_wire_of_base(self, address: IPv4Interface) -> bool:
         """Whether a base's LAN is in the address's network; otherwise the base routes there."""
         return any(
-            one.over_wire and IPv4Interface(f"{one.address}/{one.prefix}").network == address.network
+            own.over_wire and IPv4Interface(f"{own.address}/{own.prefix}").network == address.network
             for state in self._fleet.nodes.values()
             if state.spec.medium is Medium.BASE
-            for one in state.effective.addresses
+            for own in state.effective.addresses
         )
 
     def _socket_in(self, namespace: str) -> socket.socket:

@@ -99,4 +99,4 @@ def originators(pid: int) -> list[str]:
         known = json.loads(run(("batctl", "meshif", "bat0", "originators_json"), node=pid))
     except (LabError, json.JSONDecodeError):
         return []
-    return [str(one["orig_address"]) for one in known if one.get("best")]
+    return [str(originator["orig_address"]) for originator in known if originator.get("best")]

@@ -107,13 +107,13 @@ def _radio(radio: Mapping[str, Any]) -> Message:
     """Of a collector's report as a whole; empty: there is none."""
     neighbors: List[Message] = [
         {
-            "name": one["name"],
-            "radio": one["radio"],
-            "signal_dbm": one["signal_dbm"],
-            "margin_db": _known(one["margin_db"]),
-            "age_s": one["age_s"],
+            "name": neighbor["name"],
+            "radio": neighbor["radio"],
+            "signal_dbm": neighbor["signal_dbm"],
+            "margin_db": _known(neighbor["margin_db"]),
+            "age_s": neighbor["age_s"],
         }
-        for one in radio.get("neighbors") or ()
+        for neighbor in radio.get("neighbors") or ()
     ]
     return {
         "source": radio.get("source") or "",

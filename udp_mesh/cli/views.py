@@ -220,7 +220,9 @@ def relays_view(relaying: Json) -> list[str]:
     if rows:
         lines += ["", table(["relayed", "through", "links", "cost", "state", "relays with our key"], rows)]
     lines += [
-        f"relay {one['name']} DOES NOT ANSWER" for one in relaying["neighbours"] if one["relays"] and one["unanswered"]
+        f"relay {neighbour['name']} DOES NOT ANSWER"
+        for neighbour in relaying["neighbours"]
+        if neighbour["relays"] and neighbour["unanswered"]
     ]
     if relaying["relays"]:
         counters = relaying["counters"]
@@ -310,9 +312,9 @@ def subscriptions_view(reply: Json) -> str:
     saved = [(peer["name"], peer["saved"]) for peer in reply["peers"]] + [("all", reply["broadcasts_saved"])]
     kinds = ("unread", "thinned", "aged")
     rows = [
-        [name, *(text for kind in kinds for text in (str(one[f"{kind}_messages"]), size(one[f"{kind}_bytes"])))]
-        for name, one in saved
-        if any(one[f"{kind}_messages"] for kind in kinds)
+        [name, *(text for kind in kinds for text in (str(value[f"{kind}_messages"]), size(value[f"{kind}_bytes"])))]
+        for name, value in saved
+        if any(value[f"{kind}_messages"] for kind in kinds)
     ]
     if rows:
         lines += ["", table(["not sent to", "not read", "", "too many", "", "too old", ""], rows)]

@@ -231,7 +231,7 @@ def deliver(state: State, session: Session, now: float) -> None:
 def inflate_step(state: State, now: float) -> None:
     """Inflate one step of a complete message, of each session in turn."""
     session = next(iter(state.inflating))
-    held = sum(one.receiver.inflating_bytes for one in state.inflating)
+    held = sum(other.receiver.inflating_bytes for other in state.inflating)
     version = session.receiver.inflating[0].numbers
     if not session.receiver.inflate_step(now) and not version:
         state.event_queue.counters.dropped_malformed += 1

@@ -103,12 +103,12 @@ class LinkOutput:
 
     def _log_send_errors(self) -> None:
         going_on, over = self.send_errors.review(self._loop.time())
-        for one in going_on:
+        for link in going_on:
             log.warning(
-                "send-refused link=%s to=%s datagrams=%d reason=%s", one.link, one.to, one.datagrams, one.reason
+                "send-refused link=%s to=%s datagrams=%d reason=%s", link.link, link.to, link.datagrams, link.reason
             )
-        for one in over:
-            log.info("send-refused-no-more link=%s datagrams=%d reason=%s", one.link, one.datagrams, one.reason)
+        for link in over:
+            log.info("send-refused-no-more link=%s datagrams=%d reason=%s", link.link, link.datagrams, link.reason)
         self._review_timer = self._loop.call_later(REVIEW_S, self._log_send_errors) if self.send_errors else None
 
 

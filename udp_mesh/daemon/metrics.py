@@ -147,16 +147,16 @@ def _log_lines(logs: tuple[LogConditions, ...]) -> list[str]:
 
 
 _RADIO_PATH_GAUGES: tuple[tuple[str, str, Callable[[RadioPath], float | None]], ...] = (
-    ("signal_dbm", "Signal of the next hop, as the robot's radio hears it.", lambda path: path.signal_dbm),
-    ("noise_dbm", "Noise at the robot's radio.", lambda path: path.noise_dbm),
-    ("margin_db", "What the next hop's signal is above what the load needs.", lambda path: path.margin_db),
-    ("bottleneck_bits_per_second", "Least rate known of the path.", lambda path: path.bottleneck_bits_per_s),
-    ("quality_ratio", "Share of the routing protocol's packets that arrive.", lambda path: path.quality),
-    ("trend_db_per_second", "Change of the signal; negative: worsening.", lambda path: path.change_db_per_s),
+    ("signal_dbm", "Signal of the next hop, as the robot's radio hears it.", lambda neighbor: neighbor.signal_dbm),
+    ("noise_dbm", "Noise at the robot's radio.", lambda neighbor: neighbor.noise_dbm),
+    ("margin_db", "What the next hop's signal is above what the load needs.", lambda neighbor: neighbor.margin_db),
+    ("bottleneck_bits_per_second", "Least rate known of the path.", lambda neighbor: neighbor.bottleneck_bits_per_s),
+    ("quality_ratio", "Share of the routing protocol's packets that arrive.", lambda neighbor: neighbor.quality),
+    ("trend_db_per_second", "Change of the signal; negative: worsening.", lambda neighbor: neighbor.change_db_per_s),
 )
 _RADIO_NEIGHBOR_GAUGES: tuple[tuple[str, str, Callable[[RadioNeighbor], float | None]], ...] = (
-    ("signal_dbm", "Signal of a neighbor, as the radio hears it.", lambda one: one.signal_dbm),
-    ("margin_db", "What the signal of a neighbor is above what the load needs.", lambda one: one.margin_db),
+    ("signal_dbm", "Signal of a neighbor, as the radio hears it.", lambda neighbor: neighbor.signal_dbm),
+    ("margin_db", "What the signal of a neighbor is above what the load needs.", lambda neighbor: neighbor.margin_db),
 )
 
 
@@ -173,12 +173,12 @@ def _radio_lines(radio: RadioReport, peers: Iterable[str], now: float) -> list[s
     for name, help_text, read in _RADIO_PATH_GAUGES:
         samples = [({"peer": path.peer}, value) for path in paths if (value := read(path)) is not None]
         _family(lines, f"radio_path_{name}", "gauge", help_text, samples)
-    neighbors = {(one.name, one.radio): one for one in radio.recent_neighbors(now)}
+    neighbors = {(neighbor.name, neighbor.radio): neighbor for neighbor in radio.recent_neighbors(now)}
     for name, help_text, value_of in _RADIO_NEIGHBOR_GAUGES:
         samples = [
-            ({"neighbor": one.name, "radio": one.radio}, value)
-            for one in neighbors.values()
-            if (value := value_of(one)) is not None
+            ({"neighbor": neighbor.name, "radio": neighbor.radio}, value)
+            for neighbor in neighbors.values()
+            if (value := value_of(neighbor)) is not None
         ]
         _family(lines, f"radio_neighbor_{name}", "gauge", help_text, samples)
     return lines

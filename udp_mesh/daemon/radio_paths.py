@@ -86,7 +86,7 @@ class RadioReport:
         return None if path is None or now - path.measured_at > MAX_AGE_S else path
 
     def recent_neighbors(self, now: float) -> Iterator[RadioNeighbor]:
-        return (one for one in self.neighbors if now - one.measured_at <= MAX_AGE_S)
+        return (neighbor for neighbor in self.neighbors if now - neighbor.measured_at <= MAX_AGE_S)
 
     def path_json(self, peer: str, now: float) -> Json | None:
         """For the peer's conditions; None if nothing recent is known of its path."""
@@ -119,13 +119,13 @@ class RadioReport:
             "age_s": round(now - self.reported_at, 3),
             "neighbors": [
                 {
-                    "name": one.name,
-                    "radio": one.radio,
-                    "signal_dbm": one.signal_dbm,
-                    "margin_db": one.margin_db,
-                    "age_s": _age_s(one, now),
+                    "name": neighbor.name,
+                    "radio": neighbor.radio,
+                    "signal_dbm": neighbor.signal_dbm,
+                    "margin_db": neighbor.margin_db,
+                    "age_s": _age_s(neighbor, now),
                 }
-                for one in self.recent_neighbors(now)
+                for neighbor in self.recent_neighbors(now)
             ],
         }
 
@@ -178,7 +178,7 @@ def _entries(document: Mapping[str, Any], key: str, limit: int) -> Iterator[tupl
 
 def _path(entry: Mapping[str, Any], place: str, now: float) -> RadioPath:
     trend, change_db_per_s = entry.get("trend"), _number(entry, place, "change_db_per_s", -1000, 1000)
-    words = [one.value for one in RadioTrend]
+    words = [known.value for known in RadioTrend]
     if trend is not None and trend not in words:
         raise BadReport(f"{place}.trend: expected one of {', '.join(words)}, found {_shown(trend)}")
     return RadioPath(

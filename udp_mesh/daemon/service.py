@@ -108,7 +108,8 @@ class Service:
         """Starts sending and receiving."""
         self.driver.start()
         self.thin_ports.start()
-        if any(one is not None and one.outbox_on_disk for one in (*self.settings.topics, self.settings.undeclared)):
+        topics = (*self.settings.topics, self.settings.undeclared)
+        if any(topic is not None and topic.outbox_on_disk for topic in topics):
             self.store.check_writable()
         self._publish_conditions()
         self.subscriptions.announce()

@@ -86,7 +86,7 @@ def _by_interface(running: list[Interface], config: LinkConfig, port: int) -> It
         ]
         if config.broadcast:
             # All nodes on the link are reached from the link-local address, which every IPv6 interface has.
-            usable = [one for one in usable if ":" not in one.host or ipaddress.ip_address(one.host).is_link_local]
+            usable = [own for own in usable if ":" not in own.host or ipaddress.ip_address(own.host).is_link_local]
         if usable:
             address = min(usable, key=_preference)
             to_all = _broadcast_address(interface, address) if config.broadcast else None

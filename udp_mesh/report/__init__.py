@@ -88,8 +88,8 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _is_same(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
+def _is_same(path: Path, other: Path) -> bool:
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 def _options(arguments: Sequence[str]) -> argparse.Namespace:

@@ -124,14 +124,14 @@ class BinnedLines:
         for label in labels:
             line = self._shown(label, bins)
             numbers = [*line.numbers, *([0] * (bins.count - len(line.numbers)))]
-            one: dict[str, Any] = {
+            entry: dict[str, Any] = {
                 "label": label,
                 "values": [rounded(line.totals[at] / number) if number else None for at, number in enumerate(numbers)],
             }
             if any(number > 1 and line.high[at] > line.low[at] for at, number in enumerate(numbers)):
-                one["low"] = [rounded(line.low[at]) if number else None for at, number in enumerate(numbers)]
-                one["high"] = [rounded(line.high[at]) if number else None for at, number in enumerate(numbers)]
-            found.append(one)
+                entry["low"] = [rounded(line.low[at]) if number else None for at, number in enumerate(numbers)]
+                entry["high"] = [rounded(line.high[at]) if number else None for at, number in enumerate(numbers)]
+            found.append(entry)
         return found
 
     def totals(self, bins: Bins, label: str) -> list[float]:

@@ -31,7 +31,7 @@ class ThinLinkTotals:
 
     def since(self, earlier: ThinLinkTotals) -> ThinLinkTotals:
         """What was added."""
-        return ThinLinkTotals(*(getattr(self, one.name) - getattr(earlier, one.name) for one in fields(self)))
+        return ThinLinkTotals(*(getattr(self, field.name) - getattr(earlier, field.name) for field in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class ThinLinkUse:
         return self.samples_up / self.samples if self.samples else 0.0
 
 
-_COUNTERS = tuple(one.name for one in fields(ThinLinkTotals) if one.name != "airtime_s")
+_COUNTERS = tuple(field.name for field in fields(ThinLinkTotals) if field.name != "airtime_s")
 
 
 def thin_items(t: float, entry: object) -> Iterator[ThinLinkSample | ThinPeerSample]:

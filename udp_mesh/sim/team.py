@@ -183,7 +183,7 @@ class Team:
         """Messages and bytes that the robot's current run did not send because no program wants them."""
         conditions = self._members[robot].node.selective.conditions()
         counters = [conditions.broadcasts, *(peer.saved for peer in conditions.peers)]
-        return sum(one.messages for one in counters), sum(one.bytes for one in counters)
+        return sum(counter.messages for counter in counters), sum(counter.bytes for counter in counters)
 
     # Called by the medium and the timers
 

@@ -68,7 +68,7 @@ class DrivenPath:
     def decide(self, peers: tuple[PeerConditions, ...], now: float) -> None:
         """Decides from the conditions of the robot's node."""
         self._travelled_s, self._decided_at_s = self._travelled(now), now
-        peer = next((one for one in peers if one.name == self._behavior.peer), None)
+        peer = next((candidate for candidate in peers if candidate.name == self._behavior.peer), None)
         shown = None if peer is None else as_shown(peer)
         self.turns_back = decide(shown, self._behavior.need, self.turns_back).turn_back
 

@@ -334,7 +334,7 @@ def target_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             if hint:
                 yield Finding(path, "unknown target", "a target of OpenWrt", profile.target, hint)
         elif target in SUBTARGETS and subtarget not in SUBTARGETS[target]:
-            near = [f"{target}/{one}" for one in nearest(subtarget, sorted(SUBTARGETS[target]))]
+            near = [f"{target}/{known}" for known in nearest(subtarget, sorted(SUBTARGETS[target]))]
             if near:
                 yield Finding(path, "unknown subtarget", " or ".join(near), profile.target, suggestion(near))
 

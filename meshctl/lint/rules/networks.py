@@ -299,10 +299,10 @@ def network_without_station(fleet: Fleet, _context: LintContext) -> Iterator[Fin
         # where no mesh of a node has its address, MC202 reports the node, or this network
         if (
             members
-            and all(any(node.address.ip in one.network for one in meshes_of(fleet, node)) for node in members)
+            and all(any(node.address.ip in own_mesh.network for own_mesh in meshes_of(fleet, node)) for node in members)
             and not any(address in mesh.network for address, who in taken if who in own)
         ):
-            others = {str(one.network) for node in members for one in meshes_of(fleet, node) if one is not mesh}
+            others = {str(other.network) for node in members for other in meshes_of(fleet, node) if other is not mesh}
             names = join_limited([node.name for node in members])
             message = f"contains no address of {names}, nor of a computer"
             yield Finding(("meshes", mesh.name, "network"), message, join_limited(sorted(others)), str(mesh.network))

@@ -258,10 +258,16 @@ def extra_section_unread(fleet: Fleet, context: LintContext) -> Iterator[Finding
             package, _, section = key.partition(".")
             made = packages[package].section(section) if package in packages and "." not in section else None
             others = (
-                [] if made is None else [one for one in packages[package].sections if one is not made and one.options]
+                []
+                if made is None
+                else [
+                    other_section
+                    for other_section in packages[package].sections
+                    if other_section is not made and other_section.options
+                ]
             )
             # an empty section of a known type may have a meaning: all its defaults
-            if made is not None and not made.options and others and made.type not in {one.type for one in others}:
+            if made is not None and not made.options and others and made.type not in {other.type for other in others}:
                 path = ("nodes", node.name, "extra_uci", key)
                 message = f"creates an empty section of the type {value!r}"
                 yield Finding(path, message, f"an option, such as {package}.@{others[0].type}[0].{section}", key)

@@ -273,6 +273,6 @@ def type_unknown(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         known = MESSAGES.get(package, frozenset())
         name = rest.removeprefix("msg/")
         if known and "/" not in name and _TYPE.fullmatch(topic.type_name) is not None and name not in known:
-            near = [topic.type_name.removesuffix(name) + one for one in nearest(name, sorted(known))]
+            near = [topic.type_name.removesuffix(name) + known_name for known_name in nearest(name, sorted(known))]
             expected, hint = " or ".join(near) or f"a message of {package}", suggestion(near)
             yield Finding(_path(topic, "type"), f"{package} has no such message", expected, topic.type_name, hint)

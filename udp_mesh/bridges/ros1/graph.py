@@ -147,7 +147,10 @@ class Graph:
         """The type of a publisher that a subscriber of `listen` is connected to; None without one."""
         route_and_subscriber = self._subscribers.get(name)
         connections = [] if route_and_subscriber is None else route_and_subscriber[1].impl.connections
-        return next((TypeKey(str(one.type), str(one.md5sum)) for one in connections if one.type), None)
+        return next(
+            (TypeKey(str(connection.type), str(connection.md5sum)) for connection in connections if connection.type),
+            None,
+        )
 
     def reserve(self, types: Mapping[str, TypeKey]) -> None:
         """Advertises exactly these names beside those with messages, for programs that wait for a publisher. Waits for

@@ -148,7 +148,11 @@ class HeartbeatScheduler:
         tags = [session.heard_tag for session in replied]
         clocks = [clock_echo(session.clock_ms) for session in replied if session.clock_ms is not None]
         # A boot whose name was taken by another is not listed: its messages are not accepted, and it must learn that.
-        listed = [one for one in sessions if one.is_current or not one.verified or one.name == own_name]
+        listed = [
+            candidate
+            for candidate in sessions
+            if candidate.is_current or not candidate.verified or candidate.name == own_name
+        ]
         recent = [session for session in listed if now - session.last_heard < MISSED_HEARTBEATS * session.interval_s]
         if recent:
             start = self._next_listed % len(recent)

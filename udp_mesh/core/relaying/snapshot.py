@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
     """See `Endpoint.relaying`."""
-    names = relaying.routes.names() | {boot_id: one.name for boot_id, one in relaying.neighbours.items()}
+    names = relaying.routes.names() | {boot_id: neighbor.name for boot_id, neighbor in relaying.neighbours.items()}
     members = _members(state, relaying)
     routes = [
         _route(relaying, route, names, members) for route in relaying.routes.selected.values() if not route.direct
@@ -28,8 +28,8 @@ def snapshot(state: State, relaying: Relaying, now: float) -> RelayConditions:
     return RelayConditions(
         relaying.relays,
         relaying.active(now),
-        tuple(sorted(_neighbours(state, relaying, now), key=lambda one: one.name)),
-        tuple(sorted(routes, key=lambda one: one.name)),
+        tuple(sorted(_neighbours(state, relaying, now), key=lambda neighbor: neighbor.name)),
+        tuple(sorted(routes, key=lambda route: route.name)),
         replace(relaying.counters),
         relaying.queued_bytes,
     )
@@ -54,7 +54,7 @@ def _neighbours(state: State, relaying: Relaying, now: float) -> Iterator[RelayN
 def _members(state: State, relaying: Relaying) -> set[bytes]:
     """Boot ids of the nodes that hold one of our fleet keys."""
     known: list[HopNeighbour | HopRoute] = [*relaying.neighbours.values(), *relaying.routes.selected.values()]
-    return {one.boot_id for one in known if is_member(state.keys, one.boot_id, one.proofs)}
+    return {neighbor.boot_id for neighbor in known if is_member(state.keys, neighbor.boot_id, neighbor.proofs)}
 
 
 def _route(relaying: Relaying, route: HopRoute, names: dict[bytes, str], members: set[bytes]) -> RelayRoute:

@@ -121,9 +121,9 @@ class ThinSending:
         if topic.keep_last is None and topic.thin_period_s is None:
             return
         same = [
-            one
-            for one in self._messages
-            if one.topic == topic.name and one.destination == message.destination and not one.ended
+            waiting
+            for waiting in self._messages
+            if waiting.topic == topic.name and waiting.destination == message.destination and not waiting.ended
         ]
         for old in same[: max(0, len(same) + 1 - (topic.keep_last or 1))]:
             self._end(old, ExpiryReason.SUPERSEDED)

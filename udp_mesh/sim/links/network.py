@@ -50,11 +50,11 @@ class Network:
         self.bytes_sent = dict(self.datagrams_sent)
         """IP packets, by sending node."""
         rng = random.Random(f"network {seed}")
-        for number, one in enumerate(settings, 1):
-            address = (f"10.0.0.{number}", one.port)
-            node = Endpoint(one, boot_id=rng.randbytes(16), rng=random.Random(rng.random()), now=event_queue.now)
-            node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, address, (BROADCAST, one.port)), event_queue.now)
-            self._members[one.name] = self._by_address[address[0]] = _Attached(one.name, address, node)
+        for number, link in enumerate(settings, 1):
+            address = (f"10.0.0.{number}", link.port)
+            node = Endpoint(link, boot_id=rng.randbytes(16), rng=random.Random(rng.random()), now=event_queue.now)
+            node.link_up(LinkInfo(LINK, LinkKind.BROADCAST, address, (BROADCAST, link.port)), event_queue.now)
+            self._members[link.name] = self._by_address[address[0]] = _Attached(link.name, address, node)
 
     def connect(self, source: str, target: str, path: Carrier) -> None:
         """Datagrams from `source` to `target` take this path from now on."""

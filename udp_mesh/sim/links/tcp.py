@@ -157,7 +157,7 @@ class TcpFlow:
         if not acked:
             return
         sent = [self._in_flight.pop(number) for number in acked]
-        newest = max(sent, key=lambda one: one.order)
+        newest = max(sent, key=lambda segment: segment.order)
         self._delivered += len(acked)
         self._progress_at, self._rto_factor = now, 1
         rtt_s = None if newest.is_retransmission else now - newest.sent_at
@@ -166,7 +166,9 @@ class TcpFlow:
         elapsed_s = max(now - newest.delivered_at, newest.sent_at - newest.first_sent_at)
         rate = (self._delivered - newest.delivered) / elapsed_s if elapsed_s > 0 else None
         self._delivered_at, self._first_sent_at = now, newest.sent_at
-        lost = [number for number, one in self._in_flight.items() if one.order <= newest.order - REORDER_SEGMENTS]
+        lost = [
+            number for number, segment in self._in_flight.items() if segment.order <= newest.order - REORDER_SEGMENTS
+        ]
         if lost:
             in_flight = len(self._in_flight)
             is_new_episode = any(self._in_flight[number].order > self._recovers_at_order for number in lost)
