@@ -34,9 +34,9 @@ from meshctl.model import Node
 from meshctl.model.ip import IpAddress
 from meshctl.plan.cell import cells, partitions
 from meshctl.plan.lockout import lockout
+from meshctl.plan.observed_files import CONFIG, WIRELESS, management_address, packages_seen, parsed
 from meshctl.plan.preconditions import FailedPrecondition
 from meshctl.plan.radios import NO_RADIOS, Radios, restarting_radios
-from meshctl.plan.seen import CONFIG, WIRELESS, management_address, packages_seen, parsed
 from meshctl.render import MARKER_PATH
 
 INFO_NAME = "meshctl-backup.json"
@@ -73,17 +73,17 @@ class Backup:
     disabled: tuple[str, ...] = ()
 
 
-def fetch(connection: SshConnection, node: str, seen: Observation) -> bytes:
+def fetch(connection: SshConnection, node: str, observation: Observation) -> bytes:
     """The node's backup as one tar.gz file. Raises NodeError when it sends something else, or is being changed."""
     info = {
         "node": node,
-        "board": seen.board.board_name if seen.board else "",
-        "revision": seen.release.revision if seen.release else "",
-        "taken_s": round(seen.answered_at_s, 3),
-        "packages": sorted(seen.packages or ()),
+        "board": observation.board.board_name if observation.board else "",
+        "revision": observation.release.revision if observation.release else "",
+        "taken_s": round(observation.answered_at_s, 3),
+        "packages": sorted(observation.packages or ()),
     }
     archive = openwrt.backup(connection)
-    if reason := unconfirmed(node, seen.change, deadman.status(connection)):
+    if reason := unconfirmed(node, observation.change, deadman.status(connection)):
         raise NodeError(reason, hint="repeat it when that change has ended")
     try:
         # sysupgrade does not save meshctl's own files; the marker identifies the configuration
@@ -203,15 +203,15 @@ def restore_backup(ctx: NodeContext, connection: SshConnection, backup: Backup) 
     return run_change(change, connection)
 
 
-def files_to_write(backup: Backup, seen: Observation) -> dict[str, NewFile]:
+def files_to_write(backup: Backup, observation: Observation) -> dict[str, NewFile]:
     """The UCI files that differ on the node, and all others."""
-    live = seen.uci or {}
+    live = observation.uci or {}
     return {path: new for path, new in backup.files.items() if _differs(path, new, live)}
 
 
-def differing_files(backup: Backup, seen: Observation, connection: SshConnection) -> tuple[str, ...]:
+def differing_files(backup: Backup, observation: Observation, connection: SshConnection) -> tuple[str, ...]:
     """The paths that a restore would change on the node, all compared with their current content."""
-    files = files_to_write(backup, seen)
+    files = files_to_write(backup, observation)
     present = openwrt.fetch_files(connection, files)
     return tuple(path for path, new in files.items() if path not in present or present[path].content != new.content)
 
@@ -241,9 +241,9 @@ def lockout_by(backup: Backup, node: Node, own: Sequence[OwnKey]) -> FailedPreco
     return lockout(node, {path.lstrip("/"): new.content for path, new in backup.files.items()}, own)
 
 
-def incompatibility(backup: Backup, node: str, seen: Observation) -> str:
+def incompatibility(backup: Backup, node: str, observation: Observation) -> str:
     """Why a backup does not fit this device; empty when it fits."""
-    board = seen.board.board_name if seen.board else ""
+    board = observation.board.board_name if observation.board else ""
     if backup.board and board != backup.board:
         return f"the backup is of board {backup.board}; the board of {node} is {board or 'unknown'}"
     if backup.node and backup.node != node:
@@ -256,15 +256,15 @@ def without_wireless(backup: Backup) -> Backup:
     return replace(backup, files={path: new for path, new in backup.files.items() if path != f"/{WIRELESS}"})
 
 
-def departure(backup: Backup, node: str, seen: Observation) -> str:
+def departure(backup: Backup, node: str, observation: Observation) -> str:
     """Why a backup from before a change of the cell would take the node out of the mesh that it is in; empty otherwise.
 
     A node that hears no mesh neighbor has nothing to leave: it may return to the cell that its mesh still has.
     """
-    neighbors = len(heard_neighbors(seen))
+    neighbors = len(heard_neighbors(observation))
     if not neighbors:
         return ""
-    before = packages_seen(_CELL_PATHS, seen)
+    before = packages_seen(_CELL_PATHS, observation)
     after = before | {
         name: parsed(new.content.decode("utf-8", "replace"), name)
         for path in _CELL_PATHS
@@ -278,6 +278,6 @@ def departure(backup: Backup, node: str, seen: Observation) -> str:
     return f"the backup has another cell ({text}): {node} would leave {heard}"
 
 
-def uninstalled_packages(backup: Backup, seen: Observation) -> tuple[str, ...]:
+def uninstalled_packages(backup: Backup, observation: Observation) -> tuple[str, ...]:
     """Packages that were installed when the backup was taken and are not now."""
-    return tuple(name for name in backup.packages if name not in (seen.packages or {}))
+    return tuple(name for name in backup.packages if name not in (observation.packages or {}))

@@ -61,21 +61,21 @@ class FoundDevice:
 
     target: BenchTarget
     node: Node
-    seen: Observation
+    observation: Observation
     key: HostKey
     old_pins: tuple[HostKey, ...] = ()
 
 
-def identify(fleet: Fleet, seen: Observation, requested_name: str, identified: Iterable[str] = ()) -> Node:
+def identify(fleet: Fleet, observation: Observation, requested_name: str, identified: Iterable[str] = ()) -> Node:
     """The node this device is: by MAC, or by `requested_name`, the operator's, where the inventory has no MAC.
 
     Raises NodeError for a device that is another node than `requested_name`, or that cannot be identified.
     """
-    macs = {mac.lower() for mac in (seen.macs or {}).values()}
-    if seen.board is not None and seen.board.label_mac:
-        macs.add(seen.board.label_mac.lower())
+    macs = {mac.lower() for mac in (observation.macs or {}).values()}
+    if observation.board is not None and observation.board.label_mac:
+        macs.add(observation.board.label_mac.lower())
     # a radio may be recorded by its address in the mesh, which differs from the factory one
-    alternates = {other for link in seen.links or () for other in alternate_macs(link.mac)}
+    alternates = {other for link in observation.links or () for other in alternate_macs(link.mac)}
     by_mac = [node for node in fleet.managed() if _macs(node) & (macs | alternates)]
     macs_text = ", ".join(sorted(macs)) or "none"
     if len(by_mac) > 1:
@@ -141,8 +141,8 @@ def discover(
         try:
             with lock:
                 identified = tuple(found)
-            seen = observe_cleared(connection, _paths(renderer, target), signal)
-            node = identify(renderer.fleet, seen, target.node, identified)
+            observation = observe_cleared(connection, _paths(renderer, target), signal)
+            node = identify(renderer.fleet, observation, target.node, identified)
             require_site(node, target)
             assert host_key_policy.key is not None
             old_pins = trust.pinned(node.name)
@@ -151,7 +151,7 @@ def discover(
             connection.close()
             raise
         with lock:
-            found[node.name] = FoundDevice(target, node, seen, host_key_policy.key, old_pins)
+            found[node.name] = FoundDevice(target, node, observation, host_key_policy.key, old_pins)
             if not target.site:
                 connections.on_bench.add(node.name)
             connections.bench_endpoints[node.name] = replace(connection.endpoint, identity=node.name)
@@ -226,7 +226,7 @@ def plan_discovered(
     """The plan that provisions the discovered devices. Their possible neighbors are observed, too: a spare, or a device
     that was reset, may have been in the mesh before."""
     rendered = {name: renderer.desired(item.node) for name, item in discovered.found.items()}
-    found = {name: item.seen for name, item in discovered.found.items()}
+    found = {name: item.observation for name, item in discovered.found.items()}
     made = assemble(
         renderer,
         connections,

@@ -32,8 +32,8 @@ from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.slots import Slot
 from meshctl.plan import Cut
 from meshctl.plan.effects import loaded_package
+from meshctl.plan.observed_files import WIRELESS, packages_seen
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
-from meshctl.plan.seen import WIRELESS, packages_seen
 from meshctl.render.rendered import MARKER_PATH
 
 # The lock outlives the confirm window by this much, for the actions after it.

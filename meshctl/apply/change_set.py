@@ -12,7 +12,7 @@ from meshctl.device.scripts import script
 from meshctl.model import Backend, Fleet, Node, Secret
 from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.effects import loaded_package
-from meshctl.plan.seen import WIRELESS, file_info, text_of
+from meshctl.plan.observed_files import WIRELESS, file_info, text_of
 
 # The id is part of a file name on the node; the nonce must be unguessable for a confirm window of minutes.
 ID_BYTES, NONCE_BYTES = 5, 16

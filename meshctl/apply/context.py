@@ -47,10 +47,10 @@ class RunContext:
     rate_bytes_per_s: float | None = None
     macs: dict[str, frozenset[str]] = field(default_factory=dict)
 
-    def record(self, name: str, seen: Observation) -> None:
+    def record(self, name: str, observation: Observation) -> None:
         """Record an observation for the rest of this run and for later ones."""
-        self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(seen))
-        self.journal_run.remember(self.fleet.name, name, facts_of(seen), seen.answered_at_s)
+        self.macs[name] = self.macs.get(name, frozenset()) | frozenset(mesh_macs(observation))
+        self.journal_run.remember(self.fleet.name, name, facts_of(observation), observation.answered_at_s)
 
     def current_mac_owners(self) -> dict[str, str]:
         """MAC -> node, including MACs learned during the run."""

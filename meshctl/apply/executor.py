@@ -91,11 +91,11 @@ def assign_slots(prepared: Prepared, connections: ConnectionPool) -> None:
 def unflushed_since(prepared: Prepared, journal: Journal) -> dict[str, float]:
     """Node -> since when (Unix time) its radios may have restarted without a station flush: the end of a change was not
     observed, or the node has booted since. Only nodes that answered."""
-    seen = prepared.observed.observations
+    observations = prepared.observed.observations
     missing = journal.unfinished_changes(prepared.plan.fleet)
-    booted = {name: unflushed_boot_s(name, seen) for name in prepared.plan.nodes}
+    booted = {name: unflushed_boot_s(name, observations) for name in prepared.plan.nodes}
     since_s = {name: at_s for name, at_s in booted.items() if at_s is not None} | missing
-    return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in seen}
+    return {name: at_s for name, at_s in since_s.items() if name in prepared.plan.nodes and name in observations}
 
 
 # Results of a node that was in progress and is unreachable now.
@@ -160,10 +160,10 @@ def _node_contexts(prepared: Prepared, run_context: RunContext) -> dict[str, Nod
 
 
 def _node_context(prepared: Prepared, run_context: RunContext, name: str) -> NodeContext:
-    seen, desired = prepared.observed.observations[name], prepared.desired[name]
+    observation, desired = prepared.observed.observations[name], prepared.desired[name]
     node = run_context.fleet.nodes[name]
-    expected = expectation(desired, seen, run_context.current_base_macs(node))
-    return NodeContext(run_context, node, prepared.plan.nodes[name], desired, seen, expected)
+    expected = expectation(desired, observation, run_context.current_base_macs(node))
+    return NodeContext(run_context, node, prepared.plan.nodes[name], desired, observation, expected)
 
 
 def _run_stage(

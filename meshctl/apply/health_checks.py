@@ -17,8 +17,8 @@ from meshctl.plan import DesiredState
 from meshctl.plan.abilities import IW_MODES
 from meshctl.plan.cell import enabled_interfaces
 from meshctl.plan.left_over import interface_names, left_over
+from meshctl.plan.observed_files import WIRELESS, address_options, packages_seen
 from meshctl.plan.packages import NO_NEEDS, Needs, missing_packages
-from meshctl.plan.seen import WIRELESS, address_options, packages_seen
 from meshctl.topology import NEIGHBOUR_FRESH_MS
 from meshctl.uci import Package, Section
 from meshctl.wording import counted
@@ -70,9 +70,9 @@ def expectation(desired: DesiredState, before: Observation, base_macs: Iterable[
     )
 
 
-def heard_neighbors(seen: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
+def heard_neighbors(observation: Observation, fresh_ms: float = NEIGHBOUR_FRESH_MS) -> frozenset[str]:
     """The MACs of the mesh neighbors heard recently."""
-    return frozenset(n.mac.lower() for n in seen.neighbours or () if n.last_seen_ms <= fresh_ms)
+    return frozenset(n.mac.lower() for n in observation.neighbours or () if n.last_seen_ms <= fresh_ms)
 
 
 def unmet(expected: Expectation, after: Observation, *, since_s: float | None = None) -> tuple[str, ...]:

@@ -27,36 +27,36 @@ REMEMBERED_S = 1800.0
 def observe_neighbors(
     connections: ConnectionPool,
     fleet: Fleet,
-    seen: Mapping[str, Observation],
+    own: Mapping[str, Observation],
     known: Mapping[str, LastKnown],
     *,
     observations: Mapping[str, Observation] = MappingProxyType({}),
     interrupt: Interrupt | None = None,
 ) -> dict[str, Observation]:
-    """Observations of these nodes and of their reachable neighbors; `observations` holds those already made.
+    """The nodes' `own` observations and those of their reachable neighbors; `observations` holds those already made.
 
     Connections stay in the pool.
     """
-    names = known_neighbors(fleet, seen, known, now_s=time.time())
+    names = known_neighbors(fleet, own, known, now_s=time.time())
     nodes = [fleet.nodes[name] for name in names if name not in observations]
     collected = (
         collect(connections, nodes, parallel=nodes_in_work(fleet.apply.parallel), interrupt=interrupt)
         if nodes
         else None
     )
-    return {**observations, **seen, **(collected.observations if collected is not None else {})}
+    return {**observations, **own, **(collected.observations if collected is not None else {})}
 
 
 def known_neighbors(
-    fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown], *, now_s: float
+    fleet: Fleet, observations: Mapping[str, Observation], known: Mapping[str, LastKnown], *, now_s: float
 ) -> tuple[str, ...]:
     """The other nodes that may hold a station entry of one of these. Pure."""
     names = known_macs(fleet, known)
     neighbors: list[str] = []
-    for name, observation in seen.items():
+    for name, observation in observations.items():
         last = known.get(name)
         heard = () if last is None else last.facts.get("neighbours", "").split()
         is_recent = last is not None and now_s - last.seen_s < REMEMBERED_S
         former = [names[mac.lower()] for mac in heard if is_recent and mac.lower() in names]
         neighbors += [*current_neighbors(observation, names), *former][:MAX_QUERIED]
-    return tuple(name for name in dict.fromkeys(neighbors) if name not in seen and name in fleet.nodes)
+    return tuple(name for name in dict.fromkeys(neighbors) if name not in observations and name in fleet.nodes)

@@ -110,9 +110,9 @@ def rollback_reason(
     if word in NOT_IN_FORCE:
         return reason
     # a node whose network has reloaded halfway says no more than that
-    seen = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
-    failed = "; ".join(seen)
-    if word == "timeout" and tuple(seen) == (RELOADING,):
+    reasons = () if connect_error and tuple(unmet) == (RELOADING,) else unmet
+    failed = "; ".join(reasons)
+    if word == "timeout" and tuple(reasons) == (RELOADING,):
         failed = f"{RELOADING}: {NEEDS_LONGER_WINDOW}"
     first, second = (failed, login_refused) if word == "abort" else (login_refused, failed)
     details = first or second or (connect_error and f"it was unreachable: {connect_error}")
@@ -123,7 +123,7 @@ def flashed_by_others(before: Observation, last: Observation | None) -> str:
     """A clause for a rollback if the node runs another build than before the change, whose reboot undid it; else empty.
 
     Such a sysupgrade was started by someone else: meshctl itself never flashes a node with an unconfirmed change."""
-    seen = None if last is None else last.release
-    if before.release is None or seen is None or before.release.revision == seen.revision:
+    release = None if last is None else last.release
+    if before.release is None or release is None or before.release.revision == release.revision:
         return ""
-    return f"someone else flashed it from {before.release.revision} to {seen.revision} meanwhile; "
+    return f"someone else flashed it from {before.release.revision} to {release.revision} meanwhile; "

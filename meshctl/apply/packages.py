@@ -26,8 +26,8 @@ from meshctl.errors import InputError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.inventory.file_paths import file_path
 from meshctl.plan import PackageStep
+from meshctl.plan.observed_files import CONFIG
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS
-from meshctl.plan.seen import CONFIG
 
 DIRECTORY = "/tmp/meshctl/packages"
 # Unpacking packages into jffs2 takes a minute on the slowest boards, and saving the removed ones as long again.

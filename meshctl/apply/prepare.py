@@ -27,7 +27,7 @@ from meshctl.nodes.last_seen import MAX_QUERIED, last_seen_of
 from meshctl.nodes.slots import nodes_in_work
 from meshctl.plan import Cut, DesiredState, NodePlan, Plan, Verdict, fleet_plan, node_plan
 from meshctl.plan.masking import Fingerprints
-from meshctl.plan.seen import package_of
+from meshctl.plan.observed_files import package_of
 from meshctl.plan.ways import Pace
 from meshctl.topology import mesh_macs
 
@@ -80,7 +80,7 @@ def prepare(
     signal = interrupt or Interrupt()
     chosen = tuple(nodes)
     rendered = {node.name: renderer.desired(node) for node in chosen}
-    seen = collect(
+    observed = collect(
         connections,
         chosen,
         parallel=nodes_in_work(fleet.apply.parallel),
@@ -88,10 +88,10 @@ def prepare(
         interrupt=signal,
         observer=observer,
     )
-    _remember(journal, fleet, seen)
+    _remember(journal, fleet, observed)
     decided = choices or PlanOptions()
-    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=decided)
-    away = dict(seen.unreachable)
+    single = _node_plans(renderer, connections, rendered, observed, salt=salt, owner=owner, choices=decided)
+    away = dict(observed.unreachable)
     rest = _other_members(fleet, single.plans.values()) or _former_neighbors(
         fleet, single.plans.values(), journal.last_known(fleet.name)
     )
@@ -104,13 +104,13 @@ def prepare(
             observer=observer,
         )
         _remember(journal, fleet, others)
-        seen = replace(seen, observations={**seen.observations, **others.observations})
+        observed = replace(observed, observations={**observed.observations, **others.observations})
         away |= others.unreachable
         single = replace(single, unchanged=_unchanged_plans(renderer, others, salt, owner))
     if reconnects and away and not signal.stopping:
         owners = known_macs(fleet, journal.last_known(fleet.name))
         untried = {name: why for name, why in away.items() if name not in tried}
-        unreached = replace(seen, unreachable=untried)
+        unreached = replace(observed, unreachable=untried)
         repaired = reconnect(connections, fleet, unreached, owners, interrupt=signal, observer=observer)
         if repaired.nodes and not signal.stopping:
             signal.wait(RELEARN_S)
@@ -130,11 +130,13 @@ def prepare(
             )
             return replace(again, plan=replace(again.plan, notes=(*repaired.notes, *again.plan.notes)))
     pace = Pace.of(journal.change_durations_s(fleet.name))
-    return _with_fleet_plan(fleet, single, seen, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace)
+    return _with_fleet_plan(
+        fleet, single, observed, journal.last_known(fleet.name), salt=salt, choices=decided, pace=pace
+    )
 
 
-def _remember(journal: Journal, fleet: Fleet, seen: FleetObservation) -> None:
-    facts = {name: facts_of(observation) for name, observation in seen.observations.items()}
+def _remember(journal: Journal, fleet: Fleet, observed: FleetObservation) -> None:
+    facts = {name: facts_of(observation) for name, observation in observed.observations.items()}
     journal.remember_all(fleet.name, facts, time.time())
 
 
@@ -187,7 +189,7 @@ def assemble(
     renderer: Renderer,
     connections: ConnectionPool,
     rendered: Mapping[str, DesiredState],
-    seen: FleetObservation,
+    observed: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
@@ -195,8 +197,8 @@ def assemble(
     choices: PlanOptions,
 ) -> Prepared:
     """The plan from what was rendered without device facts (`rendered`) and what was observed."""
-    single = _node_plans(renderer, connections, rendered, seen, salt=salt, owner=owner, choices=choices)
-    return _with_fleet_plan(renderer.fleet, single, seen, known, salt=salt, choices=choices)
+    single = _node_plans(renderer, connections, rendered, observed, salt=salt, owner=owner, choices=choices)
+    return _with_fleet_plan(renderer.fleet, single, observed, known, salt=salt, choices=choices)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +214,7 @@ def _node_plans(
     renderer: Renderer,
     connections: ConnectionPool,
     rendered: Mapping[str, DesiredState],
-    seen: FleetObservation,
+    observed: FleetObservation,
     *,
     salt: bytes,
     owner: str,
@@ -223,13 +225,13 @@ def _node_plans(
     plans: dict[str, NodePlan] = {}
     images = CheckedImages()
     for name, want in rendered.items():
-        observation = seen.observations.get(name)
+        observation = observed.observations.get(name)
         desired[name] = want if observation is None else renderer.desired(want.node, observation)
         made = node_plan(
             desired[name],
             observation,
             fingerprints,
-            unreachable=seen.unreachable.get(name, ""),
+            unreachable=observed.unreachable.get(name, ""),
             owner=owner,
             with_firmware=choices.with_firmware,
             own_keys=None if observation is None else connections.own_keys(want.node),
@@ -239,7 +241,7 @@ def _node_plans(
             made = replace(made, notes=(_reached_at(renderer.fleet, want.node, former), *made.notes))
         if made.firmware is not None and (faults := images.faults(want.node.hardware)):
             made = made.refused(faults, "correct the image or its hardware profile, or plan with --no-firmware")
-        error = seen.refused.get(name)
+        error = observed.refused.get(name)
         if error is not None:
             made = made.refused(str(error), error.hint)
         plans[name] = made
@@ -256,7 +258,7 @@ def _reached_at(fleet: Fleet, node: Node, former: IpAddress) -> str:
 def _with_fleet_plan(
     fleet: Fleet,
     single: _NodePlans,
-    seen: FleetObservation,
+    observed: FleetObservation,
     known: Mapping[str, LastKnown],
     *,
     salt: bytes,
@@ -265,12 +267,12 @@ def _with_fleet_plan(
 ) -> Prepared:
     plans = dict(single.plans)
     away = [name for name, made in plans.items() if made.verdict is Verdict.AWAY]
-    for name, place in last_seen_of(fleet, away, seen.observations, known).items():
+    for name, place in last_seen_of(fleet, away, observed.observations, known).items():
         plans[name] = replace(plans[name], reason=f"{plans[name].reason}; {place.text(time.time())}")
     plan = fleet_plan(
         fleet,
         plans,
-        seen.graph(fleet, known),
+        observed.graph(fleet, known),
         now_s=time.time(),
         unchanged=single.unchanged,
         entry=choices.entry,
@@ -280,7 +282,7 @@ def _with_fleet_plan(
         pace=pace,
         never_meshed=[name for name in single.plans if name in known and known[name].facts.get("cell") == "none"],
     )
-    return Prepared(plan, single.desired, seen, salt)
+    return Prepared(plan, single.desired, observed, salt)
 
 
 def other_paths(desired: DesiredState) -> tuple[str, ...]:
@@ -289,13 +291,13 @@ def other_paths(desired: DesiredState) -> tuple[str, ...]:
 
 
 def base_macs(
-    fleet: Fleet, seen: Mapping[str, Observation], known: Mapping[str, LastKnown]
+    fleet: Fleet, observations: Mapping[str, Observation], known: Mapping[str, LastKnown]
 ) -> dict[str, tuple[str, ...]]:
     """The mesh MACs of each base, by its name: observed now or last known."""
     found: dict[str, tuple[str, ...]] = {}
     for base in fleet.base_nodes:
-        if base.name in seen:
-            found[base.name] = mesh_macs(seen[base.name])
+        if base.name in observations:
+            found[base.name] = mesh_macs(observations[base.name])
         elif base.name in known:
             found[base.name] = tuple(known[base.name].facts.get("macs", "").split())
     return found

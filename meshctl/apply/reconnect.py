@@ -51,7 +51,7 @@ class Reconnected:
 def reconnect(
     connections: ConnectionPool,
     fleet: Fleet,
-    seen: FleetObservation,
+    observed: FleetObservation,
     owners: Mapping[str, str],
     *,
     interrupt: Interrupt,
@@ -61,7 +61,7 @@ def reconnect(
 
     The first interrupt closes the connections, since it takes minutes and changes nothing that must be finished.
     """
-    asked = entries_of_unreachable(seen, owners)
+    asked = entries_of_unreachable(observed, owners)
     if not asked:
         return Reconnected()
     in_use: list[SshConnection] = []
@@ -93,7 +93,9 @@ def reconnect(
         if interrupt.stopping:
             for connection in in_use:
                 connection.close()
-        return repaired({name: answer.result() for name, answer in answers.items()}, asked, seen.unreachable, owners)
+        return repaired(
+            {name: answer.result() for name, answer in answers.items()}, asked, observed.unreachable, owners
+        )
 
 
 def repaired(
@@ -133,19 +135,21 @@ _TEXTS = {
 }
 
 
-def entries_of_unreachable(seen: FleetObservation, owners: Mapping[str, str]) -> dict[str, list[StationEntry]]:
+def entries_of_unreachable(
+    fleet_observation: FleetObservation, owners: Mapping[str, str]
+) -> dict[str, list[StationEntry]]:
     """Holder -> its entries of radios that it hears now and that belong to unreachable nodes. An unknown MAC may
     be that of an unreachable node without a known one; a stranger's radio, which takes no part in the mesh, answers no
     echo request either way, and is left alone."""
-    observed = {mac for observation in seen.observations.values() for mac in mesh_macs(observation)}
-    is_any_unknown = bool(set(seen.unreachable) - set(owners.values()))
+    observed = {mac for observation in fleet_observation.observations.values() for mac in mesh_macs(observation)}
+    is_any_unknown = bool(set(fleet_observation.unreachable) - set(owners.values()))
     found: dict[str, list[StationEntry]] = {}
-    for holder, observation in seen.observations.items():
+    for holder, observation in fleet_observation.observations.items():
         for station in observation.stations or ():
             mac = station.mac.lower()
             if station.inactive_ms is None or station.inactive_ms >= HEARD_MS or mac in observed:
                 continue
-            is_away = owners[mac] in seen.unreachable if mac in owners else is_any_unknown
+            is_away = owners[mac] in fleet_observation.unreachable if mac in owners else is_any_unknown
             if is_away and (holder in found or len(found) < MAX_QUERIED):
                 found.setdefault(holder, []).append(StationEntry(holder, station.ifname, station.mac))
     return found

@@ -89,7 +89,7 @@ def adopt(
     else:
         raise InputError("expected a spare of the inventory, or a device on the bench")
     try:
-        seen = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
+        observation = observe_cleared(connection, other_paths(renderer.desired(old)), interrupt)
         if key is None:
             raise NodeError(f"{connection.endpoint.label}: sent no host key")
     except BaseException:
@@ -110,7 +110,7 @@ def adopt(
         connections.interfaces[old.name] = connection.endpoint.interface
     connections.release(old.name, connection)
     where = target or BenchTarget(connection.endpoint.host, connection.endpoint.port, old.name)
-    return Replacement(Discovered({old.name: FoundDevice(where, old, seen, key, pins)}, ()), new_name, new_pins)
+    return Replacement(Discovered({old.name: FoundDevice(where, old, observation, key, pins)}, ()), new_name, new_pins)
 
 
 def _open_spare(connections: ConnectionPool, spare: Node, old: Node) -> SshConnection:
@@ -180,13 +180,15 @@ def with_identity(fleet: Fleet, old: Node, spare: Node | None) -> Fleet:
     return replace(fleet, nodes=MappingProxyType({**fleet.nodes, old.name: adopted}))
 
 
-def identity_edits(old: Node, spare: Node | None, seen: Observation) -> tuple[Mapping[str, str], Mapping[str, str]]:
+def identity_edits(
+    old: Node, spare: Node | None, observation: Observation
+) -> tuple[Mapping[str, str], Mapping[str, str]]:
     """The keys to set in the inventory: in the old node's entry, and in the spare's (empty for none).
 
     A MAC is written only where the inventory has one: a fleet may identify its nodes by label.
     """
     mine: dict[str, str] = {}
-    label_mac = seen.board.label_mac if seen.board is not None else ""
+    label_mac = observation.board.label_mac if observation.board is not None else ""
     mac = (spare.mac if spare is not None else "") or label_mac
     if mac and (old.mac or (spare is not None and spare.mac)):
         mine["mac"] = mac

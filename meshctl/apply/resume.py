@@ -19,12 +19,13 @@ def resolutions(run_id: int, earlier: Iterable[Outcome], now: Prepared) -> dict[
         plan = now.plan.nodes.get(outcome.node)
         if outcome.result is not Result.UNCERTAIN or plan is None:
             continue
-        seen = now.observed.observations.get(outcome.node)
+        observation = now.observed.observations.get(outcome.node)
         match plan.verdict:
             case Verdict.SAME:
                 what = "it matches the inventory"
             case Verdict.CHANGE:
-                what = f"it runs its previous state{_why(None if seen is None else seen.change)} and will change again"
+                why = _why(None if observation is None else observation.change)
+                what = f"it runs its previous state{why} and will change again"
             case Verdict.REFUSED:
                 what = f"it answers and is refused: {plan.reason}"
             case Verdict.AWAY:

@@ -21,7 +21,7 @@ from meshctl.plan import DesiredState, NodePlan
 from meshctl.plan.cell import Cell, cells, partitions
 from meshctl.plan.masking import masked_text, secrets_of
 from meshctl.plan.node import meshes_of
-from meshctl.plan.seen import file_info, management_address, package_of, parsed, text_of
+from meshctl.plan.observed_files import file_info, management_address, package_of, parsed, text_of
 from meshctl.render import RenderedFile
 
 # The replacement character stands for bytes that are not UTF-8, whose value the observation does not have.
@@ -61,11 +61,11 @@ class EarlierState:
         return cls(files, tuple(item["added"]), str(item["lasting"]))
 
 
-def before_state(plan: NodePlan, desired: DesiredState, seen: Observation) -> EarlierState:
+def before_state(plan: NodePlan, desired: DesiredState, observation: Observation) -> EarlierState:
     """The contents of the node's managed files before its plan is executed."""
     files: list[EarlierFile] = []
     for file in desired.files:
-        info, text = file_info(file.path, seen), text_of(file.path, seen)
+        info, text = file_info(file.path, observation), text_of(file.path, observation)
         exact = text if text is not None and _INEXACT not in text else None
         files.append(EarlierFile(file.path, file.mode if info is None else info.mode, exact))
     lasting = ["flashed its firmware"] if plan.firmware is not None else []
@@ -117,19 +117,19 @@ class EarlierStates(Renderer):
 
     states: Mapping[str, EarlierState] = field(default_factory=dict, repr=False)
 
-    def desired(self, node: Node, seen: Observation | None = None) -> DesiredState:
+    def desired(self, node: Node, observation: Observation | None = None) -> DesiredState:
         state = self.states.get(node.name)
         if state is None:
-            return Renderer.desired(self, node, seen)
+            return Renderer.desired(self, node, observation)
         files = tuple(_rendered(file) for file in state.files if file.text is not None)
         found = {secret.reveal() for file in files for secret in file.secrets}
         secrets = tuple(sorted(found, key=lambda secret: (-len(secret), secret)))
-        return DesiredState(node, files, secrets, departs=self._departs(node, files, seen))
+        return DesiredState(node, files, secrets, departs=self._departs(node, files, observation))
 
-    def _departs(self, node: Node, files: Iterable[RenderedFile], seen: Observation | None) -> tuple[str, ...]:
+    def _departs(self, node: Node, files: Iterable[RenderedFile], observation: Observation | None) -> tuple[str, ...]:
         """The meshes whose cell was another one than in the inventory; all if that cannot be rendered now."""
         try:
-            now = Renderer.desired(self, node, seen)
+            now = Renderer.desired(self, node, observation)
         except (InvalidInput, InputError):
             return node.meshes
         return meshes_of(node, partitions(_cells(now.files), _cells(files)))

@@ -68,13 +68,13 @@ class StationEntry:
     mac: str
 
 
-def radio_macs(seen: Observation, radios: Radios) -> tuple[str, ...]:
+def radio_macs(observation: Observation, radios: Radios) -> tuple[str, ...]:
     """The lower-case MACs by which neighbors know these radios of a node."""
     if radios.every:
-        return mesh_macs(seen)
-    links = {link.ifname: link.mac.lower() for link in seen.links or ()}
-    macs = {ifname: mac.lower() for ifname, mac in (seen.macs or {}).items()} | links
-    known = frozenset(mesh_macs(seen))
+        return mesh_macs(observation)
+    links = {link.ifname: link.mac.lower() for link in observation.links or ()}
+    macs = {ifname: mac.lower() for ifname, mac in (observation.macs or {}).items()} | links
+    known = frozenset(mesh_macs(observation))
     return tuple(dict.fromkeys(mac for ifname, mac in macs.items() if ifname in radios and mac in known))
 
 
@@ -87,9 +87,9 @@ def entries_of(
     macs = frozenset(radio_macs(observations[node], radios))
     return tuple(
         StationEntry(holder, station.ifname, station.mac)
-        for holder, seen in observations.items()
+        for holder, observation in observations.items()
         if holder != node
-        for station in seen.stations or ()
+        for station in observation.stations or ()
         if station.mac.lower() in macs
     )
 
@@ -111,10 +111,12 @@ def inventory_login(node: Node) -> LoginPlace:
     return LoginPlace(str(node.address.ip), node.ssh.port)
 
 
-def own_entries(node: str, seen: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
+def own_entries(node: str, observation: Observation, radios: Radios = EVERY_RADIO) -> tuple[StationEntry, ...]:
     """The entries that the node itself holds on these radios."""
     own = (
-        StationEntry(node, station.ifname, station.mac) for station in seen.stations or () if station.ifname in radios
+        StationEntry(node, station.ifname, station.mac)
+        for station in observation.stations or ()
+        if station.ifname in radios
     )
     return tuple(own)[:MAX_QUERIED]
 
@@ -128,8 +130,10 @@ def possible_holders(
     """
     if node not in observations:
         return ()
-    observed = {name: seen for name, seen in observations.items() if seen.stations is not None}
-    unknown_macs = _heard_macs(observations[node]) - {mac for seen in observed.values() for mac in mesh_macs(seen)}
+    observed = {name: observation for name, observation in observations.items() if observation.stations is not None}
+    unknown_macs = _heard_macs(observations[node]) - {
+        mac for observation in observed.values() for mac in mesh_macs(observation)
+    }
     named = [names[mac] for mac in sorted(unknown_macs) if mac in names]
     known = frozenset(names.values())
     unnamed = [name for name in mesh_nodes if name not in known] if unknown_macs - names.keys() else []
@@ -147,24 +151,26 @@ def unflushed_boot_s(node: str, observations: Mapping[str, Observation]) -> floa
     is_known_from_before = any(
         station.connected_s is not None
         and station.mac.lower() in macs
-        and seen.answered_at_s - station.connected_s < booted_s - SLACK_S
-        for holder, seen in observations.items()
-        for station in seen.stations or ()
+        and observation.answered_at_s - station.connected_s < booted_s - SLACK_S
+        for holder, observation in observations.items()
+        for station in observation.stations or ()
         if holder != node
     )
     return booted_s if is_known_from_before else None
 
 
-def current_neighbors(seen: Observation, names: Mapping[str, str]) -> tuple[str, ...]:
+def current_neighbors(observation: Observation, names: Mapping[str, str]) -> tuple[str, ...]:
     """The names of the nodes that a node hears."""
-    return tuple(dict.fromkeys(names[mac] for mac in sorted(_heard_macs(seen)) if mac in names))
+    return tuple(dict.fromkeys(names[mac] for mac in sorted(_heard_macs(observation)) if mac in names))
 
 
-def _heard_macs(seen: Observation) -> frozenset[str]:
+def _heard_macs(observation: Observation) -> frozenset[str]:
     fresh = (
-        neighbour.mac.lower() for neighbour in seen.neighbours or () if neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS
+        neighbour.mac.lower()
+        for neighbour in observation.neighbours or ()
+        if neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS
     )
-    return frozenset((*fresh, *(station.mac.lower() for station in seen.stations or ())))
+    return frozenset((*fresh, *(station.mac.lower() for station in observation.stations or ())))
 
 
 def by_holder(entries: Iterable[StationEntry]) -> dict[str, tuple[StationEntry, ...]]:
@@ -182,8 +188,8 @@ def routed_through(node: str, observations: Mapping[str, Observation], base_macs
     own, bases = frozenset(mesh_macs(observations[node])), frozenset(mac.lower() for mac in base_macs)
     return frozenset(
         name
-        for name, seen in observations.items()
-        for entry in seen.originators or ()
+        for name, observation in observations.items()
+        for entry in observation.originators or ()
         if name != node and entry.best and entry.mac.lower() in bases and entry.next_hop.lower() in own
     )
 

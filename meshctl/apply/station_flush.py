@@ -250,7 +250,9 @@ class StationFlush:
         run_context, ctx = self.ctx.run, self.ctx
         holders = by_holder(entries_of(self.node, run_context.observations, radios))
         observed_macs = {
-            mac: name for name, seen in run_context.observations.items() for mac in radio_macs(seen, EVERY_RADIO)
+            mac: name
+            for name, observation in run_context.observations.items()
+            for mac in radio_macs(observation, EVERY_RADIO)
         }
         names = {**run_context.current_mac_owners(), **observed_macs}
         mesh_nodes = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
@@ -259,7 +261,11 @@ class StationFlush:
             *(current_neighbors(now, names) if now else ()),
         )
         # the radio's MAC may have changed: use all that are known
-        own = [radio_macs(seen, radios) for seen in (run_context.observations.get(self.node), now) if seen is not None]
+        own = [
+            radio_macs(observation, radios)
+            for observation in (run_context.observations.get(self.node), now)
+            if observation is not None
+        ]
         macs = tuple(dict.fromkeys(mac for some in own for mac in some))
         for name in others:
             if name != self.node and name in run_context.fleet.nodes:

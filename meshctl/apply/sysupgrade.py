@@ -132,8 +132,8 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
         try:
             connection = ctx.run.connections.open(ctx.node)
             try:
-                seen = observe(connection, extra_paths=[MARKER_PATH])
-                upgrade = None if has_booted(ctx.before, seen, marker) else openwrt.upgrade_state(connection)
+                observation = observe(connection, extra_paths=[MARKER_PATH])
+                upgrade = None if has_booted(ctx.before, observation, marker) else openwrt.upgrade_state(connection)
             finally:
                 connection.close()
         except NodeError as error:
@@ -141,10 +141,10 @@ def _await_return(ctx: NodeContext, marker: str, listener: ChangeListener) -> Ou
             # nothing drops logins silently while it is written or boots, and then all of its radios have restarted
             listener.unreachable(is_login_due=True)
         else:
-            ctx.run.record(ctx.name, seen)
+            ctx.run.record(ctx.name, observation)
             if upgrade is None:
-                listener.ended(seen, rebooted=True)
-                return verdict(ctx.name, ctx.node.hardware, seen, marker)
+                listener.ended(observation, rebooted=True)
+                return verdict(ctx.name, ctx.node.hardware, observation, marker)
             if (why := why_not_flashed(*upgrade, after_s=since_start.elapsed_s)) is not None:
                 return Outcome(ctx.name, Result.FAILED, f"{why}; it runs the previous firmware")
             last_error = STILL_UPGRADING
@@ -178,31 +178,31 @@ def why_not_flashed(upgrade: openwrt.Upgrade, output: str, *, after_s: float) ->
     return None
 
 
-def has_booted(before: Observation, seen: Observation, marker: str) -> bool:
+def has_booted(before: Observation, observation: Observation, marker: str) -> bool:
     """Whether the node has booted since sysupgrade began. Its marker proves that by itself: nothing but a boot unpacks
     the archive. Otherwise another boot id does, if both are known: a node that is going down may not report its own."""
-    if _has_marker(seen, marker):
+    if _has_marker(observation, marker):
         return True
-    return None not in (before.boot_id, seen.boot_id) and seen.boot_id != before.boot_id
+    return None not in (before.boot_id, observation.boot_id) and observation.boot_id != before.boot_id
 
 
-def verdict(name: str, hardware: HardwareProfile, seen: Observation, marker: str) -> Outcome:
+def verdict(name: str, hardware: HardwareProfile, observation: Observation, marker: str) -> Outcome:
     """The outcome of a node that came back: revision, board and marker must match. Neither a boot nor the marker alone
     counts: a board with two slots may unpack the archive and fall back to the previous firmware."""
-    running = seen.release.revision if seen.release else "unknown"
-    board = seen.board.board_name if seen.board else "unknown"
+    running = observation.release.revision if observation.release else "unknown"
+    board = observation.board.board_name if observation.board else "unknown"
     desired = hardware.firmware.revision
     problems = [
         "" if is_revision(running, desired) else f"it runs {running}, not {desired}",
         "" if board == hardware.board else f"its board is {board}, not {hardware.board}",
-        "" if _has_marker(seen, marker) else "its configuration is not the flashed one",
+        "" if _has_marker(observation, marker) else "its configuration is not the flashed one",
     ]
     problem_text = "; ".join(problem for problem in problems if problem)
     if problem_text:
         return Outcome(name, Result.FAILED, f"it came back, but {problem_text}")
-    return Outcome(name, Result.DONE, facts={"revision": running, "boot_id": seen.boot_id or ""})
+    return Outcome(name, Result.DONE, facts={"revision": running, "boot_id": observation.boot_id or ""})
 
 
-def _has_marker(seen: Observation, marker: str) -> bool:
-    info = seen.files.get(MARKER_PATH)
+def _has_marker(observation: Observation, marker: str) -> bool:
+    info = observation.files.get(MARKER_PATH)
     return info is not None and (info.text or "").strip() == marker

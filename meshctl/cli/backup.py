@@ -84,11 +84,11 @@ def backup(
 
         def work(name: str) -> Outcome:
             with opened.access.borrow(selected[name]) as connection:
-                seen = observe_cleared(connection, (), opened.interrupt)
-                data = fetch(connection, name, seen)
-            path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(seen.answered_at_s))}.tgz"
+                observation = observe_cleared(connection, (), opened.interrupt)
+                data = fetch(connection, name, observation)
+            path = out / f"{name}-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(observation.answered_at_s))}.tgz"
             _write_private(path, data)
-            opened.journal.remember(opened.fleet.name, name, facts_of(seen), seen.answered_at_s)
+            opened.journal.remember(opened.fleet.name, name, facts_of(observation), observation.answered_at_s)
             return Outcome(name, Result.DONE, str(path))
 
         with (
@@ -157,10 +157,10 @@ def restore(
 def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) -> None:
     """Print what a restore would change. Raises PlanRefused as the restore would."""
     with opened.access.borrow(node) as connection:
-        seen = observe_cleared(connection, (), opened.interrupt)
-        _require_restorable(opened, node, saved, seen)
-        paths = differing_files(saved, seen, connection)
-    missing = uninstalled_packages(saved, seen)
+        observation = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, observation)
+        paths = differing_files(saved, observation, connection)
+    missing = uninstalled_packages(saved, observation)
     if as_json:
         report = {"node": node.name, "files": paths, "uninstalled_packages": missing, "disabled": saved.disabled}
         echo_json(json.dumps(report, indent=1))
@@ -172,11 +172,11 @@ def _show_restore(opened: Session, node: Node, saved: Backup, *, as_json: bool) 
         echo(f"  package {package} is in the backup but no longer installed")
 
 
-def _require_restorable(opened: Session, node: Node, saved: Backup, seen: Observation) -> None:
+def _require_restorable(opened: Session, node: Node, saved: Backup, observation: Observation) -> None:
     """Raises PlanRefused for a backup of another device, or one that would lock us out or leave the mesh."""
-    if problem := incompatibility(saved, node.name, seen):
+    if problem := incompatibility(saved, node.name, observation):
         raise PlanRefused(problem)
-    if problem := departure(saved, node.name, seen):
+    if problem := departure(saved, node.name, observation):
         raise PlanRefused(problem, hint=_TO_ANOTHER_CELL)
     lockout = lockout_by(saved, node, opened.access.own_keys(node))
     if lockout is not None:
@@ -199,10 +199,10 @@ def _restore_node(opened: Session, journaled: JournaledRun, node: Node, saved: B
     flushes = StationFlushes()
     connection = opened.access.open(node)
     try:
-        seen = observe_cleared(connection, (), opened.interrupt)
-        _require_restorable(opened, node, saved, seen)
-        ctx = _context(opened, journaled, node, seen, flushes)
-        for package in uninstalled_packages(saved, seen):
+        observation = observe_cleared(connection, (), opened.interrupt)
+        _require_restorable(opened, node, saved, observation)
+        ctx = _context(opened, journaled, node, observation, flushes)
+        for package in uninstalled_packages(saved, observation):
             ctx.run.note(f"package {package} is in the backup but no longer installed", node.name)
         if saved.disabled:
             ctx.run.note(f"services disabled in the backup, left unchanged: {', '.join(saved.disabled)}", node.name)
@@ -215,9 +215,9 @@ def _restore_node(opened: Session, journaled: JournaledRun, node: Node, saved: B
 
 
 def _context(
-    opened: Session, journaled: JournaledRun, node: Node, seen: Observation, flushes: StationFlushes
+    opened: Session, journaled: JournaledRun, node: Node, observation: Observation, flushes: StationFlushes
 ) -> NodeContext:
     """The context of a node to be restored, once its neighbors were observed."""
-    shared = run_context(opened, journaled, flushes, {node.name: seen})
+    shared = run_context(opened, journaled, flushes, {node.name: observation})
     plan = NodePlan(node.name, Verdict.CHANGE, effects=(Effect("everything", Cut.MESH, "restored"),))
-    return NodeContext(shared, node, plan, opened.renderer.desired(node, seen), seen, Expectation())
+    return NodeContext(shared, node, plan, opened.renderer.desired(node, observation), observation, Expectation())

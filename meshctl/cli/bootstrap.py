@@ -337,7 +337,7 @@ def _record_identity(
 ) -> Changes:
     """Write the new identity to the inventory. Raises InputError with the edits to make by hand if that fails."""
     found = successor.discovered.found[node.name]
-    mine, theirs = identity_edits(node, spare, found.seen)
+    mine, theirs = identity_edits(node, spare, found.observation)
     if dry_run:
         return _identity_changes(inventory, node, spare, found, mine, theirs)
     opened.trust.replace(node.name, found.key)

@@ -187,7 +187,7 @@ def import_device(
     from meshctl.cli.device_login import read_device
 
     password = Secret(getpass.getpass(f"password on {device}: ")) if ask_password else None
-    seen, host_key = read_device(
+    observation, host_key = read_device(
         device,
         key_files=tuple(key or ()),
         lab=lab,
@@ -197,7 +197,7 @@ def import_device(
         paths=(MARKER,),
     )
     with_key = replace(target, options=replace(target.options, host_key=host_key))
-    _import(with_key, observed_device(seen), device)
+    _import(with_key, observed_device(observation), device)
 
 
 @with_options("target", _import_target, _OPTIONS)

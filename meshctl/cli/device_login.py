@@ -79,11 +79,11 @@ def read_device(
 
     connection = _confirmed(open_connection, policy)
     try:
-        seen = observe(connection, extra_paths=paths)
+        observation = observe(connection, extra_paths=paths)
     finally:
         connection.close()
     assert policy.key is not None
-    return seen, policy.key.text
+    return observation, policy.key.text
 
 
 def _confirmed(open_connection: Callable[[], SshConnection], policy: ExpectedKey) -> SshConnection:

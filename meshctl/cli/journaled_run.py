@@ -101,7 +101,7 @@ def run_context(
     opened: Session,
     run: JournaledRun,
     flushes: StationFlushes,
-    seen: Mapping[str, Observation],
+    before: Mapping[str, Observation],
     *,
     observed: Mapping[str, Observation] = MappingProxyType({}),
     rate_bytes_per_s: float | None = None,
@@ -115,7 +115,7 @@ def run_context(
 
     fleet, known = opened.fleet, opened.journal.last_known(opened.fleet.name)
     observations = observe_neighbors(
-        opened.access, fleet, seen, known, observations=observed, interrupt=opened.interrupt
+        opened.access, fleet, before, known, observations=observed, interrupt=opened.interrupt
     )
     return RunContext(
         fleet,

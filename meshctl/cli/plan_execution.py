@@ -232,14 +232,14 @@ def execute_plan(
 def execute_direct(opened: Session, run: JournaledRun, prepared: Prepared, *, rate: float | None) -> dict[str, Outcome]:
     """Execute a plan whose nodes this process changes itself; `rate` is the upload limit per node in kB/s."""
     assign_slots(prepared, opened.access)
-    seen, flushes = prepared.observed.observations, StationFlushes()
+    observations, flushes = prepared.observed.observations, StationFlushes()
     unflushed = unflushed_since(prepared, opened.journal)
     context = run_context(
         opened,
         run,
         flushes,
-        {name: seen[name] for name in unflushed},
-        observed={**seen, **prepared.neighbor_observations},
+        {name: observations[name] for name in unflushed},
+        observed={**observations, **prepared.neighbor_observations},
         rate_bytes_per_s=None if rate is None else rate * 1000,
     )
     return execute(prepared, context, flushes, unflushed)

@@ -47,9 +47,9 @@ def with_sent_states(opened: Session) -> Session:
 
 def replaced_by(prepared: Prepared) -> dict[str, Any]:
     """Node -> what the plan replaces on it, as JSON."""
-    seen, desired = prepared.observed.observations, prepared.desired
+    observations, desired = prepared.observed.observations, prepared.desired
     return {
-        plan.node: before_state(plan, desired[plan.node], seen[plan.node]).to_json()
+        plan.node: before_state(plan, desired[plan.node], observations[plan.node]).to_json()
         for plan in prepared.plan.of(Verdict.CHANGE)
     }
 

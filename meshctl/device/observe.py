@@ -272,18 +272,18 @@ def _mesh(
     for name in names:
         as_text = reader.status(f"batctl.originators {name}") is not None
         if as_text:
-            seen = reader.read(f"batctl.originators {name}", batctl.parse_mesh_header)
+            header = reader.read(f"batctl.originators {name}", batctl.parse_mesh_header)
             near = reader.read(f"batctl.neighbors {name}", batctl.parse_neighbours_text)
             far = reader.read(f"batctl.originators {name}", batctl.parse_originators_text)
             hard.append(reader.read(f"batctl.interface {name}", batctl.parse_interfaces_text))
         else:
-            seen = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
+            header = reader.read(f"batctl.mesh_json {name}", batctl.parse_mesh_json)
             near = reader.read(f"batctl.neighbors_json {name}", lambda text: batctl.parse_neighbours_json(text, known))
             far = reader.read(
                 f"batctl.originators_json {name}", lambda text: batctl.parse_originators_json(text, known)
             )
             hard.append(reader.read(f"batctl.hardifs_json {name}", lambda text: batctl.parse_hardifs_json(text, known)))
-        info = info or seen
+        info = info or header
         neighbours = (neighbours or []) + list(near) if near is not None else neighbours
         originators = (originators or []) + list(far) if far is not None else originators
         tables[name] = _table_sizes(

@@ -64,8 +64,8 @@ def measure_uptime(
         boot_id = parse_boot_id(lines[1]) if len(lines) > 1 else None
         if uptime is None or boot_id is None:
             raise CommandFailed(f"{connection.endpoint.label}: no uptime or boot id in {lines!r}", exit_status=0)
-        seen = UptimeSample(boot_id, uptime, (asked + answered) / 2, (answered - asked) / 2)
-        best = seen if best is None or seen.error_s < best.error_s else best
+        sample = UptimeSample(boot_id, uptime, (asked + answered) / 2, (answered - asked) / 2)
+        best = sample if best is None or sample.error_s < best.error_s else best
     assert best is not None
     return best
 

@@ -198,9 +198,9 @@ class SqliteFile:
         """Wait until another process has written, or the time is over; whether one has."""
         deadline = time.monotonic() + timeout_s
         while True:
-            ((seen,),) = self.read("PRAGMA data_version", ())
-            if seen != self._data_version:
-                self._data_version = seen
+            ((data_version,),) = self.read("PRAGMA data_version", ())
+            if data_version != self._data_version:
+                self._data_version = data_version
                 return True
             if (left := deadline - time.monotonic()) <= 0:
                 return False

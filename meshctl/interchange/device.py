@@ -69,16 +69,20 @@ class ExistingDevice:
         return next((link for link in self.links if link.ifname in names), None)
 
 
-def observed_device(seen: Observation) -> ExistingDevice:
+def observed_device(observation: Observation) -> ExistingDevice:
     """The device of an observation that includes the file MARKER.
 
     Raises InputError if it reported no release, board or configuration, InvalidInput if its network, its
     radios or its system are not UCI.
     """
-    if seen.release is None or seen.board is None or seen.uci is None:
+    if observation.release is None or observation.board is None or observation.uci is None:
         missing = [
             word
-            for word, fact in (("release", seen.release), ("board", seen.board), ("/etc/config", seen.uci))
+            for word, fact in (
+                ("release", observation.release),
+                ("board", observation.board),
+                ("/etc/config", observation.uci),
+            )
             if fact is None
         ]
         raise InputError(
@@ -86,23 +90,23 @@ def observed_device(seen: Observation) -> ExistingDevice:
         )
     packages = {}
     unreadable: dict[str, tuple[Diagnostic, ...]] = {}
-    for name, text in seen.uci.items():
+    for name, text in observation.uci.items():
         try:
             packages[name] = parse(text, f"/etc/config/{name}", name=name)
         except InvalidInput as reason:
             unreadable[name] = reason.diagnostics
-    marker = seen.files.get(MARKER)
+    marker = observation.files.get(MARKER)
     device = ExistingDevice(
         packages=packages,
-        release=release_of(seen.release.version),
-        board=seen.board.board_name,
-        target=seen.release.target,
-        lan_ports=seen.board.lan_ports,
-        switch_vlans=seen.board.switch_vlans,
-        label_mac=seen.board.label_mac.lower(),
-        memory_mib=None if seen.memory is None else _memory_mib(seen.memory.total),
-        authorized_keys=seen.authorized_keys or (),
-        links=seen.links or (),
+        release=release_of(observation.release.version),
+        board=observation.board.board_name,
+        target=observation.release.target,
+        lan_ports=observation.board.lan_ports,
+        switch_vlans=observation.board.switch_vlans,
+        label_mac=observation.board.label_mac.lower(),
+        memory_mib=None if observation.memory is None else _memory_mib(observation.memory.total),
+        authorized_keys=observation.authorized_keys or (),
+        links=observation.links or (),
         marker=MappingProxyType(parse_marker("" if marker is None else marker.text or "")),
         unreadable=MappingProxyType(unreadable),
     )

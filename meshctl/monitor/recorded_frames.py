@@ -85,12 +85,12 @@ def _frame(
 
 def _unrecorded(name: str, documents: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """The state of a robot without a recording at that time, as the others had it: it is not silent."""
-    seen = [peer for document in documents.values() for peer in document["peers"] if peer["name"] == name]
-    if not seen:
+    peers = [peer for document in documents.values() for peer in document["peers"] if peer["name"] == name]
+    if not peers:
         return {"health": "unknown", "answers": None}
-    ages_s = [age_s for peer in seen if (age_s := number_of(peer.get("heard_ago_s"))) is not None]
+    ages_s = [age_s for peer in peers if (age_s := number_of(peer.get("heard_ago_s"))) is not None]
     age = {"age_s": min(ages_s)} if ages_s else {}
-    if any(peer["online"] for peer in seen):
+    if any(peer["online"] for peer in peers):
         return {"health": "ok", "answers": None, **age}
     return {"health": "unreachable", "answers": False, "silent_because": "offline for all that recorded", **age}
 

@@ -166,19 +166,19 @@ class _Topics:
             self._last.setdefault(topic, {"priority": number_of(entry.get("priority"))})[key] = time_s
 
     def at(self, time_s: float) -> list[dict[str, Any]]:
-        def ago_s(seen: Mapping[str, Any], key: str) -> float | None:
-            return round(time_s - seen[key], 3) if key in seen else None
+        def ago_s(record: Mapping[str, Any], key: str) -> float | None:
+            return round(time_s - record[key], 3) if key in record else None
 
         return [
             {
                 "name": name,
-                "priority": seen["priority"],
-                "sent_ago_s": ago_s(seen, "sent"),
-                "received_ago_s": ago_s(seen, "received"),
+                "priority": record["priority"],
+                "sent_ago_s": ago_s(record, "sent"),
+                "received_ago_s": ago_s(record, "received"),
                 "limit_s": None,
                 "trouble": None,
             }
-            for name, seen in sorted(self._last.items(), key=lambda item: (item[1]["priority"] or 0, item[0]))
+            for name, record in sorted(self._last.items(), key=lambda item: (item[1]["priority"] or 0, item[0]))
         ]
 
 

@@ -25,7 +25,7 @@ from meshctl.model import Fleet, Node, NodeState
 from meshctl.model.ip import IpAddress
 from meshctl.nodes.backoff import Backoff
 from meshctl.nodes.connections import ConnectionPool
-from meshctl.plan.seen import management_address
+from meshctl.plan.observed_files import management_address
 from meshctl.topology import Graph, Report, mesh_macs, observed_graph, report_of, with_alternates
 
 # How long a node may take to roll back a change of a dead process: its files, and a reload.
@@ -48,7 +48,7 @@ class FleetObservation:
 
 def reports_of(observations: Mapping[str, Observation]) -> dict[str, Report]:
     """The report of each node."""
-    return {name: report_of(name, seen) for name, seen in observations.items()}
+    return {name: report_of(name, observation) for name, observation in observations.items()}
 
 
 def fleet_graph(fleet: Fleet, known: Mapping[str, LastKnown], reports: Mapping[str, Report]) -> Graph:
@@ -111,13 +111,13 @@ def collect(
     def observe_one(name: str) -> Outcome:
         try:
             with connections.slots.use(name), connections.borrow(wanted[name]) as connection:
-                seen = observe_cleared(connection, tuple(paths(wanted[name])), signal)
+                observation = observe_cleared(connection, tuple(paths(wanted[name])), signal)
         except NodeError as error:
             with lock:
                 errors[name] = error
             raise
         with lock:
-            found[name] = seen
+            found[name] = observation
         return Outcome(name, Result.DONE)
 
     outcomes = run(wanted, observe_one, parallel=parallel, interrupt=signal, observer=observer)
@@ -132,19 +132,19 @@ def collect(
 
 def observe_cleared(connection: SshConnection, paths: tuple[str, ...], interrupt: Interrupt) -> Observation:
     """One observation, after clearing the lock and change of a dead meshctl process of this machine."""
-    seen = observe(connection, extra_paths=paths)
-    change = seen.change
+    observation = observe(connection, extra_paths=paths)
+    change = observation.change
     if change is None or not (is_dead(change.lock_owner) or (is_dead(change.owner) and change.state != "idle")):
-        return seen
+        return observation
     backoff = Backoff(CLEARING_S, interrupt)
     while not backoff.is_over and not interrupt.leaving:
         _clear(connection, change)
-        seen = observe(connection, extra_paths=paths)
-        change = seen.change
+        observation = observe(connection, extra_paths=paths)
+        change = observation.change
         if change is None or not is_dead(change.owner) or change.state in ("idle", "staged"):
             break
         backoff.pause()
-    return seen
+    return observation
 
 
 def _clear(connection: SshConnection, change: ChangeStatus) -> None:
@@ -157,18 +157,18 @@ def _clear(connection: SshConnection, change: ChangeStatus) -> None:
             deadman.unlock(connection, change.lock_owner)
 
 
-def facts_of(seen: Observation) -> dict[str, str]:
+def facts_of(observation: Observation) -> dict[str, str]:
     """The facts of a node that the journal stores: how to find it again, and its last known state."""
-    address = management_address((seen.uci or {}).get("network"))
+    address = management_address((observation.uci or {}).get("network"))
     facts = {
         "address": "" if address is None else str(address),
-        "macs": " ".join(mesh_macs(seen)),
-        "boot_id": seen.boot_id or "",
-        "uptime_s": "" if seen.uptime_s is None else f"{seen.uptime_s:.0f}",
-        "board": seen.board.board_name if seen.board else "",
-        "version": seen.release.version if seen.release else "",
-        "revision": seen.release.revision if seen.release else "",
-        "cell": "" if seen.links is None else "some" if mesh_macs(seen) else "none",
-        "neighbours": " ".join(neighbour.mac for neighbour in seen.neighbours or ()),
+        "macs": " ".join(mesh_macs(observation)),
+        "boot_id": observation.boot_id or "",
+        "uptime_s": "" if observation.uptime_s is None else f"{observation.uptime_s:.0f}",
+        "board": observation.board.board_name if observation.board else "",
+        "version": observation.release.version if observation.release else "",
+        "revision": observation.release.revision if observation.release else "",
+        "cell": "" if observation.links is None else "some" if mesh_macs(observation) else "none",
+        "neighbours": " ".join(neighbour.mac for neighbour in observation.neighbours or ()),
     }
     return {key: value for key, value in facts.items() if value}

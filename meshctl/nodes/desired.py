@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from meshctl.device.observation import Observation
 from meshctl.model import Fleet, Node, Secret, SecretRef
 from meshctl.plan import DesiredState
+from meshctl.plan.observed_files import packages_seen
 from meshctl.plan.packages import Needs
-from meshctl.plan.seen import packages_seen
 from meshctl.render import DeviceFacts, Rendered, Templates, render, with_switch
 from meshctl.resolve import Intent, package_files, package_needs, resolve
 
@@ -30,10 +30,14 @@ class Renderer:
     def of(cls, fleet: Fleet, secrets: Callable[[SecretRef], Secret]) -> Renderer:
         return cls(fleet, secrets, Templates.of(fleet))
 
-    def desired(self, node: Node, seen: Observation | None = None) -> DesiredState:
+    def desired(self, node: Node, observation: Observation | None = None) -> DesiredState:
         """One node's files and packages. Raises InvalidInput for values that cannot be rendered."""
         intent, plain = self._rendered(node)
-        rendered = plain if seen is None else render(intent, self.templates, device_facts(node, seen), plain=plain)
+        rendered = (
+            plain
+            if observation is None
+            else render(intent, self.templates, device_facts(node, observation), plain=plain)
+        )
         return DesiredState(
             node,
             rendered.files,
@@ -51,17 +55,17 @@ class Renderer:
         return known[1], known[2]
 
 
-def device_facts(node: Node, seen: Observation | None) -> DeviceFacts:
+def device_facts(node: Node, observation: Observation | None) -> DeviceFacts:
     """The facts to keep from the device (`meshctl.render.facts`).
 
     Where its ports are VLANs of a switch (eth0.1) that its configuration no longer defines, the board's are used.
     """
-    if seen is None:
+    if observation is None:
         return DeviceFacts()
     paths = ("etc/config/network", "etc/config/system", "etc/config/wireless")
-    packages = {name: package for name, package in packages_seen(paths, seen).items() if package is not None}
-    if "network" in packages and seen.board is not None and any("." in port for port in node.lan_ports):
-        packages["network"] = with_switch(packages["network"], seen.board.switch_vlans)
+    packages = {name: package for name, package in packages_seen(paths, observation).items() if package is not None}
+    if "network" in packages and observation.board is not None and any("." in port for port in node.lan_ports):
+        packages["network"] = with_switch(packages["network"], observation.board.switch_vlans)
     sections = packages["system"].of_type("system") if "system" in packages else ()
     return DeviceFacts(next((text for section in sections if (text := section.get("compat_version"))), ""), packages)
 

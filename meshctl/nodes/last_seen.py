@@ -91,8 +91,8 @@ def last_seen_of(
 ) -> dict[str, LastSeen]:
     """Last known facts about each of `names`, from the other nodes' observations and the journal."""
     missing = tuple(names)
-    others = {name: seen for name, seen in observations.items() if name not in missing}
-    reports = [report_of(name, seen) for name, seen in others.items()]
+    others = {name: observation for name, observation in observations.items() if name not in missing}
+    reports = [report_of(name, observation) for name, observation in others.items()]
     macs = known_macs(fleet, known)
     heard = seen_by(reports, macs, fresh_ms=REMEMBERED_MS)
     routed = _routed(others, names_by_mac(reports, macs))
@@ -102,8 +102,8 @@ def last_seen_of(
 def _routed(observations: Mapping[str, Observation], names: Mapping[str, str]) -> dict[str, tuple[Sighting, ...]]:
     """Node -> the nodes with an originator entry of it, latest first."""
     latest: dict[str, dict[str, int]] = {}
-    for by, seen in observations.items():
-        for entry in seen.originators or ():
+    for by, observation in observations.items():
+        for entry in observation.originators or ():
             name = names.get(entry.mac.lower())
             if name is not None and name != by and entry.last_seen_ms <= REMEMBERED_MS:
                 ages = latest.setdefault(name, {})
@@ -132,10 +132,10 @@ def query_neighbors(
         for name in dict.fromkeys((*neighbors, *fleet.bases_of(missing), *before.observations))
         if name in fleet.nodes and name not in missing
     ]
-    seen = collect(
+    observed = collect(
         connections,
         [fleet.nodes[name] for name in witnesses[:MAX_QUERIED]],
         parallel=nodes_in_work(fleet.apply.parallel),
         interrupt=interrupt,
     )
-    return last_seen_of(fleet, missing, seen.observations, known)
+    return last_seen_of(fleet, missing, observed.observations, known)

@@ -20,7 +20,7 @@ _NAMES = {"adhoc": "ad-hoc mode", "mesh": "802.11s", "ap": "access point mode", 
 
 
 def lacking_abilities(
-    node: Node, seen: Observation, before: Package | None, desired: Package | None
+    node: Node, observation: Observation, before: Package | None, desired: Package | None
 ) -> tuple[str, ...]:
     """Requirements of the desired wireless configuration that the node's radios cannot meet: one text each.
 
@@ -31,7 +31,7 @@ def lacking_abilities(
     for iface, device in enabled_interfaces(desired):
         hardware = node.hardware.radio(device.name or "")
         path = (hardware.path if hardware is not None else "") or paths.get(device.name, "")
-        chip = next((known_chip for known_chip in seen.chips or () if path and known_chip.path == path), None)
+        chip = next((known_chip for known_chip in observation.chips or () if path and known_chip.path == path), None)
         if hardware is not None and chip is not None:
             found.update(dict.fromkeys(_lacking(chip, hardware.band, iface, device)))
     return tuple(found)

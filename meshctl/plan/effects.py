@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from meshctl.model import Release
+from meshctl.plan.observed_files import address_options, management_section, package_of
 from meshctl.plan.radios import RadioChange, radio_changes
-from meshctl.plan.seen import address_options, management_section, package_of
 from meshctl.plan.values import Cut, Effect
 from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import Package, Section

@@ -8,16 +8,16 @@ from meshctl.model import Node
 from meshctl.plan.values import FirmwareStep
 
 
-def firmware_step(node: Node, seen: Observation) -> FirmwareStep | None:
+def firmware_step(node: Node, observation: Observation) -> FirmwareStep | None:
     """The step to the inventory's revision; None when it is running, or the inventory names no image or revision."""
     wanted = node.hardware.firmware
-    running = seen.release.revision if seen.release else ""
+    running = observation.release.revision if observation.release else ""
     if not wanted.image or not wanted.revision or is_revision(running, wanted.revision):
         return None
     return FirmwareStep(wanted.image, wanted.sha256, running or "unknown", wanted.revision)
 
 
-def runs_release(node: Node, seen: Observation) -> bool:
+def runs_release(node: Node, observation: Observation) -> bool:
     """Whether the node runs the release series its configuration is rendered for."""
-    version = seen.release.version if seen.release else ""
+    version = observation.release.version if observation.release else ""
     return version == node.release.value or version.startswith((f"{node.release.value}.", f"{node.release.value}-"))

@@ -11,7 +11,7 @@ import re
 
 from meshctl.device.observation import Observation
 from meshctl.plan.cell import enabled_interfaces
-from meshctl.plan.seen import WIRELESS, packages_seen
+from meshctl.plan.observed_files import WIRELESS, packages_seen
 from meshctl.uci import Package
 
 # as the interfaces of meshes are named (`Node.mesh_interfaces`); others are not ours
@@ -25,10 +25,10 @@ def interface_names(wireless: Package | None) -> frozenset[str]:
     return frozenset(iface.get("ifname") for iface, _ in enabled_interfaces(wireless))
 
 
-def left_over(seen: Observation) -> tuple[str, ...]:
+def left_over(observation: Observation) -> tuple[str, ...]:
     """The names of mesh interfaces that exist, but are not enabled in /etc/config/wireless; none if that is unreadable,
     or if it has an enabled interface without a name, which could be any."""
-    wireless = packages_seen([WIRELESS], seen)["wireless"]
+    wireless = packages_seen([WIRELESS], observation)["wireless"]
     if wireless is None:
         return ()
     named = interface_names(wireless)
@@ -36,6 +36,6 @@ def left_over(seen: Observation) -> tuple[str, ...]:
         return ()
     return tuple(
         link.ifname
-        for link in seen.links or ()
+        for link in observation.links or ()
         if link.mode in _MESH_MODES and _OURS.fullmatch(link.ifname) and link.ifname not in named
     )

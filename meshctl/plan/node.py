@@ -20,9 +20,9 @@ from meshctl.plan.firmware import firmware_step
 from meshctl.plan.left_over import interface_names, left_over
 from meshctl.plan.lockout import lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
+from meshctl.plan.observed_files import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.packages import NO_NEEDS, Needs, other_versions, package_step
 from meshctl.plan.preconditions import failed_precondition
-from meshctl.plan.seen import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.values import Cut, Effect, FileChange, FirmwareStep, NodePlan, Verdict
 from meshctl.render import LAN_FILTER_PATH, LINKS_PATH, MARKER_PATH, RenderedFile
 from meshctl.resolve import wireless_scripts
@@ -50,7 +50,7 @@ class DesiredState:
 
 def node_plan(
     desired: DesiredState,
-    seen: Observation | None,
+    observation: Observation | None,
     fingerprints: Fingerprints,
     *,
     unreachable: str = "",
@@ -65,9 +65,9 @@ def node_plan(
         {file.path: f"{file.mode:o} " + file.content.decode("utf-8", "surrogateescape") for file in desired.files},
         desired.secrets,
     )
-    if seen is None:
+    if observation is None:
         return NodePlan(node.name, Verdict.AWAY, unreachable or "did not answer", meshes=node.meshes, wanted=target)
-    before = packages_seen(desired.paths, seen)
+    before = packages_seen(desired.paths, observation)
     after = {file.package.name: file.package for file in desired.files if file.package is not None}
     live = cells(before.get("wireless"), before.get("network"))
     old_secrets = (secret for package in before.values() if package is not None for secret in secrets_of(package))
@@ -81,19 +81,19 @@ def node_plan(
         departs=desired.departs,
         meshes=node.meshes,
         has_cell=bool(live),
-        is_meshed=is_meshed(seen, live),
-        observed=fingerprints.of(fingerprint_texts(desired.paths, seen), (*desired.secrets, *old_secrets)),
+        is_meshed=is_meshed(observation, live),
+        observed=fingerprints.of(fingerprint_texts(desired.paths, observation), (*desired.secrets, *old_secrets)),
         wanted=target,
     )
-    firmware = firmware_step(node, seen) if with_firmware else None
-    packages = package_step(desired.needs, seen, desired.package_files)
-    lacking = lacking_abilities(node, seen, before.get("wireless"), after.get("wireless"))
+    firmware = firmware_step(node, observation) if with_firmware else None
+    packages = package_step(desired.needs, observation, desired.package_files)
+    lacking = lacking_abilities(node, observation, before.get("wireless"), after.get("wireless"))
     problem = failed_precondition(
-        node, seen, before, owner=owner, is_flashed=firmware is not None, packages=packages, lacking=lacking
+        node, observation, before, owner=owner, is_flashed=firmware is not None, packages=packages, lacking=lacking
     )
     if problem is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=problem.reason, hint=problem.hint)
-    files = file_changes(desired.files, seen)
+    files = file_changes(desired.files, observation)
     contents = {file.path: file.content for file in desired.files} if files or firmware else {}
     locked_out = None if own_keys is None else lockout(node, contents, own_keys)
     if locked_out is None and contents:
@@ -102,7 +102,7 @@ def node_plan(
         return replace(basis, verdict=Verdict.REFUSED, reason=locked_out.reason, hint=locked_out.hint)
     node_effects = effects((change.path for change in files), before, after, node.release)
     wanted_on = interface_names(after.get("wireless"))
-    still_on = () if firmware is not None else tuple(name for name in left_over(seen) if name not in wanted_on)
+    still_on = () if firmware is not None else tuple(name for name in left_over(observation) if name not in wanted_on)
     if still_on:
         why = f"{', '.join(still_on)}: turned off by its configuration, but on the air: taken down"
         node_effects = (*node_effects, Effect("wifi", Cut.MESH, why))
@@ -123,13 +123,13 @@ def node_plan(
         left_over=still_on,
         effects=node_effects,
         notes=(
-            *seen.notes,
-            *_tagged_ports(node, seen, after.get("network")),
-            *_lacking_scripts(node, seen, basis, firmware),
+            *observation.notes,
+            *_tagged_ports(node, observation, after.get("network")),
+            *_lacking_scripts(node, observation, basis, firmware),
             *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
             *(f"{text}; the new firmware must include another driver" for text in lacking),
-            *_other_target(node, seen),
-            *(other_versions(seen, desired.package_files) if firmware is None else ()),
+            *_other_target(node, observation),
+            *(other_versions(observation, desired.package_files) if firmware is None else ()),
         ),
     )
 
@@ -143,11 +143,11 @@ def meshes_of(node: Node, radios: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(mesh for name, mesh in mesh_of.items() if name in names and mesh is not None))
 
 
-def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tuple[str, ...]:
+def _tagged_ports(node: Node, observation: Observation, network: Package | None) -> tuple[str, ...]:
     """Ports to a switch that accepts only tagged frames: the inventory names eth0, the board eth0.1."""
-    if network is None or seen.board is None or not any(network.of_type("switch_vlan")):
+    if network is None or observation.board is None or not any(network.of_type("switch_vlan")):
         return ()
-    parents = {port.partition(".")[0]: port for port in seen.board.lan_ports if "." in port}
+    parents = {port.partition(".")[0]: port for port in observation.board.lan_ports if "." in port}
     return tuple(
         f"{port} connects to a switch whose LAN is {parents[port]}: devices on its ports will be unreachable; "
         "correct lan_ports"
@@ -156,10 +156,12 @@ def _tagged_ports(node: Node, seen: Observation, network: Package | None) -> tup
     )
 
 
-def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: FirmwareStep | None) -> tuple[str, ...]:
+def _lacking_scripts(
+    node: Node, observation: Observation, basis: NodePlan, firmware: FirmwareStep | None
+) -> tuple[str, ...]:
     """A note if the package with the wireless scripts is missing. A node in its mesh has them, by whatever name."""
     package = wireless_scripts(node.release)
-    if package is None or firmware is not None or seen.packages is None or package in seen.packages:
+    if package is None or firmware is not None or observation.packages is None or package in observation.packages:
         return ()
     if basis.is_meshed or not node.meshes:
         return ()
@@ -169,10 +171,10 @@ def _lacking_scripts(node: Node, seen: Observation, basis: NodePlan, firmware: F
     )
 
 
-def _other_target(node: Node, seen: Observation) -> tuple[str, ...]:
+def _other_target(node: Node, observation: Observation) -> tuple[str, ...]:
     """A note if the device runs an image of another target. Releases rename targets, so a flash is not refused; the
     image's own check compares its boards (`sysupgrade`)."""
-    found = seen.release.target if seen.release else ""
+    found = observation.release.target if observation.release else ""
     if not found or not node.hardware.target or found == node.hardware.target:
         return ()
     return (
@@ -195,19 +197,19 @@ def _lasting_thresholds(
     )
 
 
-def file_changes(files: Sequence[RenderedFile], seen: Observation) -> tuple[FileChange, ...]:
+def file_changes(files: Sequence[RenderedFile], observation: Observation) -> tuple[FileChange, ...]:
     """The files that differ from the desired ones, each with a masked diff.
 
     UCI packages are compared as trees: quoting, comments and blank lines make no difference to OpenWrt.
     """
-    return tuple(change for file in files if (change := _file_change(file, seen)) is not None)
+    return tuple(change for file in files if (change := _file_change(file, observation)) is not None)
 
 
-def _file_change(file: RenderedFile, seen: Observation) -> FileChange | None:
-    live = text_of(file.path, seen)
+def _file_change(file: RenderedFile, observation: Observation) -> FileChange | None:
+    live = text_of(file.path, observation)
     if file.package is not None:
         return _package_change(file.path, file.package, live)
-    info = file_info(file.path, seen)
+    info = file_info(file.path, observation)
     if info is None:
         return FileChange(file.path, "added", _diff(file.path, "", file.masked))
     content = file.content.decode("utf-8", "surrogateescape")

@@ -38,9 +38,9 @@ def _parts(file: str) -> re.Match[str] | None:
     return _IPK.fullmatch(base) or _APK.fullmatch(base)
 
 
-def other_versions(seen: Observation, files: Iterable[str]) -> tuple[str, ...]:
+def other_versions(observation: Observation, files: Iterable[str]) -> tuple[str, ...]:
     """A note for each package file of another version than that which is installed: it is not installed."""
-    installed = seen.packages or {}
+    installed = observation.packages or {}
     return tuple(
         f"{match['name']} is installed as {version}, package_files has {match['version']}: only missing packages are "
         "installed; to replace it, flash an image that contains it"
@@ -51,23 +51,23 @@ def other_versions(seen: Observation, files: Iterable[str]) -> tuple[str, ...]:
     )
 
 
-def missing_packages(needs: Needs, seen: Observation) -> tuple[tuple[str, ...], ...]:
+def missing_packages(needs: Needs, observation: Observation) -> tuple[tuple[str, ...], ...]:
     """The groups of which no package is installed; empty when the installed packages are unknown."""
-    if seen.packages is None:
+    if observation.packages is None:
         return ()
-    return tuple(group for group in needs.any_of if not any(name in seen.packages for name in group))
+    return tuple(group for group in needs.any_of if not any(name in observation.packages for name in group))
 
 
-def package_step(needs: Needs, seen: Observation, files: Iterable[str]) -> PackageStep | None:
+def package_step(needs: Needs, observation: Observation, files: Iterable[str]) -> PackageStep | None:
     """The packages to install and remove, None when nothing is missing. All given files that are not installed are
     included, since they may be dependencies.
 
     A group that no file provides is in `install`, too: see `unavailable`.
     """
-    missing = missing_packages(needs, seen)
+    missing = missing_packages(needs, observation)
     if not missing:
         return None
-    installed = seen.packages or {}
+    installed = observation.packages or {}
     offered = {name: file for file in files if (name := package_name(file)) is not None}
     install = tuple(next((name for name in group if name in offered), group[0]) for group in missing)
     return PackageStep(

@@ -23,7 +23,7 @@ class FailedPrecondition:
 @dataclass(frozen=True, slots=True)
 class _Checked:
     node: Node
-    seen: Observation
+    observation: Observation
     uci: Mapping[str, Package | None]
     owner: str
     is_flashed: bool
@@ -33,7 +33,7 @@ class _Checked:
 
 def failed_precondition(
     node: Node,
-    seen: Observation,
+    observation: Observation,
     uci: Mapping[str, Package | None],
     *,
     owner: str,
@@ -43,12 +43,12 @@ def failed_precondition(
 ) -> FailedPrecondition | None:
     """The first precondition that this node fails, or None. `owner` is our name in the node's lock, `lacking` what its
     radios cannot do of what they get."""
-    case = _Checked(node, seen, uci, owner, is_flashed, packages, lacking)
+    case = _Checked(node, observation, uci, owner, is_flashed, packages, lacking)
     return next((found for check in _CHECKS if (found := check(case)) is not None), None)
 
 
 def _writable(case: _Checked) -> FailedPrecondition | None:
-    if not case.seen.root_read_only:
+    if not case.observation.root_read_only:
         return None
     return FailedPrecondition(
         "its root file system is read-only: it is in failsafe mode, or its flash has failed",
@@ -57,14 +57,14 @@ def _writable(case: _Checked) -> FailedPrecondition | None:
 
 
 def _observed(case: _Checked) -> FailedPrecondition | None:
-    if case.seen.uci is None or case.seen.board is None:
-        missing = "its configuration" if case.seen.uci is None else "its board"
-        return FailedPrecondition(f"cannot read {missing}", "; ".join(case.seen.notes))
+    if case.observation.uci is None or case.observation.board is None:
+        missing = "its configuration" if case.observation.uci is None else "its board"
+        return FailedPrecondition(f"cannot read {missing}", "; ".join(case.observation.notes))
     return None
 
 
 def _board(case: _Checked) -> FailedPrecondition | None:
-    found = case.seen.board.board_name if case.seen.board else ""
+    found = case.observation.board.board_name if case.observation.board else ""
     expected = case.node.hardware.board
     if found == expected:
         return None
@@ -75,9 +75,9 @@ def _board(case: _Checked) -> FailedPrecondition | None:
 
 
 def _release(case: _Checked) -> FailedPrecondition | None:
-    if case.is_flashed or runs_release(case.node, case.seen):
+    if case.is_flashed or runs_release(case.node, case.observation):
         return None
-    found = case.seen.release.version if case.seen.release else "an unknown release"
+    found = case.observation.release.version if case.observation.release else "an unknown release"
     return FailedPrecondition(
         f"its configuration is for OpenWrt {case.node.release}, it runs {found}",
         "set the firmware image and revision in the inventory to have it flashed, or correct the release",
@@ -108,7 +108,7 @@ def _radio_abilities(case: _Checked) -> FailedPrecondition | None:
 
 
 def _lan_ports(case: _Checked) -> FailedPrecondition | None:
-    known = case.seen.macs
+    known = case.observation.macs
     if not known:
         return None
     for port in case.node.lan_ports:
@@ -134,7 +134,7 @@ def _packages(case: _Checked) -> FailedPrecondition | None:
 
 
 def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
-    changes = case.seen.uci_changes
+    changes = case.observation.uci_changes
     if not changes:
         return None
     # masked as a whole: a secret may have several lines
@@ -146,7 +146,7 @@ def _foreign_changes(case: _Checked) -> FailedPrecondition | None:
 
 
 def _other_operator(case: _Checked) -> FailedPrecondition | None:
-    change = case.seen.change
+    change = case.observation.change
     if change is None:
         return None
     if change.lock_owner and change.lock_owner != case.owner:

@@ -155,15 +155,15 @@ def observed_restarts(before: Observation, now: Observation, seconds: float) -> 
     return EVERY_RADIO if recent.every else Radios(created | recent.ifnames)
 
 
-def started_within(seen: Observation, seconds: float) -> Radios:
+def started_within(observation: Observation, seconds: float) -> Radios:
     """The radios that must have started within the last `seconds`: all of their station entries are younger, or the
     node booted since. A radio without station entries, or with entries of unknown age, does not count.
     """
     # with slack for two clocks: a node that booted just before has restarted its radios as well
-    if seen.uptime_s is not None and seen.uptime_s < seconds + SLACK_S:
+    if observation.uptime_s is not None and observation.uptime_s < seconds + SLACK_S:
         return EVERY_RADIO
     known: dict[str, list[int | None]] = {}
-    for station in seen.stations or ():
+    for station in observation.stations or ():
         known.setdefault(station.ifname, []).append(station.connected_s)
     return Radios(
         frozenset(

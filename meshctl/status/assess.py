@@ -83,28 +83,28 @@ def assess(snapshot: Snapshot, nodes: Iterable[Node], now: float, robots: Iterab
             relays.setdefault(path.via, []).append(name)
     statuses = []
     for node in nodes:
-        seen = snapshot.observations.get(node.name)
-        if seen is None:
+        observation = snapshot.observations.get(node.name)
+        if observation is None:
             statuses.append(_unreachable_status(snapshot, node, sightings.get(node.name, ()), now))
             continue
         last = snapshot.known.get(node.name)
         everything = NodeAlarmInput(
             fleet=snapshot.fleet,
             node=node,
-            observation=seen,
+            observation=observation,
             plan=snapshot.plans.get(node.name),
             neighbors=neighbors_of(
                 node,
-                seen,
+                observation,
                 heard[node.name],
                 {other: snr[other].get(node.name) for other in heard[node.name] if other in snr},
             ),
-            radios=radios_of(node, seen, snapshot.previous.get(node.name)),
+            radios=radios_of(node, observation, snapshot.previous.get(node.name)),
             path=paths.get(node.name),
             is_path_known=entry_by_site.get(node.site, snapshot.entry) in paths,
             cuts_off=cuts.get(node.name, ()),
             relays=tuple(name for name in relays.get(node.name, ()) if name != node.name),
-            seconds_since_last_known=None if last is None else max(0.0, seen.answered_at_s - last.seen_s),
+            seconds_since_last_known=None if last is None else max(0.0, observation.answered_at_s - last.seen_s),
             own_lock=snapshot.own_lock,
         )
         statuses.append(_reachable_status(everything, now))
@@ -198,14 +198,14 @@ def _unreachable_status(snapshot: Snapshot, node: Node, heard_by: tuple[Sighting
     )
 
 
-def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
-    observed, plan = seen.observation, seen.plan
+def _reachable_status(facts: NodeAlarmInput, now: float) -> NodeStatus:
+    observed, plan = facts.observation, facts.plan
     memory = observed.memory
-    found = alarms(seen)
+    found = alarms(facts)
     lan = next((bridge.ports for bridge in observed.bridges or () if bridge.name == "br-lan"), None)
     mesh_links = [link for link in observed.links or () if link.mode.lower() in MESH_MODES]
     return NodeStatus(
-        node=seen.node,
+        node=facts.node,
         health=health_of(found),
         alarms=found,
         age_s=max(0.0, now - observed.answered_at_s),
@@ -222,15 +222,15 @@ def _reachable_status(seen: NodeAlarmInput, now: float) -> NodeStatus:
         tx_power_dbm=next((link.tx_power_dbm for link in mesh_links if link.tx_power_dbm is not None), None),
         lan_ports=lan,
         lan_filter=observed.lan_filter,
-        radios=seen.radios,
+        radios=facts.radios,
         temperature_c=temperature_of(observed),
         mesh_statistics=observed.mesh_statistics,
         mesh_tables=observed.mesh_tables,
-        neighbors=seen.neighbors,
-        is_path_known=seen.is_path_known,
-        hops=seen.path.hops if seen.path else None,
-        quality=seen.path.quality if seen.path else None,
-        via=seen.path.via if seen.path and seen.path.hops else "",
-        is_cut_vertex=bool(seen.cuts_off),
-        relays=seen.relays,
+        neighbors=facts.neighbors,
+        is_path_known=facts.is_path_known,
+        hops=facts.path.hops if facts.path else None,
+        quality=facts.path.quality if facts.path else None,
+        via=facts.path.via if facts.path and facts.path.hops else "",
+        is_cut_vertex=bool(facts.cuts_off),
+        relays=facts.relays,
     )

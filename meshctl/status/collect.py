@@ -109,7 +109,9 @@ class Collector:
             of_site = answers.pop(("site", site))
             assert isinstance(of_site, Mapping)
             answers |= {("node", name): of_site[name] for name in at_sites[site]}
-        observations = {key[1]: seen for key, seen in answers.items() if isinstance(seen, Observation)}
+        observations = {
+            key[1]: observation for key, observation in answers.items() if isinstance(observation, Observation)
+        }
         facts = {key[1]: robot for key, robot in answers.items() if isinstance(robot, RobotFacts)}
         no_answer: dict[str, dict[str, NoAnswer]] = {"node": {}, "robot": {}}
         for (kind, name), answer in answers.items():
@@ -160,11 +162,11 @@ class Collector:
         return {device: count for device, count in total.items() if not device.startswith(PIN_PREFIX)}
 
     def _note(self, observations: Mapping[str, Observation]) -> None:
-        for name, seen in observations.items():
+        for name, observation in observations.items():
             last = self._observed.get(name)
             # what a site's worker said may stand for a while
-            if last is not seen:
-                self._observed[name] = seen
+            if last is not observation:
+                self._observed[name] = observation
                 if last is not None:
                     self._previous[name] = last
 
@@ -264,12 +266,12 @@ class Collector:
         plans: dict[str, NodePlan] = {}
         unrendered: dict[str, str] = {}
         for node in nodes:
-            seen, desired = observations.get(node.name), self._desired_state(node)
+            observation, desired = observations.get(node.name), self._desired_state(node)
             if isinstance(desired, str):
                 unrendered[node.name] = desired
-            elif seen is not None:
-                exact = self.renderer.desired(node, seen)
-                plans[node.name] = node_plan(exact, seen, fingerprints, owner=self.owner)
+            elif observation is not None:
+                exact = self.renderer.desired(node, observation)
+                plans[node.name] = node_plan(exact, observation, fingerprints, owner=self.owner)
         return plans, unrendered
 
     def _collect_robot(self, robot: str) -> RobotFacts:

@@ -69,22 +69,22 @@ class NodeAlarmInput:
         return self.node.state is NodeState.DEPLOYED and any(n.state is NodeState.DEPLOYED for n in others)
 
 
-def alarms(seen: NodeAlarmInput) -> tuple[Alarm, ...]:
+def alarms(facts: NodeAlarmInput) -> tuple[Alarm, ...]:
     """All alarms of a node, most severe first."""
-    found = [alarm for concern in _CONCERNS for alarm in concern(seen)]
+    found = [alarm for concern in _CONCERNS for alarm in concern(facts)]
     return tuple(sorted(found, key=lambda alarm: -alarm.level))
 
 
-def _identity(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    board = seen.observation.board
-    if board is not None and board.board_name and board.board_name != seen.node.hardware.board:
-        text = f"expected board {seen.node.hardware.board}, found {board.board_name}"
-        hint = f"check the device's label, or fix nodes.{seen.node.name} in the inventory"
+def _identity(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    board = facts.observation.board
+    if board is not None and board.board_name and board.board_name != facts.node.hardware.board:
+        text = f"expected board {facts.node.hardware.board}, found {board.board_name}"
+        hint = f"check the device's label, or fix nodes.{facts.node.name} in the inventory"
         yield Alarm(Level.ERROR, "board", text, hint)
 
 
-def _drift(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    plan, name = seen.plan, seen.node.name
+def _drift(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    plan, name = facts.plan, facts.node.name
     if plan is None:
         return
     if plan.verdict is Verdict.REFUSED:
@@ -101,23 +101,23 @@ def _drift(seen: NodeAlarmInput) -> Iterator[Alarm]:
         yield Alarm(Level.WARNING, "drift", f"configuration differs: {names}", hint)
 
 
-def _left_over(seen: NodeAlarmInput) -> Iterator[Alarm]:
+def _left_over(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A mesh that it has left may still be joined through it, and others may be disturbed on its channel."""
-    for name in left_over(seen.observation):
+    for name in left_over(facts.observation):
         text = f"{name} is on the air, although its configuration has turned it off"
-        yield Alarm(Level.WARNING, "left-over", text, f"meshctl provision {seen.node.name} takes it down")
+        yield Alarm(Level.WARNING, "left-over", text, f"meshctl provision {facts.node.name} takes it down")
 
 
-def _radios(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    mesh_radios = {radio.name for radio in seen.node.radios if radio.mesh is not None}
-    for radio in seen.observation.radios or ():
+def _radios(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    mesh_radios = {radio.name for radio in facts.node.radios if radio.mesh is not None}
+    for radio in facts.observation.radios or ():
         if radio.name in mesh_radios and (not radio.up or radio.setup_failed):
             why = "setup failed" if radio.setup_failed else "disabled" if radio.disabled else "down"
-            hint = f"meshctl run {seen.node.name} -- logread -e netifd"
+            hint = f"meshctl run {facts.node.name} -- logread -e netifd"
             yield Alarm(Level.ERROR, "radio", f"{radio.name} is {why}", hint)
-    every = {seen.fleet.meshes[mesh].channel for mesh in seen.node.meshes}
-    own = {name: {seen.fleet.meshes[mesh].channel} for name, mesh in seen.node.mesh_interfaces.items()}
-    for link in seen.observation.links or ():
+    every = {facts.fleet.meshes[mesh].channel for mesh in facts.node.meshes}
+    own = {name: {facts.fleet.meshes[mesh].channel} for name, mesh in facts.node.mesh_interfaces.items()}
+    for link in facts.observation.links or ():
         if link.mode.upper() == "IBSS" and link.joined is False:
             hint = "check channel, SSID, BSSID and key; meshctl topology shows the nodes in the cell"
             yield Alarm(Level.ERROR, "join", f"{link.ifname} has joined no cell", hint)
@@ -125,37 +125,39 @@ def _radios(seen: NodeAlarmInput) -> Iterator[Alarm]:
         channels = own.get(link.ifname, every)
         if link.mode.lower() in MESH_MODES and link.channel is not None and link.channel not in channels:
             text = f"{link.ifname} is on channel {link.channel}, its mesh on {', '.join(map(str, sorted(channels)))}"
-            yield Alarm(Level.ERROR, "channel", text, f"meshctl plan {seen.node.name}")
+            yield Alarm(Level.ERROR, "channel", text, f"meshctl plan {facts.node.name}")
 
 
-def _mesh(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    if seen.must_mesh and not seen.neighbors:
+def _mesh(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    if facts.must_mesh and not facts.neighbors:
         yield Alarm(
             Level.ERROR,
             "alone",
             "hears no other node",
             "check antennas, distance and interference",
         )
-    elif seen.must_mesh and seen.path is None and seen.is_path_known:
+    elif facts.must_mesh and facts.path is None and facts.is_path_known:
         text = "no path through the mesh to the base"
         yield Alarm(Level.WARNING, "no-path", text, "find the missing node between them with meshctl topology")
-    elif seen.path is not None and seen.path.hops and seen.path.quality < WEAK_QUALITY:
-        hops = counted(seen.path.hops, "hop")
-        text = f"path to the base has {seen.path.quality:.0%} quality over {hops}"
-        yield Alarm(Level.WARNING, "weak", text, f"drop a beacon between {seen.node.name} and {seen.path.via}")
-    if seen.cuts_off and seen.node.state is NodeState.DEPLOYED:
-        yield Alarm(Level.NOTE, "cut-vertex", f"without it {join_limited(seen.cuts_off)} would be cut off")
+    elif facts.path is not None and facts.path.hops and facts.path.quality < WEAK_QUALITY:
+        hops = counted(facts.path.hops, "hop")
+        text = f"path to the base has {facts.path.quality:.0%} quality over {hops}"
+        yield Alarm(Level.WARNING, "weak", text, f"drop a beacon between {facts.node.name} and {facts.path.via}")
+    if facts.cuts_off and facts.node.state is NodeState.DEPLOYED:
+        yield Alarm(Level.NOTE, "cut-vertex", f"without it {join_limited(facts.cuts_off)} would be cut off")
 
 
-def _air(seen: NodeAlarmInput) -> Iterator[Alarm]:
+def _air(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """The signal to the next hop, the channel, and the radio's queue."""
-    via = seen.path.via if seen.path is not None and seen.path.hops else ""
-    for neighbor in seen.neighbors:
+    via = facts.path.via if facts.path is not None and facts.path.hops else ""
+    for neighbor in facts.neighbors:
         snr_db = neighbor.worse_snr_db
         if neighbor.name == via and snr_db is not None and snr_db < LOW_SNR_DB:
             text = f"the signal between it and {via} is {snr_db} dB above the noise"
-            yield Alarm(Level.WARNING, "snr", text, f"move closer, or drop a beacon between {seen.node.name} and {via}")
-    for radio in seen.radios:
+            yield Alarm(
+                Level.WARNING, "snr", text, f"move closer, or drop a beacon between {facts.node.name} and {via}"
+            )
+    for radio in facts.radios:
         if radio.busy_ratio is not None and radio.busy_ratio > BUSY_CHANNEL_RATIO:
             channel = "" if radio.channel is None else f" {radio.channel}"
             text = f"channel{channel} is busy for {radio.busy_ratio:.0%} of the time at {radio.ifname}"
@@ -165,38 +167,38 @@ def _air(seen: NodeAlarmInput) -> Iterator[Alarm]:
             yield Alarm(Level.WARNING, "radio-queue", text, "send less through it, or improve its links")
 
 
-def _dropped(seen: NodeAlarmInput) -> Iterator[Alarm]:
+def _dropped(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A beacon marked as carried that other nodes depend on."""
-    if seen.node.state is NodeState.CARRIED and seen.node.role is Role.BEACON and seen.relays:
-        text = f"marked as carried, but relays to the base for {join_limited(seen.relays)}"
-        yield Alarm(Level.NOTE, "dropped", text, f"if it has been dropped: meshctl deployed {seen.node.name}")
+    if facts.node.state is NodeState.CARRIED and facts.node.role is Role.BEACON and facts.relays:
+        text = f"marked as carried, but relays to the base for {join_limited(facts.relays)}"
+        yield Alarm(Level.NOTE, "dropped", text, f"if it has been dropped: meshctl deployed {facts.node.name}")
 
 
-def _bridge(seen: NodeAlarmInput) -> Iterator[Alarm]:
+def _bridge(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A LAN port in no bridge connects nothing to the mesh."""
-    bridges = seen.observation.bridges
-    if bridges is None or not seen.node.meshes:
+    bridges = facts.observation.bridges
+    if bridges is None or not facts.node.meshes:
         return
     joined = {port for bridge in bridges for port in bridge.ports}
-    missing = [port for port in seen.node.lan_ports if port not in joined]
+    missing = [port for port in facts.node.lan_ports if port not in joined]
     if missing:
-        level = Level.WARNING if seen.node.role is Role.BEACON else Level.ERROR
+        level = Level.WARNING if facts.node.role is Role.BEACON else Level.ERROR
         text = f"{', '.join(missing)} in no bridge: devices connected there are not in the mesh"
-        yield Alarm(level, "bridge", text, f"meshctl plan {seen.node.name}")
+        yield Alarm(level, "bridge", text, f"meshctl plan {facts.node.name}")
 
 
-def _lan_filter(seen: NodeAlarmInput) -> Iterator[Alarm]:
+def _lan_filter(facts: NodeAlarmInput) -> Iterator[Alarm]:
     """A filter that is configured, but not loaded; with other files than the inventory's, that is the alarm."""
-    plan = seen.plan
-    if seen.node.lan_filter is None or not seen.node.bridges_lan or plan is None or plan.files:
+    plan = facts.plan
+    if facts.node.lan_filter is None or not facts.node.bridges_lan or plan is None or plan.files:
         return
-    if seen.observation.lan_filter is None:
+    if facts.observation.lan_filter is None:
         text = "its LAN filter is not loaded: broadcasts of its wired ports reach the mesh"
-        yield Alarm(Level.WARNING, "lan-filter", text, f"meshctl run {seen.node.name} -- logread -e meshctl")
+        yield Alarm(Level.WARNING, "lan-filter", text, f"meshctl run {facts.node.name} -- logread -e meshctl")
 
 
-def _resources(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    memory, flash, load = seen.observation.memory, seen.observation.overlay, seen.observation.load
+def _resources(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    memory, flash, load = facts.observation.memory, facts.observation.overlay, facts.observation.load
     if memory is not None and memory.total and memory.available / memory.total < LOW_MEMORY_SHARE:
         text = f"{memory.available / 2**20:.1f} MiB of memory left"
         yield Alarm(Level.WARNING, "memory", text, "reboot it before changing anything on it")
@@ -205,29 +207,29 @@ def _resources(seen: NodeAlarmInput) -> Iterator[Alarm]:
         yield Alarm(Level.WARNING, "flash", f"{flash.free // 1024} KiB of flash left", hint)
     if load is not None and load.minute / load.processors > BUSY_LOAD:
         text = f"load {load.minute:.1f} on {counted(load.processors, 'processor')}"
-        yield Alarm(Level.NOTE, "load", text, f"meshctl run {seen.node.name} -- top -b -n 1")
+        yield Alarm(Level.NOTE, "load", text, f"meshctl run {facts.node.name} -- top -b -n 1")
 
 
-def _changes(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    change = seen.observation.change
+def _changes(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    change = facts.observation.change
     if change is not None and change.state not in ("idle", "", "unknown", "absent"):
         left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
         text = f"a change by {change.owner or 'an unknown owner'} is {change.state}{left}"
         yield Alarm(Level.WARNING, "change", text, "wait until it is confirmed or rolled back")
-    if change is not None and change.lock_owner and change.lock_owner != seen.own_lock:
+    if change is not None and change.lock_owner and change.lock_owner != facts.own_lock:
         yield Alarm(Level.NOTE, "locked", f"locked by {lock_owners(change.lock_owner)}")
-    if seen.observation.uci_changes:
-        count = len(seen.observation.uci_changes)
+    if facts.observation.uci_changes:
+        count = len(facts.observation.uci_changes)
         text = f"{counted(count, 'uncommitted UCI change')} made by hand"
-        hint = f"meshctl run {seen.node.name} -- uci changes; move them into the inventory, or `uci revert` them"
+        hint = f"meshctl run {facts.node.name} -- uci changes; move them into the inventory, or `uci revert` them"
         yield Alarm(Level.WARNING, "foreign", text, hint)
 
 
-def _time(seen: NodeAlarmInput) -> Iterator[Alarm]:
-    offset_s, uptime_s = seen.observation.clock_offset_s, seen.observation.uptime_s
+def _time(facts: NodeAlarmInput) -> Iterator[Alarm]:
+    offset_s, uptime_s = facts.observation.clock_offset_s, facts.observation.uptime_s
     if offset_s is not None and abs(offset_s) > CLOCK_TOLERANCE_S:
         yield Alarm(Level.NOTE, "clock", f"its clock is off by {duration(abs(offset_s))}")
-    since_s = seen.seconds_since_last_known
+    since_s = facts.seconds_since_last_known
     if uptime_s is not None and since_s is not None and uptime_s < since_s:
         yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
 

@@ -16,13 +16,13 @@ _NO_SENSORS = Sensors({}, {})
 _NO_STATION = Station("", "")
 
 
-def radios_of(node: Node, seen: Observation, previous: Observation | None = None) -> tuple[RadioStatus, ...]:
+def radios_of(node: Node, observation: Observation, previous: Observation | None = None) -> tuple[RadioStatus, ...]:
     """The interfaces of a node's meshes. `previous` is an earlier observation: the busy time is that since then."""
-    surveys = {survey.ifname: survey for survey in seen.surveys or ()}
+    surveys = {survey.ifname: survey for survey in observation.surveys or ()}
     before = {survey.ifname: survey for survey in (previous.surveys if previous is not None else None) or ()}
-    sensors = seen.sensors or _NO_SENSORS
+    sensors = observation.sensors or _NO_SENSORS
     found = []
-    for link in seen.links or ():
+    for link in observation.links or ():
         mesh = node.mesh_interfaces.get(link.ifname)
         if mesh is None:
             continue
@@ -64,15 +64,15 @@ def _busy(survey: ChannelSurvey | None, before: ChannelSurvey | None) -> tuple[f
     return min(1.0, busy / active), active / 1000
 
 
-def temperature_of(seen: Observation) -> float | None:
+def temperature_of(observation: Observation) -> float | None:
     """The highest temperature that the board reports."""
-    return max((seen.sensors or _NO_SENSORS).temperatures_c.values(), default=None)
+    return max((observation.sensors or _NO_SENSORS).temperatures_c.values(), default=None)
 
 
-def snr_of(seen: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, int]:
+def snr_of(observation: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, int]:
     """The SNR of each node that a node hears, as far as the radio reports signal and noise."""
-    noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
-    at = {station.mac.lower(): noise.get(station.ifname) for station in seen.stations or ()}
+    noise = {survey.ifname: survey.noise_dbm for survey in observation.surveys or ()}
+    at = {station.mac.lower(): noise.get(station.ifname) for station in observation.stations or ()}
     return {
         name: neighbor.signal_dbm - noise_dbm
         for name, neighbor in heard.items()
@@ -81,13 +81,13 @@ def snr_of(seen: Observation, heard: Mapping[str, HeardNeighbor]) -> dict[str, i
 
 
 def neighbors_of(
-    node: Node | None, seen: Observation, heard: Mapping[str, HeardNeighbor], snr_there: Mapping[str, int | None]
+    node: Node | None, observation: Observation, heard: Mapping[str, HeardNeighbor], snr_there: Mapping[str, int | None]
 ) -> tuple[Neighbor, ...]:
     """A node's reports of the nodes it hears, best first; `snr_there` is the SNR at which they report to hear it."""
     stations: dict[str, Station] = {}
-    for station in seen.stations or ():
+    for station in observation.stations or ():
         stations.setdefault(station.mac.lower(), station)
-    noise = {survey.ifname: survey.noise_dbm for survey in seen.surveys or ()}
+    noise = {survey.ifname: survey.noise_dbm for survey in observation.surveys or ()}
     meshes = {} if node is None else node.mesh_interfaces
     found = [
         _neighbor(name, neighbor, stations.get(neighbor.mac.lower(), _NO_STATION), noise, meshes, snr_there.get(name))

@@ -57,14 +57,14 @@ def urgent_bytes(fleet: Fleet, facts: RobotFacts) -> int:
     return sum(queue.bytes for queue in facts.queues if queue.priority in urgent)
 
 
-def robot_alarms(seen: RobotAlarmInput) -> tuple[Alarm, ...]:
+def robot_alarms(facts: RobotAlarmInput) -> tuple[Alarm, ...]:
     """All alarms of a robot, most severe first."""
-    found = [alarm for concern in _CONCERNS for alarm in concern(seen)]
+    found = [alarm for concern in _CONCERNS for alarm in concern(facts)]
     return tuple(sorted(found, key=lambda alarm: -alarm.level))
 
 
-def _daemon(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    facts, name = seen.facts, seen.robot.name
+def _daemon(given: RobotAlarmInput) -> Iterator[Alarm]:
+    facts, name = given.facts, given.robot.name
     if not facts.is_installed:
         yield Alarm(Level.ERROR, "not-installed", "udp_mesh is not installed", f"meshctl robots deploy {name}")
         return
@@ -102,26 +102,26 @@ def _collector(service: ServiceFacts, problem: str, name: str) -> Iterator[Alarm
         yield Alarm(Level.WARNING, "collector", f"its collector: {problem}", hint)
 
 
-def _restarts(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    before = seen.last.facts.get("restarts", "") if seen.last else ""
-    again = seen.facts.service.restarts - int(before) if before.isdecimal() else 0
+def _restarts(facts: RobotAlarmInput) -> Iterator[Alarm]:
+    before = facts.last.facts.get("restarts", "") if facts.last else ""
+    again = facts.facts.service.restarts - int(before) if before.isdecimal() else 0
     if again > 0:
         text = f"its daemon crashed and was restarted {counted(again, 'time')} since the last snapshot"
-        yield Alarm(Level.WARNING, "restarts", text, f"meshctl robots logs {seen.robot.name} -n 200")
-    uptime_s = seen.facts.computer.uptime_s
-    since_s = seen.facts.seen_s - seen.last.seen_s if seen.last else None
+        yield Alarm(Level.WARNING, "restarts", text, f"meshctl robots logs {facts.robot.name} -n 200")
+    uptime_s = facts.facts.computer.uptime_s
+    since_s = facts.facts.seen_s - facts.last.seen_s if facts.last else None
     if uptime_s is not None and since_s is not None and uptime_s < since_s:
         yield Alarm(Level.NOTE, "rebooted", f"rebooted {duration(uptime_s)} ago")
 
 
-def _drift(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    facts, name = seen.facts, seen.robot.name
+def _drift(given: RobotAlarmInput) -> Iterator[Alarm]:
+    facts, name = given.facts, given.robot.name
     if facts.drift and facts.release:
         more = len(facts.drift) - MAX_DRIFT_LINES
         text = "; ".join(facts.drift[:MAX_DRIFT_LINES]) + (f"; and {more} more" if more > 0 else "")
         hint = f"meshctl robots diff {name}; meshctl robots deploy {name} fixes it"
         yield Alarm(Level.WARNING, "drift", text, hint)
-    versions = Counter(daemon.version for daemon in (*seen.daemons.values(), facts) if daemon.answers)
+    versions = Counter(daemon.version for daemon in (*given.daemons.values(), facts) if daemon.answers)
     if facts.answers and len(versions) > 1:
         usual = max(versions, key=lambda version: (versions[version], version))
         if facts.version != usual:
@@ -129,64 +129,64 @@ def _drift(seen: RobotAlarmInput) -> Iterator[Alarm]:
             yield Alarm(Level.WARNING, "version", text, "meshctl robots deploy")
 
 
-def _keys(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    facts = seen.facts
+def _keys(given: RobotAlarmInput) -> Iterator[Alarm]:
+    facts = given.facts
     if facts.unkeyed:
-        level = Level.ERROR if seen.fleet.udp_mesh.keys else Level.NOTE
-        hint = f"meshctl robots deploy {seen.robot.name}" if seen.fleet.udp_mesh.keys else "set udp_mesh.keys"
+        level = Level.ERROR if given.fleet.udp_mesh.keys else Level.NOTE
+        hint = f"meshctl robots deploy {given.robot.name}" if given.fleet.udp_mesh.keys else "set udp_mesh.keys"
         yield Alarm(level, "unkeyed", "its daemon neither encrypts nor authenticates", hint)
     elif facts.keys:
-        lacking = [name for name, daemon in seen.daemons.items() if daemon.keys and facts.keys[0] not in daemon.keys]
+        lacking = [name for name, daemon in given.daemons.items() if daemon.keys and facts.keys[0] not in daemon.keys]
         if lacking:
             text = f"its messages cannot be decrypted by {', '.join(lacking)}"
             yield Alarm(Level.ERROR, "key", text, "meshctl robots deploy, or continue with meshctl robots rotate-key")
 
 
-def _peers(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    if not seen.facts.answers:
+def _peers(facts: RobotAlarmInput) -> Iterator[Alarm]:
+    if not facts.facts.answers:
         return
-    missing = [name for name in seen.daemons if name not in seen.facts.online and name in seen.fleet.robots]
+    missing = [name for name in facts.daemons if name not in facts.facts.online and name in facts.fleet.robots]
     if missing:
-        others = len(seen.daemons)
+        others = len(facts.daemons)
         text = f"does not hear {', '.join(missing)}" + (f", of {others} whose daemons run" if others > 1 else "")
         yield Alarm(Level.ERROR, "peers", text, "check the radios between them with meshctl topology")
 
 
-def _queues(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    urgent = urgent_priorities(seen.fleet)
-    late = [queue for queue in seen.facts.queues if queue.priority in urgent and queue.oldest_s > URGENT_WAIT_S]
+def _queues(facts: RobotAlarmInput) -> Iterator[Alarm]:
+    urgent = urgent_priorities(facts.fleet)
+    late = [queue for queue in facts.facts.queues if queue.priority in urgent and queue.oldest_s > URGENT_WAIT_S]
     if not late:
         return
-    last = seen.last
-    is_recent = last is not None and seen.facts.seen_s - last.seen_s <= GROWING_WITHIN_S
+    last = facts.last
+    is_recent = last is not None and facts.facts.seen_s - last.seen_s <= GROWING_WITHIN_S
     before = last.facts.get("urgent_bytes", "") if last is not None and is_recent else ""
-    grows = before.isdecimal() and seen.urgent_bytes > int(before)
+    grows = before.isdecimal() and facts.urgent_bytes > int(before)
     messages, oldest_s = sum(queue.messages for queue in late), max(queue.oldest_s for queue in late)
     text = f"{counted(messages, 'urgent message')} queued, the oldest for {duration(oldest_s)}"
-    text += f", and growing ({before} to {seen.urgent_bytes} B)" if grows else ""
+    text += f", and growing ({before} to {facts.urgent_bytes} B)" if grows else ""
     level = Level.ERROR if grows else Level.WARNING
-    yield Alarm(level, "urgent-queue", text, f"meshctl robots status {seen.robot.name} shows the unreachable peers")
+    yield Alarm(level, "urgent-queue", text, f"meshctl robots status {facts.robot.name} shows the unreachable peers")
 
 
-def _topics(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    if not seen.facts.answers:
+def _topics(facts: RobotAlarmInput) -> Iterator[Alarm]:
+    if not facts.facts.answers:
         return
-    urgent = {topic.name for topic in seen.fleet.topics if is_urgent(topic)}
+    urgent = {topic.name for topic in facts.fleet.topics if is_urgent(topic)}
     hints = {
-        "undeclared": f"meshctl robots deploy {seen.robot.name}",
+        "undeclared": f"meshctl robots deploy {facts.robot.name}",
         "silent": "check that the publishing program runs",
         "not-arriving": "check meshctl robots status, and the path between them with meshctl topology",
     }
     for code, hint in hints.items():
-        bad = [topic for topic in seen.topics if topic.code == code]
+        bad = [topic for topic in facts.topics if topic.code == code]
         if bad:
             is_worse = code != "silent" and any(topic.name in urgent for topic in bad)
             text = "; ".join(f"{topic.name}: {topic.problem}" for topic in bad)
             yield Alarm(Level.ERROR if is_worse else Level.WARNING, f"topic-{code}", text, hint)
 
 
-def _computer(seen: RobotAlarmInput) -> Iterator[Alarm]:
-    computer, name = seen.facts.computer, seen.robot.name
+def _computer(facts: RobotAlarmInput) -> Iterator[Alarm]:
+    computer, name = facts.facts.computer, facts.robot.name
     if computer.disk_kib:
         free = f"{size(computer.disk_free_kib)} of {size(computer.disk_kib)} of disk left"
         if computer.disk_free_kib < FULL_DISK_KIB:
@@ -218,13 +218,13 @@ def size(kib: float) -> str:
     return f"{kib / (1 << 30):.0f} TiB"
 
 
-def _others(seen: RobotAlarmInput) -> Iterator[Alarm]:
+def _others(facts: RobotAlarmInput) -> Iterator[Alarm]:
     """Computers on its switch that the robot's daemon computer does not reach."""
-    if seen.facts.answering is None:
+    if facts.facts.answering is None:
         return
-    for name, computer in seen.robot.computers.items():
+    for name, computer in facts.robot.computers.items():
         address = str(computer.address.ip)
-        if address not in seen.facts.answering:
+        if address not in facts.facts.answering:
             text = f"its computer {name} ({address}) does not answer a ping"
             yield Alarm(Level.WARNING, "computer-silent", text, "check its power, its cable and its address")
 
@@ -235,7 +235,7 @@ _CONCERNS: tuple[Callable[[RobotAlarmInput], Iterator[Alarm]], ...] = (
     _drift,
     _keys,
     _peers,
-    lambda seen: thin_alarms(seen.facts),
+    lambda given: thin_alarms(given.facts),
     _queues,
     _topics,
     _computer,

@@ -101,10 +101,10 @@ def _unreachable_status(
 
 def _heard_by(answers: RobotAnswers, robot: str) -> tuple[Sighting, ...]:
     """The robots whose daemons report this one online, latest first."""
-    seen = [
+    sightings = [
         Sighting(name, round(peer.heard_ago_s * 1000))
         for name, facts in answers.facts.items()
         for peer in facts.peers
         if peer.name == robot and peer.online and peer.heard_ago_s is not None
     ]
-    return tuple(sorted(seen, key=lambda sighting: (sighting.age_ms, sighting.by)))
+    return tuple(sorted(sightings, key=lambda sighting: (sighting.age_ms, sighting.by)))

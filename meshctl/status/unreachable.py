@@ -55,7 +55,7 @@ def no_answer_alarm(
     `is_required`: it must answer. `trust` is the command that pins its key, `first_contact_hint` the hint for a device
     that never answered.
     """
-    seen = sighting_text(heard_by)
+    sighting = sighting_text(heard_by)
     if why.of_gateway:
         return Alarm(Level.ERROR, why.code, why.reason, why.hint) if is_required else None
     if why.code != "unreachable":
@@ -68,11 +68,11 @@ def no_answer_alarm(
     if not is_required:
         # on and in range of others, but without an answer: check it before it is dropped
         hint = "wait a minute for it to boot, then check its address and cable"
-        return Alarm(Level.WARNING, "mute", f"{why.reason}, but {seen}", hint) if seen else None
+        return Alarm(Level.WARNING, "mute", f"{why.reason}, but {sighting}", hint) if sighting else None
     last_answer = f"last answered {duration(now - last.seen_s)} ago" if last else "never answered"
-    if seen:
+    if sighting:
         hint = "it is on and in range: wait a minute, then run meshctl provision; if that fails, keep it off for 2 min"
-        return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; {seen}", hint)
+        return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; {sighting}", hint)
     hint = first_contact_hint if last is None else last_place_hint(last)
     return Alarm(Level.ERROR, "unreachable", f"{why.reason}; {last_answer}; no node hears it", hint)
 

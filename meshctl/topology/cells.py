@@ -26,29 +26,33 @@ class LinkCell:
         return f"{self.mesh} {self.band.value} ch {self.channel}"
 
 
-def within(seen: Observation, node: Node, mesh: str) -> Observation:
+def within(observation: Observation, node: Node, mesh: str) -> Observation:
     """The observation reduced to one mesh of the node; unchanged for a node with one mesh."""
     if len(node.meshes) < 2:
-        return seen
+        return observation
     names = {name for name, joined in node.mesh_interfaces.items() if joined == mesh}
-    all_hard = None if seen.mesh is None else seen.mesh.hard_interfaces
+    all_hard = None if observation.mesh is None else observation.mesh.hard_interfaces
     hard = None if all_hard is None else tuple(name for name in all_hard if name in names)
     return replace(
-        seen,
-        macs={name: mac for name, mac in (seen.macs or {}).items() if name in names},
-        links=tuple(link for link in seen.links or () if link.ifname in names),
-        stations=tuple(station for station in seen.stations or () if station.ifname in names),
-        neighbours=None if seen.neighbours is None else tuple(n for n in seen.neighbours if n.ifname in names),
-        originators=None if seen.originators is None else tuple(o for o in seen.originators if o.ifname in names),
-        mesh=None if seen.mesh is None else replace(seen.mesh, hard_interfaces=hard),
+        observation,
+        macs={name: mac for name, mac in (observation.macs or {}).items() if name in names},
+        links=tuple(link for link in observation.links or () if link.ifname in names),
+        stations=tuple(station for station in observation.stations or () if station.ifname in names),
+        neighbours=None
+        if observation.neighbours is None
+        else tuple(n for n in observation.neighbours if n.ifname in names),
+        originators=None
+        if observation.originators is None
+        else tuple(o for o in observation.originators if o.ifname in names),
+        mesh=None if observation.mesh is None else replace(observation.mesh, hard_interfaces=hard),
     )
 
 
 def mesh_reports(fleet: Fleet, observations: Mapping[str, Observation], mesh: str) -> dict[str, Report]:
     """The reports of a mesh's members, reduced to this mesh."""
     return {
-        name: report_of(name, within(seen, fleet.nodes[name], mesh))
-        for name, seen in observations.items()
+        name: report_of(name, within(observation, fleet.nodes[name], mesh))
+        for name, observation in observations.items()
         if name in fleet.nodes and mesh in fleet.nodes[name].meshes
     }
 
@@ -68,6 +72,6 @@ def link_cells(
     return found
 
 
-def _channel(fleet: Fleet, node: Node, seen: Observation, mesh: str) -> int:
-    observed = (link.channel for link in within(seen, node, mesh).links or () if link.channel is not None)
+def _channel(fleet: Fleet, node: Node, observation: Observation, mesh: str) -> int:
+    observed = (link.channel for link in within(observation, node, mesh).links or () if link.channel is not None)
     return next(observed, fleet.meshes[mesh].channel)

@@ -125,4 +125,7 @@ def seen_by(
         for name, heard in neighbours_of(report, names, fresh_ms=fresh_ms).items():
             if name in known:
                 sightings.setdefault(name, []).append(Sighting(report.node, heard.last_seen_ms, heard.signal_dbm))
-    return {name: tuple(sorted(seen, key=lambda s: (s.age_ms, s.by))) for name, seen in sightings.items()}
+    return {
+        name: tuple(sorted(found, key=lambda sighting: (sighting.age_ms, sighting.by)))
+        for name, found in sightings.items()
+    }

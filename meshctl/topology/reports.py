@@ -14,23 +14,23 @@ TQ_MAX = 255
 FULL_THROUGHPUT_KBIT_S = 20_000
 
 
-def report_of(node: str, seen: Observation) -> Report:
+def report_of(node: str, observation: Observation) -> Report:
     """The node's report: from batman-adv's tables, or from the radio's station entries if there are none."""
-    signals = {station.mac.lower(): station.signal_dbm for station in seen.stations or ()}
-    if seen.neighbours is None:
+    signals = {station.mac.lower(): station.signal_dbm for station in observation.stations or ()}
+    if observation.neighbours is None:
         heard = [
             HeardNeighbor(station.mac.lower(), station.inactive_ms or 0, None, station.signal_dbm)
-            for station in seen.stations or ()
+            for station in observation.stations or ()
             if station.can_forward
         ]
-        return Report(node, mesh_macs(seen), tuple(heard))
-    paths = _paths(seen.originators or ())
+        return Report(node, mesh_macs(observation), tuple(heard))
+    paths = _paths(observation.originators or ())
     return Report(
         node,
-        mesh_macs(seen),
+        mesh_macs(observation),
         tuple(
             _heard(mac, neighbour.last_seen_ms, signals.get(mac), paths.get(mac, {}))
-            for neighbour in seen.neighbours
+            for neighbour in observation.neighbours
             for mac in (neighbour.mac.lower(),)
         ),
     )
@@ -41,11 +41,11 @@ def _heard(mac: str, last_seen_ms: int, signal_dbm: int | None, paths: Mapping[s
     return HeardNeighbor(mac, last_seen_ms, paths.get(mac), signal_dbm, others)
 
 
-def mesh_macs(seen: Observation) -> tuple[str, ...]:
+def mesh_macs(observation: Observation) -> tuple[str, ...]:
     """The MACs by which neighbors know it: those of batman-adv's hard interfaces, and of every mesh radio."""
-    hard = seen.mesh.hard_interfaces if seen.mesh is not None else None
-    macs = [(seen.macs or {}).get(name, "") for name in hard or ()]
-    macs += [link.mac for link in seen.links or () if link.mode.lower() in ("ibss", "mesh point")]
+    hard = observation.mesh.hard_interfaces if observation.mesh is not None else None
+    macs = [(observation.macs or {}).get(name, "") for name in hard or ()]
+    macs += [link.mac for link in observation.links or () if link.mode.lower() in ("ibss", "mesh point")]
     return tuple(dict.fromkeys(mac.lower() for mac in macs if mac))
 
 

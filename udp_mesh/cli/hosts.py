@@ -160,18 +160,18 @@ def _edit(path: Path, change: Callable[[str], str]) -> None:
     target = Path(os.path.realpath(path))
     while True:
         with target.open("rb") as file:
-            seen = os.fstat(file.fileno())
+            status = os.fstat(file.fileno())
             raw = file.read(MAX_FILE_BYTES + 1)
         if len(raw) > MAX_FILE_BYTES:
             raise ValueError(f"expected at most {MAX_FILE_BYTES} bytes")
         # bytes that are not UTF-8 are kept
         before = raw.decode("utf-8", "surrogateescape")
         after = change(before)
-        if after == before or _replace(target, after.encode("utf-8", "surrogateescape"), seen):
+        if after == before or _replace(target, after.encode("utf-8", "surrogateescape"), status):
             return
 
 
-def _replace(target: Path, content: bytes, seen: os.stat_result) -> bool:
+def _replace(target: Path, content: bytes, before: os.stat_result) -> bool:
     """Replaces the file by one with its mode and extended attributes, in one rename; False if it is no longer the file
     that was `seen`. Raises OSError."""
     temporary = target.with_name(f".{target.name}.udp-mesh")
@@ -185,7 +185,7 @@ def _replace(target: Path, content: bytes, seen: os.stat_result) -> bool:
         shutil.copystat(target, temporary)
         os.utime(temporary)
         now = target.stat()
-        if (now.st_ino, now.st_mtime_ns, now.st_size) != (seen.st_ino, seen.st_mtime_ns, seen.st_size):
+        if (now.st_ino, now.st_mtime_ns, now.st_size) != (before.st_ino, before.st_mtime_ns, before.st_size):
             temporary.unlink()
             return False
         temporary.replace(target)

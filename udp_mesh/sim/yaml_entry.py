@@ -17,8 +17,8 @@ class Entry:
 
     def problem(self, expected: str, found: object = None) -> None:
         line = 1 if self.node is None else self.node.start_mark.line + 1
-        seen = self._found() if found is None else repr(found)
-        self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {seen}")
+        shown = self._found() if found is None else repr(found)
+        self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {shown}")
 
     def _found(self) -> str:
         match self.node:

@@ -145,12 +145,12 @@ def query(*operations: str) -> list[Json]:
 
 
 def take_snapshot(units: list[str]) -> HealthSnapshot:
-    seen = [_unit(unit) for unit in units]
+    states = [_unit(unit) for unit in units]
     try:
         status, topics = query("status", "topics")
     except (OSError, ValueError) as error:
-        return HealthSnapshot(seen, {}, [], str(error) or type(error).__name__)
-    return HealthSnapshot(seen, status, list(topics.get("topics", ())))
+        return HealthSnapshot(states, {}, [], str(error) or type(error).__name__)
+    return HealthSnapshot(states, status, list(topics.get("topics", ())))
 
 
 def _unit(name: str) -> ServiceState:
@@ -188,8 +188,10 @@ def wait_healthy(wait_s: float, was: Baseline, units: list[str]) -> str:
 
 def main(words: list[str]) -> None:
     if words[0] == "facts":
-        seen = take_snapshot([])
-        sys.stdout.write(f"== status\n{json.dumps(seen.status)}\n== topics\n{json.dumps({'topics': seen.topics})}\n")
+        snapshot = take_snapshot([])
+        sys.stdout.write(
+            f"== status\n{json.dumps(snapshot.status)}\n== topics\n{json.dumps({'topics': snapshot.topics})}\n"
+        )
     elif words[0] == "online":
         sys.stdout.write(" ".join(take_snapshot([]).online))
     elif words[0] == "before":

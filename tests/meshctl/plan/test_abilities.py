@@ -11,7 +11,7 @@ from meshctl.device.observation import Observation, RadioChip
 from meshctl.model import Fleet
 from meshctl.plan import Verdict
 from meshctl.plan.abilities import lacking_abilities
-from meshctl.plan.seen import packages_seen
+from meshctl.plan.observed_files import packages_seen
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
 
 PATH = "platform/ahb/18100000.wmac"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from meshctl.plan.seen import management_address
+from meshctl.plan.observed_files import management_address
 
 
 @pytest.mark.parametrize(

@@ -25,27 +25,27 @@ def package_of(path: str) -> str | None:
     return path.removeprefix(CONFIG) if path.startswith(CONFIG) else None
 
 
-def text_of(path: str, seen: Observation) -> str | None:
+def text_of(path: str, observation: Observation) -> str | None:
     """A file's text on the node; None when it is missing or not text."""
     package = package_of(path)
     if package is not None:
-        return (seen.uci or {}).get(package)
-    info = file_info(path, seen)
+        return (observation.uci or {}).get(package)
+    info = file_info(path, observation)
     return None if info is None else info.text
 
 
-def file_info(path: str, seen: Observation) -> FileInfo | None:
+def file_info(path: str, observation: Observation) -> FileInfo | None:
     """The file's mode, hash and text, if it was requested by path."""
-    return seen.files.get(f"/{path}") or seen.files.get(path)
+    return observation.files.get(f"/{path}") or observation.files.get(path)
 
 
-def packages_seen(paths: Iterable[str], seen: Observation) -> dict[str, Package | None]:
+def packages_seen(paths: Iterable[str], observation: Observation) -> dict[str, Package | None]:
     """The UCI packages among these paths as trees; None for one that is missing or not readable as UCI."""
     found: dict[str, Package | None] = {}
     for path in paths:
         package = package_of(path)
         if package is not None:
-            found[package] = parsed(text_of(path, seen), package)
+            found[package] = parsed(text_of(path, observation), package)
     return found
 
 
@@ -91,22 +91,24 @@ def management_address(network: str | None) -> IpAddress | None:
     return None
 
 
-def fingerprint_texts(paths: Iterable[str], seen: Observation) -> dict[str, str]:
+def fingerprint_texts(paths: Iterable[str], observation: Observation) -> dict[str, str]:
     """Everything a plan depends on, by name: if any of it differs later, the plan is stale."""
-    texts = {f"file {path}": "missing" if (text := text_of(path, seen)) is None else f"text {text}" for path in paths}
+    texts = {
+        f"file {path}": "missing" if (text := text_of(path, observation)) is None else f"text {text}" for path in paths
+    }
     for path in paths:
-        info = file_info(path, seen)
+        info = file_info(path, observation)
         if info is not None:
             texts[f"mode {path}"] = f"{info.mode:o} {info.sha256}"
-    texts["board"] = seen.board.board_name if seen.board else "?"
-    texts["revision"] = seen.release.revision if seen.release else "?"
+    texts["board"] = observation.board.board_name if observation.board else "?"
+    texts["revision"] = observation.release.revision if observation.release else "?"
     return texts
 
 
-def is_meshed(seen: Observation, live: Mapping[str, Cell]) -> bool:
+def is_meshed(observation: Observation, live: Mapping[str, Cell]) -> bool:
     """Whether the node is part of a running mesh: a radio in a cell, and a neighbor heard recently or unknown."""
     if not live:
         return False
-    if seen.neighbours is not None:
-        return any(neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS for neighbour in seen.neighbours)
-    return seen.stations is None or bool(seen.stations)
+    if observation.neighbours is not None:
+        return any(neighbour.last_seen_ms <= NEIGHBOUR_FRESH_MS for neighbour in observation.neighbours)
+    return observation.stations is None or bool(observation.stations)
