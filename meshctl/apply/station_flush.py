@@ -249,24 +249,17 @@ class StationFlush:
         observed, and new neighbors."""
         run_context, ctx = self.ctx.run, self.ctx
         holders = by_holder(entries_of(self.node, run_context.observations, radios))
-        observed_macs = {
-            mac: name
-            for name, observation in run_context.observations.items()
-            for mac in radio_macs(observation, EVERY_RADIO)
-        }
-        names = {**run_context.current_mac_owners(), **observed_macs}
+        names = dict(run_context.current_mac_owners())
+        for name, observation in run_context.observations.items():
+            names |= dict.fromkeys(radio_macs(observation, EVERY_RADIO), name)
         mesh_nodes = [node.name for mesh in ctx.node.meshes for node in run_context.fleet.members(mesh)]
         others = (
             *possible_holders(self.node, run_context.observations, names, mesh_nodes),
             *(current_neighbors(now, names) if now else ()),
         )
         # the radio's MAC may have changed: use all that are known
-        own = [
-            radio_macs(observation, radios)
-            for observation in (run_context.observations.get(self.node), now)
-            if observation is not None
-        ]
-        macs = tuple(dict.fromkeys(mac for some in own for mac in some))
+        own = filter(None, (run_context.observations.get(self.node), now))
+        macs = tuple(dict.fromkeys(mac for observation in own for mac in radio_macs(observation, radios)))
         for name in others:
             if name != self.node and name in run_context.fleet.nodes:
                 holders.setdefault(name, tuple(StationEntry(name, "", mac) for mac in macs))
