@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from meshctl.apply.bootstrap import BenchTarget
+from meshctl.apply.bootstrap import FACTORY_ADDRESS, BenchTarget
 from meshctl.cli.extensions import LabFleet
 from meshctl.errors import InputError
 from meshctl.inventory.suggest import did_you_mean
-from meshctl.model import Fleet
+from meshctl.model import Fleet, Node
 
 At = Annotated[
     list[str] | None,
@@ -52,6 +52,25 @@ def with_site(fleet: Fleet, place: BenchTarget, site: str) -> BenchTarget:
     if not fleet.sites[site].has_gateway:
         raise InputError(f"--at-site {site}: the site has no login", hint=f"set sites.{site}.ssh.host")
     return replace(place, site=site)
+
+
+def no_answer_hint(place: BenchTarget, node: Node | None, *, is_pinned: bool) -> str:
+    """What it probably is that nothing answers at a place, and what to do; empty at an address that the operator gave.
+
+    `node` is expected there; `is_pinned` if it has a host key, as since its first bootstrap.
+    """
+    if node is not None and is_pinned:
+        return (
+            f"{node.name} has a pinned host key, so it is probably set up already and answers at {node.address.ip} "
+            f"instead: check with `meshctl status {node.name}`; to set it up again, reset it to factory defaults and "
+            "pass --replace-key"
+        )
+    if place.host != FACTORY_ADDRESS or place.site:
+        return ""
+    return (
+        f"check that it has booted and that this machine has an address in the network of {FACTORY_ADDRESS}; "
+        "a device that is set up already answers at its address in the inventory instead"
+    )
 
 
 def named_places(at: list[str], interfaces: list[str], site: str) -> list[BenchTarget]:

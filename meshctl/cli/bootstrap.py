@@ -14,7 +14,6 @@ from typing import Annotated, Any
 import typer
 
 from meshctl.apply.bootstrap import (
-    FACTORY_ADDRESS,
     BenchTarget,
     FoundDevice,
     discover,
@@ -31,7 +30,15 @@ from meshctl.apply.replace import (
     still_on,
     with_identity,
 )
-from meshctl.cli.bench_places import At, AtSite, Interfaces, named_places, places_in_lab, with_site
+from meshctl.cli.bench_places import (
+    At,
+    AtSite,
+    Interfaces,
+    named_places,
+    no_answer_hint,
+    places_in_lab,
+    with_site,
+)
 from meshctl.cli.context import (
     AsJson,
     DryRun,
@@ -62,7 +69,6 @@ Changes = tuple[FileEdit, ...]
 
 # Argument for a device that is not in the inventory.
 BENCH = "bench"
-NO_ANSWER_HINT = f"check that it has booted and that this machine has an address in the network of {FACTORY_ADDRESS}"
 
 
 def bootstrap(
@@ -94,7 +100,7 @@ def bootstrap(
     Example: meshctl bootstrap b03 --at-site north
     """
     choices = PlanOptions(with_firmware=not no_firmware)
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         given = _given_places(opened, at or [], interface or [], at_site)
         places = _expected_places(opened, nodes or [], limit or [], given)
         places = [with_site(opened.fleet, place, at_site) for place in places]
@@ -109,7 +115,7 @@ def bootstrap(
                 interrupt=opened.interrupt,
             )
         for outcome in arrivals.outcomes:
-            _print_failure(outcome)
+            _print_failure(outcome, opened, next((place for place in places if str(place) == outcome.node), None))
         if not as_json:
             for name, item in arrivals.found.items():
                 echo(f"{name}: found at {item.target.label}, host key {item.key.fingerprint}")
@@ -145,11 +151,12 @@ def bootstrap(
             raise
 
 
-def _print_failure(outcome: Outcome) -> None:
+def _print_failure(outcome: Outcome, opened: Session, place: BenchTarget | None) -> None:
     echo(f"{outcome_text(outcome)}", err=True)
-    is_unreachable = outcome.result is Result.UNREACHABLE and FACTORY_ADDRESS in outcome.node
-    is_here = not outcome.node.partition(" at site ")[1]
-    hint = outcome.hint or (NO_ANSWER_HINT if is_unreachable and is_here else "")
+    hint = outcome.hint
+    if not hint and outcome.result is Result.UNREACHABLE and place is not None:
+        node = opened.fleet.nodes.get(place.node)
+        hint = no_answer_hint(place, node, is_pinned=node is not None and bool(opened.trust.pinned(node.name)))
     if hint:
         echo(f"  hint: {hint}", err=True)
 
@@ -217,7 +224,7 @@ def replace(
     Example: meshctl replace husky1-b03 spare2
     """
     choices = PlanOptions(with_firmware=not no_firmware)
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         old_node = _replaced(opened.fleet, old)
         spare = _spare(opened, old_node, new)
         has_taken_over = not old_is_off and _require_off(opened, inventory, old_node, spare)

@@ -13,7 +13,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -24,7 +24,7 @@ import typer
 from meshctl import event_log
 from meshctl.cli.extensions import LabFleet, attach_lab
 from meshctl.cli.output import console, echo, echo_error
-from meshctl.errors import ExitCode, InputError
+from meshctl.errors import ExitCode, InputError, MeshctlError
 from meshctl.fleet import Interrupt, Outcome, totals
 from meshctl.model import Fleet, Node
 
@@ -95,8 +95,13 @@ class Session:
 
 
 @contextmanager
-def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None = None) -> Iterator[Session]:
-    """Open a session and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
+def session(
+    inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None = None, changes_nothing: bool = False
+) -> Iterator[Session]:
+    """Open a session and close it at the end; with `changes_nothing`, a journal that cannot be written is a warning.
+
+    Raises InvalidInput, InputError, MeshctlError.
+    """
     from meshctl.fleet.journal_store import open_journal
     from meshctl.fleet.lab_directory import lab_of
     from meshctl.fleet.lab_sites import without_real_gateways
@@ -118,10 +123,12 @@ def session(inventory: Path, *, key_files: Iterable[Path] = (), lab: Path | None
             echo_error,
             lab=lab_directory,
             pinned=lambda node: (key.fingerprint for key in trust.pinned(node)),
+            changes_nothing=changes_nothing,
         ) as journal,
         ConnectionPool(fleet, trust, key_files=tuple(key_files), locate=locate_in(virtual)) as access,
     ):
-        journal.move_lab_runs(fleet.name, lab_of)
+        with suppress(MeshctlError) if changes_nothing else nullcontext():
+            journal.move_lab_runs(fleet.name, lab_of)
         access.former_addresses = cache(lambda: former_addresses(fleet, journal.last_known(fleet.name)))
         yield Session(
             fleet,

@@ -98,7 +98,7 @@ def open_fleet_view(
 ) -> Iterator[FleetView]:
     """Open the fleet and close it at the end. Raises InvalidInput, InputError, MeshctlError."""
     password = None if no_robots else sudo_password(ask_sudo)
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         opened.access.deadlines = _deadlines(timeout)
         robots, skipped = _robots(opened, not no_robots)
         connector = RobotConnector(opened.fleet, opened.access, lambda: password) if robots else None

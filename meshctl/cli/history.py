@@ -52,7 +52,7 @@ def history(
         )
     if follow and run is not None:
         raise InputError("--follow shows all runs", hint="leave out the run number, or narrow with --node")
-    with open_journal(os.environ, echo_error) as journal:
+    with open_journal(os.environ, echo_error, changes_nothing=True) as journal:
         run_filter = _RunFilter(node, fleet, lab)
         if follow:
             follow_runs(journal, run_filter.matches, node, as_json=as_json)

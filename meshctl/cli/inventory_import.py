@@ -23,6 +23,15 @@ from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
 from meshctl.wording import counted
 
+NewNodesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--file",
+        metavar="FILE",
+        help="With --add: the file of the inventory that gets new nodes, if several have nodes.",
+    ),
+]
+
 app = typer.Typer(help="Import nodes from a CSV table (the default), an existing device, its `uci export`, or NetBox.")
 
 
@@ -31,6 +40,7 @@ def import_table(
     table: Annotated[str, typer.Argument(metavar="FILE", help="CSV file with a header; - for standard input.")],
     inventory: InventoryPath = Path(),
     add: Annotated[bool, typer.Option("--add", help="Add nodes that the inventory does not have.")] = False,
+    file: NewNodesFile = None,
     column: Annotated[
         list[str] | None,
         typer.Option("--column", metavar="COLUMN=HEADING", help="Read a column under another heading."),
@@ -52,7 +62,7 @@ def import_table(
     fleet = load_fleet(inventory, environ=os.environ)
     source = read_input(table)
     rows = read(source.text, source.file, headings=_headings(column or ()), ignored=ignore or ())
-    _take_over(inventory, fleet, rows, source.file, add=add, dry_run=dry_run, as_json=as_json)
+    _take_over(inventory, fleet, rows, source.file, add=add, new_in=file, dry_run=dry_run, as_json=as_json)
 
 
 @app.command("netbox")
@@ -64,6 +74,7 @@ def import_netbox(
         typer.Option("--filter", metavar="KEY=VALUE", help="Only devices that match, e.g. site=lab; repeatable."),
     ] = None,
     add: Annotated[bool, typer.Option("--add", help="Add nodes that the inventory does not have.")] = False,
+    file: NewNodesFile = None,
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
@@ -80,7 +91,7 @@ def import_netbox(
     devices, interfaces = fetch(url, os.environ.get("NETBOX_TOKEN", ""), _filters(query or ()))
     place = f"{url.rstrip('/')}/dcim/devices"
     found = checked(netbox_rows(devices, interfaces, fleet), place)
-    _take_over(inventory, fleet, found, place, add=add, dry_run=dry_run, as_json=as_json)
+    _take_over(inventory, fleet, found, place, add=add, new_in=file, dry_run=dry_run, as_json=as_json)
 
 
 def _filters(words: Sequence[str]) -> dict[str, list[str]]:
@@ -99,11 +110,22 @@ app.command("uci")(import_export)
 
 
 def _take_over(
-    inventory: Path, fleet: Fleet, rows: tuple[Row, ...], file: str, *, add: bool, dry_run: bool, as_json: bool
+    inventory: Path,
+    fleet: Fleet,
+    rows: tuple[Row, ...],
+    file: str,
+    *,
+    add: bool,
+    new_in: Path | None,
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Show and write what the rows change in the inventory."""
     found = edits(rows, fleet, file, add=add)
-    changes = _changes(inventory, found, file)
+    editor = Editor.open(inventory, environ=os.environ)
+    if any(each.is_new for each in found):
+        editor.new_nodes_file = _file_of_new_nodes(editor, new_in)
+    changes = _changes(editor, found, file)
     if as_json:
         nodes = [{"node": each.node, "line": each.line, "new": each.is_new, "values": each.values} for each in found]
         echo_json(json.dumps({"fleet": fleet.name, "rows": len(rows), "nodes": nodes}, indent=2))
@@ -111,13 +133,33 @@ def _take_over(
         for change in changes:
             echo(change.diff(), nl=False)
         new = sum(each.is_new for each in found)
-        echo(f"{counted(len(rows), 'row')}: {counted(len(found) - new, 'node')} to change, {new} to add", err=True)
+        where = f" in {editor.new_nodes_file}" if new else ""
+        echo(
+            f"{counted(len(rows), 'row')}: {counted(len(found) - new, 'node')} to change, {new} to add{where}", err=True
+        )
     if not dry_run:
         save(changes)
 
 
-def _changes(inventory: Path, found: tuple[NodeEdit, ...], file: str) -> tuple[FileEdit, ...]:
-    editor = Editor.open(inventory, environ=os.environ)
+def _file_of_new_nodes(editor: Editor, given: Path | None) -> Path:
+    """The inventory's file for new nodes. Raises InputError where that is the operator's choice."""
+    files = editor.files()
+    if given is not None:
+        found = next((file for file in files if file.resolve() == given.resolve()), None)
+        if found is None:
+            listed = ", ".join(map(str, files))
+            raise InputError(f"--file {given}: expected a file of the inventory, one of {listed}")
+        return found
+    candidates = editor.files_with_nodes() or files[:1]
+    if len(candidates) > 1:
+        raise InputError(
+            f"{len(candidates)} files of the inventory have nodes: {', '.join(map(str, candidates))}",
+            hint=f"say which one gets the new nodes: --file {candidates[-1]}",
+        )
+    return candidates[0]
+
+
+def _changes(editor: Editor, found: tuple[NodeEdit, ...], file: str) -> tuple[FileEdit, ...]:
     editor.set_nodes({each.node: each.values for each in found})
     try:
         return editor.changes()

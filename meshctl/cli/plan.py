@@ -104,7 +104,7 @@ def plan(
 
     Example: meshctl plan 'husky1-*' --out plan.json
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         choices = choices_of(opened.fleet, no_firmware, leave_behind, accept_cut, together)
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
@@ -141,11 +141,11 @@ def apply(
         raise InputError(f"cannot read {plan_file}: {what}") from error
     everywhere = load_site_plans(text, str(plan_file))
     if everywhere is not None:
-        with session(inventory, key_files=key or (), lab=lab) as opened:
+        with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
             options = RunOptions("apply", PlanOptions(everywhere.with_firmware), as_json, rate)
             raise _apply_everywhere(opened, inventory, everywhere, str(plan_file), options, dry_run=dry_run)
     saved = load(text, str(plan_file))
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         check_fleet(saved.plan.fleet, opened.fleet, str(plan_file))
         opened = with_sent_states(opened)
         agreed = prepare_agreed(opened, saved, reconnects=reconnect or not dry_run)
@@ -188,7 +188,7 @@ def provision(
 
     Example: meshctl provision 'b*' --together
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=check or dry_run) as opened:
         choices = choices_of(opened.fleet, no_firmware, leave_behind, accept_cut, together)
         own, sites = sites_of(opened, nodes, limit, direct=direct)
         if sites:
@@ -229,7 +229,7 @@ def resume(
 
     Example: meshctl resume --yes
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         record, left = _to_resume(opened.journal, opened.fleet.name, run)
         if record.command.startswith("robots "):
             from meshctl.cli.robots_context import resume_run

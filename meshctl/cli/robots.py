@@ -49,7 +49,7 @@ def deploy_command(context: RobotsContext, dry_run: DryRun = False) -> None:
 
 
 @app.command("diff")
-@with_robots_context("robots", "limit", "inventory", "wheels", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "wheels", "ask_sudo", "as_json", "key", changes_nothing=True)
 def diff_command(context: RobotsContext) -> None:
     """Show what a deploy would change on each robot, including changes by hand. Exit with 1 if there are any.
 
@@ -63,7 +63,7 @@ def diff_command(context: RobotsContext) -> None:
 
 
 @app.command("status")
-@with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "as_json", "key", changes_nothing=True)
 def status_command(context: RobotsContext) -> None:
     """Show each daemon: service state, uptime, peers and queues. Exit with 0 only if all are healthy.
 
@@ -111,7 +111,7 @@ def stop_command(context: RobotsContext, dry_run: DryRun = False) -> None:
 
 
 @app.command("logs")
-@with_robots_context("robots", "limit", "inventory", "ask_sudo", "key")
+@with_robots_context("robots", "limit", "inventory", "ask_sudo", "key", changes_nothing=True)
 def logs_command(
     context: RobotsContext,
     lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="Number of lines per robot.")] = 50,

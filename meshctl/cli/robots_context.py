@@ -188,10 +188,11 @@ def open_robots_context(
     wheels: Path | None = None,
     wait_s: int = 30,
     as_json: bool = False,
+    changes_nothing: bool = False,
 ) -> Iterator[RobotsContext]:
     """Open a session and its context. Raises InvalidInput and InputError for a bad inventory or selection."""
     password = sudo_password(ask_sudo)
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=changes_nothing) as opened:
         yield robots_context(
             opened, inventory, robots, password, limits=limit, wheels=wheels, wait_s=wait_s, as_json=as_json
         )
@@ -211,12 +212,19 @@ def robots_context(
     """A context in an open session."""
     fleet = opened.fleet
     secrets = SecretStore(os.environ, Path(fleet.base)).get
-    options = DeployOptions(
-        fleet, secrets, Wheelhouse(wheels, _cache()).wheels, time.time, wait_s, radios=_radios(opened)
-    )
     lab = "" if opened.lab is None else str(opened.lab.directory)
     connector = RobotConnector(fleet, opened.access, lambda: password, opened.owner, lab)
     selected = selected_robots(fleet, robots, read_selection, limits or ())
+    first = selected if len(selected) <= transfers_at_once(fleet.apply.parallel) else ()
+    options = DeployOptions(
+        fleet,
+        secrets,
+        Wheelhouse(wheels, _cache()).wheels,
+        time.time,
+        wait_s,
+        radios=_radios(opened),
+        apart=frozenset(fleet.robots).difference(first),
+    )
     return RobotsContext(opened, connector, selected, options, inventory, wheels, as_json)
 
 
@@ -229,10 +237,13 @@ def _radios(opened: Session) -> RadioKnowledge:
     return RadioKnowledge(opened.trust.pinned, names)
 
 
-def with_robots_context(*shared: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def with_robots_context(
+    *shared: str, changes_nothing: bool = False
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Add these shared options to a command that takes a `context`, and open the context for it."""
 
     def opened(**given: Any) -> AbstractContextManager[RobotsContext]:
+        given["changes_nothing"] = changes_nothing
         return open_robots_context(**{"robots" if name == "named" else name: value for name, value in given.items()})
 
     names = {*shared, "lab"}

@@ -68,7 +68,7 @@ def rollback(
 
     Example: meshctl rollback 12
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=dry_run) as opened:
         record = _record(opened, run)
         selected = {node.name for node in selected_nodes(opened.fleet, nodes, limit)} if nodes or limit else None
         # how parts of it ended that were left to their sites

@@ -56,7 +56,7 @@ def trust(
 
     Example: meshctl trust b03
     """
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         shown = fetch_host_keys(
             opened.access,
             opened.trust,
@@ -149,7 +149,7 @@ def run(
     if raw and as_json:
         raise InputError("expected --raw or --json, found both")
     patterns, command = _split(words)
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         selected = {node.name: node for node in selected_nodes(opened.fleet, patterns, limit)}
         out = threading.Lock()
 
@@ -224,7 +224,7 @@ def ssh(
     program = shutil.which("ssh")
     if program is None:
         raise InputError("ssh is not installed", hint="install openssh-client")
-    with session(inventory, key_files=key or (), lab=lab) as opened:
+    with session(inventory, key_files=key or (), lab=lab, changes_nothing=True) as opened:
         there = selected_node(opened.fleet, node)
         arguments = ssh_arguments(opened, there)
     os.execv(program, [*arguments, *([command_line(command)] if command else [])])

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
+from pathlib import Path
 
 from meshctl.errors import MeshctlError
 from meshctl.fleet.journal import Journal, default_path
+from meshctl.fleet.tolerant_store import TolerantStore
 
 STORE_VARIABLE = "MESHCTL_STORE"
 
@@ -21,14 +23,20 @@ def open_journal(
     *,
     lab: str = "",
     pinned: Callable[[str], Iterable[str]] = lambda node: (),
+    changes_nothing: bool = False,
 ) -> Journal:
     """The journal of real fleets as `environ` says; that of a virtual fleet is always the file of this computer.
 
-    Raises InputError for a bad URL, MeshctlError for a file or a database that cannot be used.
+    With `changes_nothing`, a file that cannot be written is a warning. Raises InputError for a bad URL, MeshctlError
+    for a file or a database that cannot be used.
     """
     path, url = default_path(environ), environ.get(STORE_VARIABLE, "")
+
+    def own_file() -> Path | TolerantStore:
+        return TolerantStore.open(path, notify) if changes_nothing else path
+
     if not url or lab:
-        return Journal(path, lab=lab, pinned=pinned)
+        return Journal(own_file(), lab=lab, pinned=pinned)
     # psycopg takes a tenth of a second to import
     from meshctl.fleet.postgresql import Database, DatabaseLost, label_of
     from meshctl.fleet.process import owner
@@ -39,12 +47,19 @@ def open_journal(
     except DatabaseLost as error:
         target = label_of(url)
 
-        def merge_later(run: int) -> None:
-            with closing(Spool(path)) as spool:
-                spool.note_unmerged(target, run)
-
         notify(f"{error}; the journal of this computer is used, and merged later")
-        return Journal(path, pinned=pinned, merge_later=merge_later)
+        file = own_file()
+
+        def merge_later(run: int) -> None:
+            try:
+                with closing(Spool(path)) as spool:
+                    spool.note_unmerged(target, run)
+            except MeshctlError as unwritable:
+                if not isinstance(file, TolerantStore):
+                    raise
+                file.report(unwritable)
+
+        return Journal(file, pinned=pinned, merge_later=merge_later)
     try:
         merged = store.merge(path)
     except MeshctlError as error:
@@ -56,4 +71,4 @@ def open_journal(
         if merged:
             numbers = ", ".join(str(number) for number in merged)
             notify(f"runs of this computer are merged into the shared journal as {numbers}")
-    return Journal(store, pinned=pinned)
+    return Journal(TolerantStore(store, notify) if changes_nothing else store, pinned=pinned)

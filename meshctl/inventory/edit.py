@@ -64,6 +64,8 @@ class Editor:
 
     path: Path
     environ: Mapping[str, str]
+    new_nodes_file: Path | None = None
+    """The file that gets entries of new nodes; by default the first one that has nodes."""
     _before: dict[Path, str] = field(default_factory=dict)
     _texts: dict[Path, str] = field(default_factory=dict)
     _roots: dict[Path, MappingNode] = field(default_factory=dict)
@@ -136,6 +138,14 @@ class Editor:
         """Whether a file sets `path`."""
         return any(descend(self._roots[file], path) is not None for file in self._texts)
 
+    def files_with_nodes(self) -> tuple[Path, ...]:
+        """The files that have a section `nodes`, in the order in which they are read."""
+        return tuple(file for file in self._texts if "nodes" in self._roots[file].values)
+
+    def files(self) -> tuple[Path, ...]:
+        """All files of the inventory, in the order in which they are read."""
+        return tuple(self._texts)
+
     def sibling_of(self, node: str) -> str:
         """The entry after which `node`'s own entry belongs: the range that contains it, or the last entry of a node of
         that range right below it; an empty string if no range contains it."""
@@ -153,6 +163,11 @@ class Editor:
                     own = takewhile(names.__contains__, patterns[number + 1 :])
                     found.append((names, [pattern, *own][-1]))
         return found
+
+    def _has_range_of(self, file: Path, node: str) -> bool:
+        nodes = self._roots[file].values.get("nodes")
+        patterns = nodes.keys if isinstance(nodes, MappingNode) else {}
+        return any(is_range(pattern) and node in _names(pattern) for pattern in patterns)
 
     def _has_entries_beside(self, node: str) -> bool:
         """Whether the file that gets the entry of this new node has entries of others."""
@@ -185,7 +200,12 @@ class Editor:
         return self._texts[file].removeprefix(_BOM)
 
     def _file_of(self, path: tuple[str, ...]) -> Path:
-        """The file that sets `path` or its longest prefix; the first file if none does."""
+        """The file that sets `path` or its longest prefix; the first file if none does. The own entry of a node of a
+        range belongs into the range's file."""
+        if len(path) > 1 and path[0] == "nodes" and not self.has(path[:2]):
+            with_range = next((file for file in self._texts if self._has_range_of(file, path[1])), None)
+            if (file := with_range or self.new_nodes_file) is not None:
+                return file
 
         def depth(file: Path) -> int:
             root = self._roots[file]

@@ -34,6 +34,8 @@ _VARIABLE = re.compile(r"[A-Z_][A-Z0-9_]*")
 _SUSPICIOUS_COMMENT = re.compile(rf"({_SECRET_WORDS.pattern})\s*[:=]|[A-Za-z0-9+/_=-]{{20,}}", re.IGNORECASE)
 _WORD = re.compile(r"[^\s\[\]{},:#\"'&*|>-]+")
 _MAX_KEY_CHARACTERS = 40
+# an anchor or alias where YAML allows one: after a space or an indicator
+_ANCHOR = re.compile(r"(?:^|(?<=[\s\[{,]))([&*])([^\s\[\]{},]+)", re.MULTILINE)
 
 
 class _Visibility(IntEnum):
@@ -79,10 +81,19 @@ class Excerpts:
             self._is_inventory = all(key in known for key in root.keys)
             for start, end, mark in sorted(_spans(root, InventoryDocument), key=lambda span: span[2]):
                 self._marks[start:end] = bytes([mark]) * (min(end, len(self._marks)) - start)
+            self._show_anchors(self._marks)
         else:
             for found in re.finditer(r"([A-Za-z_]+)[\"']?\s*:(?=\s|$)", self.text):
                 if found[1] in _all_keys():
                     self._marks[found.start(1) : found.end(1)] = bytes([_Visibility.SHOWN]) * len(found[1])
+
+    def _show_anchors(self, marks: bytearray) -> None:
+        """Show the names that are both defined and used. Another `&word` may be a secret that was not quoted."""
+        found = [one for one in _ANCHOR.finditer(self.text) if marks[one.start()] != _Visibility.HIDDEN]
+        defined, used = ({one[2] for one in found if one[1] == mark} for mark in "&*")
+        for one in found:
+            if one[2] in defined & used:
+                marks[one.start() : one.end()] = bytes([_Visibility.SHOWN]) * len(one[0])
 
 
 def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:

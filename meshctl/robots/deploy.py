@@ -20,6 +20,8 @@ from meshctl.model import Fleet, Secret, SecretRef
 from meshctl.model.computers import ROS_1
 from meshctl.robots.bundle import Bundle, bundle, has_bridge
 from meshctl.robots.collector_release import RadioKnowledge, has_collector, missing_pins, own_radios, radio_archive
+from meshctl.robots.expected_release import expected_release
+from meshctl.robots.facts import collect_facts
 from meshctl.robots.host import Host, ScriptRefused
 from meshctl.robots.preconditions import (
     HostFacts,
@@ -82,7 +84,8 @@ class DeployOptions:
 
     `now_s` returns our clock (Unix time); `wait_s` is the time a daemon has to become healthy; `only_configuration`
     refuses robots that would get other code; `radios` is for their collectors; `step` is entered with robot, step name
-    and detail, and left when the step ends.
+    and detail, and left when the step ends. `apart` are the robots that do not switch at the same time as these: on
+    another port they are not heard.
     """
 
     fleet: Fleet
@@ -92,6 +95,7 @@ class DeployOptions:
     wait_s: int = 30
     only_configuration: bool = False
     radios: RadioKnowledge = field(default_factory=RadioKnowledge)
+    apart: frozenset[str] = frozenset()
     step: Callable[[str, str, str], AbstractContextManager[None]] = lambda robot, name, text: nullcontext()
 
 
@@ -118,12 +122,25 @@ def plan_deploy(host: Host, robot: str, options: DeployOptions) -> tuple[HostFac
         radios = [node.name for node in own_radios(options.fleet, options.fleet.robots[robot])]
         without_pin = missing_pins(options.fleet, robot, options.radios)
         reasons += unmet_for_collector(facts, robot=robot, radios=radios, without_pin=without_pin)
+    if not reasons and facts.port not in (0, options.fleet.udp_mesh.port):
+        reasons += _unmet_for_port(host, robot, options, facts.port)
     if reasons:
         return _refused(robot, reasons)
     try:
         return facts, desired_bundle(options, robot, facts)
     except InputError as error:
         return Outcome(robot, Result.REFUSED, str(error), hint=error.hint)
+
+
+def _unmet_for_port(host: Host, robot: str, options: DeployOptions, old: int) -> list[tuple[str, str]]:
+    """A daemon on a new port does not hear peers that are still on the old one, and would be rolled back for that."""
+    seen = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
+    if not (left := sorted(options.apart & set(seen.online))):
+        return []
+    count = sum(one.computer is not None for one in options.fleet.robots.values())
+    port = options.fleet.udp_mesh.port
+    reason = f"its port changes from {old} to {port}, and {', '.join(left)}, which it hears, would change later"
+    return [(reason, f"change all robots at once: run `MESHCTL_PARALLEL={count} meshctl robots deploy`")]
 
 
 def _refused(robot: str, reasons: list[tuple[str, str]]) -> Outcome:

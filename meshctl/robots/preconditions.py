@@ -51,6 +51,8 @@ class HostFacts:
     services: tuple[tuple[str, str, str], ...] = ()
     no_route: tuple[str, ...] = ()
     has_ssh: bool = True
+    port: int = 0
+    """The daemon's UDP port in the current release; 0 without one."""
 
     @property
     def units(self) -> tuple[tuple[str, str, str], ...]:
@@ -118,6 +120,7 @@ def parse_facts(text: str) -> HostFacts:
         services=tuple(_service(row) for row in many.get("unit", ())),
         no_route=tuple(many.get("no_route", ())),
         has_ssh="no_ssh" not in value_of,
+        port=_number(value_of.get("port", "")),
     )
 
 

@@ -14,7 +14,7 @@ from meshctl.status.rows import COLUMNS, Column, TableCell
 
 _GAP = "  "
 # Columns of this rank or more are dropped before cells are shortened.
-_SHORTEN_BELOW_RANK = 5
+_SHORTEN_BELOW_RANK = 8
 Paint = Callable[[str, str], str]
 """(text, style) -> text; styles: ok, degraded, unreachable, off, heading, known, error, warning, note, hint."""
 

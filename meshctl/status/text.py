@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from meshctl.errors import ExitCode
 from meshctl.inventory.selection import COMPUTER
 from meshctl.report.duration import duration
+from meshctl.report.line_wrap import wrap
 from meshctl.report.terminal_escapes import one_line
 from meshctl.status.node_alarms import join_limited
 from meshctl.status.preflight import Check, verdict
@@ -49,7 +50,7 @@ def text(
     if topics:
         lines += ["", *topic_lines(status, width)]
     if len(devices) > MAX_SCREEN_ROWS:
-        lines += ["", verdict_line(status, paint)]
+        lines += ["", *_verdict_lines(status, width, paint)]
     return "\n".join(lines)
 
 
@@ -57,8 +58,9 @@ def summary_lines(
     status: FleetStatus, width: int | None = None, paint: Paint = plain, *, brief: bool = False
 ) -> list[str]:
     """The verdict, the totals and the alarms."""
-    lines = [verdict_line(status, paint)]
-    lines += [f"  {text}" for text in _totals(status)]
+    lines = _verdict_lines(status, width, paint)
+    for total in _totals(status):
+        lines += wrap(f"  {total}", width)
     alarms = list(_alarm_lines(status, width, paint, brief))
     return [*lines, "", *alarms] if alarms else lines
 
@@ -71,6 +73,15 @@ def verdict_line(status: FleetStatus, paint: Paint = plain) -> str:
     when = time.strftime("%H:%M:%S UTC", time.gmtime(status.taken_s))
     took = f", took {status.took_s:.1f} s" if status.took_s else ""
     return f"{status.fleet}: {paint(word, style)}{': ' if parts else ''}{', '.join(parts)} ({when}{took})"
+
+
+def _verdict_lines(status: FleetStatus, width: int | None, paint: Paint) -> list[str]:
+    """`verdict_line`, wrapped."""
+    if width is None or len(verdict_line(status)) <= width:
+        return [verdict_line(status, paint)]
+    word, style = _VERDICTS[status.exit_code]
+    first, *others = wrap(verdict_line(status), width)
+    return [first.replace(word, paint(word, style), 1), *others]
 
 
 def _totals(status: FleetStatus) -> Iterator[str]:
@@ -124,10 +135,13 @@ def _wrapped(lead: str, text: str, width: int | None, paint: Paint, style: str) 
 
 
 def _beside(lead: str, text: str, width: int | None, indent: str = "") -> list[str]:
-    """The text wrapped beside `lead`, with later lines `indent`ed further."""
+    """The text wrapped beside `lead`, with later lines `indent`ed further; below it where there is no room beside."""
     lead, text = one_line(lead), one_line(text)
-    room = None if width is None else max(width - len(lead), _MIN_WIDTH)
-    parts = [text] if room is None else textwrap.wrap(text, room, subsequent_indent=indent, break_on_hyphens=False)
+    if width is None:
+        return [f"{lead}{text}"]
+    if text and width - len(lead) < min(_MIN_WIDTH, len(text)):
+        return [lead.rstrip(), *textwrap.wrap(text, width, initial_indent="  ", subsequent_indent="  ")]
+    parts = textwrap.wrap(text, max(width - len(lead), 1), subsequent_indent=indent, break_on_hyphens=False)
     first, *others = parts or [""]
     return [f"{lead}{first}", *(f"{' ' * len(lead)}{part}" for part in others)]
 
@@ -148,10 +162,13 @@ def topic_lines(status: FleetStatus, width: int | None = None) -> list[str]:
                 )
             )
     rows = [rows[0], *sorted(rows[1:], key=lambda cells: (cells[1] == "-", cells[1].rjust(3), cells[0]))]
-    widths = [max(len(cells[column]) for cells in rows) for column in range(len(rows[0]) - 1)]
+    widths = [max(len(cells[column]) for cells in rows) + 2 for column in range(len(rows[0]) - 1)]
+    for least in (rows[0].index("priority"), rows[0].index("sent")):
+        if width is not None and sum(widths) > width + 2:
+            widths[least] = 0
     lines = []
     for *cells, problem in rows:
-        lead = "".join(f"{cell.ljust(room)}  " for cell, room in zip(cells, widths, strict=True))
+        lead = "".join(cell.ljust(room) for cell, room in zip(cells, widths, strict=True) if room)
         lines += [line.rstrip() for line in _beside(lead, problem, width)]
     return lines
 

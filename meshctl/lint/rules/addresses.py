@@ -210,7 +210,7 @@ def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
 def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     host = fleet.system.log_host
     if host and _out_of_reach(fleet, host):
-        yield Finding(("system", "log_host"), "outside the fleet's networks", "an address of a mesh's network", host)
+        yield Finding(("system", "log_host"), "outside the fleet's networks", _within_reach(fleet), host)
 
 
 @fleet_rule(
@@ -226,16 +226,24 @@ def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Findin
 def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     servers = fleet.system.ntp_servers
     if servers and all(_out_of_reach(fleet, server) for server in servers):
-        expected = "an address of a mesh's network"
-        yield Finding(("system", "ntp_servers"), "outside the fleet's networks", expected, ", ".join(servers))
+        message = "outside the fleet's networks"
+        yield Finding(("system", "ntp_servers"), message, _within_reach(fleet), ", ".join(servers))
 
 
 def _out_of_reach(fleet: Fleet, host: str) -> bool:
-    if any(node.gateway is not None for node in fleet.managed()):
-        return False
+    versions = {node.gateway.version for node in fleet.managed() if node.gateway is not None}
     address = as_address(host)
-    # a name needs a resolver, which also is behind a gateway
-    return address is None or not any(address in network for _, network in networks(fleet))
+    if address is None:
+        # a name needs a resolver, which also is behind a gateway
+        return not versions
+    return address.version not in versions and not any(address in network for _, network in networks(fleet))
+
+
+def _within_reach(fleet: Fleet) -> str:
+    """What a reachable host would be."""
+    gateways = {str(node.gateway): node.gateway.version for node in fleet.managed() if node.gateway is not None}
+    behind = [f"an IPv{version} address, as gateway {gateway}" for gateway, version in gateways.items()]
+    return ", or ".join([*behind[:1], "an address of a mesh's network"])
 
 
 def as_address(host: str) -> IpAddress | None:

@@ -65,6 +65,7 @@ done
 [ ! -e "$root/unproven" ] && echo proven=yes || echo proven=no
 if [ -n "$current" ]; then
 	sed 's/^/file=/' "$root/current/manifest" 2>/dev/null || echo damaged=manifest
+	sed -n 's/^port = /port=/p' "$root/current/etc/udp-mesh.toml" 2>/dev/null | sed 1q
 	# what was changed by hand, or by a failing disk
 	(cd "$root/current" && sha256sum -c manifest) 2>/dev/null | sed -n 's/: FAILED.*//p' | sed 's/^/damaged=/'
 	[ -e "$root/current/lib/.sums" ] || echo damaged=lib

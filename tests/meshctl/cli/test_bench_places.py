@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 
 from meshctl.apply.bootstrap import BenchTarget
-from meshctl.cli.bench_places import named_places, places_in_lab, with_site
+from meshctl.cli.bench_places import named_places, no_answer_hint, places_in_lab, with_site
 from meshctl.cli.extensions import LabFleet
 from meshctl.device.connection import Endpoint
 from meshctl.errors import InputError
@@ -71,3 +71,18 @@ def test_a_lab_reaches_no_real_device(given: BenchTarget, message: str, hint: st
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         places_in_lab([given], cast(LabFleet, _Lab()))
     assert caught.value.hint == hint
+
+
+def test_silence_on_the_bench_names_its_probable_reason(tmp_path: Path) -> None:
+    fleet = fleet_of(tmp_path, _SITES)
+    node = fleet.nodes["n1"]
+    for place in (BenchTarget(node="n1"), BenchTarget("127.255.0.4", 2022, node="n1")):
+        text = no_answer_hint(place, node, is_pinned=True)
+        assert "n1 has a pinned host key, so it is probably set up already and answers at 10.42.0.1" in text
+        assert "`meshctl status n1`" in text
+        assert "--replace-key" in text
+    assert "in the network of 192.168.1.1; a device that is set up" in no_answer_hint(
+        BenchTarget(), None, is_pinned=False
+    )
+    assert no_answer_hint(BenchTarget("10.0.0.9"), node, is_pinned=False) == ""
+    assert no_answer_hint(BenchTarget(site="north"), None, is_pinned=False) == ""

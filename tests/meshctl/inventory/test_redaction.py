@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from textwrap import dedent
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -87,3 +89,27 @@ def test_the_shipped_inventories_are_shown_unmasked(name: str) -> None:
 def test_arbitrary_text_yields_excerpts_with_valid_columns(text: str, number: int, column: int) -> None:
     found = Excerpts(text).line(number, column)
     assert found is None or found[1] <= len(found[0]) + 1
+
+
+def test_names_of_anchors_are_shown_where_an_alias_uses_them() -> None:
+    text = dedent(
+        """\
+        defaults: &common {hardware: rocket}
+        groups:
+          first: &relay
+            role: beacon
+          second: *relay
+        nodes:
+          b0: *common
+          b1: {address: &start 10.42.0.1}
+          b2: {address: *start}
+          b3: {mesh: &hunter2 x}
+        meshes:
+          main: {key: &hunter3 hunter4}
+          other: {key: *hunter3}
+        """
+    )
+    excerpts = Excerpts(text)
+    shown = [found[0] for number in range(1, 14) if (found := excerpts.line(number, 1)) is not None]
+    assert shown[:9] == text.splitlines()[:9]
+    assert "hunter" not in "".join(shown)

@@ -88,3 +88,19 @@ def test_a_radio_without_a_mesh_may_serve_an_access_point(tmp_path: Path) -> Non
     """
     found = [item for item in _found(Example(fragment), tmp_path) if item.code == "MC529"]
     assert [item.path.rpartition("extra_uci.")[2] for item in found] == ["wireless.radio0.channel"]
+
+
+@pytest.mark.parametrize(
+    ("server", "expected"),
+    [
+        ("2001:db8::123", "an IPv4 address, as gateway 10.42.0.254, or an address of a mesh's network"),
+        ("192.0.2.9", ""),
+        ("pool.ntp.org", ""),
+    ],
+)
+def test_a_gateway_leads_to_hosts_of_its_own_family(server: str, expected: str, tmp_path: Path) -> None:
+    text = f'nodes: {{b01: {{gateway: 10.42.0.254}}}}\nsystem: {{ntp_servers: ["{server}"], log_host: "{server}"}}\n'
+    example = Example(text)
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    of_hosts = {one.code: one.expected for one in found if one.code in ("MC212", "MC213")}
+    assert of_hosts == ({"MC212": expected, "MC213": expected} if expected else {})

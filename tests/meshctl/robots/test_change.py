@@ -65,6 +65,23 @@ def test_a_deploy_restarts_a_daemon_for_what_a_reload_cannot_change(fleet: Robot
     assert _boots(fleet) != {"husky1": boot}
 
 
+def test_a_new_port_is_refused_where_peers_would_get_it_later(
+    fleet: RobotFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boots = _pair(fleet)
+    text = fleet.file.read_text().replace("parallel: 8", "parallel: 1")
+    fleet.file.write_text(text.replace("  heartbeat_s:", "  port: 8710\n  heartbeat_s:"))
+    output = fleet.deploy(exit_code=1)
+    assert "husky1: refused: its port changes from 8700 to 8710, and husky2, which it hears, would change" in output
+    assert "husky2: refused: " in output
+    assert "MESHCTL_PARALLEL=2 meshctl robots deploy" in output
+    assert "refused: its port changes" in fleet.deploy("husky1", exit_code=1)
+    assert _boots(fleet) == boots
+    monkeypatch.setenv("MESHCTL_PARALLEL", "2")
+    assert "2 done" in fleet.deploy()
+    eventually(lambda: _all_online(fleet))
+
+
 def test_a_dry_run_shows_the_change_without_applying_it(fleet: RobotFleet) -> None:
     boots = _pair(fleet)
     fleet.meshctl("topic", "set", "status", "priority=6")

@@ -50,7 +50,7 @@ def broken(fleet: Fleet) -> FleetStatus:
     )
 
 
-@pytest.mark.parametrize("width", [72, 80, 100, 120, 200])
+@pytest.mark.parametrize("width", [40, 50, 60, 72, 80, 100, 120, 200])
 def test_no_line_is_wider_than_the_terminal(fleet: Fleet, width: int) -> None:
     status = broken(fleet)
     silent = [
