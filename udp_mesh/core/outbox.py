@@ -17,6 +17,7 @@ from heapq import heapify, heappop, heappush
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.interfaces import Store, StoredMessage
 from udp_mesh.core.sender.message import AcceptedMessage, OutgoingMessage
+from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.core.settings import Outbox
 
 
@@ -76,9 +77,10 @@ class _TopicQueue:
 class Outboxes:
     """By peer name and topic."""
 
-    __slots__ = ("_deadlines", "_held", "_messages", "_next_key", "_serial", "_store", "bytes")
+    __slots__ = ("_deadlines", "_held", "_memory", "_messages", "_next_key", "_serial", "_store", "bytes")
 
-    def __init__(self, store: Store | None) -> None:
+    def __init__(self, store: Store | None, memory: SendMemory) -> None:
+        self._memory = memory
         self._held: dict[str, dict[str, _TopicQueue]] = {}
         self._deadlines: list[tuple[float, int, str, HeldMessage]] = []
         self._messages = 0
@@ -122,6 +124,7 @@ class Outboxes:
         queue.put(new)
         self.bytes += new.size
         self._messages += 1
+        self._memory.add(accepted)
         dropped: list[tuple[HeldMessage, ExpiryReason]] = []
         last = topic.outbox is Outbox.LAST
         while queue.messages > 1 if last else queue.bytes > topic.outbox_bytes:
@@ -190,12 +193,14 @@ class Outboxes:
             for peer, queues in self._held.items()
             for queue in queues.values()
             for held in queue.held
-            if not held.dropped and not self.on_disk(held.store_key)
+            if not held.dropped
         ]
+        for _, held in everything:
+            self._memory.remove(held.accepted)
         self._held.clear()
         self._deadlines.clear()
         self.bytes = self._messages = 0
-        return everything
+        return [(peer, held) for peer, held in everything if not self.on_disk(held.store_key)]
 
     def peers(self) -> list[str]:
         return [peer for peer in self._held if self.holds(peer)]
@@ -213,6 +218,7 @@ class Outboxes:
         queue.drop(held)
         self.bytes -= held.size
         self._messages -= 1
+        self._memory.remove(held.accepted)
 
     def _note_deadline(self, peer: str, held: HeldMessage) -> None:
         deadline = held.accepted.deadline

@@ -8,6 +8,7 @@
 from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 
+from udp_mesh.core.capacity import check_capacity
 from udp_mesh.core.compression import STEP_BYTES, Uncompressed, compress
 from udp_mesh.core.events import (
     ExpiryReason,
@@ -80,7 +81,7 @@ def send(
     names = [name for name in wanted if name != state.settings.name]
     if wanted and not names:
         return Rejected(RejectReason.UNKNOWN_PEER, f"{wanted[0]} is this node, and messages go to others")
-    rejected = _check_capacity(state, topic, names, len(payload))
+    rejected = check_capacity(state, topic, names, len(payload))
     if rejected is not None:
         return rejected
     message_id = MessageId(state.next_message_id)
@@ -127,31 +128,6 @@ def _enqueue_all(
             enqueue(state, name, accepted, now, store_key)
     else:
         _broadcast(state, accepted, now)
-
-
-def _check_capacity(state: State, topic: Topic, names: list[str], size_bytes: int) -> Rejected | None:
-    limits = state.settings.limits
-    for name in names or [peer.name for peer in state.peer_table.online()]:
-        peer = state.peer_table.peers.get(name)
-        if peer is None:
-            if topic.outbox is Outbox.NONE and name not in topic.destinations:
-                return Rejected(RejectReason.UNKNOWN_PEER, f"{name} is not a known peer")
-            if len(state.peer_table.peers) >= limits.peers:
-                return Rejected(RejectReason.QUEUE_FULL, f"limit of {limits.peers} peers reached")
-            continue
-        sender = peer.sender
-        if sender is None:
-            continue
-        if (
-            sender.levels.queued_bytes + size_bytes > limits.queue_bytes_per_peer
-            or len(sender.pending) >= limits.queue_messages_per_peer
-        ):
-            return Rejected(RejectReason.QUEUE_FULL, f"queue for {name} is full")
-    if topic.compression and state.compression_queue.bytes + size_bytes > limits.queue_bytes_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "compression queue is full")
-    if not names and state.broadcasts.queued() >= limits.queue_messages_per_peer:
-        return Rejected(RejectReason.QUEUE_FULL, "broadcast queue is full")
-    return None
 
 
 def topic_channel(state: State, topic: Topic, type_name: str) -> TopicChannel | None:

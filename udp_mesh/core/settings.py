@@ -333,6 +333,8 @@ class Limits:
     """Bytes pending for one peer: an application faster than the link."""
     queue_messages_per_peer: int = 65536
     """Messages pending for one peer: as above, with tiny messages."""
+    queue_bytes: int = 512 << 20
+    """The same for all peers and outboxes, a message to several counted once: applications sending to many names."""
     repair_bytes: int = 4 << 20
     """Broadcasts kept for repair: an application that broadcasts without end."""
     events: int = 65536

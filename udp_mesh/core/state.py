@@ -66,7 +66,7 @@ class State:
         """Wire bytes sent by this node to all nodes."""
         self.channel_share = ChannelShare()
         self.event_queue = EventQueue(settings.limits.events)
-        self.outboxes = Outboxes(store)
+        self.outboxes = Outboxes(store, self.peer_table.send_memory)
         self.heartbeats = HeartbeatScheduler(rng, settings.rates, now)
         self.broadcasts = BroadcastQueue()
         self.compression_queue = CompressionQueue()

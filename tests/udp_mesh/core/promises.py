@@ -26,11 +26,13 @@ from udp_mesh.core import transmit
 from udp_mesh.core.interfaces import Datagram
 from udp_mesh.core.peers.session import Peer
 from udp_mesh.core.receiver.reassembly import RELIABLE_TIMEOUT_S
+from udp_mesh.core.sender.message import OutgoingMessage
 from udp_mesh.core.sender.path import Path
 from udp_mesh.core.sender.rate_limit import TokenBucket
 from udp_mesh.core.sender.send_state import SendState
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.sender.sent_packets import Packet, SentPackets
+from udp_mesh.core.state import State
 
 MAX_STEPS_PER_S = 60_000
 """Datagrams, timers and calls of all nodes in a second of virtual time: more is a loop."""
@@ -56,8 +58,9 @@ def go(team: RandomTeam, seconds: float, until: Callable[[], bool] | None = None
 
 
 def check_node(team: RandomTeam, name: str) -> None:
-    """What is ready to be sent has a timer."""
+    """What is ready to be sent has a timer, and what waits is counted."""
     state = team.nodes[name]._state
+    check_memory(name, state)
     for peer in state.peer_table.peers.values():
         sender = peer.sender
         if sender is None or peer.session is None or not peer.session.path.link or peer in state.ready:
@@ -71,6 +74,28 @@ def check_node(team: RandomTeam, name: str) -> None:
             raise Broken(f"{name} has no timer for what waits for {peer.name}: {_shown(peer)}")
         if peer.due_at == float("inf"):
             raise Broken(f"{name} has no timer at all for {peer.name}: {_shown(peer)}")
+
+
+def check_memory(name: str, state: State) -> None:
+    """The memory of what waits for all peers is what is in their queues and outboxes."""
+    waiting = [message.accepted for peer in state.peer_table.peers.values() for message in _pending(peer)]
+    waiting += [
+        held.accepted
+        for queues in state.outboxes._held.values()
+        for queue in queues.values()
+        for held in queue.held
+        if not held.dropped
+    ]
+    copies = Counter(accepted.message_id for accepted in waiting)
+    counted = {number: found[0] for number, found in state.peer_table.send_memory._messages.items()}
+    if copies != counted:
+        raise Broken(f"{name} counts {counted} as waiting, and has {copies}")
+    if not counted and state.peer_table.send_memory.bytes:
+        raise Broken(f"{name} counts {state.peer_table.send_memory.bytes} B although nothing waits")
+
+
+def _pending(peer: Peer) -> list[OutgoingMessage]:
+    return [] if peer.sender is None else list(peer.sender.pending)
 
 
 def check_finished(team: RandomTeam) -> None:

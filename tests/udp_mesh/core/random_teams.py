@@ -32,7 +32,6 @@ from udp_mesh.core.settings import LinkInfo, LinkKind, Log, Outbox, Rates, Relay
 from udp_mesh.core.subscriptions.messages import Bounds, Subscription
 from udp_mesh.crypto import Key
 from udp_mesh.sim.topology import Topology
-from udp_mesh.wire.header import SEAL_TAG_BYTES
 
 NEXT_KEY = Key(bytes(range(1, 33)))
 RATES = Rates(offline_s=3.0, peer_lost_s=8.0, heartbeat_sparse_s=1.0)
@@ -127,8 +126,6 @@ class RandomTeam(Topology):
         self.reading: set[str] = set()
         self.suspended: dict[str, Endpoint] = {}
         self.datagrams: Counter[str] = Counter()
-        self.sealed_at: dict[bytes, float] = {}
-        """When each datagram was sent, by its seal, which no other has."""
         self.serial = 0
         self._starting: list[tuple[str, Event]] | None = None
         self.on_event = self._on_event
@@ -445,7 +442,6 @@ class RandomTeam(Topology):
 
     def _on_datagram(self, name: str, network: str, datagram: Datagram, now: float) -> None:
         self.datagrams[name] += 1
-        self.sealed_at.setdefault(datagram.data[-SEAL_TAG_BYTES:], now)
 
     def unfinished(self) -> list[tuple[tuple[str, int, int, str], Sent]]:
         return [(key, sent) for key, sent in self.sent.items() if not sent.ends]

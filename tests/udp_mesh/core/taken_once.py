@@ -7,7 +7,7 @@ refusal or announcement might.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from unittest.mock import patch
 
@@ -17,8 +17,10 @@ from udp_mesh.core.peers.session import Challenge, Session
 from udp_mesh.core.receiver import replay_check
 from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S
 from udp_mesh.core.receiver.replay_check import clock_of, timestamp_of
+from udp_mesh.core.relaying import relaying
 from udp_mesh.core.settings import Address
 from udp_mesh.core.state import State
+from udp_mesh.crypto import SendChannel
 from udp_mesh.wire.frames import Frame
 from udp_mesh.wire.header import SEAL_TAG_BYTES
 
@@ -38,8 +40,13 @@ class Effects:
         """Receiver's boot, and sender's boot and packet number, or seal and no number."""
         self._least_ages_s: dict[tuple[bytes, bytes], float] = {}
         """By boots of receiver and sender, of what took effect: ages are compared with that."""
+        self._sealed_at: dict[bytes, float] = {}
+        """When each datagram was sealed, by its seal, which no other has."""
         self._seal = b""
         """Of the datagram being received; each datagram has another one."""
+
+    def on_sealed(self, data: bytes) -> None:
+        self._sealed_at[data[-SEAL_TAG_BYTES:]] = self._team.now
 
     def receiving(self, data: bytes | memoryview) -> None:
         self._seal = bytes(data[-SEAL_TAG_BYTES:])
@@ -51,7 +58,7 @@ class Effects:
         self._once((state.boot_id, self._seal, -1), state, session)
 
     def check_age(self, state: State, session: Session, *, timestamped: bool) -> None:
-        sent_at = self._team.sealed_at.get(self._seal)
+        sent_at = self._sealed_at.get(self._seal)
         if sent_at is None:
             raise Broken(f"a datagram that no node sent took effect at {state.settings.name} as from {session.name}")
         age_s, boots = self._team.now - sent_at, (state.boot_id, session.boot_id)
@@ -75,9 +82,21 @@ def effects_watched(team: RandomTeam) -> Iterator[None]:
     """Fails when a datagram takes effect that must not. Those that wait for the proof of a first contact take effect
     while another one is received."""
     effects, released = Effects(team), False
+    seal_run, seal_long = SendChannel.seal_run, SendChannel.seal_long
     receive_datagram, process_frames = endpoint.receive_datagram, receive.process_frames  # type: ignore[attr-defined]
     on_path_validated = replay_check.on_path_validated  # type: ignore[attr-defined]
     release_held, receive_broadcast = receive._release_held, receive._receive_broadcast
+
+    def sealed_run(channel: SendChannel, run: Sequence[bytes | bytearray | memoryview]) -> list[bytes]:
+        found = seal_run(channel, run)
+        for data in found:
+            effects.on_sealed(data)
+        return found
+
+    def sealed_long(channel: SendChannel, frames: bytes | bytearray | memoryview) -> tuple[int, bytes]:
+        number, data = seal_long(channel, frames)
+        effects.on_sealed(data)
+        return number, data
 
     def received(state: State, data: bytes | memoryview, link: str, source: Address, now: float) -> None:
         effects.receiving(data)
@@ -118,7 +137,11 @@ def effects_watched(team: RandomTeam) -> Iterator[None]:
 
     with (
         patch.object(replay_check, "on_path_validated", validated),
+        patch.object(SendChannel, "seal_run", sealed_run),
+        patch.object(SendChannel, "seal_long", sealed_long),
         patch.object(endpoint, "receive_datagram", received),
+        # What relays carried.
+        patch.object(relaying, "receive_datagram", received),
         patch.object(receive, "process_frames", processed),
         patch.object(receive, "_release_held", releases),
         patch.object(receive, "_receive_broadcast", broadcast),

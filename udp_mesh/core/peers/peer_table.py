@@ -10,6 +10,7 @@ from udp_mesh.core.peers.channel_counters import BootMemory
 from udp_mesh.core.peers.session import Peer, Session
 from udp_mesh.core.peers.session_state import SessionEvent, SessionState
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
+from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.core.settings import Settings
 from udp_mesh.core.versions.received import CounterTable, ReceivedVersions
 from udp_mesh.crypto import Key, ReceiveChannel
@@ -43,6 +44,7 @@ class PeerTable:
         "own_boot",
         "own_name",
         "peers",
+        "send_memory",
         "sessions",
         "version_counters",
         "version_memory",
@@ -59,6 +61,8 @@ class PeerTable:
         """Sessions that are not the current one of any peer, by boot id."""
         self._boots = BootMemory()
         self.memory = MemoryBudget(settings.limits.partial_bytes)
+        self.send_memory = SendMemory(settings.limits.queue_bytes)
+        """What waits to be sent, to all peers and in all outboxes."""
         self.version_memory = MemoryBudget(settings.limits.version_bytes)
         self.version_counters = CounterTable()
         self.data_tags: dict[int, list[tuple[ReceiveChannel, Session]]] = {}
@@ -67,13 +71,14 @@ class PeerTable:
     def apply(self, settings: Settings) -> None:
         self._limits = settings.limits
         self.memory.set_limit(settings.limits.partial_bytes)
+        self.send_memory.limit = settings.limits.queue_bytes
         self.version_memory.set_limit(settings.limits.version_bytes)
 
     def get_or_create(self, name: str, settings: Settings) -> Peer | None:
         """The peer of a name, created if needed. None if there are too many."""
         peer = self.peers.get(name)
         if peer is None and len(self.peers) < self._limits.peers:
-            peer = self.peers[name] = Peer(name, settings)
+            peer = self.peers[name] = Peer(name, settings, self.send_memory)
         return peer
 
     def add_unverified(self, name: str, boot_id: bytes, keys: tuple[Key, ...], settings: Settings) -> Session:

@@ -21,6 +21,7 @@ from udp_mesh.core.receiver.datagram_age import ACCEPT_AGE_S, Freshness
 from udp_mesh.core.receiver.memory_limit import MemoryBudget
 from udp_mesh.core.receiver.receiver import Receiver
 from udp_mesh.core.sender.path import Path
+from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.core.sender.sender import Sender
 from udp_mesh.core.settings import Address, Settings
 from udp_mesh.core.subscriptions.table import KnownTable
@@ -83,10 +84,12 @@ class Meters:
 class Peer:
     """A name: what is being sent to it, whichever of its boots receives.
 
-    `sender` is None until `open_sender`: in a large team most nodes send to few.
+    `sender` is None until `open_sender`: in a large team most nodes send to few. `memory` counts what waits for all
+    peers.
     """
 
     __slots__ = (
+        "_memory",
         "_settings",
         "conflict_reported_at",
         "due_at",
@@ -105,9 +108,10 @@ class Peer:
         "trend",
     )
 
-    def __init__(self, name: str, settings: Settings) -> None:
+    def __init__(self, name: str, settings: Settings, memory: SendMemory | None = None) -> None:
         self.name = name
         self._settings = settings
+        self._memory = memory
         self.sender: Sender | None = None
         self.trend: LinkTrend | None = None
         """Of what is sent: set with `sender`."""
@@ -134,7 +138,7 @@ class Peer:
     def open_sender(self) -> Sender:
         """The sender, created if there is none yet."""
         if self.sender is None:
-            self.sender = Sender(self._settings)
+            self.sender = Sender(self._settings, self._memory)
             self.trend = LinkTrend()
         return self.sender
 

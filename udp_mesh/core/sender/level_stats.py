@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from udp_mesh.core.meter import Meter
 from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.wire.limits import PRIORITY_LEVELS
 
 
@@ -50,12 +51,14 @@ class LevelStats:
 
 
 class PriorityLevels:
-    """One `LevelStats` per priority. `queued_bytes` is the total pending on all levels."""
+    """One `LevelStats` per priority. `queued_bytes` is the total pending on all levels; `memory` counts what is pending
+    for all peers."""
 
-    __slots__ = ("_levels", "queued_bytes")
+    __slots__ = ("_levels", "_memory", "queued_bytes")
 
-    def __init__(self) -> None:
+    def __init__(self, memory: SendMemory) -> None:
         self._levels = [LevelStats() for _ in range(PRIORITY_LEVELS)]
+        self._memory = memory
         self.queued_bytes = 0
 
     def __getitem__(self, priority: int) -> LevelStats:
@@ -71,6 +74,7 @@ class PriorityLevels:
         level.messages += 1
         level.bytes += size
         self.queued_bytes += size
+        self._memory.add(message.accepted)
         self._append(level, message)
 
     def append(self, message: OutgoingMessage) -> None:
@@ -85,6 +89,7 @@ class PriorityLevels:
     def remove(self, message: OutgoingMessage) -> None:
         """Stop counting a message that ended."""
         self._count(message, -1)
+        self._memory.remove(message.accepted)
 
     def _count(self, message: OutgoingMessage, sign: int) -> None:
         level = self._levels[message.priority]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from udp_mesh.core.events import ExpiryReason
 from udp_mesh.core.sender.level_stats import PriorityLevels
 from udp_mesh.core.sender.message import OutgoingMessage
+from udp_mesh.core.sender.send_memory import SendMemory
 
 
 class Outcome(Enum):
@@ -55,10 +56,10 @@ class Unconfirmed:
 class PendingMessages:
     """The session fetches and clears `ended` and `cancelled`."""
 
-    def __init__(self) -> None:
+    def __init__(self, memory: SendMemory) -> None:
         self.pending: dict[OutgoingMessage, None] = {}
         """Messages without an outcome, in the order accepted."""
-        self.levels = PriorityLevels()
+        self.levels = PriorityLevels(memory)
         self.ended: list[Ended] = []
         self.cancelled: list[int] = []
         """Wire ids abandoned after their first fragment was sent: the peer may discard them."""

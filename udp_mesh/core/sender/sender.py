@@ -25,6 +25,7 @@ from udp_mesh.core.sender.pmtu import PathMtu
 from udp_mesh.core.sender.probing import PROBE_INTERVAL_S, Probing
 from udp_mesh.core.sender.redundancy import OVERDUE_ROUND_TRIPS, RedundantCopies
 from udp_mesh.core.sender.scheduler import Scheduler
+from udp_mesh.core.sender.send_memory import SendMemory
 from udp_mesh.core.sender.send_state import TRANSITIONS, SendEvent, SendState
 from udp_mesh.core.sender.sent_packets import Packet, SendSnapshot, SentPackets
 from udp_mesh.core.settings import Rates, Settings
@@ -52,10 +53,10 @@ STALE_AFTER_S = 1.0
 
 
 class Sender(PendingMessages):
-    """The sending half of a session. Times in seconds."""
+    """The sending half of a session. Times in seconds. `memory` counts what waits for all peers together."""
 
-    def __init__(self, settings: Settings) -> None:
-        super().__init__()
+    def __init__(self, settings: Settings, memory: SendMemory | None = None) -> None:
+        super().__init__(memory or SendMemory(settings.limits.queue_bytes))
         self.rtt = RttEstimator()
         self.urgent_rtt = RttEstimator()
         """Of urgent packets only: in a radio's queues they overtake others (Wi-Fi access categories)."""

@@ -76,6 +76,7 @@ class Selection:
         self._due: list[tuple[float, int, Destination, _Pace]] = []
         """A heap, by time, of those that have, or had, a waiting message."""
         self._serial = 0
+        self._paced_bytes = 0
         self._saved: dict[Destination, SavedCounters] = {}
         self._asked_at: dict[Session, float] = {}
         self.to_ask: dict[Session, None] = {}
@@ -85,6 +86,11 @@ class Selection:
         """Take over changed settings; what is withheld is admitted when it is due."""
         self._enabled = settings.selective
         self._urgent_priority = settings.rates.urgent_priority
+
+    @property
+    def withheld_bytes(self) -> int:
+        """Bytes of all messages that are withheld."""
+        return self._unread_bytes + self._paced_bytes
 
     def saved(self, destination: Destination) -> SavedCounters:
         """What this peer was not sent."""
@@ -194,18 +200,24 @@ class Selection:
             if len(self._paces) < MAX_PACED:
                 self._paces[key] = _Pace(now + 1 / rate_hz)
             return True
-        older, pace.waiting = pace.waiting, None
+        older = self._replace_waiting(pace, None)
         if older is not None:
             self._drop(destination, older, ExpiryReason.SUPERSEDED)
         pace.next_at = min(pace.next_at, now + 1 / rate_hz)
         if now >= pace.next_at:
             pace.next_at = now + 1 / rate_hz
             return True
-        pace.waiting = accepted
+        self._replace_waiting(pace, accepted)
         if older is None:
             self._schedule(destination, pace)
         self.next_at = min(self.next_at, pace.next_at)
         return False
+
+    def _replace_waiting(self, pace: _Pace, accepted: AcceptedMessage | None) -> AcceptedMessage | None:
+        """Let this message wait. Returns the one that waited until now."""
+        before, pace.waiting = pace.waiting, accepted
+        self._paced_bytes += _size(accepted) - _size(before)
+        return before
 
     def _schedule(self, destination: Destination, pace: _Pace) -> None:
         if pace.scheduled_at <= pace.next_at:
@@ -248,7 +260,7 @@ class Selection:
                 self._schedule(destination, pace)
             else:
                 due.append(Withheld(destination, pace.waiting))
-                pace.waiting = None
+                self._replace_waiting(pace, None)
         if self._due:
             self.next_at = min(self.next_at, self._due[0][0])
         return due
@@ -262,7 +274,7 @@ class Selection:
         for (destination, _), pace in self._paces.items():
             if destination in concerned and pace.waiting is not None:
                 found.append(Withheld(destination, pace.waiting))
-                pace.waiting = None
+                self._replace_waiting(pace, None)
         found.sort(key=lambda withheld: withheld.accepted.message_id)
         return found
 
@@ -273,6 +285,7 @@ class Selection:
             self.on_drop(withheld.destination, withheld.accepted, ExpiryReason.CLOSED)
         self._unread.clear()
         self._paces.clear()
+        self._unread_bytes = self._paced_bytes = 0
         self._due.clear()
         self.next_at = _NEVER
 
@@ -303,6 +316,13 @@ class Selection:
         """A message expired where it waited for its turn: perhaps because of a reader's maximum age."""
         if self._enabled and _is_aged(accepted):
             self.count(destination, accepted, ExpiryReason.DEADLINE)
+
+
+def _size(accepted: AcceptedMessage | None) -> int:
+    """Bytes in memory."""
+    if accepted is None:
+        return 0
+    return len(accepted.payload) + (0 if accepted.body is accepted.payload else len(accepted.body))
 
 
 def _is_known(peer: Peer, session: Session) -> bool:
