@@ -145,3 +145,10 @@ def test_an_emergency_stop_that_others_delay_is_reported_itself(tmp_path: Path) 
         "0, which no other topic has",
         "9",
     )
+
+
+@pytest.mark.parametrize(("width", "is_found"), [("HT20", False), ("HE80", False), ("HT80", True), ("ht20", True)])
+def test_the_width_of_an_access_points_channel_is_one_of_openwrts(width: str, is_found: bool, tmp_path: Path) -> None:
+    example = Example(f"nodes: {{b01: {{extra_uci: {{wireless.radio1.htmode: {width}}}}}}}\n")
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    assert ("MC918" in [one.code for one in found]) is is_found
