@@ -34,3 +34,8 @@ def join_limited(names: Sequence[str], limit: int = _MAX_NAMES) -> str:
 def node_list(names: Sequence[str]) -> str:
     """All names of a few nodes; `75 nodes (a, b, c, d and 71 more)` of many."""
     return ", ".join(names) if len(names) <= MAX_IN_FULL else f"{counted(len(names), 'node')} ({join_limited(names)})"
+
+
+def one_of(names: Sequence[str]) -> str:
+    """The alternatives after `expected`; the name alone if there is no other."""
+    return names[0] if len(names) == 1 else f"one of {join_limited(names)}"

@@ -246,7 +246,7 @@ def ssh_arguments(opened: Session, node: Node) -> list[str]:
     elif (site := opened.fleet.gateway_site(node)) is not None:
         hop = _gateway_arguments(opened, site)
     if hop:
-        arguments += ["-o", f"ProxyCommand={shlex.join([*hop[:-1], '-W', '%h:%p', hop[-1]])}"]
+        arguments += ["-o", f"ProxyCommand={shlex.join([*hop[:-1], '-W', '[%h]:%p', hop[-1]])}"]
     return [*arguments, _login(opened, node)]
 
 

@@ -216,7 +216,7 @@ def _section(
 ) -> None:
     """A section that meshctl does not render."""
     if not any(fnmatchcase(key, pattern) for pattern in patterns):
-        hint = "" if own.name is None else f"--keep {key} keeps it"
+        hint = "" if own.name is None else _obstacle(package, own) or f"--keep {key} keeps it"
         if (package, own.type) in _ROUTES:
             hint = "meshctl writes the routes to robots' LANs (`robots: NAME: lan`)"
         differences.append(Difference(Fate.REMOVED, key, _section_text(own), reason=hint))

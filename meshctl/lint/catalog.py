@@ -18,6 +18,7 @@ from meshctl.lint.rules import (
     drivers,
     encryption,
     extra_networks,
+    extra_radios,
     extra_services,
     extra_values,
     firmware,
@@ -84,6 +85,7 @@ CHAPTERS: tuple[tuple[str, ModuleType], ...] = (
     ("Further services", extra_services),
     ("Further networks", extra_networks),
     ("Further values", extra_values),
+    ("Further radios", extra_radios),
 )
 
 

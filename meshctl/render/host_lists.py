@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -127,11 +127,13 @@ def _block(entry: HostEntry, known_hosts: Path, key_path: Callable[[str], Path])
 def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path: Callable[[str], Path]) -> str:
     """A static YAML inventory (JSON is YAML). OpenWrt has no Python: the module `raw` works there, others do not."""
     groups: dict[str, dict[str, dict[str, object]]] = {}
-    for entry in entries:
+    known = {entry.name: entry for entry in entries}
+    for entry in known.values():
         options = [f"HostKeyAlias={entry.alias}", f"UserKnownHostsFile={_quoted(known_hosts)}"]
         # one private key has a variable of its own
         options += [f"IdentityFile={_quoted(key_path(text))}" for text in entry.ssh.key_files[1:]]
-        options += [f"ProxyJump={entry.ssh.jump}"] if entry.ssh.jump else []
+        if (jump := known.get(entry.ssh.jump)) is not None:
+            options.append(f"ProxyCommand={_proxy_command(jump, known, known_hosts, key_path)}")
         options += [f"{name}=+ssh-rsa" for name in _SHA1_RSA] if entry.has_sha1_rsa_only else []
         variables: dict[str, object] = {
             "ansible_host": entry.address,
@@ -149,6 +151,22 @@ def ansible_inventory(entries: Iterable[HostEntry], known_hosts: Path, key_path:
             groups.setdefault(group, {})[entry.name] = {} if index else variables
     children = {group: {"hosts": hosts} for group, hosts in groups.items()}
     return json.dumps({"all": {"children": children}}, indent=2) + "\n"
+
+
+def _proxy_command(
+    jump: HostEntry, known: Mapping[str, HostEntry], known_hosts: Path, key_path: Callable[[str], Path]
+) -> str:
+    """Connect through a jump host. ProxyJump would look its name up in DNS: here, no `Host` block says where it is."""
+    options = [f"HostKeyAlias={jump.alias}", f"UserKnownHostsFile={_quoted(known_hosts)}"]
+    options += [f"IdentityFile={_quoted(key_path(text))}" for text in jump.ssh.key_files]
+    options += [f"{name}=+ssh-rsa" for name in _SHA1_RSA] if jump.has_sha1_rsa_only else []
+    if (before := known.get(jump.ssh.jump)) is not None:
+        options.append(f"ProxyCommand={_proxy_command(before, known, known_hosts, key_path)}")
+    login = f"{jump.ssh.user}@{jump.address}" if jump.ssh.user else jump.address
+    words = ["ssh", "-p", str(jump.ssh.port), *(word for option in options for word in ("-o", option))]
+    # ssh expands %h and %p once for each level, and an IPv6 address needs the brackets
+    own = shlex.join(words).replace("%", "%%")
+    return f"{own} -W '[%h]:%p' {shlex.quote(_literal(login))}"
 
 
 def _group_name(name: str) -> str:

@@ -214,7 +214,7 @@ def _changes(facts: NodeAlarmInput) -> Iterator[Alarm]:
     change = facts.observation.change
     if change is not None and change.state not in ("idle", "", "unknown", "absent"):
         left = "" if change.left_s is None else f", {change.left_s:.0f} s left"
-        text = f"a change by {change.owner or 'an unknown owner'} is {change.state}{left}"
+        text = f"a change by {lock_owners(change.owner) or 'an unknown owner'} is {change.state}{left}"
         yield Alarm(Level.WARNING, "change", text, "wait until it is confirmed or rolled back")
     if change is not None and change.lock_owner and change.lock_owner != facts.own_lock:
         yield Alarm(Level.NOTE, "locked", f"locked by {lock_owners(change.lock_owner)}")

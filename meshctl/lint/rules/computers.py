@@ -1,4 +1,4 @@
-"""The robots' computers: architecture, ROS distribution, names for /etc/hosts (MC631 to MC634)."""
+"""The robots' computers: architecture, ROS distribution, names for /etc/hosts, the daemons' port (MC631 to MC639)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from meshctl.wording import join_limited
 
 # one label of a host name (RFC 1123, section 2.1), and not an address
 _HOST_LABEL = re.compile(r"(?!\d+$)[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?")
+# Linux, net.ipv4.ip_unprivileged_port_start
+_FIRST_OPEN_PORT = 1024
 # other names of the same architectures
 _ALIASES = {"amd64": "x86_64", "x64": "x86_64", "arm64": "aarch64", "armhf": "armv7l", "i386": "i686"}
 
@@ -126,3 +128,20 @@ def others_not_monitored(fleet: Fleet, _context: LintContext) -> Iterator[Findin
             path = ("robots", robot.name, "computers")
             found = join_limited(tuple(robot.computers))
             yield Finding(path, "nothing pings them", "a `computer` that runs the daemon", found)
+
+
+@fleet_rule(
+    "MC639",
+    Severity.ERROR,
+    "The daemon cannot open its port",
+    why="""Ports below 1024 need privileges that the daemon's service does not have: the daemon does not start, and
+    `meshctl robots deploy` rolls it back.""",
+    fix="Use a port from 1024 on; 8700 is the default.",
+    failing="udp_mesh: {port: 700}",
+    passing="udp_mesh: {port: 8700}",
+)
+def port_needs_privileges(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    has_daemons = any(robot.computer is not None for robot in fleet.robots.values())
+    for key, port in (("port", fleet.udp_mesh.port), ("metrics_port", fleet.udp_mesh.metrics_port)):
+        if has_daemons and port is not None and port < _FIRST_OPEN_PORT:
+            yield Finding(("udp_mesh", key), "needs privileges", f"{_FIRST_OPEN_PORT} or more", str(port))

@@ -10,7 +10,7 @@ from meshctl.lint.grouping import group_by_key
 from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Encryption, Fleet, Mesh, MeshMode, Node, Release
 from meshctl.resolve import FULL_SUPPLICANTS, supplicant_need
-from meshctl.wording import counted, join_limited
+from meshctl.wording import counted, join_limited, one_of
 
 # a shorter passphrase can be guessed offline from a recorded handshake
 _MIN_PASSPHRASE_CHARACTERS = 16
@@ -135,7 +135,7 @@ def supplicant_too_small(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         if need is None or not small or any(name in FULL_SUPPLICANTS for name in named):
             continue
         path = packages_path(node, small[0])
-        yield Finding(path, f"cannot encrypt mesh {mesh.name}", f"one of {join_limited(need.any_of)}", small[0])
+        yield Finding(path, f"cannot encrypt mesh {mesh.name}", one_of(need.any_of), small[0])
 
 
 def packages_path(node: Node, package: str) -> tuple[str, ...]:

@@ -66,7 +66,13 @@ def _netmask(value: str) -> tuple[str, str] | None:
 
 
 _POLICY = _one_of("ACCEPT", "REJECT", "DROP")
+_HTMODES = (
+    *("NOHT", "NONE", "HT20", "HT40", "HT40+", "HT40-", "VHT20", "VHT40", "VHT80", "VHT160", "VHT80_80"),
+    *(f"{standard}{width}" for standard in ("HE", "EHT") for width in (20, 40, 80, 160)),
+    "EHT320",
+)
 _CHECKS: dict[tuple[str, str, str], _Check] = {
+    ("wireless", "wifi-device", "htmode"): _one_of(*_HTMODES),
     ("wireless", "wifi-iface", "mode"): _one_of("ap", "sta", "adhoc", "mesh", "monitor"),
     ("wireless", "wifi-iface", "ssid"): _ssid,
     ("wireless", "wifi-iface", "encryption"): _encryption,

@@ -17,7 +17,7 @@ from meshctl.lint.rules.firmware import ROCKET_IMAGE
 from meshctl.lint.rules.references import suggest
 from meshctl.model import Fleet, Release
 from meshctl.resolve import package_files, package_needs
-from meshctl.wording import join_limited
+from meshctl.wording import one_of
 
 # no security fixes (openwrt.org/docs/guide-developer/security)
 _UNMAINTAINED = (Release.V19_07, Release.V21_02, Release.V22_03, Release.V23_05)
@@ -53,7 +53,7 @@ def needed_package_removed(fleet: Fleet, _context: LintContext) -> Iterator[Find
             if dropped.issuperset(need.any_of) or (need.any_of[0] in dropped and not set(named) & set(need.any_of)):
                 package = next(name for name in need.any_of if name in dropped)
                 path = packages_path(node, f"-{package}")
-                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", f"-{package}")
+                yield Finding(path, need.reason, one_of(need.any_of), f"-{package}")
 
 
 @fleet_rule(
@@ -92,7 +92,7 @@ def image_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
         for need in package_needs(fleet, node):
             if not named.intersection(need.any_of) and not any(file.startswith(need.any_of) for file in brought):
                 path = ("hardware", profile.name, "packages")
-                yield Finding(path, need.reason, f"one of {join_limited(need.any_of)}", "none of them")
+                yield Finding(path, need.reason, one_of(need.any_of), "none of them")
 
 
 @fleet_rule(

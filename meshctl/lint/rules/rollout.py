@@ -12,7 +12,7 @@ from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Fleet, Mesh, MeshMode, NodeState
 from meshctl.regdb import CHANNELS, Country, DfsRegion, Flag, Span, check_span, occupied_span, primary_span
 from meshctl.resolve import package_files, package_needs, package_plan
-from meshctl.wording import join_limited
+from meshctl.wording import join_limited, one_of
 
 # Radar detection before the first frame on a channel (channel availability check): the kernel's minimum, and that of
 # ETSI EN 301 893 where the channel overlaps weather radar.
@@ -184,4 +184,4 @@ def spare_lacks_packages(fleet: Fleet, _context: LintContext) -> Iterator[Findin
                 and not any(file.startswith(any_of) for file in brought)
             ):
                 message = f"cannot replace {join_limited(names)}"
-                yield Finding(("nodes", spare.name), message, f"one of {join_limited(any_of)}", "none of them")
+                yield Finding(("nodes", spare.name), message, one_of(any_of), "none of them")

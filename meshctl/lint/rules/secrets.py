@@ -198,7 +198,7 @@ def transport_key_invalid(fleet: Fleet, context: LintContext) -> Iterator[Findin
 def transport_key_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     computers = any(robot.computer is not None for robot in fleet.robots.values())
     if computers and fleet.topics and not fleet.udp_mesh.keys:
-        yield Finding(("udp_mesh",), "messages would be unprotected", "a reference in `keys`", "none")
+        yield Finding(("udp_mesh", "keys"), "messages would be unprotected", "a reference in `keys`", "none")
 
 
 @fleet_rule(

@@ -44,13 +44,15 @@ def _path(topic: Topic, *key: str) -> tuple[str, ...]:
 )
 def stop_not_first(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     stops = [topic for topic in fleet.topics if topic.topic_class is TopicClass.EMERGENCY_STOP]
-    if not stops:
-        return
-    level = max(stop.priority for stop in stops)
-    for topic in fleet.topics:
-        if topic.topic_class is not TopicClass.EMERGENCY_STOP and topic.priority <= level:
-            message = f"can delay {stops[0].name}"
-            yield Finding(_path(topic, "priority"), message, f"more than {level}", str(topic.priority))
+    others = [topic for topic in fleet.topics if topic.topic_class is not TopicClass.EMERGENCY_STOP]
+    for stop in stops:
+        before = [topic for topic in others if topic.priority <= stop.priority]
+        if before and stop.priority > 0:
+            message = f"{join_limited([topic.name for topic in before])} can delay it"
+            yield Finding(_path(stop, "priority"), message, "0, which no other topic has", str(stop.priority))
+        for topic in before if stop.priority == 0 else ():
+            message = f"can delay {stop.name}"
+            yield Finding(_path(topic, "priority"), message, f"more than {stop.priority}", str(topic.priority))
 
 
 @fleet_rule(

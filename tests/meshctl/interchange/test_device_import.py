@@ -64,7 +64,7 @@ def test_a_foreign_mesh_becomes_an_entry_with_its_options_in_extra_uci(tmp_path:
         "network.wan": "--keep network.wan keeps it",
         "system.@system[0].urandom_seed": "OpenWrt's default",
         "wireless.radio0.cell_density": "OpenWrt's default",
-        "wireless.guests": "--keep wireless.guests keeps it",
+        "wireless.guests": "its key is a secret, which extra_uci cannot hold",
     }
     assert [each.line for each in made.of(Fate.CHANGED)] == [
         "system.@system[0].hostname: Roof West -> Roof-West",

@@ -110,3 +110,45 @@ def test_a_mistake_is_reported_at_its_key(key: str, value: str, code: str, tmp_p
 )
 def test_what_openwrt_understands_is_not_reported(key: str, value: str, tmp_path: Path) -> None:
     assert _found({key: value}, tmp_path) == []
+
+
+@pytest.mark.parametrize(("channel", "is_found"), [("5", False), ("auto", False), ("14", True), ("36", True)])
+def test_the_channel_of_an_access_point_is_one_that_the_country_allows(
+    channel: str, is_found: bool, tmp_path: Path
+) -> None:
+    extra = f"wireless.radio0.channel: '{channel}'"
+    text = f"nodes: {{b01: {{radios: {{radio0: {{mesh: null}}}}, extra_uci: {{{extra}}}}}}}\n"
+    example = Example(text)
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    assert [one.path for one in found if one.code == "MC919"] == (
+        ["nodes.b01.extra_uci.wireless.radio0.channel"] if is_found else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [("devic", "device"), ("netwrk", "network"), ("ssid", ""), ("vendor_elements", ""), ("isolat", "isolate")],
+)
+def test_an_option_that_is_almost_a_known_one_is_reported(option: str, expected: str, tmp_path: Path) -> None:
+    extra = f"wireless.guest: wifi-iface, wireless.guest.{option}: lan"
+    example = Example(f"nodes: {{b01: {{extra_uci: {{{extra}}}}}}}\n")
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    assert [one.expected for one in found if one.code == "MC920"] == ([expected] if expected else [])
+
+
+def test_an_emergency_stop_that_others_delay_is_reported_itself(tmp_path: Path) -> None:
+    example = Example("topics: {estop: {priority: 9}}\n")
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    (stop,) = (one for one in found if one.code == "MC701")
+    assert (stop.path, stop.expected, stop.found) == (
+        "topics.estop.priority",
+        "0, which no other topic has",
+        "9",
+    )
+
+
+@pytest.mark.parametrize(("width", "is_found"), [("HT20", False), ("HE80", False), ("HT80", True), ("ht20", True)])
+def test_the_width_of_an_access_points_channel_is_one_of_openwrts(width: str, is_found: bool, tmp_path: Path) -> None:
+    example = Example(f"nodes: {{b01: {{extra_uci: {{wireless.radio1.htmode: {width}}}}}}}\n")
+    found = check_path(write(example, tmp_path), _REGDB, environment(example)).diagnostics
+    assert ("MC918" in [one.code for one in found]) is is_found

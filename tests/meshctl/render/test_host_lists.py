@@ -74,6 +74,21 @@ def test_ansible_logs_in_like_openssh() -> None:
     )
 
 
+def test_ansible_reaches_a_jump_host_by_its_address_and_not_by_its_name() -> None:
+    gate = HostEntry("gate", "gate", "fe80::1%eth0", SshSettings(user="root", port=2222), (), is_openwrt=True)
+    far = HostEntry("far", "far", "fd42:10::1", SshSettings(user="root", jump="gate"), (), is_openwrt=True)
+    behind = HostEntry("behind", "behind", "fd42:20::1", SshSettings(user="root", jump="far"), (), is_openwrt=True)
+    text = ansible_inventory([gate, far, behind], Path("/fleet/known_hosts"), Path)
+    options = json.loads(text)["all"]["children"]["openwrt"]["hosts"]["behind"]["ansible_ssh_common_args"]
+    seen = subprocess.run(["ssh", "-G", *shlex.split(options), "b"], capture_output=True, text=True, check=True).stdout
+    (command,) = (line.partition(" ")[2] for line in seen.splitlines() if line.startswith("proxycommand "))
+    words = shlex.split(command)
+    assert words[-3:] == ["-W", "[%h]:%p", "root@fd42:10::1"]
+    # ssh expands the outer command once before it runs it
+    (inner,) = (word.removeprefix("ProxyCommand=") for word in words if word.startswith("ProxyCommand="))
+    assert shlex.split(inner.replace("%%", "%"))[-3:] == ["-W", "[%h]:%p", "root@fe80::1%%eth0"]
+
+
 def test_ansible_gives_ssh_a_path_with_a_blank_as_one() -> None:
     """Before, ssh read two names of files that are not there, and knew no host."""
     entry = HostEntry("u", "u", "10.60.0.1", SshSettings(key_files=("ed25519", "rsa")), (), is_openwrt=True)

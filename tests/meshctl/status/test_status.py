@@ -161,6 +161,12 @@ def test_a_node_problem_degrades_the_node(fleet: Fleet, change: dict[str, Any], 
     assert status.exit_code is not ExitCode.OK
 
 
+def test_the_owner_of_a_change_is_named_as_a_person_reads_it(fleet: Fleet) -> None:
+    change = ChangeStatus("applied", owner="ada@base:17:4711", left_s=40.0)
+    status = status_of(fleet, {**HEALTHY, "rover": seen("rover", {"b01": 200}, change=change)})
+    assert alarms(status, "rover")["change"].text == "a change by ada@base (process 17) is applied, 40 s left"
+
+
 def test_a_radio_that_is_off_but_on_the_air_is_an_alarm_and_a_no_go(fleet: Fleet) -> None:
     """25.12 leaves it in its cell, and versions before this one did not take it down."""
     wireless = """
