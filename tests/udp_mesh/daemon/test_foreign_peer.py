@@ -11,27 +11,32 @@ from pathlib import Path
 
 import pytest
 
-from tests.udp_mesh.daemon.processes import KEY, RunningDaemon, collect, configuration, outcomes, wait_online
+from tests.udp_mesh.daemon.processes import KEY, OTHER_KEY, RunningDaemon, collect, configuration, outcomes, wait_online
 from tests.udp_mesh.links.sockets import WAIT_S, free_port
-from tests.udp_mesh.wire.foreign_peer import (
+from tests.udp_mesh.wire.foreign_format import (
+    COMPACT,
     COMPRESSED,
+    CONFIRM,
+    CONFIRMS,
     FLAG_TO_ALL,
     FLAG_ZSTD,
     NUMBERED,
     RELIABLE,
+    TIMED,
     VERSION,
     VERSIONS,
     ZLIB,
     ZSTD,
     Channel,
     FleetKey,
-    ForeignNode,
     Parser,
     difference,
+    fragment,
     read_number,
     read_version,
     version_hash,
 )
+from tests.udp_mesh.wire.foreign_peer import ForeignNode
 from tests.udp_mesh.wire.make_vectors import FOLDER
 from udp_mesh.client import MeshClient
 
@@ -40,6 +45,8 @@ pytestmark = pytest.mark.xdist_group("udp_mesh_daemons")
 TOPICS = """
 packed = { priority = 6, compression = true }
 cast = { priority = 4, repair = true }
+stored = { priority = 5, outbox = "all", outbox_on_disk = true }
+soon = { priority = 5, deadline_s = 30.0 }
 grid = { priority = 7, delta = true }
 """
 LATER_FEATURES = 0xFFFFFFFF << 11 & 0xFFFFFFFF
@@ -55,7 +62,10 @@ def daemon() -> Iterator[RunningDaemon]:
             yield one
 
 
-@pytest.fixture(params=[0, ZLIB, ZLIB | ZSTD | VERSIONS, ZLIB | ZSTD | VERSIONS | LATER_FEATURES])
+EVERYTHING = ZLIB | TIMED | CONFIRMS | COMPACT | ZSTD | VERSIONS
+
+
+@pytest.fixture(params=[0, ZLIB, ZLIB | ZSTD | VERSIONS, ZLIB | ZSTD | VERSIONS | LATER_FEATURES, EVERYTHING])
 def foreign(daemon: RunningDaemon, request: pytest.FixtureRequest) -> Iterator[ForeignNode]:
     """One that the daemon has met; it goes with a good-bye."""
     with daemon.client() as client:
@@ -125,6 +135,14 @@ def test_a_foreign_node_receives_and_acknowledges_messages_of_any_size(
 
 def has_arrived(foreign: ForeignNode, count: int) -> bool:
     return len(foreign.arrived) == count
+
+
+def add_ends(ends: list[str], client: MeshClient) -> bool:
+    """Add an outcome, if one is here. Whether there is any."""
+    frame = client.next_frame(0.0)
+    if frame is not None and frame[0].get("event") == "outcome":
+        ends.append(str(frame[0]["outcome"]))
+    return bool(ends)
 
 
 def grids(count: int) -> list[bytes]:
@@ -243,3 +261,84 @@ def test_broadcasts_work_in_both_directions(daemon: RunningDaemon, foreign: Fore
         assert foreign.run(lambda: len(foreign.arrived) == 2, WAIT_S)
         assert [one.payload for one in foreign.arrived] == [b"short", bytes(5000)]
     assert all(one.flags & FLAG_TO_ALL for one in foreign.arrived)
+
+
+def test_a_daemon_requests_lost_broadcasts_of_a_foreign_node(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    with daemon.client() as client:
+        client.subscribe("*")
+        for payload, lost in ((b"first", False), (b"second", True), (b"gone", True), (b"fourth", False)):
+            foreign.broadcast("shout", payload, repair=True, lost=lost)
+        # No longer kept: the answer is a CANCEL.
+        del foreign.repairable[2]
+        assert foreign.run(lambda: foreign.requested == {1, 2}, WAIT_S)
+        assert sorted(message.payload for message in collect(client, 3)) == [b"first", b"fourth", b"second"]
+
+
+def test_a_message_is_delivered_once_a_foreign_node_that_confirms_has_confirmed_it(
+    daemon: RunningDaemon, foreign: ForeignNode
+) -> None:
+    foreign.confirms = False
+    with daemon.client() as client:
+        client.publish("stored", b"keep this", to=foreign.name, notify=True)
+        assert foreign.run(lambda: len(foreign.arrived) == 1, WAIT_S)
+        assert bool(foreign.arrived[0].flags & CONFIRM) == bool(foreign.features & CONFIRMS)
+        if foreign.features & CONFIRMS:
+            foreign.run(lambda: False, 0.2)
+            assert client.next_frame(0.0) is None
+            # The daemon sends the head again because the confirmation is overdue.
+            foreign.confirms = True
+        ends: list[str] = []
+        assert foreign.run(partial(add_ends, ends, client), WAIT_S)
+        assert ends == ["delivered"]
+
+
+def test_a_message_has_the_lifetime_that_a_foreign_node_states(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    alice = foreign.peer("alice")
+    assert alice is not None
+    with daemon.client() as client:
+        for number in (1, 2):
+            client.publish("soon", b"in time", to=foreign.name, notify=True)
+            assert foreign.run(partial(has_arrived, foreign, number), WAIT_S)
+            foreign.run(lambda: False, 0.1)
+            assert set(outcomes(client, 1).values()) == {"delivered"}
+        # The first one came in an introduction, which has no lifetimes.
+        life_ms = foreign.arrived[1].head.get("life")
+        if not foreign.features & TIMED:
+            assert life_ms is None
+            return
+        assert life_ms is not None
+        assert 0 < life_ms <= 30_000
+        client.subscribe("*")
+        parts = bytes(1000), b"the rest"
+        late = foreign.send(alice, "from-abroad", b"".join(parts), life_ms=200, leave_out=1)
+        foreign.run(lambda: False, 0.4)
+        alice.in_flight[late] = [(fragment(late, 1, parts[1], None), set())]
+        kept = foreign.send(alice, "from-abroad", b"soon enough", life_ms=30_000)
+        assert foreign.run(lambda: kept in alice.ends, WAIT_S)
+        foreign.run(lambda: False, 1.0)
+        assert [message.payload for message in collect(client, 1)] == [b"soon enough"]
+        # An acknowledgment would mean that it was delivered.
+        assert late in alice.in_flight
+
+
+def test_keys_are_rotated_without_interruption(daemon: RunningDaemon, foreign: ForeignNode) -> None:
+    alice = foreign.peer("alice")
+    assert alice is not None
+    key_file = daemon.folder / "alice.key"
+    old, new = bytes.fromhex(KEY), bytes.fromhex(OTHER_KEY)
+    steps = [([KEY, OTHER_KEY], (old,)), ([KEY, OTHER_KEY], (new, old)), ([OTHER_KEY, KEY], (new, old))]
+    steps += [([OTHER_KEY, KEY], (new,)), ([OTHER_KEY], (new,))]
+    with daemon.client() as client:
+        client.subscribe("*")
+        for number, (keys, secrets) in enumerate([*steps, *reversed(steps), ([KEY], (old,))]):
+            key_file.write_text("\n".join(keys) + "\n")
+            client.request("reload")
+            foreign.set_keys(*secrets)
+            sent = foreign.send(alice, "from-abroad", b"%d" % number)
+            assert foreign.run(partial(alice.ends.get, sent), WAIT_S), number
+            client.publish("status", b"%d" % number, to=foreign.name)
+            assert foreign.run(partial(has_arrived, foreign, number + 1), WAIT_S), number
+        assert [message.payload for message in collect(client, number + 1)] == [
+            b"%d" % one for one in range(number + 1)
+        ]
+    assert foreign.peers[alice.boot] is alice

@@ -140,8 +140,9 @@ class HeartbeatScheduler:
 
     def _heard(self, sessions: list[Session], own_name: str, now: float) -> tuple[tuple[bytes, ...], tuple[int, ...]]:
         """Tags of the nodes to answer first, then of the others in turn; and the clocks of the first ones: who is
-        answered may not believe us without (see `first_contact`)."""
-        tags = list(self._pending_replies)[:MAX_HEARD]
+        answered may not believe us without (see `first_contact`), and would ask, as would every other node of a large
+        team. For those to answer that have no room beside their clock there is another heartbeat."""
+        tags = list(self._pending_replies)[:MAX_HEARD_CLOCKS]
         replied = [self._pending_replies.pop(tag) for tag in tags]
         # Those of earlier versions, which send no clock, follow.
         replied.sort(key=lambda session: session.clock_ms is None)
@@ -159,10 +160,10 @@ class HeartbeatScheduler:
             for session in recent[start:] + recent[:start]:
                 if len(tags) >= MAX_HEARD:
                     break
-                if session.heard_tag not in tags:
+                if session.heard_tag not in tags and session.heard_tag not in self._pending_replies:
                     tags.append(session.heard_tag)
                 self._next_listed += 1
-        return tuple(tags), tuple(clocks[:MAX_HEARD_CLOCKS])
+        return tuple(tags), tuple(clocks)
 
 
 def encode_numbered(beat: Heartbeat, channel: SendChannel) -> bytes:

@@ -49,6 +49,25 @@ def test_a_new_node_is_answered_immediately_in_a_small_team_and_delayed_in_a_lar
     assert large.next_at >= 0.9
 
 
+def test_no_new_node_is_answered_without_its_clock() -> None:
+    """Each of a large team would ask each other one for a proof of its first contact."""
+    heartbeats, new = HeartbeatScheduler(random.Random(1), RATES, 0.0), []
+    for number in range(200):
+        session = Session(f"r{number}", number.to_bytes(16, "little"), bytes(16), (KEY,), settings(f"r{number}"))
+        session.clock_ms, session.last_heard = 1000 * number, 0.0
+        new.append(session)
+        heartbeats.reply_to(session, number, 0.0)
+    answered: list[bytes] = []
+    while len(answered) < len(new):
+        now = heartbeats.next_at
+        assert now < 20.0
+        beat = heartbeats.build(settings("a"), new, (), 0, 0.0, now)
+        fresh = [tag for tag in beat.heard if tag not in answered]
+        assert fresh == list(beat.heard[: len(fresh)])
+        assert 0 < len(fresh) <= len(beat.heard_clocks)
+        answered += fresh
+
+
 def test_a_peer_has_no_sender_until_data_is_sent_to_it() -> None:
     world = World(seed=3)
     for name in ("a", "b", "c"):

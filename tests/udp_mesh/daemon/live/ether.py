@@ -29,6 +29,9 @@ PORT = 8700
 MAX_QUEUE_S = 0.25
 """Of the channel: what would wait longer is dropped."""
 RECORDED = 400
+ICMP_ERRORS = ((0, 0), (1, 0), (3, 0), (13, 0), (4, 576), (4, 1200), (4, 68))
+"""Codes of ICMP's "destination unreachable" and the next hop's MTU: network, host, port, prohibited, and fragmentation
+needed."""
 MULTICAST = 1
 
 
@@ -71,6 +74,8 @@ class Ether(threading.Thread):
         """Directions in which a datagram exceeded the path's MTU."""
         self.failure: Exception | None = None
         self._recorded: deque[tuple[str, bytes]] = deque(maxlen=RECORDED)
+        self._sent: dict[str, deque[bytes]] = {}
+        """Recorded datagrams by their sender."""
         self._sockets: dict[str, socket.socket] = {}
         self._names: dict[int, str] = {}
         self._macs: dict[bytes, str] = {}
@@ -99,6 +104,15 @@ class Ether(threading.Thread):
             chosen = self.rng.choices(self._recorded, k=count) if self._recorded else []
             for port, frame in chosen:
                 self._send_at(time.monotonic() + self.rng.uniform(0, 0.5), port, _from(frame, source))
+
+    def send_icmp_errors(self, name: str, count: int) -> None:
+        """Tell a robot that datagrams which it sent did not arrive: ports and hosts that are not reached, and paths
+        that carry little. IPv4 only."""
+        with self._lock:
+            sent = [frame for frame in self._sent.get(name, ()) if frame[12:14] == IPV4]
+            for frame in self.rng.choices(sent, k=count) if sent else []:
+                code, mtu = self.rng.choice(ICMP_ERRORS)
+                self._send_at(time.monotonic(), name, _icmp_error(frame, code, mtu))
 
     def close(self) -> None:
         self._ended.set()
@@ -166,6 +180,7 @@ class Ether(threading.Thread):
             self._busy_until -= len(frame) * 8 / self.rate_bits_per_s
             return
         self._recorded.append((other, frame))
+        self._sent.setdefault(name, deque(maxlen=RECORDED)).append(frame)
         for _ in range(2 if rng.random() < path.duplicates else 1):
             at = self._busy_until + path.delay_s + rng.random() * path.jitter_s
             self._send_at(at, other, self._damaged(frame) if rng.random() < path.damage else frame)
@@ -225,6 +240,17 @@ def _from(frame: bytes, source: tuple[str, int] | None) -> bytes:
     address = socket.inet_pton(socket.AF_INET if count == 4 else socket.AF_INET6, host)
     at = _udp_start(frame)
     return _finished(frame[:start] + address + frame[start + count : at] + struct.pack(">H", port) + frame[at + 2 :])
+
+
+def _icmp_error(frame: bytes, code: int, mtu: int) -> bytes:
+    """What the receiver of this datagram, or a router in its name, says to its sender (RFC 792, RFC 1191)."""
+    packet = frame[IP_START:]
+    message = bytearray(struct.pack(">BBHHH", 3, code, 0, 0, mtu) + packet[: IPV4_BYTES + 8])
+    message[2:4] = struct.pack(">H", _checksum(message))
+    header = bytearray(struct.pack(">BBHHHBBH", 0x45, 0, IPV4_BYTES + len(message), 0, 0, 64, socket.IPPROTO_ICMP, 0))
+    header += packet[16:20] + packet[12:16]
+    header[10:12] = struct.pack(">H", _checksum(header))
+    return frame[6:12] + frame[:6] + IPV4 + header + message
 
 
 def _finished(frame: bytes) -> bytes:

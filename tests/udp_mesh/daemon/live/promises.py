@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -20,11 +21,12 @@ from tests.udp_mesh.daemon.live.team import LiveTeam
 
 NETWORK_CHANGES = (
     *("down", "one-way", "loss", "jitter", "damage", "mtu", "rate", "heal"),
-    *("nat", "replay", "forge"),
+    *("nat", "replay", "forge", "icmp"),
 )
 ROBOT_CHANGES = (
     *("kill", "leave", "suspend", "disk", "reader", "pause", "writer"),
     *("move", "unplug", "renumber", "refuse", "reload", "stranger", "twin", "second", "read-only", "clock", "link-mtu"),
+    "no-buffers",
 )
 SMALL, LARGE = (60, 100, 100, 300, 1_380, 1_400), (1_420, 9_000, 60_000, 200_000)
 SETTLE_S, LEAST_BYTES_PER_S = 120.0, 15_000
@@ -38,7 +40,7 @@ def change(team: LiveTeam) -> None:
     """One random change."""
     name = team.dice.choice(team.names)
     other = team.dice.choice([one for one in team.names if one != name])
-    kind = team.dice.choice(NETWORK_CHANGES + ROBOT_CHANGES)
+    kind = team.dice.choice(team.kinds or NETWORK_CHANGES + ROBOT_CHANGES)
     team.changes.append(f"{time.monotonic():.2f} {kind} {name} {other}")
     if kind in NETWORK_CHANGES:
         change_network(team, kind, name, other)
@@ -64,7 +66,7 @@ def change_network(team: LiveTeam, kind: str, name: str, other: str) -> None:
         case "damage":
             path.damage = dice.choice((0.0, 0.01, 0.2))
         case "mtu":
-            path.mtu = dice.choice((1500, 1300, 1000, 700))
+            path.mtu = dice.choice((1500, 1300, 1000, 700, 576))
         case "rate":
             ether.rate_bits_per_s = dice.choice((1e6, 5e6, 20e6))
         case "heal":
@@ -80,6 +82,13 @@ def change_network(team: LiveTeam, kind: str, name: str, other: str) -> None:
             stranger = "fe80::7:9" if team.ipv6 else "10.7.200.9"
             host = dice.choice([team.robots[name].address.split("/")[0], stranger])
             ether.replay(dice.choice((5, 100)), source=(host, dice.choice((PORT, 9999))))
+
+        case "icmp":
+            # Errors about datagrams that this robot sent, true or forged: a datagram tells nothing of its path but by
+            # its answer. After "fragmentation needed" the kernel sends to that address in fragments of that size.
+            team.ether.too_long |= {(name, one) for one in team.names}
+            for _ in range(dice.choice((1, 20))):
+                team.later(dice.random(), partial(ether.send_icmp_errors, name, dice.choice((1, 50))))
 
 
 def set_up(*paths: Direction) -> None:
@@ -123,6 +132,9 @@ def change_robot(team: LiveTeam, kind: str, name: str) -> None:
         case "refuse":
             robot.refuse_to_send(dice.choice(("prohibit", "unreachable", "blackhole")))
             team.later(dice.choice((0.2, 2.0, 8.0)), robot.allow_to_send)
+        case "no-buffers":
+            robot.refuse_some(dice.choice(("ENOBUFS", "EAGAIN", "ENOBUFS EAGAIN EPERM", "ENETDOWN ENOMEM")))
+            team.later(dice.choice((0.2, 2.0, 8.0)), robot.refuse_none)
         case "second":
             if robot.running and dice.random() < 0.3:
                 robot.start_second()
@@ -136,7 +148,7 @@ def change_robot(team: LiveTeam, kind: str, name: str) -> None:
         case "link-mtu":
             # IPv6 needs 1280. Larger datagrams of others do not arrive.
             team.ether.too_long |= {(one, name) for one in team.names}
-            robot.ip(f"link set mesh0 mtu {dice.choice((1500, 1400, 1280) if team.ipv6 else (1500, 1300, 700))}")
+            robot.ip(f"link set mesh0 mtu {dice.choice((1500, 1400, 1280) if team.ipv6 else (1500, 1300, 700, 576))}")
         case "clock":
             robot.set_clock(dice.choice((-1e9, -3600.0, -0.5, 0.0, 0.05, 1.0, 3600.0, 1e8)))
         case "reload":
@@ -170,6 +182,7 @@ def repair(team: LiveTeam) -> None:
         robot.set_disk("rw")
         robot.free_disk()
         robot.allow_to_send()
+        robot.refuse_none()
         robot.resume()
         robot.ip("link set mesh0 mtu 1500")
         robot.plug_in()
@@ -182,9 +195,16 @@ def repair(team: LiveTeam) -> None:
         robot.end(politely=True)
 
 
-def play(seed: int, seconds: float, size: int | None = None, version: Path | None = None) -> LiveTeam:
-    """Messages and changes for so long, then none. Raises Broken."""
+def play(
+    seed: int,
+    seconds: float,
+    size: int | None = None,
+    version: Path | None = None,
+    kinds: Sequence[str] = (),
+) -> LiveTeam:
+    """Messages and changes for so long, then none. `kinds` are those of changes, none: all. Raises Broken."""
     with LiveTeam(seed, size, version) as team:
+        team.kinds = tuple(kinds)
         try:
             _play(team, seconds)
         except Exception:
@@ -315,6 +335,9 @@ def main() -> None:
     parser.add_argument(
         "--version", type=Path, metavar="FOLDER", help="a checkout of another version, for one robot of each team"
     )
+    parser.add_argument(
+        "--only", nargs="+", default=(), choices=sorted({*NETWORK_CHANGES, *ROBOT_CHANGES}), help="kinds of changes"
+    )
     arguments = parser.parse_args()
     if "LIVE_TEAM" not in os.environ:
         user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
@@ -325,7 +348,7 @@ def main() -> None:
     failed = 0
     for seed in range(arguments.first, arguments.last):
         try:
-            team = play(seed, arguments.seconds, arguments.robots, arguments.version)
+            team = play(seed, arguments.seconds, arguments.robots, arguments.version, arguments.only)
             worst = {topic: f"{sorted(found)[len(found) * 99 // 100]:.2f}" for topic, found in team.latencies.items()}
             robots = f"{len(team.names)} robots over {'IPv6' if team.ipv6 else 'IPv4'}"
             sys.stdout.write(f"seed {seed}: {robots}, {len(team.sent)} sent, {dict(team.outcomes)}, p99 {worst}\n")

@@ -190,6 +190,13 @@ state_directory = "{folder}/{self.name}.disk"
         self.allow_to_send()
         self.ip(f"{self._family} rule add pref {REFUSING_RULE} to {'fe80::/10' if self.ipv6 else '10.7.0.0/16'} {how}")
 
+    def refuse_some(self, errors: str) -> None:
+        """The kernel refuses some datagrams with these errors."""
+        self._clock.with_suffix(".refused").write_text(errors)
+
+    def refuse_none(self) -> None:
+        self._clock.with_suffix(".refused").unlink(missing_ok=True)
+
     def allow_to_send(self) -> None:
         rules = f"nsenter -t {self.holder.pid} -n ip {self._family} rule del pref {REFUSING_RULE}"
         subprocess.run(rules.split(), check=False, stderr=subprocess.DEVNULL)

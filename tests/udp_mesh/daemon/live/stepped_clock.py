@@ -2,14 +2,18 @@
 
 The host's clock cannot be set for one process alone. Here `time.time` and the kernel's timestamps of datagrams are
 moved by the last line of the file CLOCK, in seconds. What arrived before that line was written has the offset before
-it, as after settimeofday(2). With SMALL_BUFFERS in the environment, the sockets hold a few datagrams only.
+it, as after settimeofday(2). With SMALL_BUFFERS in the environment, the sockets hold a few datagrams only. While the
+file CLOCK.refused exists, the kernel refuses some datagrams with the errors that it names, such as `ENOBUFS EAGAIN`.
 """
 
 from __future__ import annotations
 
+import errno
 import os
+import random
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from udp_mesh.cli import main as command
@@ -18,7 +22,20 @@ from udp_mesh.links.attachments import Address
 
 SMALL_BUFFER_BYTES = 8192
 """The kernel doubles it and counts its own overhead: about ten full datagrams."""
+REFUSED_SHARE = 0.3
 _real_time = time.time
+
+
+class RefusingSocket:
+    """Takes the place of a socket for one call."""
+
+    def __init__(self, number: int) -> None:
+        self._error = OSError(number, os.strerror(number))
+
+    def sendto(self, *_: object) -> int:
+        raise self._error
+
+    sendmsg = sendto
 
 
 class SteppedClock:
@@ -43,8 +60,11 @@ class SteppedClock:
 
 
 def main() -> int:
-    clock = SteppedClock(Path(sys.argv.pop(1)))
-    receive = udp.UdpLink._receive
+    clock_file = Path(sys.argv.pop(1))
+    clock = SteppedClock(clock_file)
+    refused = clock_file.with_suffix(".refused")
+    receive, send_run = udp.UdpLink._receive, udp.UdpLink._send_run
+    rng = random.Random(str(clock_file))
 
     def received(self: udp.UdpLink, from_socket: object, deliver: udp.Deliver, limit: int, stop_after: float) -> int:
         def moved(data: memoryview, source: Address, arrived: float) -> None:
@@ -52,10 +72,22 @@ def main() -> int:
 
         return receive(self, from_socket, moved, limit, stop_after - clock.offset_s())  # type: ignore[arg-type]
 
+    def sent(self: udp.UdpLink, run: Sequence[udp.OutgoingDatagram], destination: Address) -> int | None:
+        if not refused.exists() or rng.random() >= REFUSED_SHARE:
+            return send_run(self, run, destination)
+        names = refused.read_text().split() if refused.exists() else []
+        real, refusing = self._socket, RefusingSocket(getattr(errno, rng.choice(names or ["EAGAIN"])))
+        self._socket = refusing  # type: ignore[assignment]
+        try:
+            return send_run(self, run, destination)
+        finally:
+            self._socket = real
+
     if "SMALL_BUFFERS" in os.environ:
         udp.RECEIVE_BUFFER_BYTES = udp.STRANGERS_BUFFER_BYTES = udp.SEND_BUFFER_BYTES = SMALL_BUFFER_BYTES
     time.time = clock.time
     udp.UdpLink._receive = received  # type: ignore[method-assign]
+    udp.UdpLink._send_run = sent  # type: ignore[method-assign]
     return command.main()
 
 

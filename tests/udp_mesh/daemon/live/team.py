@@ -49,6 +49,8 @@ class LiveTeam:
         self.outcomes: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.changes: list[str] = []
+        self.kinds: tuple[str, ...] = ()
+        """Kinds of changes (none: all)."""
         self._serial = 0
         self._later: list[tuple[float, Callable[[], None]]] = []
         self._stack = contextlib.ExitStack()
