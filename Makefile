@@ -33,7 +33,7 @@ docs: $(VENV)-docs/.ready
 
 $(VENV)-docs/.ready: pyproject.toml
 	test -x $(VENV)-docs/bin/python || python3 -m venv $(VENV)-docs
-	$(VENV)-docs/bin/pip install --quiet --disable-pip-version-check -e '.[docs]'
+	HATCH_BUILD_NO_HOOKS=true $(VENV)-docs/bin/pip install --quiet --disable-pip-version-check -e '.[docs]'
 	touch $@
 
 # The long proofs: every kill point, hundreds of virtual nodes, hours of virtual time, real roscores, real sudo, missions of
@@ -47,7 +47,7 @@ proof: setup
 bench: setup
 	-scripts/setup-ros2
 	test -x $(VENV)-bench/bin/python || python3 -m venv $(VENV)-bench
-	$(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
+	HATCH_BUILD_NO_HOOKS=true $(VENV)-bench/bin/pip install --quiet -e '.[dev,bench]'
 	$(VENV)-bench/bin/python -m benchmarks $(if $(QUICK),--quick)
 
 # A fleet on the kernel's own radios to practice on; `meshctl lab up` without --real starts in a second and needs no QEMU.

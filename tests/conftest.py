@@ -101,16 +101,21 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest groups first: pytest-xdist hands groups out in this order (`--no-loadscope-reorder`).
+    """Put the longest groups first, then the other groups: pytest-xdist hands them out in this order
+    (`--no-loadscope-reorder`).
 
-    It would begin with the group of the most tests; then a group of few long ones would run last, and alone.
+    Its own order begins with the group of the most tests, and that of the files ends with the groups of `udp_mesh`:
+    either way a group of few long tests would run last, and alone. Tests without a group end the run evenly on all
+    workers.
     """
     items.sort(key=_turn)
 
 
 def _turn(item: pytest.Item) -> int:
     mark = item.get_closest_marker("xdist_group")
-    return LONGEST_GROUPS.index(mark.args[0]) if mark and mark.args[0] in LONGEST_GROUPS else len(LONGEST_GROUPS)
+    if mark is None:
+        return len(LONGEST_GROUPS) + 1
+    return LONGEST_GROUPS.index(mark.args[0]) if mark.args[0] in LONGEST_GROUPS else len(LONGEST_GROUPS)
 
 
 def pytest_collection_finish() -> None:

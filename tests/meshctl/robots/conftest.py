@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.made_once import made_once
 from tests.meshctl.robots.fleets import RobotFleet
 from tests.meshctl.robots.lan import Lan
 from tests.meshctl.robots.machine import debian
@@ -22,22 +23,26 @@ def base() -> Path:
 
 @pytest.fixture(scope="session")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return repack(tmp_path_factory.mktemp("wheels"))
+    def make(directory: Path) -> None:
+        repack(directory)
+
+    return made_once(tmp_path_factory, "robots-wheels", make)
 
 
 @pytest.fixture(scope="session")
 def seed(base: Path, wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a deploy leaves of its packages, made by one."""
-    directory = tmp_path_factory.mktemp("seed")
-    with pytest.MonkeyPatch.context() as patch, _running(base, wheels, directory, patch) as fleet:
-        fleet.add("husky1", fresh=True)
-        fleet.write()
-        fleet.deploy()
-        fleet.shell("husky1", "cd /opt/udp-mesh && systemctl stop udp-mesh && rm -rf releases current .lock")
-    kept = directory / "husky1/upper/opt/udp-mesh"
-    (directory / "kept/opt").mkdir(parents=True)
-    kept.rename(directory / "kept/opt/udp-mesh")
-    return directory / "kept"
+
+    def make(directory: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch, _running(base, wheels, directory, patch) as fleet:
+            fleet.add("husky1", fresh=True)
+            fleet.write()
+            fleet.deploy()
+            fleet.shell("husky1", "cd /opt/udp-mesh && systemctl stop udp-mesh && rm -rf releases current .lock")
+        (directory / "kept/opt").mkdir(parents=True)
+        (directory / "husky1/upper/opt/udp-mesh").rename(directory / "kept/opt/udp-mesh")
+
+    return made_once(tmp_path_factory, "robots-seed", make) / "kept"
 
 
 @pytest.fixture
