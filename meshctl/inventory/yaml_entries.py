@@ -49,7 +49,8 @@ class YamlEntry:
         """The entries by key. A `known` key (None: any key is) that is missing gets an absent entry."""
         if not isinstance(self.tree, MappingNode):
             if self.is_present or required:
-                self.problem("a mapping")
+                # never the text: a file that is one value may be a key file
+                self.problem("a mapping", describe(self.tree) if isinstance(self.tree, Scalar) else "")
             return {key: self._child(None, key) for key in known or ()}
         entries = {key: self._child(None, key) for key in known or ()}
         for key, value in self.tree.values.items():

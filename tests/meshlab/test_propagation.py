@@ -166,6 +166,8 @@ def test_an_environment_round_trips_through_its_file(ground: RadioEnvironment) -
         ("links: [{between: [a, b], tq: 2.5}]", "expected an integer from 0 to 255, found '2.5'"),
         ("place: {}", "ground.yaml:1:1: expected one of nodes, walls, air, links, found 'place'"),
         ("[1, 2]", "ground.yaml:1:1: expected a mapping, found a list of 2"),
+        # the text of a key file, for example
+        ("f772a084226a36ec", "ground.yaml:1:1: expected a mapping, found a single value"),
         ("nodes: {a: [0, 0}", "ground.yaml:1:17: not valid YAML"),
         ("nodes: {a: [0, 0], a: [1, 1]}", "ground.yaml:1:20: duplicate key 'a'"),
     ],

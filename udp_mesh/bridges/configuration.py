@@ -124,10 +124,10 @@ class _Reader:
         self._path = path
         self.problems: List[str] = []
 
-    def refuse(self, node: Any, at: str, expected: str, found: object) -> None:
+    def refuse(self, node: Any, at: str, expected: str, found: object, *, is_text: bool = True) -> None:
         mark = node.start_mark
-        text = "{}:{}:{}: {}: expected {}, found {!r}".format(
-            self._path, mark.line + 1, mark.column + 1, at or "file", expected, found
+        text = "{}:{}:{}: {}: expected {}, found {}".format(
+            self._path, mark.line + 1, mark.column + 1, at or "file", expected, repr(found) if is_text else found
         )
         self.problems.append(text)
 
@@ -135,7 +135,8 @@ class _Reader:
         if node is None or (node.id == "scalar" and node.value in ("", "null", "~")):
             return []
         if node.id != "mapping":
-            self.refuse(node, at, "a mapping", node.value if node.id == "scalar" else node.id)
+            # never the text: a file that is one value may be a key file
+            self.refuse(node, at, "a mapping", "a single value" if node.id == "scalar" else "a list", is_text=False)
             return []
         return list(node.value)
 

@@ -15,9 +15,9 @@ class Entry:
     def __init__(self, node: yaml.Node | None, file: str, what: str, problems: list[str]) -> None:
         self.node, self.file, self.what, self.problems = node, file, what, problems
 
-    def problem(self, expected: str, found: object = None) -> None:
+    def problem(self, expected: str, found: object = None, *, kind: str = "") -> None:
         line = 1 if self.node is None else self.node.start_mark.line + 1
-        shown = self._found() if found is None else repr(found)
+        shown = kind or (self._found() if found is None else repr(found))
         self.problems.append(f"{self.file}:{line}: {self.what or 'scenario'}: expected {expected}, found {shown}")
 
     def _found(self) -> str:
@@ -35,7 +35,8 @@ class Entry:
         if self.node is None:
             return {}
         if not isinstance(self.node, yaml.MappingNode):
-            self.problem("a mapping")
+            # never the text: a file that is one value may be a key file
+            self.problem("a mapping", kind="a single value" if isinstance(self.node, yaml.ScalarNode) else "a list")
             return {}
         entries: dict[str, Entry] = {}
         for key, value in self.node.value:

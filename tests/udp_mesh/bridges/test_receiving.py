@@ -36,6 +36,12 @@ def test_a_bridge_without_entries_receives_everything_and_one_with_some_also_wha
     assert with_needed([Receive("map")], ["bridge/*"]) == [Receive("map"), Receive("bridge/*")]
 
 
+def test_a_file_of_one_value_is_not_quoted_because_it_may_be_a_key() -> None:
+    with pytest.raises(BridgeConfigurationError) as raised:
+        parse_configuration("f772a084226a36ec", "fleet.key")
+    assert str(raised.value) == "fleet.key:1:1: file: expected a mapping, found a single value"
+
+
 def test_the_file_of_a_bridge_lists_what_it_receives() -> None:
     text = 'receive:\n  map: {}\n  "artifacts/*": {}\n  video: { rate_hz: 1, max_age_s: 2 }\n'
     found = parse_configuration(text, "bridge.yaml").receive

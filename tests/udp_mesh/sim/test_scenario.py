@@ -81,6 +81,13 @@ def test_a_problem_is_reported_with_its_line(old: str, new: str, message: str) -
     assert message in str(raised.value)
 
 
+def test_a_file_of_one_value_is_not_quoted_because_it_may_be_a_key() -> None:
+    with pytest.raises(ScenarioError) as raised:
+        parse(b"f772a084226a36ec", "fleet.key")
+    assert str(raised.value).splitlines()[0] == "fleet.key:1: scenario: expected a mapping, found a single value"
+    assert "f772" not in str(raised.value)
+
+
 def test_all_problems_are_reported_at_once() -> None:
     with pytest.raises(ScenarioError) as raised:
         parse(GOOD.replace("priority: 0", "priority: x").replace("[0, 0]", "{}").encode(), "s.yaml")
