@@ -14,7 +14,7 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     """The directory `name` of this run, which `make` filled. A worker that comes while another makes it waits.
 
     `make` gets a directory of another name, which is renamed when it is complete: after a failure the next caller
-    starts anew.
+    starts over.
     """
     base = factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:

@@ -1,4 +1,4 @@
-"""Fixtures that the workers of a run share are made once, and anew after a failure."""
+"""Fixtures that the workers of a run share are made once, and again after a failure."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def test_one_of_two_makes_it_and_the_other_waits(tmp_path_factory: pytest.TempPa
     assert (one.result() / "file").read_text() == "whole"
 
 
-def test_what_was_not_completed_is_made_anew(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_was_not_completed_is_made_again(tmp_path_factory: pytest.TempPathFactory) -> None:
     def fail(directory: Path) -> None:
         (directory / "torn").write_text("")
         raise OSError("no space")
 
-    name = f"anew-{id(fail)}"
+    name = f"again-{id(fail)}"
     with pytest.raises(OSError, match="no space"):
         made_once(tmp_path_factory, name, fail)
     made = made_once(tmp_path_factory, name, lambda directory: (directory / "file").touch())

@@ -17,12 +17,7 @@ from meshctl.regdb import SHIPPED, load
 
 _REGDB = load(SHIPPED)
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DOCUMENTS = [
-    yaml.load(compose(example), Loader=_LOADER)
-    for rule in RULES[::7]
-    for example in (rule.failing, rule.passing)
-    if "#" not in example.fragment
-]
+_EXAMPLES = [example for rule in RULES[::7] for example in (rule.failing, rule.passing) if "#" not in example.fragment]
 _NUMBERS = [0, 1, 14, 36, 173, 196, 60, 40, 0.001, 65535, 99999]
 _WORDS = ["", "x", "ü'", "HT40+", "VHT160", "BATMAN_V", "meshmerize", "sae", "mesh", "19.07", "25.12", "lost", "spare"]
 _NAMES = [
@@ -44,6 +39,12 @@ _WHOLES: list[Any] = [None, True, [], {}, ["x", "x"], {"x": 1}, {"env": "X"}, {"
 _VALUES = st.sampled_from([*_NUMBERS, *_WORDS, *_NAMES, *_WHOLES])
 
 
+def _document(example: Example) -> dict[str, Any]:
+    """Parsed when a test draws it, since every worker of a run imports this module."""
+    document: dict[str, Any] = yaml.load(compose(example), Loader=_LOADER)
+    return document
+
+
 def _places(tree: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
     if path:
         yield path
@@ -53,7 +54,10 @@ def _places(tree: object, path: tuple[str | int, ...] = ()) -> Iterator[tuple[st
 
 
 @settings(max_examples=40)
-@given(st.sampled_from(_DOCUMENTS), st.lists(st.tuples(st.integers(0, 10_000), _VALUES), min_size=1, max_size=3))
+@given(
+    st.sampled_from(_EXAMPLES).map(_document),
+    st.lists(st.tuples(st.integers(0, 10_000), _VALUES), min_size=1, max_size=3),
+)
 def test_a_mutated_inventory_never_crashes_the_linter(
     tmp_path_factory: pytest.TempPathFactory, document: dict[str, Any], changes: list[tuple[int, Any]]
 ) -> None:
