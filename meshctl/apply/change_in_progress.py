@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -75,15 +76,15 @@ class ChangeInProgress:
     unmet: tuple[str, ...] = ()
     last: Observation | None = None
     last_error: str = ""
-    # the refused login, since the change was last observed as applied
+    # since the change was last observed as applied: the refused login, and why the node was unreachable
     login_refused: str = ""
-    # why the node was unreachable, since the change was last observed as applied
     connect_error: str = ""
     # from now on the change is only ever aborted
     is_abandoned: bool = False
     # how long its `extra` script may take before the confirm window starts
     extra_s: float = 0.0
-    # the radios that the change restarts
+    # uploads again what that script reads from the node's memory, which a reboot has emptied
+    upload_again: Callable[[SshConnection], object] | None = None
     radios: Radios = NO_RADIOS
     # when it was started, by the monotonic clock
     started_s: float | None = None
@@ -181,8 +182,7 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
 
 
 def await_first_boot(ctx: NodeContext, connection: SshConnection) -> None:
-    """Wait until the first boot after a flash has ended: before, a power cut may undo what is written, even once it is
-    confirmed. Raises NodeError on timeout."""
+    """Wait for the end of the first boot after a flash: a power cut in it undoes confirmed files. Raises NodeError."""
     if not ctx.before.is_first_boot or not is_first_boot(connection):
         return
     ctx.run.note("waiting until its first boot has ended (its flash is formatted, its services start)", ctx.name)

@@ -170,6 +170,8 @@ def _resend(change: ChangeInProgress, connection: SshConnection, move: Action) -
         return Outcome(name, Result.FAILED, f"its link fails before the change is armed: {change.last_error}")
     try:
         if move is Action.START:
+            if change.upload_again is not None:
+                change.upload_again(connection)
             arm(change, connection)
         else:
             change.starts += 1

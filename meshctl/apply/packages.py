@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from meshctl.apply.change_in_progress import ChangeInProgress, await_first_boot
@@ -56,7 +57,10 @@ def install(ctx: NodeContext, connection: SshConnection, step: PackageStep) -> O
     except BaseException:
         connection.close()
         raise
-    outcome = run_change(_new_change(ctx, connection, script, has_other_supplicant=bool(step.remove)), connection)
+    change = _new_change(ctx, connection, script, has_other_supplicant=bool(step.remove))
+    # a node that lost its power before the change was armed has lost the files, too
+    change.upload_again = partial(_upload, ctx, files=files)
+    outcome = run_change(change, connection)
     return with_full_flash(outcome, ctx.before.overlay, sum(file.stat().st_size for file in files))
 
 

@@ -75,3 +75,14 @@ def test_a_failed_package_installation_leaves_the_node_unchanged(tmp_path: Path)
         ended = rig.meshctl("bootstrap", "a", "n001", "--yes", "--json")
         assert ended.results == {"n001": "rolled back"}, ended.out + ended.err
         assert node.exec("opkg list-installed; cat /etc/config/*").stdout == before
+
+
+def test_packages_are_uploaded_again_to_a_node_that_lost_its_power_before_they_were_armed(tmp_path: Path) -> None:
+    line = files(tmp_path / "rig")
+    with Rig(tmp_path / "rig", 1, firmware=dict.fromkeys(("a", "b", "split"), line), packages=()) as rig:
+        rig.wait_all_up()
+        # while it reads the package files, which are in its memory
+        rig.fleet.inject_fault("n001", "power-cut@tar -xzOf")
+        ended = rig.meshctl("bootstrap", "a", "n001", "--yes", "--json")
+        assert ended.results == {"n001": "done"}, ended.out + ended.err
+        assert "kmod-batman-adv - 1" in rig.fleet.node("n001").exec("opkg list-installed").stdout
