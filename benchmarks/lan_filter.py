@@ -1,7 +1,7 @@
 """Urgent messages beside a lidar that broadcasts on the robot's LAN: `python -m benchmarks.lan_filter [--fill]`.
 
-The lab's example fleet is provisioned on the kernel's 802.11 radios with a LAN filter on rover2's radio. The base's link
-is limited, and its broadcasts to a rate that is as much lower as a basic rate is on the air. Then, in each run:
+The lab's example fleet is provisioned on the kernel's 802.11 radios with a LAN filter on rover2's radio. The base's
+link has a limited rate, and its broadcasts a quarter of it, as with a low basic rate. Then, in each run:
 
     no lidar -> lidar to a device on the robot, filter on -> lidar to 255.255.255.255, filter on -> the same, filter off
 

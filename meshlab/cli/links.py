@@ -65,7 +65,8 @@ def link(
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
         raise InputError(
-            f"nothing to change between {a} and {b}", hint="use --loss, --up, --down, --tq, --delay, --rate or --broadcast-rate"
+            f"nothing to change between {a} and {b}",
+            hint="use --loss, --up, --down, --tq, --delay, --rate or --broadcast-rate",
         )
     fleet = VirtualFleet.attach(lab_directory(directory))
     fleet.link(a, b, **changes)
