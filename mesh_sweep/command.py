@@ -70,6 +70,7 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
     parse_goals(options.goals)
     workers = options.workers()
     out = options.out or Path(f"{study.identity.scenario}-sweep.jsonl")
+    _check_report(options.report, out)
     if options.report is not None:
         # before hours of work
         with options.report.open("ab") as opened:
@@ -101,8 +102,15 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
 
 def show(file: Path, options: SweepOptions, default_figures: tuple[str, ...]) -> int:
     """Compare the results of a file, of whatever scenario and revision. Raises SweepError and OSError."""
+    _check_report(options.report, file)
     stored = decode(file.read_bytes(), str(file))
     return _show(stored.identity, stored.results, options, default_figures)
+
+
+def _check_report(report: Path | None, results: Path) -> None:
+    """Raise SweepError for a report that would replace the results."""
+    if report is not None and report.resolve() == results.resolve():
+        raise SweepError(f"--report {report}: expected another file than that of the results: give it another name")
 
 
 def _show(

@@ -104,7 +104,7 @@ def _check_names(patterns: Sequence[str], names: Sequence[str]) -> None:
     for pattern in patterns if names else ():
         if not any(fnmatchcase(name, pattern) for name in names):
             near = difflib.get_close_matches(pattern, names, n=1, cutoff=0.4)
-            meant = f"; did you mean {near[0]!r}?" if near else ""
+            meant = f"; did you mean {near[0]!r}?" if near else f"; they have {', '.join(names)}"
             raise SweepError(f"expected a figure of these results, found {pattern!r}{meant}")
 
 

@@ -9,6 +9,7 @@ import importlib
 import logging
 import multiprocessing
 import os
+import re
 import signal
 import sys
 import threading
@@ -21,6 +22,7 @@ from mesh_sweep.errors import SweepError
 
 CONTINUE = "the results so far are kept, and the same command continues"
 _CONNECT_S = 15
+_ADDRESS = re.compile(r"([a-z]+://)?[^/]+:[0-9]+")
 
 
 class Workers(Protocol):
@@ -103,6 +105,9 @@ class DaskWorkers:
             raise SweepError(
                 "--dask: expected the package distributed, found none: pip install 'meshctl-fleet[dask]'"
             ) from None
+        if not _ADDRESS.fullmatch(self.address):
+            # distributed finds that out too late, and prints a traceback
+            raise SweepError(f"--dask: expected an address such as tcp://host:8786, found {self.address!r}")
         try:
             connect: Any = distributed.Client
             self._client = connect(self.address, timeout=_CONNECT_S, set_as_default=False)

@@ -93,9 +93,13 @@ def decode(raw: bytes, file: str, expected: Identity | None = None) -> StoredRes
         raise SweepError(f"{file}: expected results of a sweep, found {'no complete line' if raw else 'an empty file'}")
     if torn and not (torn.startswith(identity.line_start) or identity.line_start.startswith(torn)):
         raise SweepError(
-            f"{file}:{len(found) + 1}: expected a result of {identity}, found {torn[:40]!r}: give another --out"
+            f"{file}:{len(found) + 1}: expected a result of {identity}, found {_start(torn)}: give another --out"
         )
     return StoredResults(identity, tuple(merge(found, file)), size)
+
+
+def _start(line: bytes) -> str:
+    return repr(line[:40].decode("utf-8", "replace"))
 
 
 def _decode_line(line: bytes, where: str) -> tuple[Identity, Result]:
@@ -106,7 +110,7 @@ def _decode_line(line: bytes, where: str) -> tuple[Identity, Result]:
         figures = {str(name): _number(figure) for name, figure in value.get("figures", {}).items()}
         result = Result(Case(settings, int(value["seed"])), figures, str(value.get("failed", "")))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        raise SweepError(f"{where}: expected a result of a sweep (one JSON object), found {line[:40]!r}") from None
+        raise SweepError(f"{where}: expected a result of a sweep (one JSON object), found {_start(line)}") from None
     return identity, result
 
 

@@ -64,7 +64,8 @@ def _link(entry: YamlEntry) -> LinkSpec | None:
         if keys["between"].is_present:
             keys["between"].problem("two different nodes")
         return None
-    rate, loss_back, signal_back = keys["rate_kbps"], keys["loss_back"], keys["signal_back_dbm"]
+    loss_back, signal_back = keys["loss_back"], keys["signal_back_dbm"]
+    rate, broadcast = keys["rate_kbps"], keys["broadcast_kbps"]
     standard = LinkSpec(ends[0], ends[1])
     return LinkSpec(
         ends[0],
@@ -77,6 +78,7 @@ def _link(entry: YamlEntry) -> LinkSpec | None:
         up=keys["up"].flag(standard.up),
         loss_back=loss_back.share(0.0) if loss_back.is_present else None,
         signal_back_dbm=signal_back.integer(0, -120, 30) if signal_back.is_present else None,
+        broadcast_kbps=broadcast.integer(1, 1, 10_000_000) if broadcast.is_present else None,
     )
 
 

@@ -84,7 +84,7 @@ class LinkSpec:
     `loss` is the share (0..1) of frames from `a` that `b` loses, `loss_back` that of frames from `b` (None: the same);
     1.0: no frame arrives. `signal_dbm` is the signal of `a` at `b`, `signal_back_dbm` that of `b` at `a` (None: the
     same). `tq` limits batman-adv's quality (0..255) of the link; losses lower it. `delay_ms` is one way; `rate_kbps`
-    None: unlimited.
+    None: unlimited. `broadcast_kbps` is the rate of broadcasts on a link with a rate (None: the same).
     """
 
     a: str
@@ -97,6 +97,7 @@ class LinkSpec:
     up: bool = True
     loss_back: float | None = None
     signal_back_dbm: int | None = None
+    broadcast_kbps: int | None = None
 
     @property
     def ends(self) -> frozenset[str]:

@@ -39,6 +39,10 @@ def link(
     tq: Annotated[int | None, typer.Option("--tq", min=0, max=255, help="Maximum link quality, 0 to 255.")] = None,
     delay_ms: Annotated[float | None, typer.Option("--delay", min=0, help="One-way delay in milliseconds.")] = None,
     rate_kbps: Annotated[int | None, typer.Option("--rate", min=1, help="Rate in kbit/s.")] = None,
+    broadcast_kbps: Annotated[
+        int | None,
+        typer.Option("--broadcast-rate", min=1, help="Rate of broadcasts in kbit/s, which share the link's time."),
+    ] = None,
     directory: LabDirectory = None,
 ) -> None:
     """Change or add a link between two nodes; `meshctl lab mend A-B` undoes it.
@@ -56,11 +60,13 @@ def link(
         "tq": tq,
         "delay_ms": delay_ms,
         "rate_kbps": rate_kbps,
+        "broadcast_kbps": broadcast_kbps,
     }
     changes = {name: value for name, value in given.items() if value is not None}
     if not changes:
         raise InputError(
-            f"nothing to change between {a} and {b}", hint="use --loss, --up, --down, --tq, --delay or --rate"
+            f"nothing to change between {a} and {b}",
+            hint="use --loss, --up, --down, --tq, --delay, --rate or --broadcast-rate",
         )
     fleet = VirtualFleet.attach(lab_directory(directory))
     fleet.link(a, b, **changes)

@@ -88,7 +88,7 @@ class QemuLinkState(LinkState):
             other = link.b if name == link.a else link.a
             # a TQ limit is implemented as the loss that leads to it
             loss = max(link.loss_to(name), loss_of(link.tq))
-            impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps)
+            impairment = traffic_control.Impairment(loss, link.delay_ms, link.rate_kbps, link.broadcast_kbps)
             if not impairment.is_none:
                 heard.update({cell.mac: impairment for cell in self._fleet.nodes[other].effective.interfaces})
         self.impair(state, heard)

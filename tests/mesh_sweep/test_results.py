@@ -54,10 +54,10 @@ def test_a_line_that_is_torn_anywhere_is_left_out() -> None:
     [
         (
             b"precious",
-            "f:1: expected a result of scenario mine (0123456789abcdef) at revision 1.0-abc, found b'precious'",
+            "f:1: expected a result of scenario mine (0123456789abcdef) at revision 1.0-abc, found 'precious'",
         ),
-        (b"precious\n", "f:1: expected a result of a sweep (one JSON object), found b'precious'"),
-        (b"[1]\n", "f:1: expected a result of a sweep (one JSON object), found b'[1]'"),
+        (b"precious\n", "f:1: expected a result of a sweep (one JSON object), found 'precious'"),
+        (b"[1]\n", "f:1: expected a result of a sweep (one JSON object), found '[1]'"),
         (b'{"scenario": "mine"}\n', "f:1: expected a result of a sweep (one JSON object)"),
         (encode(OURS, ONE) + b"\xff\n", "f:2: expected a result of a sweep"),
         (

@@ -80,5 +80,8 @@ def test_what_is_no_executor_is_reported(name: str, problem: str) -> None:
 
 
 def test_an_invalid_scheduler_address_is_reported() -> None:
-    with pytest.raises(SweepError, match="--dask: expected a Dask scheduler at nowhere://x, found none: "):
-        DaskWorkers("nowhere://x").open()
+    with pytest.raises(SweepError, match="--dask: expected a Dask scheduler at nowhere://x:1, found none: "):
+        DaskWorkers("nowhere://x:1").open()
+    # without a traceback half a minute later
+    with pytest.raises(SweepError, match="--dask: expected an address such as tcp://host:8786, found 'cluster'"):
+        DaskWorkers("cluster").open()

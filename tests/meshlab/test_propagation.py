@@ -33,6 +33,7 @@ links = st.builds(
     loss_back=st.sampled_from([None, 0.1, 1.0]),
     up=st.booleans(),
     rate_kbps=st.none() | st.integers(1, 1000),
+    broadcast_kbps=st.none() | st.integers(1, 1000),
 )
 grounds = st.builds(
     RadioEnvironment,
@@ -116,7 +117,7 @@ nodes: {base: [0, 0], b01: {at: [80, 0.5], tx_power_dbm: 33}}
 walls: [{a: [40, 10], b: [200, 10], loss_db: 40}, {a: [0, 0], b: [1, 1]}]
 air: {exponent: 2, sensitivity_dbm: -90}
 links:
-  - {between: [base, b02], loss: 30%, loss_back: 0.05, delay_ms: 5, rate_kbps: 64}
+  - {between: [base, b02], loss: 30%, loss_back: 0.05, delay_ms: 5, rate_kbps: 64, broadcast_kbps: 8}
   - {between: [b01, b02], up: false}
 """
     assert propagation_file.parse(text, FILE) == RadioEnvironment(
@@ -124,7 +125,7 @@ links:
         (Wall((40, 10), (200, 10), 40.0), Wall((0, 0), (1, 1))),
         PathLossModel(exponent=2.0, sensitivity_dbm=-90.0),
         (
-            LinkSpec("base", "b02", loss=0.3, loss_back=0.05, delay_ms=5.0, rate_kbps=64),
+            LinkSpec("base", "b02", loss=0.3, loss_back=0.05, delay_ms=5.0, rate_kbps=64, broadcast_kbps=8),
             LinkSpec("b01", "b02", up=False),
         ),
     )

@@ -102,3 +102,19 @@ def test_the_command_for_what_a_run_left_is_one_that_takes_the_run_up() -> None:
     # `meshctl resume` refuses these
     assert retry_command("rollback", undoes=4) == "meshctl rollback 4"
     assert retry_command("restore") == "meshctl restore"
+
+
+@pytest.mark.usefixtures("journal")
+def test_the_runs_of_a_lab_are_those_of_this_computer_where_operators_share_a_journal(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    # opening it would fail
+    monkeypatch.setenv("MESHCTL_STORE", "not the URL of a database")
+    assert [run["run"] for run in json.loads(said(capfd, "--virtual", "--json"))] == [2]
+    monkeypatch.setenv("MESHCTL_LAB", "/lab")
+    assert "b01: done" in said(capfd, "2")
+    for words in (["--real"], ["--real", "1"]):
+        with pytest.raises(SystemExit) as ended:
+            main(["history", *words])
+        assert ended.value.code == 2
+        assert "MESHCTL_STORE: expected postgresql://" in capfd.readouterr().err

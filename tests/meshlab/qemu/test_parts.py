@@ -88,9 +88,32 @@ def test_unicast_loss_accounts_for_retries() -> None:
     qdiscs = [line for line in lines if "netem" in line]
     assert "delay 5ms loss 50.0000% rate 1000kbit" in qdiscs[0]
     assert "loss 0.7812%" in qdiscs[1]
-    groups = [line for line in lines if "src_mac 02:00:00:00:00:01" in line]
-    assert "dst_mac 01:00:00:00:00:00/01:00:00:00:00:00 classid 1:2" in groups[0]
-    assert groups[1].endswith("classid 1:3")
+    senders = [line for line in lines if "dev air-mesh0" in line and "src_mac 02:00:00:00:00:01" in line]
+    assert "dst_mac 01:00:00:00:00:00/01:00:00:00:00:00 classid 1:3" in senders[0]
+    assert senders[1].endswith("classid 1:4")
+
+
+def test_broadcasts_and_unicast_frames_of_a_link_share_its_rate_and_a_broadcast_takes_longer() -> None:
+    impairment = Impairment(rate_kbps=6000, broadcast_kbps=1000)
+    lines = traffic_control.batch("mesh0", {"02:00:00:00:00:01": impairment}).splitlines()
+    parents = [line.split("parent ")[1].split()[0] for line in lines if line.startswith("class ")]
+    assert parents == ["1:", "1:2", "1:2"]
+    shared, *both = [line for line in lines if line.startswith("class ")]
+    assert "classid 1:2 htb rate 6000kbit" in shared
+    assert all("ceil 6000kbit" in line and "quantum 9600" in line for line in both)
+    copies = [line for line in lines if "dev mesh0" in line and "flower" in line]
+    assert [line.count("mirred egress mirror") for line in copies] == [5]
+    assert [line.count("mirred egress redirect") for line in copies] == [1]
+
+
+@pytest.mark.parametrize(
+    ("rate_kbps", "broadcast_kbps", "copies"),
+    [(None, 1000, 1), (6000, None, 1), (6000, 6000, 1), (1000, 6000, 1), (6000, 4000, 2), (10**7, 1, 24)],
+)
+def test_a_broadcast_is_never_faster_than_a_unicast_frame(
+    rate_kbps: int | None, broadcast_kbps: int | None, copies: int
+) -> None:
+    assert Impairment(rate_kbps=rate_kbps, broadcast_kbps=broadcast_kbps).broadcast_copies == copies
 
 
 def test_no_qdisc_is_configured_without_an_impairment() -> None:

@@ -76,6 +76,16 @@ def test_settings_are_compared_and_a_second_run_computes_nothing(
     assert "8 runs of scenario mine" in capsys.readouterr().out
 
 
+def test_a_report_never_replaces_the_results_that_it_shows(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_sweep([str(scenario), "--seeds", "1", *INLINE]) == 0
+    results = Path("mine-sweep.jsonl").read_bytes()
+    words = ["--report", str(Path.cwd() / "mine-sweep.jsonl")]
+    assert run_sweep([str(scenario), "--seeds", "1", *words, *INLINE]) == 2
+    assert run_sweep(["--show", "mine-sweep.jsonl", *words]) == 2
+    assert capsys.readouterr().err.count("expected another file than that of the results: give it another name") == 2
+    assert Path("mine-sweep.jsonl").read_bytes() == results
+
+
 def test_one_seed_is_the_run_that_sim_makes(scenario: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_sweep([str(scenario), "--seeds", "7-7", *INLINE]) == 0
     assert main([str(scenario), "--seed", "7", "--json"]) == 0
@@ -101,6 +111,8 @@ def test_one_seed_is_the_run_that_sim_makes(scenario: Path, capsys: pytest.Captu
         (["--seeds", "0"], "udp-mesh: --seeds: expected a number (1000) or a range (501-1000)"),
         (["--dask", "tcp://x:1", "--executor", "a:b"], "expected --dask or --executor, found both"),
         (["--report", "no/such/dir.html"], "udp-mesh: no/such/dir.html: No such file or directory"),
+        (["--report", "./mine-sweep.jsonl"], "mine-sweep.jsonl: expected another file than that of the results"),
+        (["--figure", "zzz", "--seeds", "1", *INLINE], "found 'zzz'; they have accepted, "),
         (["--figure", "accepte", "--seeds", "1", *INLINE], "found 'accepte'; did you mean 'accepted'?"),
     ],
 )  # fmt: skip

@@ -50,6 +50,7 @@ from udp_mesh.bridges.ros1.graph import (
     parameters,
     unknown_arguments,
 )
+from udp_mesh.bridges.ros1.lost_connections import SystemState
 from udp_mesh.bridges.ros1.services import Ros1Calls
 from udp_mesh.bridges.runtime import BridgeRuntime
 from udp_mesh.bridges.settings_check import settings_without_effect, unread_names
@@ -201,7 +202,8 @@ class Ros1Bridge:
             return
         declared = [topic for topic in topics if not topic.startswith("bridge/")]
         table = routes(self._own, declared, peers)
-        published = self._published()
+        state = self._system_state()
+        published = state.publishers
         if undeclared:
             self._add_undeclared(table, peers, published)
         with self._actions_lock:
@@ -212,15 +214,22 @@ class Ros1Bridge:
             }
         self._graph.listen(table)
         self._graph.reserve(reserved)
+        self._reconnect(state)
         self._check(published, table, topics, peers)
 
-    def _published(self) -> dict[str, list[str]]:
-        """Names that programs of this robot publish, and their nodes; none while there is no master."""
+    def _system_state(self) -> SystemState:
+        """What other nodes publish and subscribe to; nothing while there is no master."""
         try:
-            return self._graph.published()
+            return self._graph.system_state()
         except MASTER_ERRORS as error:
             log.debug("master-unreachable %s", error)
-            return {}
+            return SystemState({}, {})
+
+    def _reconnect(self, state: SystemState) -> None:
+        try:
+            self._graph.reconnect(state)
+        except MASTER_ERRORS as error:
+            log.debug("master-unreachable %s", error)
 
     def _check(
         self,

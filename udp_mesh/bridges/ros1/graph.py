@@ -25,6 +25,7 @@ from udp_mesh.bridges.names import Route
 from udp_mesh.bridges.receiving import Receive, parse_receive
 from udp_mesh.bridges.relay import ToRos
 from udp_mesh.bridges.ros1 import legacy
+from udp_mesh.bridges.ros1.lost_connections import LostConnections, SystemState
 from udp_mesh.bridges.ros1.publications import Publications, RosPublication
 from udp_mesh.bridges.types import TypeKey
 
@@ -108,6 +109,7 @@ class Graph:
         self._reserved: dict[str, _Opaque] = {}
         self._publications = Publications(_Opaque, _subscribers_of, time.monotonic)
         self._unknown: set[TypeKey] = set()
+        self._lost_publishers, self._lost_subscribers = LostConnections(), LostConnections()
         self._conditions: Mapping[str, Any] | None = None
         self._prefix = prefix
         self._stats = rospy.Publisher(prefix + "mesh_status", legacy.NetworkStats, queue_size=1)
@@ -175,11 +177,21 @@ class Graph:
         if len(message._buff) == 1:
             on_window(message._buff[0])
 
-    def published(self) -> dict[str, list[str]]:
-        """Names with publishers beside this node, and these, according to the master. Raises one of MASTER_ERRORS."""
-        ours = rospy.get_name()
-        listed = {name: [node for node in nodes if node != ours] for name, nodes in _master().getSystemState()[0]}
-        return {name: nodes for name, nodes in listed.items() if nodes}
+    def system_state(self) -> SystemState:
+        """Names with publishers or subscribers beside this node. Raises one of MASTER_ERRORS."""
+        publishers, subscribers, _ = _master().getSystemState()
+        return SystemState(_of_others(publishers), _of_others(subscribers))
+
+    def reconnect(self, state: SystemState) -> None:
+        """Has the master repeat who publishes the names whose connections were lost. Raises one of MASTER_ERRORS."""
+        subscribed = [subscriber for _, subscriber in self._subscribers.values()] + self._watched
+        incoming = {one.resolved_name: one.impl.get_num_connections() for one in subscribed}
+        for name in self._lost_publishers.due(incoming, state.publishers):
+            self._register_subscriber(name)
+        types = dict(self._publications.advertised())
+        for name in self._lost_subscribers.due(self._publications.connections(), state.subscribers):
+            if name in types:
+                _master().registerPublisher(name, types[name], rospy.get_node_uri())
 
     # Publish
 
@@ -222,21 +234,31 @@ class Graph:
         if pid == self._pid and _is_registered(master):
             return False
         uri = rospy.get_node_uri()
-        ourselves = xmlrpc.client.ServerProxy(uri)
         fixed = [(publisher.resolved_name, publisher.type) for publisher in (self._stats, self._hosts)]
         reserved = [(name, opaque.type) for name, opaque in self._reserved.items()]
         for name, message_type in [*fixed, *self._publications.advertised(), *reserved]:
             master.registerPublisher(name, message_type, uri)
         watched = [subscriber.resolved_name for subscriber in self._watched]
         for name in [*self._subscribers, *watched, self._settings.resolved_name]:
-            publishers = master.registerSubscriber(name, rospy.AnyMsg._type, uri)
-            # Pass the new master's answer to rospy as if the master had called.
-            ourselves.publisherUpdate("/master", name, publishers)
+            self._register_subscriber(name)
         for name, service_uri in [(self._service.resolved_name, self._service.uri), *services]:
             master.registerService(name, service_uri, uri)
         self._pid = pid
         log.info("master-restarted pid=%d", pid)
         return True
+
+    def _register_subscriber(self, name: str) -> None:
+        """Registers the subscriber, and passes the master's answer to rospy as if the master had called."""
+        uri = rospy.get_node_uri()
+        publishers = _master().registerSubscriber(name, rospy.AnyMsg._type, uri)
+        xmlrpc.client.ServerProxy(uri).publisherUpdate("/master", name, publishers)
+
+
+def _of_others(names: Iterable[Sequence[Any]]) -> dict[str, list[str]]:
+    """The nodes of each name without this one; names without another node are left out."""
+    ours = rospy.get_name()
+    listed = {str(name): [str(node) for node in nodes if node != ours] for name, nodes in names}
+    return {name: nodes for name, nodes in listed.items() if nodes}
 
 
 def _master() -> Any:

@@ -132,6 +132,12 @@ class Publications:
             topic.waiting_bytes -= len(payload)
             advertised.publish(payload)
 
+    def connections(self) -> dict[str, int]:
+        """How many subscribers are connected to each advertised name."""
+        with self._changed:
+            topics = [(name, topic.advertised) for name, topic in self._topics.items()]
+        return {name: advertised.connections() for name, advertised in topics if advertised is not None}
+
     def advertised(self) -> list[tuple[str, str]]:
         """Names and types registered with the master, or to be registered."""
         with self._changed:
