@@ -1,7 +1,8 @@
-"""Whether a plan would lock the operator out: a node's authorized keys, and its SSH server after a boot. Pure.
+"""Whether a plan would lock the operator out: authorized keys, the SSH server and its port, the firewall. Pure.
 
-A change is confirmed over a login with a key. Without one of the operator's keys on the node it could never be
-confirmed and would roll back after its window, so it is refused.
+A change is confirmed over a login with a key. Without one of the operator's keys on the node, or an SSH server on the
+port where meshctl logs in, it could never be confirmed and would roll back after its window, so it is refused
+(`lockout`, `server_lockout`). A firewall may accept SSH in ways that are not checked here: `firewall_notes` only warns.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from collections.abc import Mapping, Sequence
 
 from meshctl.device.connection import OwnKey, fingerprint_of
 from meshctl.model import Node
+from meshctl.plan.observed_files import management_section
 from meshctl.plan.preconditions import FailedPrecondition
-from meshctl.uci import Package
+from meshctl.uci import Package, Section
 
 # the values that libubox treats as false
 _OFF = frozenset({"0", "off", "false", "no", "disabled"})
@@ -43,8 +45,9 @@ def lockout(node: Node, files: Mapping[str, bytes], own: Sequence[OwnKey]) -> Fa
     )
 
 
-def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None:
-    """The failed precondition of a configuration (package name -> tree) whose dropbear would not listen after a boot.
+def server_lockout(node: Node, packages: Mapping[str, Package]) -> FailedPrecondition | None:
+    """The failed precondition of a configuration (package name -> tree) whose dropbear would not listen after a boot,
+    or not on the port where meshctl logs in. A node behind another host (`ssh.host`) may have any port.
 
     On a running node `Interface` and `DirectInterface` have no effect for a missing network: dropbear listens on all
     addresses (24.10 and later). At boot it waits for that network's trigger forever (dropbear.init, all releases). So
@@ -64,6 +67,13 @@ def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None
         return FailedPrecondition(
             "no login would be possible afterwards: its dropbear is disabled", "remove `enable` from extra_uci"
         )
+    ports = list(dict.fromkeys(port for section in sections for port in section.items("Port") or ("22",)))
+    if not node.ssh.host and str(node.ssh.port) not in ports:
+        return FailedPrecondition(
+            f"no login would be possible afterwards: its dropbear would listen on port {', '.join(ports)}, "
+            f"and ssh.port is {node.ssh.port}",
+            "remove `Port` from extra_uci",
+        )
     if not all(missing):
         return None
     option, name = missing[0][0]
@@ -73,6 +83,44 @@ def server_lockout(packages: Mapping[str, Package]) -> FailedPrecondition | None
         f"name one of {', '.join(sorted(str(network) for network in steady - {'loopback'})) or 'its networks'}, "
         f"or remove {option} from extra_uci",
     )
+
+
+def firewall_notes(node: Node, packages: Mapping[str, Package]) -> tuple[str, ...]:
+    """A note if the firewall zone of the management network refuses new connections, and no rule accepts SSH."""
+    firewall, network = packages.get("firewall"), packages.get("network")
+    management = None if network is None else management_section(network)
+    if firewall is None or management is None:
+        return ()
+    zones = [zone for zone in firewall.of_type("zone") if management.name in zone.get("network").split()]
+    for zone in zones:
+        if zone.get("input", "ACCEPT").upper() != "ACCEPT" and not any(
+            _accepts_ssh(rule, zone, node.ssh.port) for rule in firewall.of_type("rule")
+        ):
+            name = zone.get("name") or zone.name
+            return (
+                f"its firewall zone {name} would {zone.get('input').lower()} new connections, and no rule accepts SSH: "
+                "without one, the change is rolled back after the confirm window",
+            )
+    return ()
+
+
+def _accepts_ssh(rule: Section, zone: Section, port: int) -> bool:
+    """Whether a rule may accept SSH from this zone. Conditions other than zone and port are taken to hold."""
+    ports = rule.get("dest_port").split()
+    return (
+        rule.get("target").upper() == "ACCEPT"
+        and rule.get("src") in ("*", zone.get("name"))
+        and not rule.get("dest")
+        and (not ports or any(_includes(ports_word, port) for ports_word in ports))
+    )
+
+
+def _includes(word: str, port: int) -> bool:
+    """Whether `22`, `20-30` or `20:30` includes the port; a name does if it is `ssh`."""
+    first, _, last = word.replace(":", "-").partition("-")
+    if not first.isdigit() or (last and not last.isdigit()):
+        return word == "ssh"
+    return int(first) <= port <= int(last or first)
 
 
 def _shown(line: str) -> str:

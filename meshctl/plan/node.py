@@ -18,7 +18,7 @@ from meshctl.plan.cell import cells, partitions
 from meshctl.plan.effects import effects
 from meshctl.plan.firmware import firmware_step
 from meshctl.plan.left_over import interface_names, left_over
-from meshctl.plan.lockout import lockout, server_lockout
+from meshctl.plan.lockout import firewall_notes, lockout, server_lockout
 from meshctl.plan.masking import Fingerprints, masked_text, secrets_of
 from meshctl.plan.observed_files import file_info, fingerprint_texts, is_meshed, packages_seen, parsed, text_of
 from meshctl.plan.packages import NO_NEEDS, Needs, other_versions, package_step
@@ -97,7 +97,7 @@ def node_plan(
     contents = {file.path: file.content for file in desired.files} if files or firmware else {}
     locked_out = None if own_keys is None else lockout(node, contents, own_keys)
     if locked_out is None and contents:
-        locked_out = server_lockout(after)
+        locked_out = server_lockout(node, after)
     if locked_out is not None:
         return replace(basis, verdict=Verdict.REFUSED, reason=locked_out.reason, hint=locked_out.hint)
     node_effects = effects((change.path for change in files), before, after, node.release)
@@ -125,6 +125,7 @@ def node_plan(
         notes=(
             *observation.notes,
             *_tagged_ports(node, observation, after.get("network")),
+            *(firewall_notes(node, after) if contents else ()),
             *_lacking_scripts(node, observation, basis, firmware),
             *_lasting_thresholds(before.get("wireless"), after.get("wireless"), firmware),
             *(f"{text}; the new firmware must include another driver" for text in lacking),

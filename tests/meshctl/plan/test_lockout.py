@@ -10,7 +10,7 @@ import pytest
 from meshctl.device.connection import OwnKey
 from meshctl.model import Release
 from meshctl.plan import DesiredState, Verdict
-from meshctl.plan.lockout import AUTHORIZED_KEYS, lockout, server_lockout
+from meshctl.plan.lockout import AUTHORIZED_KEYS, firewall_notes, lockout, server_lockout
 from meshctl.uci import parse
 from tests.meshctl.plan.support import factory, fleet, planned, running, wanted
 
@@ -18,6 +18,9 @@ TEAM = fleet()
 AUTHORIZED = TEAM.operators.ssh_keys[0]
 OURS = OwnKey("agent key alice", "ssh-ed25519", base64.b64decode(AUTHORIZED.split()[1]))
 OTHER = OwnKey("key /home/bob/.ssh/id_ed25519", "ssh-ed25519", b"\0\0\0\x0bssh-ed25519\0\0\0 " + bytes(32))
+
+
+NODE = TEAM.nodes["b01"]
 
 
 def contents(want: DesiredState) -> dict[str, bytes]:
@@ -103,7 +106,7 @@ def test_a_dropbear_that_would_not_listen_after_a_boot_is_refused(options: str, 
         "network": parse(NETWORK, "network"),
         "dropbear": parse(f"config dropbear 'main'\n\toption Port '22'\n{options}", "dropbear"),
     }
-    found = server_lockout(packages)
+    found = server_lockout(NODE, packages)
     assert (found is not None) == bool(reason)
     assert found is None or reason in found.reason
     assert found is None or "extra_uci" in found.hint
@@ -114,4 +117,50 @@ def test_a_dropbear_that_would_not_listen_after_a_boot_is_refused(options: str, 
 )
 def test_one_listening_dropbear_instance_is_enough(missing: str) -> None:
     text = f"config dropbear 'main'\n\toption enable '1'\n\nconfig dropbear 'other'\n{missing}"
-    assert server_lockout({"network": parse(NETWORK, "network"), "dropbear": parse(text, "dropbear")}) is None
+    assert server_lockout(NODE, {"network": parse(NETWORK, "network"), "dropbear": parse(text, "dropbear")}) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "host", "reason"),
+    [
+        ("", "", ""),
+        ("\toption Port '22'\n", "", ""),
+        ("\tlist Port '2222'\n\tlist Port '22'\n", "", ""),
+        ("\toption Port '2222'\n", "", "would listen on port 2222, and ssh.port is 22"),
+        # a host in front of the node forwards to any port
+        ("\toption Port '2222'\n", "10.0.0.9", ""),
+    ],
+)
+def test_a_dropbear_on_another_port_is_refused(options: str, host: str, reason: str) -> None:
+    packages = {
+        "network": parse(NETWORK, "network"),
+        "dropbear": parse(f"config dropbear 'main'\n{options}", "dropbear"),
+    }
+    found = server_lockout(replace(NODE, ssh=replace(NODE.ssh, host=host)), packages)
+    assert (found is not None) == bool(reason)
+    assert found is None or reason in found.reason
+
+
+ZONE = "config zone 'management'\n\toption name 'mgmt'\n\tlist network 'lan'\n\toption input '{}'\n"
+RULE = "\nconfig rule\n\toption src '{}'\n\toption dest_port '{}'\n\toption target '{}'\n"
+
+
+@pytest.mark.parametrize(
+    ("firewall", "is_noted"),
+    [
+        (ZONE.format("ACCEPT"), False),
+        (ZONE.format("REJECT"), True),
+        (ZONE.format("drop"), True),
+        (ZONE.format("REJECT") + RULE.format("mgmt", "22", "ACCEPT"), False),
+        (ZONE.format("REJECT") + RULE.format("*", "20-30", "ACCEPT"), False),
+        (ZONE.format("REJECT") + RULE.format("mgmt", "80 ssh", "ACCEPT"), False),
+        (ZONE.format("REJECT") + RULE.format("mgmt", "80", "ACCEPT"), True),
+        (ZONE.format("REJECT") + RULE.format("wan", "22", "ACCEPT"), True),
+        (ZONE.format("REJECT") + RULE.format("mgmt", "22", "DROP"), True),
+        # a zone of other networks
+        (ZONE.format("REJECT").replace("'lan'", "'wan'"), False),
+    ],
+)
+def test_a_firewall_that_refuses_ssh_is_noted(firewall: str, is_noted: bool) -> None:
+    packages = {"network": parse(NETWORK, "network"), "firewall": parse(firewall, "firewall")}
+    assert bool(firewall_notes(NODE, packages)) == is_noted
