@@ -1,19 +1,21 @@
 """`meshctl history --follow`: what happens in the journal from now on, one line for each beginning, outcome and end.
 
 The runs in progress -> wait until the journal changes -> the differences. Where operators share a journal, the lines
-are of all of them.
+are of all of them; a lost database is waited for.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from meshctl.cli.output import echo, echo_json
+from meshctl.cli.output import echo, echo_error, echo_json
 from meshctl.fleet.journal import Journal, RunRecord
 from meshctl.fleet.outcome import Outcome, Result
+from meshctl.fleet.postgresql import DatabaseLost
 
 # A journal that is waited for so long is read anyway: a process that was killed writes no end.
 LOOK_S = 5.0
@@ -58,9 +60,14 @@ def follow(journal: Journal, matches: Callable[[RunRecord], bool], node: str | N
 
 
 def happenings(
-    journal: Journal, matches: Callable[[RunRecord], bool], node: str | None
+    journal: Journal,
+    matches: Callable[[RunRecord], bool],
+    node: str | None,
+    *,
+    notify: Callable[[str], None] = echo_error,
 ) -> Generator[Happening, None, None]:
-    """First the runs in progress, as `began`; then everything that happens."""
+    """First the runs in progress, as `began`; then everything that happens. Raises DatabaseLost at the start; later,
+    `notify` is called, and what happened meanwhile follows once the database is back."""
     journal.wait_for_change(0.0)
     latest = journal.runs(limit=_RUNS)
     last = max((run.id for run in latest), default=0)
@@ -69,15 +76,23 @@ def happenings(
         if matches(run) and not run.is_over:
             looks[run.id] = _results(_outcomes(journal, run, node))
             yield Happening("began", run)
+    is_lost = False
     while True:
-        journal.wait_for_change(LOOK_S)
-        for run in reversed(journal.runs(limit=_RUNS)):
-            if not matches(run) or (run.id <= last and run.id not in looks):
-                continue
+        try:
+            journal.wait_for_change(LOOK_S)
+            runs = [run for run in journal.runs(limit=_RUNS) if matches(run) and (run.id > last or run.id in looks)]
+            changed = [(run, _outcomes(journal, run, node)) for run in reversed(runs)]
+        except DatabaseLost as error:
+            if not is_lost:
+                notify(f"warning: {error}; waiting until it is back")
+            is_lost = True
+            time.sleep(LOOK_S)
+            continue
+        is_lost = False
+        for run, outcomes in changed:
             if run.id not in looks:
                 looks[run.id] = {}
                 yield Happening("began", run)
-            outcomes = _outcomes(journal, run, node)
             for outcome in outcomes:
                 if outcome.result not in (Result.PENDING, looks[run.id].get(outcome.node)):
                     yield Happening("node", run, outcome)

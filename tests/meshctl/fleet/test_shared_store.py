@@ -7,12 +7,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from meshctl.cli.history_follow import happenings
 from meshctl.errors import InputError, MeshctlError
 from meshctl.fleet import Outcome, Result, postgresql, shared_store
 from meshctl.fleet.journal import Journal, default_path
@@ -24,51 +22,11 @@ from meshctl.monitor.alarm_log import Silence
 from meshctl.monitor.frame import Frame, frame_of
 from meshctl.monitor.shared_alarms import SharedAlarms
 from meshctl.monitor.store import MIN_BYTES, FrameStore
+from tests.meshctl.fleet.laptops import Laptop
 from tests.meshctl.fleet.postgresql_server import Server, Uplink
 from tests.waiting import until
 
 pytestmark = pytest.mark.xdist_group("postgresql")
-
-
-class Laptop:
-    """An operator's computer: a state directory, and the way to the database."""
-
-    def __init__(self, state: Path, url: str) -> None:
-        self.environ = {"XDG_STATE_HOME": str(state), "MESHCTL_STORE": url}
-        self.notices: list[str] = []
-
-    def open(self) -> Journal:
-        return open_journal(self.environ, self.notices.append)
-
-
-@pytest.fixture
-def url(server: Server) -> str:
-    return server.new_database()
-
-
-@pytest.fixture
-def alice(tmp_path: Path, url: str) -> Laptop:
-    return Laptop(tmp_path / "alice", url)
-
-
-@pytest.fixture
-def bob(tmp_path: Path, url: str) -> Laptop:
-    return Laptop(tmp_path / "bob", url)
-
-
-@pytest.fixture
-def uplink(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Uplink]:
-    monkeypatch.setattr(shared_store, "RETRY_S", 0.05)
-    uplink = Uplink(server.port)
-    yield uplink
-    uplink.close()
-
-
-@pytest.fixture
-def carol(tmp_path: Path, url: str, uplink: Uplink) -> Laptop:
-    """Her way to the database can be cut."""
-    name = url.rpartition("/")[2]
-    return Laptop(tmp_path / "carol", f"postgresql://postgres@127.0.0.1:{uplink.port}/{name}")
 
 
 def test_what_one_operator_records_the_others_see(alice: Laptop, bob: Laptop) -> None:
@@ -392,30 +350,6 @@ def test_a_wrong_password_is_reported_without_it(server: Server) -> None:
         Database(f"postgresql://eve:hunter2@127.0.0.1:{server.port}/postgres")
     assert "eve" in str(caught.value)
     assert "hunter2" not in str(caught.value)
-
-
-def test_following_shows_what_other_operators_do(alice: Laptop, bob: Laptop) -> None:
-    with alice.open() as hers, bob.open() as his:
-        old = hers.begin("provision", fleet="f", inventory="i", nodes=("x",))
-        seen: list[str] = []
-        following = happenings(his, lambda run: True, None)
-        seen.append(str(next(following)))
-        run = hers.begin("provision", fleet="f", inventory="i", nodes=("a", "b"))
-        seen.append(str(next(following)))
-        run.finish_node(Outcome("a", Result.DONE, duration_s=2.0))
-        seen.append(str(next(following)))
-        run.end("1 done, 1 pending")
-        old.end("1 pending")
-        seen += sorted([str(next(following)), str(next(following))])
-        following.close()
-        owner = hers.runs()[0].owner
-        assert seen == [
-            f"run {old.id}: provision of f by {owner}: began",
-            f"run {run.id}: provision of f by {owner}: began",
-            f"run {run.id}: a: done (2.0 s)",
-            f"run {old.id}: provision of f by {owner}: 1 pending",
-            f"run {run.id}: provision of f by {owner}: 1 done, 1 pending",
-        ]
 
 
 def test_what_an_operator_does_about_an_alarm_reaches_the_monitors_of_the_others(
