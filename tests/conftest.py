@@ -38,6 +38,8 @@ gc.set_threshold(50_000, 20, 50)
 
 LONGEST_GROUPS = ("lab-real", "fleet", "tutorials", "lab")
 """The groups of tests that share a fleet or a machine and wait for minutes: each begins at once, on its own worker."""
+GROUPS_UNTIL = 2 / 3
+"""The share of the tests without a group before which all other groups have begun."""
 
 TRIED_AGAIN = "tried again"
 """The property of a test in whose setup a machine was made once more: why."""
@@ -101,21 +103,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest groups first, then the other groups: pytest-xdist hands them out in this order
-    (`--no-loadscope-reorder`).
+    """Put the longest groups first, and the others among the tests without a group: pytest-xdist hands them out in this
+    order (`--no-loadscope-reorder`).
 
-    Its own order begins with the group of the most tests, and that of the files ends with the groups of `udp_mesh`:
-    either way a group of few long tests would run last, and alone. Tests without a group end the run evenly on all
-    workers.
+    The tests of a group mostly wait in real time, those without one compute: beside each other they use the whole
+    machine. Tests without a group end the run evenly on all workers.
     """
-    items.sort(key=_turn)
-
-
-def _turn(item: pytest.Item) -> int:
-    mark = item.get_closest_marker("xdist_group")
-    if mark is None:
-        return len(LONGEST_GROUPS) + 1
-    return LONGEST_GROUPS.index(mark.args[0]) if mark.args[0] in LONGEST_GROUPS else len(LONGEST_GROUPS)
+    groups: dict[str, list[pytest.Item]] = {}
+    single: list[pytest.Item] = []
+    for item in items:
+        mark = item.get_closest_marker("xdist_group")
+        (single if mark is None else groups.setdefault(mark.args[0], [])).append(item)
+    ordered = [item for name in LONGEST_GROUPS for item in groups.pop(name, ())]
+    step = int(len(single) * GROUPS_UNTIL / max(1, len(groups)))
+    for number, group in enumerate(groups.values()):
+        ordered += [*single[number * step : (number + 1) * step], *group]
+    items[:] = [*ordered, *single[len(groups) * step :]]
 
 
 def pytest_collection_finish() -> None:
