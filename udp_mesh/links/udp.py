@@ -32,6 +32,7 @@ from udp_mesh.links.source_filter import (
 
 SOL_UDP, UDP_SEGMENT, UDP_GRO = 17, 103, 104
 SO_REUSEPORT, SO_BINDTODEVICE, SO_RCVBUFFORCE, SO_TIMESTAMPNS = 15, 25, 33, 35
+IP_MTU_DISCOVER, IPV6_MTU_DISCOVER, PMTUDISC_INTERFACE = 10, 23, 4
 
 MAX_SEGMENTS = 64
 """UDP_MAX_SEGMENTS of older kernels (newer ones allow 128)."""
@@ -163,7 +164,12 @@ class UdpLink:
             own.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, buffer_bytes)
         # The arrival time rather than the time of reading: round trips must measure the network, not this machine.
         own.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        if own.family == socket.AF_INET6:
+        # Anyone can forge an ICMP error that makes the kernel cut our datagrams into IP packets of 552 bytes for ten
+        # minutes, of which some networks drop all. The core finds the path MTU by what arrives (`core.sender.pmtu`).
+        if own.family == socket.AF_INET:
+            own.setsockopt(socket.IPPROTO_IP, IP_MTU_DISCOVER, PMTUDISC_INTERFACE)
+        else:
+            own.setsockopt(socket.IPPROTO_IPV6, IPV6_MTU_DISCOVER, PMTUDISC_INTERFACE)
             # IPv4 has a socket of its own, and our own multicasts need not come back.
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             own.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_LOOP, 0)

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import os
 import socket
 from collections.abc import Iterator
 from contextlib import closing
@@ -56,6 +57,15 @@ def test_long_runs_are_split_at_the_kernel_segment_limit(pair: tuple[UdpLink, Ud
     assert alice.send([Out(bytes(100), bob.attachment.address)] * (2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
     assert alice.system_calls == 3
     assert len(receive(bob, 2 * MAX_SEGMENTS + 1)) == 2 * MAX_SEGMENTS + 1
+
+
+@pytest.mark.parametrize(
+    ("host", "level", "option"), [(ALICE, socket.IPPROTO_IP, 10), ("::1", socket.IPPROTO_IPV6, 23)], ids=["v4", "v6"]
+)
+def test_the_kernel_ignores_path_mtus_from_icmp(host: str, level: int, option: int) -> None:
+    with closing(open_link(host, free_port())) as link, socket.socket(fileno=os.dup(link.fileno())) as own:
+        # IP_MTU_DISCOVER, IPV6_MTU_DISCOVER: IP_PMTUDISC_INTERFACE
+        assert own.getsockopt(level, option) == 4
 
 
 def test_only_urgent_datagrams_carry_the_urgent_dscp(pair: tuple[UdpLink, UdpLink]) -> None:
