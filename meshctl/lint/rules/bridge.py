@@ -264,7 +264,7 @@ def robot_without_port(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
     check has passed: the cell may split, a limit may be exceeded, or a node lost, unnoticed. Sections that `extra_uci`
     itself creates, such as an access point, are not checked.""",
     fix="Use the inventory's own key, which is checked; without one, remove the option.",
-    failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '13'}}}",
+    failing="nodes: {b01: {extra_uci: {wireless.radio0.channel: '11'}}}",
     passing="""
     nodes:
       b01:
