@@ -89,11 +89,11 @@ class Excerpts:
 
     def _show_anchors(self, marks: bytearray) -> None:
         """Show the names that are both defined and used. Another `&word` may be a secret that was not quoted."""
-        found = [one for one in _ANCHOR.finditer(self.text) if marks[one.start()] != _Visibility.HIDDEN]
-        defined, used = ({one[2] for one in found if one[1] == mark} for mark in "&*")
-        for one in found:
-            if one[2] in defined & used:
-                marks[one.start() : one.end()] = bytes([_Visibility.SHOWN]) * len(one[0])
+        found = [anchor for anchor in _ANCHOR.finditer(self.text) if marks[anchor.start()] != _Visibility.HIDDEN]
+        defined, used = ({anchor[2] for anchor in found if anchor[1] == mark} for mark in "&*")
+        for anchor in found:
+            if anchor[2] in defined & used:
+                marks[anchor.start() : anchor.end()] = bytes([_Visibility.SHOWN]) * len(anchor[0])
 
 
 def _spans(tree: Tree, kind: Any) -> Iterator[tuple[int, int, _Visibility]]:

@@ -19,6 +19,8 @@ from meshctl.uci import Package, Section
 
 # the values that libubox treats as false
 _OFF = frozenset({"0", "off", "false", "no", "disabled"})
+# the values of a rule's `proto` that include TCP
+_TCP = frozenset({"tcp", "6", "tcpudp", "all", "any", "*", "0"})
 AUTHORIZED_KEYS = "etc/dropbear/authorized_keys"
 
 
@@ -109,9 +111,11 @@ def _accepts_ssh(rule: Section, zone: Section, port: int) -> bool:
     ports = rule.get("dest_port").split()
     return (
         rule.get("target").upper() == "ACCEPT"
+        and rule.get("enabled", "1") not in _OFF
+        and not _TCP.isdisjoint((rule.get("proto") or "tcp").lower().split())
         and rule.get("src") in ("*", zone.get("name"))
         and not rule.get("dest")
-        and (not ports or any(_includes(ports_word, port) for ports_word in ports))
+        and (not ports or any(_includes(word, port) for word in ports))
     )
 
 

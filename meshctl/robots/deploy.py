@@ -137,7 +137,7 @@ def _unmet_for_port(host: Host, robot: str, options: DeployOptions, old: int) ->
     seen = collect_facts(host, robot, expected_release(options.fleet, robot, options.secrets), now_s=options.now_s())
     if not (left := sorted(options.apart & set(seen.online))):
         return []
-    count = sum(one.computer is not None for one in options.fleet.robots.values())
+    count = sum(other.computer is not None for other in options.fleet.robots.values())
     port = options.fleet.udp_mesh.port
     reason = f"its port changes from {old} to {port}, and {', '.join(left)}, which it hears, would change later"
     return [(reason, f"change all robots at once: run `MESHCTL_PARALLEL={count} meshctl robots deploy`")]

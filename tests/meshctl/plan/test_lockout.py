@@ -155,6 +155,12 @@ RULE = "\nconfig rule\n\toption src '{}'\n\toption dest_port '{}'\n\toption targ
         (ZONE.format("REJECT") + RULE.format("*", "20-30", "ACCEPT"), False),
         (ZONE.format("REJECT") + RULE.format("mgmt", "80 ssh", "ACCEPT"), False),
         (ZONE.format("REJECT") + RULE.format("mgmt", "80", "ACCEPT"), True),
+        (ZONE.format("REJECT") + RULE.format("mgmt", "22", "ACCEPT") + "\toption enabled '0'\n", True),
+        # the rule for ping
+        (
+            ZONE.format("REJECT") + "config rule\n\toption src '*'\n\toption proto 'icmp'\n\toption target 'ACCEPT'\n",
+            True,
+        ),
         (ZONE.format("REJECT") + RULE.format("wan", "22", "ACCEPT"), True),
         (ZONE.format("REJECT") + RULE.format("mgmt", "22", "DROP"), True),
         # a zone of other networks
