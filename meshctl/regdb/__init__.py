@@ -7,11 +7,19 @@ checks a channel of a given width against them.
 from meshctl.regdb.binary import RegdbError, decode
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, channel_at, occupied_span, width_mhz
 from meshctl.regdb.file import SHIPPED, SYSTEM, load, shipped_version
-from meshctl.regdb.legality import Legality, check_span, legal_channels, primary_span
+from meshctl.regdb.legality import (
+    NO_INITIATE,
+    Legality,
+    check_span,
+    initiating_channels,
+    legal_channels,
+    primary_span,
+)
 from meshctl.regdb.values import Country, DfsRegion, Flag, FrequencyRule, Regdb
 
 __all__ = [
     "CHANNELS",
+    "NO_INITIATE",
     "SHIPPED",
     "SYSTEM",
     "Country",
@@ -26,6 +34,7 @@ __all__ = [
     "channel_at",
     "check_span",
     "decode",
+    "initiating_channels",
     "legal_channels",
     "load",
     "occupied_span",

@@ -12,6 +12,9 @@ from meshctl.model import Band
 from meshctl.regdb.channels import CHANNELS, Span, center_mhz, occupied_span, width_mhz
 from meshctl.regdb.values import NO_FLAGS, Country, Flag, FrequencyRule
 
+NO_INITIATE = Flag.DFS | Flag.NO_IR
+"""The flags of rules under which a radio may not start to transmit by itself."""
+
 
 @dataclass(frozen=True, slots=True)
 class Legality:
@@ -61,6 +64,12 @@ def legal_channels(country: Country, band: Band, htmode: str, *, forbidden: Flag
         if verdict.allows(width) and not verdict.flags & forbidden:
             legal.append(channel)
     return tuple(legal)
+
+
+def initiating_channels(country: Country | None, band: Band) -> tuple[int, ...]:
+    """The 20 MHz channels of `band` on which a radio may start a cell or an access point in the country; all of the
+    band's without one."""
+    return legal_channels(country, band, "HT20", forbidden=NO_INITIATE) if country else CHANNELS[band]
 
 
 def primary_span(band: Band, channel: int) -> Span:

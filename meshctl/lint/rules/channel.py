@@ -10,10 +10,12 @@ from meshctl.lint.rule import Example, Finding, fleet_rule
 from meshctl.model import Band, Fleet, Mesh, MeshMode, Release
 from meshctl.regdb import (
     CHANNELS,
+    NO_INITIATE,
     Country,
     Flag,
     Legality,
     check_span,
+    initiating_channels,
     legal_channels,
     occupied_span,
     primary_span,
@@ -21,7 +23,6 @@ from meshctl.regdb import (
 )
 
 # flags that prevent a station from starting a cell
-_NO_INITIATE = Flag.DFS | Flag.NO_IR
 # the only build whose wifi-scripts declare `mcast_rate` as an array (docs/facts/openwrt-checked.md)
 _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
@@ -95,9 +96,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     country = _country(fleet, context)
     for mesh in fleet.meshes.values():
         if mesh.channel not in CHANNELS[mesh.band]:
-            legal = (
-                legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE) if country else CHANNELS[mesh.band]
-            )
+            legal = initiating_channels(country, mesh.band)
             path = ("meshes", mesh.name, "channel")
             yield Finding(
                 path, f"not a channel of the {mesh.band.value} band", _format_channels(legal), str(mesh.channel)
@@ -120,7 +119,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, "not allowed in this country", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
@@ -169,7 +168,7 @@ def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -193,7 +192,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _format_channels(legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE))
+            legal = _format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
             yield Finding(path, "stations may not initiate transmission", expected, f"{mesh.channel} (no-IR)")
@@ -220,7 +219,7 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if not verdict.covered or mesh.htmode not in _known_htmodes(mesh.band):
             continue
         if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
-            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
+            legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
             expected = f"a channel {_format_channels(legal)}" if legal else "a narrower htmode"
             path = ("meshes", mesh.name, "htmode")
             yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
@@ -244,11 +243,11 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict, width in _wide_channels(fleet, context):
-        silent = verdict.flags & _NO_INITIATE if verdict.covered else Flag(0)
-        own = check_span(country, primary_span(mesh.band, mesh.channel)).flags & _NO_INITIATE
+        silent = verdict.flags & NO_INITIATE if verdict.covered else Flag(0)
+        own = check_span(country, primary_span(mesh.band, mesh.channel)).flags & NO_INITIATE
         if verdict.allows(width) and (not silent or own):
             continue
-        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=_NO_INITIATE)
+        legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
         expected = f"a channel {_format_channels(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
@@ -358,8 +357,8 @@ def channel_between(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 )
 def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
-        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & _NO_INITIATE:
-            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=_NO_INITIATE | Flag.NO_OUTDOOR)
+        if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & NO_INITIATE:
+            outdoor = legal_channels(country, mesh.band, "HT20", forbidden=NO_INITIATE | Flag.NO_OUTDOOR)
             expected = f"{_format_channels(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "indoor use only", expected, str(mesh.channel))
 

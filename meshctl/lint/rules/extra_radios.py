@@ -11,7 +11,7 @@ from meshctl.lint.openwrt_names import one_edit_apart
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.lint.rules.rendering import extra_entries, with_extra
 from meshctl.model import Fleet
-from meshctl.regdb import CHANNELS, Flag, legal_channels
+from meshctl.regdb import initiating_channels
 
 # the options of wireless that inventories set; others are compared with these only
 _OPTIONS = {
@@ -53,8 +53,7 @@ def extra_channel(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             band = bands.get(section.name or "") if section is not None and package == "wireless" else None
             if band is None or option != "channel" or value in ("", "auto"):
                 continue
-            forbidden = Flag.DFS | Flag.NO_IR
-            legal = legal_channels(country, band, "HT20", forbidden=forbidden) if country else CHANNELS[band]
+            legal = initiating_channels(country, band)
             if value not in map(str, legal):
                 path = ("nodes", node.name, "extra_uci", key)
                 expected = f"one of {', '.join(map(str, legal))}"
