@@ -37,13 +37,11 @@ from meshctl.plan.observed_files import WIRELESS, packages_seen
 from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, restarting_radios
 from meshctl.render.rendered import MARKER_PATH
 
-# The lock outlives the confirm window by this much, for the actions after it.
-LOCK_SLACK_S = 60
+LOCK_SLACK_S = 60  # the lock outlives the confirm window by this much, for the actions after it
 # The first look at a node whose connection the change has cut: before, its services cannot have reloaded, because procd
 # collects events for 1 s, and a login would slow them down. Not a settling time: the reload's end is observed.
 FIRST_LOOK_S = 3.0
-# The reload of a package change sends its events and does not wait for them.
-PACKAGES_SETTLE_S = 3.0
+PACKAGES_SETTLE_S = 3.0  # the reload of a package change sends its events and does not wait for them
 # The change starts after this delay, so that the answer to `apply` arrives before the connection may be cut.
 APPLY_DELAY_S, APPLY_ANSWER_TIMEOUT_S = 0.5, 15.0
 # How long a node that keeps its address is waited for over the connection that sent the change.
@@ -83,6 +81,7 @@ class ChangeInProgress:
     is_abandoned: bool = False
     # how long its `extra` script may take before the confirm window starts
     extra_s: float = 0.0
+    armed_in_s: float = 0.0  # how long its node took to arm it: a start takes about as long
     # uploads again what that script reads from the node's memory, which a reboot has emptied
     upload_again: Callable[[SshConnection], object] | None = None
     radios: Radios = NO_RADIOS
@@ -174,11 +173,12 @@ def arm(change: ChangeInProgress, connection: SshConnection) -> None:
     with ctx.step("stage"):
         install_switch(ctx, connection)
         deadman.lock(connection, owner, ttl_s=change.window_s + LOCK_SLACK_S)
-        deadman.stage(
-            connection, owner, change.payload, rate_bytes_per_s=ctx.run.rate_bytes_per_s, progress=ctx.progress
-        )
+        rate = ctx.run.rate_bytes_per_s
+        deadman.stage(connection, owner, change.payload, rate_bytes_per_s=rate, progress=ctx.progress)
     with ctx.step("arm"):
+        began_s = time.monotonic()
         deadman.arm(connection, owner, change.id, nonce=change.nonce, window_s=change.window_s)
+        change.armed_in_s = time.monotonic() - began_s
 
 
 def await_first_boot(ctx: NodeContext, connection: SshConnection) -> None:

@@ -41,9 +41,11 @@ from meshctl.fleet import Outcome, Result
 from meshctl.nodes.backoff import Backoff
 from meshctl.wording import counted
 
-# The scheduled moment is this many round trips of the slowest node ahead, for each batch of parallel commands, and at
-# least LEAD_S: the slowest board needs that to start a start-stop-daemon and two shells.
+# The scheduled moment is this many round trips of the slowest node ahead, or this many times the time that the slowest
+# took to be armed, for each batch of parallel commands, and at least LEAD_S: the slowest board needs that to start a
+# start-stop-daemon and two shells.
 LEAD_ROUND_TRIPS = 6
+LEAD_ARMS = 3
 LEAD_S = 2.0
 # The share of the confirm window reserved for confirming.
 CONFIRM_SHARE = 0.25
@@ -150,19 +152,14 @@ def _watch_unchanged(commit: _MeshCommit, change: ChangeInProgress, connection: 
 
 def _schedule(commit: _MeshCommit) -> None:
     """Schedule the change on every node, in its own uptime."""
-    slowest_s = max(
-        (2 * participant.clock.error_s for participant in commit.participants if participant.clock is not None),
-        default=0.0,
-    )
-    turns = math.ceil(len(commit.participants) / commit.parallel)
-    moment = time.monotonic() + max(LEAD_S, LEAD_ROUND_TRIPS * slowest_s * turns)
+    moment = time.monotonic() + _lead_s(commit)
 
     def start_one(participant: Participant) -> None:
         if participant.change is None or participant.clock is None:
             return
         try:
             with commit.run.connections.borrow(participant.ctx.node) as connection:
-                start(participant.change, connection, at_uptime_s=participant.clock.uptime_at(moment))
+                _start_at(commit, participant, connection, participant.clock.uptime_at(moment))
             participant.is_scheduled = True
         except NodeError as error:
             participant.failure = Outcome(participant.name, Result.FAILED, str(error), hint=error.hint)
@@ -175,6 +172,29 @@ def _schedule(commit: _MeshCommit) -> None:
         for participant in commit.participants:
             commit.run.connections.drop(participant.name)
         time.sleep(max(0.0, moment - time.monotonic()))
+
+
+def _lead_s(commit: _MeshCommit) -> float:
+    """How far ahead the moment is, so that every node has its start in time."""
+    participants = commit.participants
+    round_trip_s = max((2 * each.clock.error_s for each in participants if each.clock is not None), default=0.0)
+    arm_s = max((each.change.armed_in_s for each in participants if each.change is not None), default=0.0)
+    turns = math.ceil(len(participants) / commit.parallel)
+    return max(LEAD_S, turns * max(LEAD_ROUND_TRIPS * round_trip_s, LEAD_ARMS * arm_s))
+
+
+def _start_at(commit: _MeshCommit, participant: Participant, connection: SshConnection, at_uptime_s: float) -> None:
+    """Start it at the moment, or immediately if that has passed: the others are changing, and would leave it behind."""
+    assert participant.change is not None
+    try:
+        start(participant.change, connection, at_uptime_s=at_uptime_s)
+    except NodeRefused as refusal:
+        if refusal.code != "too-late" or any(each.failure for each in commit.participants):
+            raise
+        commit.run.note(
+            "the start arrived after the moment at which all nodes change; it changes now", participant.name
+        )
+        start(participant.change, connection)
 
 
 def _cancel(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:

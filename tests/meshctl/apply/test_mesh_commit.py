@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -14,7 +14,7 @@ import pytest
 from meshctl.apply import mesh_commit
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.mesh_commit import commit_mesh
+from meshctl.apply.mesh_commit import _MeshCommit, commit_mesh
 from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
 from meshctl.device.errors import NodeRefused
@@ -187,7 +187,7 @@ def test_a_node_whose_answer_to_the_start_was_lost_may_have_changed(
     monkeypatch.setattr(mesh_commit, "unlock", lambda *change: None)
     back = Outcome("b03", Result.ROLLED_BACK, "it was not confirmed in time")
     monkeypatch.setattr(mesh_commit, "poll", lambda change: back)
-    change = cast("ChangeInProgress", SimpleNamespace(is_abandoned=False, last_error=""))
+    change = cast("ChangeInProgress", SimpleNamespace(is_abandoned=False, last_error="", armed_in_s=0.0))
     clock = cast("UptimeSample", SimpleNamespace(error_s=0.1, uptime_at=lambda moment: moment))
     ctx = cast("NodeContext", SimpleNamespace(name="b03", node=None))
     run = cast("RunContext", SimpleNamespace(connections=SimpleNamespace(borrow=borrow)))
@@ -197,3 +197,61 @@ def test_a_node_whose_answer_to_the_start_was_lost_may_have_changed(
         mesh_commit._schedule(commit)
         ended = mesh_commit._cancel(commit, canceled_because(participants, "scheduled"))
     assert (ended["b03"].result, ended["b03"].reason) == expected
+
+
+class TestMoment:
+    """Seen on a busy host: the base's start arrived after the moment, so the others changed their cell without it."""
+
+    def commit(self, participants: Sequence[Participant], notes: list[str], pool: ThreadPoolExecutor) -> _MeshCommit:
+        connections = SimpleNamespace(borrow=lambda _: nullcontext(), drop=lambda _: None)
+        run = SimpleNamespace(connections=connections, note=lambda text, node: notes.append(f"{node}: {text}"))
+        return _MeshCommit(cast("RunContext", run), participants, 60, 1, (), is_together=False, pool=pool)
+
+    def member(self, name: str, *, armed_in_s: float = 0.0) -> Participant:
+        change = cast("ChangeInProgress", SimpleNamespace(name=name, armed_in_s=armed_in_s, last_error=""))
+        clock = cast("UptimeSample", SimpleNamespace(error_s=0.01, uptime_at=lambda moment: 100.0))
+        ctx = cast("NodeContext", SimpleNamespace(name=name, node=None))
+        return Participant(ctx, change=change, clock=clock)
+
+    def schedule(
+        self, monkeypatch: pytest.MonkeyPatch, refusals: dict[str, NodeError]
+    ) -> tuple[list[tuple[str, float | None]], list[str], list[Participant]]:
+        """Schedule b02, b01 and the base, of which some refuse a start at a moment; the starts, notes, participants."""
+        starts: list[tuple[str, float | None]] = []
+        notes: list[str] = []
+
+        def start(change: SimpleNamespace, connection: object, *, at_uptime_s: float | None = None) -> None:
+            starts.append((change.name, at_uptime_s))
+            if at_uptime_s is not None and change.name in refusals:
+                raise refusals[change.name]
+
+        monkeypatch.setattr(mesh_commit, "start", start)
+        monkeypatch.setattr(mesh_commit, "LEAD_S", 0.0)
+        participants = [self.member(name) for name in ("b02", "b01", "base")]
+        with ThreadPoolExecutor(1) as pool:
+            mesh_commit._schedule(self.commit(participants, notes, pool))
+        return starts, notes, participants
+
+    def test_a_node_whose_start_arrives_too_late_changes_immediately(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        late = NodeRefused("uptime 100 is 40 hundredths of a second ago", code="too-late", exit_status=3)
+        starts, notes, participants = self.schedule(monkeypatch, {"base": late})
+        assert starts == [("b02", 100.0), ("b01", 100.0), ("base", 100.0), ("base", None)]
+        assert all(each.is_scheduled and each.failure is None for each in participants)
+        assert notes == ["base: the start arrived after the moment at which all nodes change; it changes now"]
+
+    def test_a_change_that_is_canceled_starts_on_no_further_node(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        refusals: dict[str, NodeError] = {
+            "b01": Unreachable("the connection broke"),
+            "base": NodeRefused("40 hundredths of a second ago", code="too-late", exit_status=3),
+        }
+        starts, _, participants = self.schedule(monkeypatch, refusals)
+        assert starts == [("b02", 100.0), ("b01", 100.0), ("base", 100.0)]
+        assert [each.is_scheduled for each in participants] == [True, False, False]
+
+    def test_the_moment_leaves_the_slowest_node_time_to_start(self) -> None:
+        participants = [self.member("b01", armed_in_s=0.1), self.member("b02", armed_in_s=4.0)]
+        with ThreadPoolExecutor(1) as pool:
+            one_after_the_other = self.commit(participants, [], pool)
+            assert mesh_commit._lead_s(one_after_the_other) == 24.0
+            assert mesh_commit._lead_s(replace(one_after_the_other, parallel=2)) == 12.0
+            assert mesh_commit._lead_s(replace(one_after_the_other, participants=participants[:1])) == 2.0

@@ -37,7 +37,7 @@ SETUP = Path(__file__).parents[3] / "scripts" / "setup-lab"
 START_S = 900.0
 # a run of meshctl over several hops with emulated logins, up to the end of a confirm window of ten minutes
 COMMAND_S = 900.0
-_TRIES = 3
+TRIES = 3
 # six emulated nodes that boot together took up to 200 s on two cores beside twenty other programs
 WAIT_S = 600.0
 NODES = ("base", "b01", "b02", "husky-front", "husky-rear")
@@ -118,14 +118,14 @@ class Lab:
         On a starved host a node may not answer in time, or not begin; then an operator does it again.
         """
         left = set(self.NODES)
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             done = self.meshctl("bootstrap", "--yes", "--json", *sorted(left), expect=None)
             finished = [event for event in done.events if event["event"] == "finished"]
             left -= {event["node"] for event in finished if event["outcome"]["result"] in ("done", "unchanged")}
             if not left:
                 break
         else:
-            raise AssertionError(f"meshctl bootstrap did not take in {sorted(left)} in {_TRIES} tries: {done.errors}")
+            raise AssertionError(f"meshctl bootstrap did not take in {sorted(left)} in {TRIES} tries: {done.errors}")
         for name in self.NODES[1:]:
             self.node(name).plug(False)
         self.settle()
@@ -136,13 +136,13 @@ class Lab:
         On a starved host a connection may be given up, and the change is undone: then an operator does it again.
         """
         runs = []
-        for _ in range(_TRIES):
+        for _ in range(TRIES):
             done = self.meshctl("provision", "--yes", "--json", *nodes, expect=None)
             runs.append(done.events)
             if done.status == 0:
                 return runs
             self.settle()
-        raise AssertionError(f"meshctl provision did not succeed {_TRIES} times: {runs[-1]}")
+        raise AssertionError(f"meshctl provision did not succeed {TRIES} times: {runs[-1]}")
 
     def edit(self, old: str, new: str) -> None:
         """Replace a text that occurs once in the inventory."""
@@ -150,6 +150,17 @@ class Lab:
         text = file.read_text(encoding="utf-8")
         assert text.count(old) == 1, f"{old!r} stands {text.count(old)} times in {file}"
         file.write_text(text.replace(old, new), encoding="utf-8")
+
+    @contextmanager
+    def edited(self, *pairs: tuple[str, str]) -> Iterator[None]:
+        """Replace texts of the inventory, each of which occurs once, for the time of the block."""
+        for old, new in pairs:
+            self.edit(old, new)
+        try:
+            yield
+        finally:
+            for old, new in reversed(pairs):
+                self.edit(new, old)
 
     def node(self, name: str) -> VirtualNode:
         return self.fleet.node(name)
