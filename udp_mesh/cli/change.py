@@ -41,7 +41,7 @@ def set_position(arguments: argparse.Namespace) -> int:
 def set_neighbour(arguments: argparse.Namespace) -> int:
     return _change(
         arguments,
-        "set-neighbour",
+        "set-neighbor",
         address=arguments.address,
         name=arguments.name,
         link=arguments.link,
@@ -58,7 +58,7 @@ def drop_topic(arguments: argparse.Namespace) -> int:
 
 
 def drop_neighbour(arguments: argparse.Namespace) -> int:
-    return _change(arguments, "drop-neighbour", address=arguments.address)
+    return _change(arguments, "drop-neighbor", address=arguments.address)
 
 
 def reload(arguments: argparse.Namespace) -> int:

@@ -123,10 +123,15 @@ def build_parser() -> CommandParser:
 
 
 def _parser(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser], name: str, help_text: str, example: str
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    help_text: str,
+    example: str,
+    earlier: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
     return commands.add_parser(
         name,
+        aliases=earlier,
         help=help_text,
         description=f"{help_text[:1].upper()}{help_text[1:]}.",
         epilog=f"example: {example}",
@@ -141,10 +146,12 @@ def _command(
     help_text: str,
     *,
     example: str,
+    earlier: Sequence[str] = (),
     daemon: bool = True,
     json: bool = True,
 ) -> argparse.ArgumentParser:
-    parser = _parser(commands, name, help_text, example)
+    """`earlier`: names that it had, which are still accepted."""
+    parser = _parser(commands, name, help_text, example, earlier)
     parser.set_defaults(command=command)
     if daemon:
         parser.add_argument(
@@ -267,17 +274,18 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         example="udp-mesh set rates offline_s=5 heartbeat_s=0.5",
     )
     rates.add_argument("values", nargs="+", metavar="key=value", help="settings as in [rates], such as offline_s=5")
-    neighbour = _command(
+    neighbor = _command(
         setters,
-        "neighbour",
+        "neighbor",
         change.set_neighbour,
         "add or change a fixed neighbor",
-        example="udp-mesh set neighbour 10.42.0.11 --name husky1 --legacy",
+        example="udp-mesh set neighbor 10.42.0.11 --name husky1 --legacy",
+        earlier=("neighbour",),
     )
-    neighbour.add_argument("address", help="10.0.0.2, 10.0.0.2:8700 or [fd00::2]:8700")
-    neighbour.add_argument("--name", help="node name (required with --legacy)")
-    neighbour.add_argument("--link", help="link over which the neighbor is reached")
-    neighbour.add_argument("--legacy", action="store_true", help="the neighbor uses the legacy format")
+    neighbor.add_argument("address", help="10.0.0.2, 10.0.0.2:8700 or [fd00::2]:8700")
+    neighbor.add_argument("--name", help="node name (required with --legacy)")
+    neighbor.add_argument("--link", help="link over which the neighbor is reached")
+    neighbor.add_argument("--legacy", action="store_true", help="the neighbor uses the legacy format")
     position = _command(
         setters, "position", change.set_position, "set this node's position", example="udp-mesh set position 12.5 -3"
     )
@@ -300,10 +308,11 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     )
     _command(
         droppers,
-        "neighbour",
+        "neighbor",
         change.drop_neighbour,
         "remove a fixed neighbor",
-        example="udp-mesh drop neighbour 10.42.0.11",
+        example="udp-mesh drop neighbor 10.42.0.11",
+        earlier=("neighbour",),
     ).add_argument("address", help="address as it was set")
     _command(
         commands, "reload", change.reload, "reload the daemon's configuration file", example="udp-mesh reload --json"

@@ -117,10 +117,10 @@ def _neighbours(old: tuple[Neighbour, ...], new: tuple[Neighbour, ...]) -> list[
     before = {neighbour.address: neighbour for neighbour in old}
     after = {neighbour.address: neighbour for neighbour in new}
     return [
-        *(f"neighbour {address[0]}: added" for address in after if address not in before),
-        *(f"neighbour {address[0]}: removed" for address in before if address not in after),
+        *(f"neighbor {address[0]}: added" for address in after if address not in before),
+        *(f"neighbor {address[0]}: removed" for address in before if address not in after),
         *(
-            f"neighbour {address[0]}: {text}"
+            f"neighbor {address[0]}: {text}"
             for address in before.keys() & after.keys()
             for text in _differences(before[address], after[address])
         ),

@@ -216,7 +216,7 @@ class Neighbour:
 
     def __post_init__(self) -> None:
         if self.legacy and self.name is None:
-            raise ValueError(f"neighbour {self.address[0]}: legacy requires a name")
+            raise ValueError(f"neighbor {self.address[0]}: legacy requires a name")
 
 
 @dataclass(frozen=True, slots=True)

@@ -299,7 +299,7 @@ def set_neighbour(service: Service, _client: Client, header: Header, _: bytes) -
     text, name, link = _text(header, "address"), _optional_text(header, "name"), _optional_text(header, "link")
     values = {"address": text, "name": name, "link": link, "legacy": bool(header.get("legacy"))}
     neighbour = read_neighbour(
-        Table({key: value for key, value in values.items() if value is not None}, source, ("neighbour",)), settings.port
+        Table({key: value for key, value in values.items() if value is not None}, source, ("neighbor",)), settings.port
     )
     if neighbour is None:
         raise RequestError("bad-request", str(_request_error(ConfigurationError(source.problems))))
@@ -386,9 +386,9 @@ COMMANDS = {
     "set-position": set_position,
     "publish-meter": publish_meter,
     "set-radio": set_radio,
-    "set-neighbour": set_neighbour,
-    "drop-neighbour": drop_neighbour,
-    "neighbours": neighbours,
+    **dict.fromkeys(("set-neighbor", "set-neighbour"), set_neighbour),
+    **dict.fromkeys(("drop-neighbor", "drop-neighbour"), drop_neighbour),
+    **dict.fromkeys(("neighbors", "neighbours"), neighbours),
     "set-keys": set_keys,
     "reload": reload,
     "record-start": record_start,

@@ -1,4 +1,4 @@
-"""Names of nodes and topics, `[[links]]`, `[[neighbours]]` and addresses in a configuration."""
+"""Names of nodes and topics, `[[links]]`, `[[neighbors]]` and addresses in a configuration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def is_topic_name(name: str) -> bool:
 def read_link(table: Table) -> LinkConfig:
     """An entry of `[[links]]`; reports problems to the table's source."""
     interface, address = table.text("interface"), table.text("address")
-    kind = table.choice("kind", "broadcast", ("broadcast", "neighbours"))
+    kind = table.choice("kind", "broadcast", ("broadcast", "neighbors"), {"neighbours": "neighbors"})
     mtu = table.integer("mtu", None, 200, 65_535)
     table.finish()
     if (interface is None) == (address is None):
@@ -42,9 +42,9 @@ def read_link(table: Table) -> LinkConfig:
 
 
 def read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:
-    """All of `[[neighbours]]`; reports problems to the table's source."""
+    """All of `[[neighbors]]`, or `[[neighbours]]` as it was; reports problems to the table's source."""
     found: dict[Address, Neighbour] = {}
-    for entry in top.tables("neighbours"):
+    for entry in (*top.tables("neighbours"), *top.tables("neighbors")):
         neighbour = read_neighbour(entry, port)
         if neighbour is None:
             continue
@@ -55,7 +55,7 @@ def read_neighbours(top: Table, port: int) -> tuple[Neighbour, ...]:
 
 
 def read_neighbour(table: Table, port: int) -> Neighbour | None:
-    """A fixed neighbor from an entry of `[[neighbours]]` or from a request; None, with a problem reported to the
+    """A fixed neighbor from an entry of `[[neighbors]]` or from a request; None, with a problem reported to the
     table's source, if it is invalid."""
     text, name = table.text("address"), table.text("name")
     link, legacy = table.text("link"), table.boolean("legacy", False)

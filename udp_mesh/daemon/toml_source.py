@@ -13,6 +13,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,12 +243,15 @@ class Table:
         self.report(key, f"a number from {low:g} to {high:g}", value)
         return default
 
-    def choice(self, key: str, default: str, choices: Iterable[str]) -> str:
+    def choice(
+        self, key: str, default: str, choices: Iterable[str], earlier: Mapping[str, str] = MappingProxyType({})
+    ) -> str:
+        """`earlier`: spellings that are still accepted -> what they are now."""
         value, allowed = self._take(key), tuple(choices)
         if value is None:
             return default
-        if isinstance(value, str) and value in allowed:
-            return value
+        if isinstance(value, str) and earlier.get(value, value) in allowed:
+            return earlier.get(value, value)
         self.report(key, " or ".join(f'"{name}"' for name in allowed), value, did_you_mean(value, allowed))
         return default
 

@@ -334,7 +334,9 @@ def _commands(parser: argparse.ArgumentParser, *words: str) -> Iterator[tuple[st
     if not groups:
         yield words
     for group in groups:
-        yield from (found for name, below in group.choices.items() for found in _commands(below, *words, name))
+        # the first name of each is the present one
+        names = {id(below): name for name, below in reversed(group.choices.items())}
+        yield from (found for name in names.values() for found in _commands(group.choices[name], *words, name))
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,8 @@ def test_changes_are_described_with_configuration_keys_and_values() -> None:
         "topic map: destinations [] -> [b, c]",
         "topic map: outbox none -> all",
         "undeclared: added",
-        "neighbour 10.0.0.8: removed",
-        "neighbour 10.0.0.7: name none -> c",
+        "neighbor 10.0.0.8: removed",
+        "neighbor 10.0.0.7: name none -> c",
     ]
     later = settings("a", new, undeclared=replace(old, priority=3), neighbours=settings_now.neighbours)
     assert both.a.apply(later, both.now) == ["undeclared: priority 8 -> 3"]

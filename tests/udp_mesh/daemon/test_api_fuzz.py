@@ -23,8 +23,8 @@ FIELDS = {
     "set-window": ("window",),
     "set-rates": ("values",),
     "set-position": ("x_m", "y_m", "z_m", "frame", "time_s"),
-    "set-neighbour": ("address", "name", "link", "legacy"),
-    "drop-neighbour": ("address",),
+    "set-neighbor": ("address", "name", "link", "legacy"),
+    "drop-neighbor": ("address",),
     "set-keys": ("file",),
 }
 """Commands without an entry have no fields, or write files wherever these say."""

@@ -50,14 +50,14 @@ interface = "wlan*"
 
 [[links]]
 address = "127.0.0.2"
-kind = "neighbours"
+kind = "neighbors"
 mtu = 1400
 
-[[neighbours]]
+[[neighbors]]
 name = "base"
 address = "127.0.0.3"
 
-[[neighbours]]
+[[neighbors]]
 name = "old"
 address = "127.0.0.4:8700"
 legacy = true
@@ -120,6 +120,25 @@ def test_every_setting_in_the_file_is_loaded(tmp_path: Path) -> None:
     assert configuration.links == (LinkConfig("wlan*"), LinkConfig(None, "127.0.0.2", broadcast=False, mtu=1400))
     assert configuration.daemon.socket_mode == 0o666
     assert configuration.daemon.metrics_address == ("127.0.0.1", 9871)
+
+
+def test_the_earlier_spelling_of_neighbors_is_accepted_beside_the_present_one(tmp_path: Path) -> None:
+    """Files that an earlier meshctl deployed have it."""
+    text = """\
+key_file = "fleet.key"
+[[links]]
+address = "127.0.0.2"
+kind = "neighbours"
+[[neighbours]]
+address = "127.0.0.3"
+"""
+    configuration = load(write(tmp_path, text))
+    assert configuration == load(write(tmp_path, text.replace("neighbours", "neighbors")))
+    assert configuration.links == (LinkConfig(None, "127.0.0.2", broadcast=False),)
+    both = text + '[[neighbors]]\naddress = "127.0.0.3"\n'
+    assert problems(tmp_path, both) == [
+        'udp-mesh.toml:8: neighbors.0.address: expected each neighbor once, found "127.0.0.3"'
+    ]
 
 
 def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
@@ -187,13 +206,13 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
             "udp-mesh.toml:2: topics.map: expected no delta for a log, found true",
         ),
         (
-            '[[neighbours]]\naddress = "fe80::1"',
-            'udp-mesh.toml:3: neighbours.0.address: expected link = "INTERFACE" with a link-local address, '
+            '[[neighbors]]\naddress = "fe80::1"',
+            'udp-mesh.toml:3: neighbors.0.address: expected link = "INTERFACE" with a link-local address, '
             'found "fe80::1"',
         ),
         (
-            '[[neighbours]]\naddress = "fd00::1"\nlegacy = true\nname = "old"',
-            "udp-mesh.toml:3: neighbours.0.address: expected an IPv4 address (the legacy format has no IPv6), "
+            '[[neighbors]]\naddress = "fd00::1"\nlegacy = true\nname = "old"',
+            "udp-mesh.toml:3: neighbors.0.address: expected an IPv4 address (the legacy format has no IPv6), "
             'found "fd00::1"',
         ),
         (
@@ -210,7 +229,7 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
             '[[links]]\ninterface = "a"\n[[links]]\naddress = "10.0.0"',
             'udp-mesh.toml:5: links.1.address: expected an IPv4 or IPv6 address, found "10.0.0"',
         ),
-        ('[[neighbours]]\nname = "b"', "udp-mesh.toml:2: neighbours.0: expected an address, found none"),
+        ('[[neighbors]]\nname = "b"', "udp-mesh.toml:2: neighbors.0: expected an address, found none"),
         ("[rates]\noffline_s = -1", "udp-mesh.toml:3: rates.offline_s: expected a number from 0 to 86400, found -1"),
         (
             '[daemon]\nsocket_mode = "rw"',
@@ -262,13 +281,13 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
             'spaces or slashes, found "a b"',
         ),
         (
-            '[[neighbours]]\naddress = "10.0.0.1"\nname = "a/b"',
-            "udp-mesh.toml:4: neighbours.0.name: expected a name of 1 to 63 bytes without spaces or slashes, "
+            '[[neighbors]]\naddress = "10.0.0.1"\nname = "a/b"',
+            "udp-mesh.toml:4: neighbors.0.name: expected a name of 1 to 63 bytes without spaces or slashes, "
             'found "a/b"',
         ),
         (
-            '[[neighbours]]\naddress = "10.0.0.1"\n[[neighbours]]\naddress = "10.0.0.1:8700"',
-            'udp-mesh.toml:5: neighbours.1.address: expected each neighbor once, found "10.0.0.1"',
+            '[[neighbors]]\naddress = "10.0.0.1"\n[[neighbors]]\naddress = "10.0.0.1:8700"',
+            'udp-mesh.toml:5: neighbors.1.address: expected each neighbor once, found "10.0.0.1"',
         ),
         ('[daemon]\nsocket = ""', 'udp-mesh.toml:3: daemon.socket: expected a path, found ""'),
         ('[daemon]\nstate_directory = ""', 'udp-mesh.toml:3: daemon.state_directory: expected a path, found ""'),
@@ -425,14 +444,14 @@ TEXTS = [
 ]
 WORDS = [*NUMBERS, *TABLES, *(f'"{text}"' for text in TEXTS)]
 KEYS = {
-    "": ["name", "port", "window", "fragment_bytes", "topics", "links", "neighbours", "rates", "limits", "daemon", "x"],
+    "": ["name", "port", "window", "fragment_bytes", "topics", "links", "neighbors", "rates", "limits", "daemon", "x"],
     "[topics.x]": [item.name for item in dataclasses.fields(Topic)],
     "[undeclared]": [item.name for item in dataclasses.fields(Topic)],
     "[rates]": [item.name for item in dataclasses.fields(Rates)],
     "[limits]": [item.name for item in dataclasses.fields(Limits)],
     "[daemon]": [item.name for item in dataclasses.fields(DaemonSettings)],
     "[[links]]": ["interface", "address", "kind", "mtu"],
-    "[[neighbours]]": ["address", "name", "link", "legacy"],
+    "[[neighbors]]": ["address", "name", "link", "legacy"],
 }
 
 
