@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from mesh_sweep.cases import Settings, cases_of, combinations, parse_parameters, parse_seeds
-from mesh_sweep.comparison import Comparison, as_json, as_text, compare, parse_goals
+from mesh_sweep.comparison import Comparison, Goal, as_json, as_text, check_figures, compare, parse_goals
 from mesh_sweep.errors import SweepError
 from mesh_sweep.executors import DaskWorkers, OtherWorkers, ProcessWorkers, Workers, core_count
 from mesh_sweep.page import page
@@ -67,7 +67,7 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
     settings = combinations(parse_parameters(options.set, short))
     cases = cases_of(settings, seeds)
     _check_all(settings, study.check)
-    parse_goals(options.goals)
+    goals = parse_goals(options.goals)
     workers = options.workers()
     out = options.out or Path(f"{study.identity.scenario}-sweep.jsonl")
     _check_report(options.report, out)
@@ -85,10 +85,14 @@ def sweep(study: Study, options: SweepOptions, short: dict[str, str]) -> int:
         if len(missing) < len(cases):
             _note(f"{out}: {len(cases) - len(missing)} of {len(cases)} cases have a result already")
         progress = _Progress(len(missing))
+        is_checked = False
         try:
             for result in run_cases(missing, study.run, workers, progress.show):
                 file.append(result)
                 results[result.case] = result
+                if not is_checked and not result.failed:
+                    is_checked = True
+                    _warn_of_unknown_figures(result, options.figures, goals, progress)
                 progress.add(result)
         except KeyboardInterrupt:
             progress.end()
@@ -126,6 +130,17 @@ def _show(
     sys.stdout.write(f"{text}\n")
     _list_failures(comparison)
     return 1 if comparison.failed else 0
+
+
+def _warn_of_unknown_figures(
+    result: Result, patterns: Sequence[str], goals: Sequence[Goal], progress: _Progress
+) -> None:
+    """After the first result, before hours of work; only a warning, because another seed or setting may have them."""
+    try:
+        check_figures(result, patterns, goals)
+    except SweepError as error:
+        progress.end()
+        _note(f"warning: --figure or --goal: {error} (after the first result; Ctrl-C keeps the results)")
 
 
 def _existing(patterns: Iterable[str], results: Sequence[Result]) -> list[str]:

@@ -100,6 +100,11 @@ def compare(results: Sequence[Result], patterns: Sequence[str], goals: Sequence[
     return Comparison(tuple(figures), len(good), tuple(result for result in results if result.failed))
 
 
+def check_figures(result: Result, patterns: Sequence[str], goals: Sequence[Goal]) -> None:
+    """Raises SweepError for a figure or a goal that a result does not have."""
+    _check_names([*patterns, *(goal.figure for goal in goals)], sorted(result.figures))
+
+
 def _check_names(patterns: Sequence[str], names: Sequence[str]) -> None:
     for pattern in patterns if names else ():
         if not any(fnmatchcase(name, pattern) for name in names):
