@@ -156,10 +156,7 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     # procd rejects `-f` for such an image only after `sysupgrade` has started; -T does not check it
     bare = validation.get("allow_backup") is False
     passed = "status 0" in lines and (not validation or truth(validation.get("valid"))) and not bare
-    reason = (
-        "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE))
-        or "sysupgrade -T failed"
-    )
+    reason = "; ".join(line for line in said if line and not line.startswith(_FORCE_ADVICE)) or "sysupgrade -T failed"
     if bare:
         reason = "it does not accept a configuration from the running system"
     return FirmwareCheck(
