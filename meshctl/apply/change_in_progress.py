@@ -130,9 +130,9 @@ class ChangeInProgress:
 
     @property
     def is_login_due(self) -> bool:
-        """Whether its SSH server has to answer, if only by a refusal: the change cannot drop logins, or its timer has
-        undone it."""
-        touched = (*self.payload.files, *self.payload.removed)
+        """Whether its SSH server has to answer, if only by a refusal: the change has not started, cannot drop logins,
+        or was undone by its timer."""
+        touched = () if self.started_s is None else (*self.payload.files, *self.payload.removed)
         return self.is_undone or not any(loaded_package(path.lstrip("/")) in _MAY_DROP_LOGINS for path in touched)
 
     @property

@@ -16,6 +16,7 @@ class ChangeListener(Protocol):
     `armed` comes first, in a simultaneous change after `restarting`; if a whole mesh changes its
     cell, `watch_own_entries` comes instead. Then `started`, again for each new attempt; `waiting`,
     `connecting`, `unreachable` and `observed` while the node is polled; `ended` once its end was observed.
+    A power cut may come first: then `connecting` and `unreachable` precede `armed`.
     """
 
     def restarting(self, names: Iterable[str]) -> None:

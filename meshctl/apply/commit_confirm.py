@@ -198,6 +198,9 @@ def _notify_end(change: ChangeInProgress, outcome: Outcome) -> None:
 
 
 def _uncertain(change: ChangeInProgress) -> Outcome:
+    if change.started_s is None:
+        # the node drops what it has staged or armed
+        return Outcome(change.ctx.name, Result.FAILED, f"nothing was changed: {change.last_error or 'interrupted'}")
     if change.ctx.run.interrupt.leaving:
         why = f"interrupted during its change; it rolls back by itself within {change.window_s} s"
     else:

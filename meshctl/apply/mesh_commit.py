@@ -32,7 +32,7 @@ from meshctl.apply.change_in_progress import (
 )
 from meshctl.apply.commit_confirm import GRACE_AFTER_WINDOW_S, poll
 from meshctl.apply.context import NodeContext, RunContext
-from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum, unmet_of
+from meshctl.apply.participant import Participant, canceled_because, cause_of, quorum_of, short_of_quorum, unmet_of
 from meshctl.device.errors import NodeRefused
 from meshctl.device.openwrt import measure_uptime
 from meshctl.device.ssh import SshConnection
@@ -371,7 +371,7 @@ def _roll_back(commit: _MeshCommit, reason: str) -> dict[str, Outcome]:
             ended.get(participant.name),
             participant.name,
             f"{'all nodes were' if commit.is_together else 'the whole mesh was'} rolled back: {reason}",
-            unmet.get(participant.name, ""),
+            cause_of(participant) or unmet.get(participant.name, ""),
         )
         for participant in commit.participants
     }

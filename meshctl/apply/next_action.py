@@ -93,6 +93,7 @@ REASONS = {
     "flash-full": "its flash has no room for the packages",
     "moved-on": "a file on it was changed by someone else",
     "operator": "it was canceled",
+    "unknown": "its flash was too full to store the reason",
 }
 
 

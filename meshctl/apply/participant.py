@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from meshctl.apply.change_in_progress import ChangeInProgress
 from meshctl.apply.context import NodeContext
-from meshctl.apply.next_action import Action
+from meshctl.apply.next_action import REASONS, Action
 from meshctl.device.openwrt import UptimeSample
 from meshctl.fleet import Outcome
 
@@ -92,3 +92,13 @@ def unmet_of(participant: Participant) -> str:
         last_error = "" if change is None else change.last_error
         return f"{participant.name}: it does not answer{f' ({last_error})' if last_error else ''}"
     return f"{participant.name}: {', '.join(change.unmet)}"
+
+
+def cause_of(participant: Participant) -> str:
+    """`b01: its power was cut, ...`: why a participant rolled back by itself; empty if it was only made to, or was not
+    confirmed in time, as all of them."""
+    change = participant.change
+    if change is None or change.status.last_id != change.id or change.status.last_outcome != "restored":
+        return ""
+    word = change.status.last_reason.partition("+")[0]
+    return "" if word in ("abort", "timeout") else f"{participant.name}: {REASONS.get(word, word)}"

@@ -1,9 +1,9 @@
 """Flush stale station entries: neighbors remove them over SSH while a node's radios restart.
 
     armed: nodes reached through the node, and the node itself, start to watch their entries
-    unreachable: the other holders are queried, with growing pauses; after `BOOT_S` those of its other radios as well,
-        which restart if it has lost its power; its SSH server has to answer, too: at once if the node watches its own
-        entries or the change cannot drop logins, otherwise once its timer has undone the change
+    unreachable, also before the start: the other holders are queried, with growing pauses; after `BOOT_S` those of its
+        other radios as well, which restart if it has lost its power; its SSH server has to answer, too: at once if the
+        node watches its own entries or the change cannot drop logins, otherwise once its timer has undone the change
     ended: all holders that do not watch, and the nodes it hears now, are queried
     end of the run: those that did not answer are queried again, and the operator sees the rest (`retry_unanswered`)
     next run: the same for a change whose end was not observed, or a reboot (`flush_later`)
@@ -48,7 +48,7 @@ from meshctl.device.connection import Deadlines
 from meshctl.device.observation import Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError
-from meshctl.plan.radios import EVERY_RADIO, Radios, observed_restarts, started_within
+from meshctl.plan.radios import EVERY_RADIO, NO_RADIOS, Radios, observed_restarts, started_within
 
 # A neighbor waits up to 3 s for an echo, and 3 s for a login, once for each of a node's two radios.
 QUERY_TIMEOUT_S = 15.0
@@ -100,7 +100,8 @@ class StationFlush:
     # once each, although a node that is flashed is queried for many times
     _journaled_steps: set[str] = field(default_factory=set)
     _reported: set[str] = field(default_factory=set)
-    # since when its radio may have restarted, by the change and by its rollback
+    # since when its radio may have restarted: by a power cut, by the change, and by its rollback
+    _began_s: float = field(init=False)
     _started_s: float | None = None
     _observed_s: float | None = None
     # the holders that did not answer at the end; since when an entry is not stale
@@ -108,6 +109,7 @@ class StationFlush:
     _since_s: float = 0.0
 
     def __post_init__(self) -> None:
+        self._began_s = time.monotonic()
         self._holders = by_holder(entries_of(self.ctx.name, self.ctx.run.observations, self.radios))
 
     @property
@@ -198,20 +200,20 @@ class StationFlush:
         """The node did not answer: query its neighbors if it is time to. `among`: the only ones that are reachable.
         `is_login_due`: its SSH server has to answer a login, if only by a refusal."""
         now_s = time.monotonic()
-        # there, an entry that is removed by mistake costs seconds
-        is_login_due |= self._watches_itself
-        if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before, self.radios)):
+        is_login_due |= self._watches_itself  # there, an entry that is removed by mistake costs seconds
+        # before the change starts only a power cut restarts a radio: packages take minutes to upload and to stage
+        since_s, radios = (self._began_s, NO_RADIOS) if self._started_s is None else (self._started_s, self.radios)
+        if is_login_due and self._login is None and (login := login_of(self.ctx.node, self.ctx.before, radios)):
             self._login = login
             self._queried_s.clear()
-        if self._started_s is None or now_s < next_query_s(self._queried_s):
+        if now_s < next_query_s(self._queried_s):
             return
-        answered_s = max(self._started_s, self._observed_s or 0.0)
-        # a plan for this node alone may have observed none of its neighbors
+        answered_s = max(since_s, self._observed_s or 0.0)
         holders = self._holders if now_s < answered_s + BOOT_S else self._possible_holders(None, EVERY_RADIO)
         names = [name for name in holders if name not in self._watching and (among is None or name in among)]
         if names:
             self._queried_s.append(now_s)
-            self._flush({name: holders[name] for name in names}, self._started_s, login=self._login)
+            self._flush({name: holders[name] for name in names}, since_s, login=self._login)
 
     def ended(self, now: Observation | None = None, *, went_back: bool = False, rebooted: bool = False) -> None:
         """The change has ended: query all holders that do not watch. `now` is the latest observation; a node that has
@@ -246,7 +248,7 @@ class StationFlush:
 
     def _possible_holders(self, now: Observation | None, radios: Radios) -> dict[str, tuple[StationEntry, ...]]:
         """Nodes known to hold a station entry of these radios, then nodes that may hold one on any interface: those not
-        observed, and new neighbors."""
+        observed (a plan for this node alone may have observed no neighbor), and new neighbors."""
         run_context, ctx = self.ctx.run, self.ctx
         holders = by_holder(entries_of(self.node, run_context.observations, radios))
         names = dict(run_context.current_mac_owners())

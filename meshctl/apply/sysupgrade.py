@@ -78,8 +78,10 @@ def _upload(ctx: NodeContext, connection: SshConnection, image: Path) -> str:
     with ctx.step("test"):
         tested = openwrt.check_firmware(connection, IMAGE_PATH)
         if not tested.valid:
+            _free_memory(connection)
             raise NodeError(f"{ctx.name}: its sysupgrade rejects the image: {tested.reason}")
         if tested.available_bytes is not None and tested.available_bytes < HEADROOM_BYTES:
+            _free_memory(connection)
             raise NodeError(
                 f"{ctx.name}: {tested.available_bytes >> 20} MiB of memory left beside the image, "
                 f"{HEADROOM_BYTES >> 20} needed",
@@ -93,6 +95,12 @@ def _upload(ctx: NodeContext, connection: SshConnection, image: Path) -> str:
     recipe = ctx.node.hardware.recovery or "its hardware profile has no recovery instructions"
     ctx.run.note(f"if it does not come back: {recipe}", ctx.name)
     return marker
+
+
+def _free_memory(connection: SshConnection) -> None:
+    """Remove an image that will not be flashed: it takes a tenth of a small board's memory until it reboots."""
+    with suppress(NodeError):
+        connection.run(f"rm -f {IMAGE_PATH}")
 
 
 def _check_memory(before: Observation, size: int) -> None:

@@ -150,7 +150,7 @@ def check_firmware(connection: Connection, image_path: str) -> FirmwareCheck:
     )
     done = connection.run(script, timeout_s=FIRMWARE_TEST_TIMEOUT_S)
     lines = done.check(f"{connection.endpoint.label}: test the firmware").stdout.splitlines()
-    said = [_STAMP.sub("", line[5:]).strip() for line in lines if line.startswith("said ")]
+    said = [_STAMP.sub("", line[5:]).strip().rstrip(".") for line in lines if line.startswith("said ")]
     validation = mapping(parse_json(next((line[5:] for line in lines if line.startswith("json ")), "")))
     memory = parse_meminfo(done.stdout)
     # procd rejects `-f` for such an image only after `sysupgrade` has started; -T does not check it

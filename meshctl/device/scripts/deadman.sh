@@ -8,9 +8,9 @@
 # after a power cut the marker alone says what to do. Content is synced before the rename that makes it count.
 # Restoring moves the kept files back one by one: done twice, or half and then again, it ends the same, and it needs no
 # free flash.
-VERSION=11
+VERSION=12
 SELF=/usr/sbin/meshctl-deadman
-CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra
+CHANGE=/etc/meshctl/change # flash: marker, manifest, reload, new/ (to come), prev/ and previous (to go back to), extra, last.*
 LAST=/etc/meshctl/last     # flash: "ID OUTCOME REASON NONCE_SHA256" of the last change that ended
 SNAPSHOT=/var/run/rpcd/snapshot-files # RAM: what rpcd copies back when its timer ends
 RUN=/tmp/meshctl           # RAM: locks and timers; a reboot forgets them, as it should
@@ -158,16 +158,35 @@ alive() { # PIDFILE: a process of ours still runs under that number
 finish() {
 	write_last "$1" "$2"
 	sync
-	forget
+	forget "$1"
 }
 
-# Without room for it in flash the change ends all the same; half a line must not become the last one.
-write_last() { echo "$ID $1 $2 ${NONCE:--}" 2>/dev/null >"$LAST.new" || rm -f "$LAST.new"; }
+# write_arming DIRECTORY ID OWNER NONCE_SHA256 WINDOW_S: the marker to come, and the lines that become `last`: once the
+# change is in force, its flash may be full, and an owner who has lost the answer would find no trace of the change
+write_arming() {
+	{
+		echo "$2 $3 $4 $5" >"$1/arming" &&
+			echo "$2 confirmed operator $4" >"$1/last.confirmed" &&
+			echo "$2 restored unknown $4" >"$1/last.restored"
+	} 2>/dev/null
+}
 
-# forget: `write_last` and what the marker decided are synced. A power cut in here leaves the marker, and the next verb
-# ends the change once more, or only what is rubbish.
+# write_last OUTCOME REASON. Without room for it in flash the prepared line counts; half a line must not become the last one.
+write_last() {
+	if [ "$1" = confirmed ] && [ -s "$CHANGE/last.confirmed" ]; then
+		# what a power cut has left of another change
+		[ ! -e "$LAST.new" ] || rm -f "$LAST.new"
+	else
+		echo "$ID $1 $2 ${NONCE:--}" 2>/dev/null >"$LAST.new" || rm -f "$LAST.new"
+	fi
+}
+
+# forget OUTCOME: `write_last` and what the marker decided are synced. A power cut in here leaves the marker, and the next
+# verb ends the change once more, or only what is rubbish.
 forget() {
-	[ ! -s "$LAST.new" ] || mv -f "$LAST.new" "$LAST"
+	ending=$LAST.new
+	[ -s "$ending" ] || ending=$CHANGE/last.$1
+	[ ! -s "$ending" ] || mv -f "$ending" "$LAST"
 	rm -f "$CHANGE"/*."$ID"
 	rm -rf "$CHANGE" "$TIMER"
 }
@@ -388,7 +407,7 @@ stage() { # OWNER ID BUNDLE [NONCE_SHA256 WINDOW_S]: with the last two, `arm_sta
 		[ ! -f "$conf" ] || uci -c "$w/new/etc/config" show "${conf##*/}" >/dev/null 2>&1 ||
 			drop "$w" bad-uci "uci cannot read the new ${conf##*/}"
 	done
-	{ echo "$2 $1 - 0" >"$w/ready" && echo "$2 $1 ${4:--} ${5:-0}" >"$w/arming"; } 2>/dev/null ||
+	{ echo "$2 $1 - 0" 2>/dev/null >"$w/ready" && write_arming "$w" "$2" "$1" "${4:--}" "${5:-0}"; } ||
 		drop "$w" flash-full "could not write the marker"
 	# Everything is in flash before the renames that make it count; only the last one makes it a stage: where a directory
 	# cannot be renamed, mv copies, and may be cut short. A stage that a power cut takes is sent again.
@@ -413,7 +432,7 @@ arm() { # OWNER ID NONCE_SHA256 WINDOW_S
 			no_foreign_changes
 			check_new "$CHANGE" || refuse bad-bundle "a staged file is damaged; stage again"
 			unchanged_since_kept "$CHANGE" || refuse moved-on "a file changed since it was staged"
-			{ echo "$2 $1 $3 $4" 2>/dev/null >"$CHANGE/arming" && sync; } || refuse flash-full "could not write the marker"
+			{ write_arming "$CHANGE" "$2" "$1" "$3" "$4" && sync; } || refuse flash-full "could not write the marker"
 		}
 		[ ! -e "$TIMER" ] || rm -rf "$TIMER"
 		mv -f "$CHANGE/arming" "$CHANGE/armed.$2" || refuse flash-full "could not write the marker"
@@ -720,7 +739,7 @@ confirm() { # ID NONCE [OWNER]: with OWNER, gives its lock back
 		write_last confirmed operator
 		mv "$CHANGE/armed.$ID" "$CHANGE/confirmed.$ID" 2>/dev/null || refuse restored "the window has just run out"
 		sync
-		forget
+		forget confirmed
 	fi
 	[ -z "$3" ] || { part=yes && unlock "$3" && part=''; }
 	answer "state=idle id=$1 outcome=confirmed"

@@ -12,7 +12,7 @@ import pytest
 
 from meshctl.apply import change_in_progress
 from meshctl.apply.change_in_progress import ROLLBACK_S, ChangeInProgress, connect, observe_and_decide
-from meshctl.apply.commit_confirm import _observe_once
+from meshctl.apply.commit_confirm import _observe_once, _uncertain
 from meshctl.apply.context import NodeContext
 from meshctl.apply.health_checks import Expectation
 from meshctl.apply.next_action import Action
@@ -22,6 +22,7 @@ from meshctl.device.errors import AuthenticationRefused
 from meshctl.device.observation import ChangeStatus, NetInterface, Observation
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import Unreachable
+from meshctl.fleet import Outcome, Result
 from meshctl.model import Secret
 from meshctl.render import LAN_FILTER_PATH
 from meshctl.uci import parse
@@ -152,3 +153,11 @@ def test_neighbors_try_to_log_in_unless_the_change_may_drop_logins(files: tuple[
     change.started_s -= change.window_s + ROLLBACK_S + 1
     assert _observe_once(change, None) == (None, None)
     assert calls == [is_due, True]
+
+
+def test_a_node_that_stays_unreachable_before_its_change_has_started_was_not_changed() -> None:
+    """Seen on a virtual fleet: it was uncertain, and its timer had allegedly rolled back what it had never started."""
+    run = SimpleNamespace(interrupt=SimpleNamespace(leaving=False))
+    change = SimpleNamespace(ctx=SimpleNamespace(name="b01", run=run), started_s=None, last_error="no route to host")
+    outcome = _uncertain(cast("ChangeInProgress", change))
+    assert outcome == Outcome("b01", Result.FAILED, "nothing was changed: no route to host")

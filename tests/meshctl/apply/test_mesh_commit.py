@@ -18,7 +18,7 @@ from meshctl.apply.mesh_commit import _MeshCommit, commit_mesh
 from meshctl.apply.next_action import Action
 from meshctl.apply.participant import Participant, canceled_because, quorum_of, short_of_quorum
 from meshctl.device.errors import NodeRefused
-from meshctl.device.observation import Observation
+from meshctl.device.observation import ChangeStatus, Observation
 from meshctl.device.openwrt import UptimeSample
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Interrupt, Outcome, Result
@@ -255,3 +255,31 @@ class TestMoment:
             assert mesh_commit._lead_s(one_after_the_other) == 24.0
             assert mesh_commit._lead_s(replace(one_after_the_other, parallel=2)) == 12.0
             assert mesh_commit._lead_s(replace(one_after_the_other, participants=participants[:1])) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("change_id", "last_reason", "expected"),
+    [
+        ("c1", "boot", "b01: its power was cut, or it rebooted, before it was confirmed"),
+        ("c1", "abort", "b01: it does not answer (no route to host)"),
+        ("c1", "timeout", "b01: it does not answer (no route to host)"),
+        # an earlier change's end
+        ("c2", "boot", "b01: it does not answer (no route to host)"),
+    ],
+)
+def test_a_node_of_a_mesh_that_was_rolled_back_names_its_own_cause(
+    monkeypatch: pytest.MonkeyPatch, change_id: str, last_reason: str, expected: str
+) -> None:
+    """Seen on real OpenWrt: b01's power was cut in a switch of the channel, and it said only that it did not answer."""
+    status = ChangeStatus("idle", last_id="c1", last_outcome="restored", last_reason=last_reason)
+    change = SimpleNamespace(id=change_id, is_abandoned=False, unmet=(), last_error="no route to host", status=status)
+    monkeypatch.setattr(mesh_commit, "connect", lambda change: None)
+    monkeypatch.setattr(mesh_commit, "poll", lambda change: Outcome("b01", Result.ROLLED_BACK, "its power was cut"))
+    ctx = cast("NodeContext", SimpleNamespace(name="b01", plan=SimpleNamespace(splits=("main",))))
+    participants = [Participant(ctx, change=cast("ChangeInProgress", change), is_unreachable=True)]
+    with ThreadPoolExecutor(1) as pool:
+        run = cast("RunContext", SimpleNamespace())
+        commit = mesh_commit._MeshCommit(run, participants, 60, 1, (), is_together=False, pool=pool)
+        ended = mesh_commit._roll_back(commit, "the base did not come back")
+    why = f"the whole mesh was rolled back: the base did not come back; {expected}"
+    assert ended == {"b01": Outcome("b01", Result.ROLLED_BACK, why)}

@@ -204,6 +204,25 @@ def test_without_restarting_radios_neighbors_are_queried_only_after_a_reboot() -
     assert near.names == ["b01"]
 
 
+def test_a_node_that_loses_its_power_before_its_change_starts_has_its_neighbors_queried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Seen on real OpenWrt: packages were being staged, and the node, back in its mesh, was unreachable for minutes."""
+    now_s = [1000.0]
+    monkeypatch.setattr("meshctl.apply.station_flush.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    interfaces = (NetInterface("lan", up=True, pending=False, addresses=("10.42.0.102/24",)),)
+    before = replace(node("b02"), interfaces=interfaces)
+    before = replace(before, macs={**(before.macs or {}), "bat0": "76:9f:08:ba:c9:d5"})
+    near = Neighbours({"b02": before, "b01": node("b01", "b02")})
+    flush = near.flushes.listener(near.job, NO_RADIOS)
+    now_s[0] += 30
+    flush.unreachable(is_login_due=True)
+    ((name, script),) = near.asked
+    login = "10.42.0.102 22 76:9f:08:ba:c9:d5"
+    assert (name, script.splitlines()[-1]) == ("b01", f"flush_stale mesh0 {MAC} 30 {login}")
+    assert near.notes == ["b02: b01 removed a stale entry of its radio"]
+
+
 def test_an_armed_change_starts_watches_on_the_node_and_on_those_reached_through_it() -> None:
     base = "02:00:00:00:01:00"
     route = Originator(base, MAC, "mesh0", last_seen_ms=100, best=True)

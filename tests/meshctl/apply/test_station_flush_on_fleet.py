@@ -148,6 +148,23 @@ class TestOnAVirtualFleet:
         finally:
             node.plug(True)
 
+    def test_a_node_whose_power_is_cut_before_its_change_is_armed_is_reached_and_changed(self, rig: Rig) -> None:
+        node = rig.fleet.node("n001")
+        waiting.until(lambda: max(known_for_s(rig), default=0) > SLACK_S + 2, "base to know the radio for a while")
+        text = rig.inventory(rig.current).read_text(encoding="utf-8")
+        rig.inventory("penalty").write_text(text.replace("hop_penalty: 3", "hop_penalty: 4"), encoding="utf-8")
+        # over the mesh alone
+        node.plug(False)
+        try:
+            rig.fleet.inject_fault("n001", "power-cut@tar -xzf")
+            # with a limited rate the steps are commands of their own
+            ended = rig.meshctl("provision", "penalty", "n001", "--rate", "1000", "--yes", "--json")
+            assert ended.results == {"n001": "done"}, ended.out + ended.err
+            assert notes(ended) == FLUSHED
+        finally:
+            node.plug(True)
+        assert rig.meshctl("provision", rig.current, "n001", "--yes", "--json").results == {"n001": "done"}
+
     def test_an_unobserved_radio_restart_is_flushed_later(self, rig: Rig) -> None:
         old, new = rig.current, {"a": "b", "b": "a"}[rig.current]
         boot = rig.fleet.node("n001").boot_id

@@ -17,7 +17,7 @@ from meshctl.apply.context import NodeContext
 from meshctl.apply.sysupgrade import MARKER_PATH, archive, has_booted, verdict, why_not_flashed
 from meshctl.device import deadman
 from meshctl.device.observation import BoardInfo, FileInfo, Observation, ReleaseInfo
-from meshctl.device.openwrt import FetchedFile, Upgrade
+from meshctl.device.openwrt import FetchedFile, FirmwareCheck, Upgrade
 from meshctl.device.ssh import SshConnection
 from meshctl.errors import NodeError, Unreachable
 from meshctl.fleet import Outcome, Result
@@ -193,6 +193,33 @@ def test_a_node_shows_whether_it_is_flashed_if_the_link_broke_as_that_was_to_sta
     assert outcome.reason == (
         "" if result is Result.DONE else "no sysupgrade runs on it; it runs the previous firmware"
     )
+
+
+@pytest.mark.parametrize(
+    ("check", "why"),
+    [
+        (FirmwareCheck(False, "Image check failed", {}, None), "its sysupgrade rejects the image: Image check failed"),
+        (FirmwareCheck(True, "", {}, 1 << 20), "1 MiB of memory left beside the image, 4 needed"),
+    ],
+)
+def test_an_image_that_is_not_flashed_does_not_stay_in_memory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, check: FirmwareCheck, why: str
+) -> None:
+    """Seen on real OpenWrt: it stayed until the next reboot."""
+    image = tmp_path / "new.bin"
+    image.write_bytes(b"image")
+    monkeypatch.setattr(sysupgrade, "install_switch", ignore)
+    monkeypatch.setattr(sysupgrade, "upload", ignore)
+    monkeypatch.setattr("meshctl.device.deadman.lock", ignore)
+    monkeypatch.setattr("meshctl.device.openwrt.check_firmware", lambda *_: check)
+    node = SlowNode(monkeypatch, leaves_s=1e9, back_s=1e9, timeout_s=300)
+    run = SimpleNamespace(owner="alice", rate_bytes_per_s=None)
+    ctx = SimpleNamespace(name="b01", node=node.node, before=BEFORE, run=run, step=nullcontext, progress=None)
+    commands: list[str] = []
+    connection = cast(SshConnection, SimpleNamespace(run=commands.append))
+    with pytest.raises(NodeError, match=why):
+        sysupgrade._upload(cast(NodeContext, ctx), connection, image)
+    assert commands == ["rm -f /tmp/meshctl/firmware.bin"]
 
 
 def test_a_slower_flash_is_waited_for_if_the_inventory_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

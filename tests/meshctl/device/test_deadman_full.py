@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 
+from meshctl.device.parse.deadman import parse_status
 from tests.meshctl.device.changes import (
     BUNDLE,
+    NONCE,
     NONCE_HASH,
     OWNER,
     change,
+    is_after,
     is_before,
     prepare,
     refusal,
@@ -61,6 +64,58 @@ def test_a_flash_that_fills_up_later_does_not_block_the_rollback(node: Sandbox) 
     )
     assert "ok state=armed id=c1" in answer
     assert "free 0" in answer
+    assert is_before(node.path("/tmp/after"))
+
+
+STARTED = f"""
+d=/usr/sbin/meshctl-deadman
+fill() {{{{ cat /dev/zero >/etc/filler 2>/dev/null; }}}}
+$d stage {OWNER} c0 {BUNDLE} && $d arm {OWNER} c0 {NONCE_HASH} 1000 && $d abort {OWNER} c0
+$d stage {OWNER} c1 {BUNDLE} && $d arm {OWNER} c1 {NONCE_HASH} {{window_s}}
+"""
+
+
+def last_of(answer: str) -> tuple[str, str, str]:
+    status = parse_status(answer.splitlines()[-1])
+    assert status is not None
+    return status.last_id, status.last_outcome, status.last_reason
+
+
+def test_a_flash_that_is_full_at_the_confirmation_keeps_its_outcome(node: Sandbox) -> None:
+    """Otherwise an owner who has lost the answer finds no trace of the change, and starts it again."""
+    prepare(node)
+    answer = on_small_flash(
+        node,
+        1024,
+        f"""{STARTED.format(window_s=1000)}
+        $d apply {OWNER} c1 now
+        until $d status | grep -q state=applied; do sleep 0.1; done
+        fill
+        $d confirm c1 {NONCE} >/dev/null
+        $d confirm c1 {NONCE}
+        $d status
+        """,
+    )
+    assert last_of(answer) == ("c1", "confirmed", "operator")
+    assert answer.splitlines()[-2] == "ok state=idle id=c1 outcome=confirmed"
+    assert is_after(node.path("/tmp/after"))
+    assert not (node.path("/tmp/after") / "meshctl/change").exists()
+
+
+def test_a_flash_that_is_full_at_the_end_of_a_rollback_keeps_its_outcome(node: Sandbox) -> None:
+    prepare(node)
+    answer = on_small_flash(
+        node,
+        1024,
+        f"""{STARTED.format(window_s=0)}
+        sed 's/^write_last() {{/&\\nfill/' $d >/tmp/filled
+        {{ echo 'fill() {{ cat /dev/zero >/etc/filler 2>/dev/null; }}'; cat /tmp/filled; }} >/tmp/full.sh
+        mkdir -p /tmp/meshctl/change-c1
+        sh /tmp/full.sh watch c1 0
+        $d status
+        """,
+    )
+    assert last_of(answer) == ("c1", "restored", "unknown")
     assert is_before(node.path("/tmp/after"))
 
 

@@ -208,7 +208,7 @@ def test_an_image_is_validated_by_sysupgrade_and_procd(connection: SshConnection
     node.put("/tmp/good.bin", "good")
     node.put("/tmp/bad.bin", "wrong board")
     bad = openwrt.check_firmware(connection, "/tmp/bad.bin")
-    assert (bad.valid, bad.reason) == (False, "Device x not supported by this image; Image check failed.")
+    assert (bad.valid, bad.reason) == (False, "Device x not supported by this image; Image check failed")
     assert bad.available_bytes is not None
     without_procd = openwrt.check_firmware(connection, "/tmp/good.bin")
     assert (without_procd.valid, without_procd.tests) == (True, {})
