@@ -28,7 +28,7 @@ _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
 
 
-def _format_channels(channels: tuple[int, ...]) -> str:
+def format_channels(channels: tuple[int, ...]) -> str:
     """`one of 1-11`, `one of 36, 40, 44, 48`."""
     if not channels:
         return "another band"
@@ -99,7 +99,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             legal = initiating_channels(country, mesh.band)
             path = ("meshes", mesh.name, "channel")
             yield Finding(
-                path, f"not a channel of the {mesh.band.value} band", _format_channels(legal), str(mesh.channel)
+                path, f"not a channel of the {mesh.band.value} band", format_channels(legal), str(mesh.channel)
             )
 
 
@@ -119,7 +119,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, "not allowed in this country", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
@@ -168,7 +168,7 @@ def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -192,7 +192,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
             yield Finding(path, "stations may not initiate transmission", expected, f"{mesh.channel} (no-IR)")
@@ -220,7 +220,9 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             continue
         if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
             legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-            expected = f"a channel {_format_channels(legal)}" if legal else "a narrower htmode"
+            expected = (
+                f"a channel of {format_channels(legal).removeprefix('one of ')}" if legal else "a narrower htmode"
+            )
             path = ("meshes", mesh.name, "htmode")
             yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
 
@@ -248,7 +250,11 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if verdict.allows(width) and (not silent or own):
             continue
         legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-        expected = f"a channel {_format_channels(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
+        expected = (
+            f"a channel of {format_channels(legal).removeprefix('one of ')} (country {country.alpha2})"
+            if legal
+            else "a narrower htmode"
+        )
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
 
@@ -359,7 +365,7 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & NO_INITIATE:
             outdoor = legal_channels(country, mesh.band, "HT20", forbidden=NO_INITIATE | Flag.NO_OUTDOOR)
-            expected = f"{_format_channels(outdoor)} (country {country.alpha2})"
+            expected = f"{format_channels(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "indoor use only", expected, str(mesh.channel))
 
 
