@@ -39,7 +39,7 @@ def broadcast_rate_high(fleet: Fleet, _context: LintContext) -> Iterator[Finding
     "MC319",
     Severity.WARNING,
     "Two networks have meshes with the same SSID",
-    why="""Their channels alone keep them apart. A scan does not tell them apart, `meshctl inventory
+    why="""Their channels alone keep them apart. In a scan they look alike, `meshctl inventory
     import` takes the first one, and once one moves to the other's channel, their radios join one cell with two
     networks. Meshes of one network, or at different sites, may share a name.""",
     fix="Give each mesh a name of its own, or set the `site` of their nodes.",

@@ -22,7 +22,6 @@ from meshctl.regdb import (
     width_mhz,
 )
 
-# flags that prevent a station from starting a cell
 # the only build whose wifi-scripts declare `mcast_rate` as an array (docs/facts/openwrt-checked.md)
 _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
@@ -33,9 +32,13 @@ def format_channels(channels: tuple[int, ...]) -> str:
     if not channels:
         return "another band"
     run = range(channels[0], channels[-1] + 1)
-    return (
-        f"one of {channels[0]}-{channels[-1]}" if channels == tuple(run) else f"one of {', '.join(map(str, channels))}"
-    )
+    shown = f"{channels[0]}-{channels[-1]}" if channels == tuple(run) else ", ".join(map(str, channels))
+    return f"one of {shown}"
+
+
+def channel_or_width(channels: tuple[int, ...]) -> str:
+    """What to choose where a channel may not be so wide: one of those that may, if there are any."""
+    return f"a channel of {format_channels(channels).removeprefix('one of ')}" if channels else "a narrower htmode"
 
 
 def _country(fleet: Fleet, context: LintContext) -> Country | None:
@@ -220,9 +223,7 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             continue
         if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
             legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-            expected = (
-                f"a channel of {format_channels(legal).removeprefix('one of ')}" if legal else "a narrower htmode"
-            )
+            expected = channel_or_width(legal)
             path = ("meshes", mesh.name, "htmode")
             yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
 
@@ -250,11 +251,7 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if verdict.allows(width) and (not silent or own):
             continue
         legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-        expected = (
-            f"a channel of {format_channels(legal).removeprefix('one of ')} (country {country.alpha2})"
-            if legal
-            else "a narrower htmode"
-        )
+        expected = channel_or_width(legal) + (f" (country {country.alpha2})" if legal else "")
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
 

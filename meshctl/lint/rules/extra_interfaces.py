@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.channel import format_channels
+from meshctl.lint.rules.channel import channel_or_width
 from meshctl.lint.rules.drivers import generation, htmode_limits
 from meshctl.lint.rules.extra_networks import is_on
 from meshctl.lint.rules.rendering import created_sections, extra_entries, with_extra
@@ -211,9 +211,7 @@ def extra_htmode(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
                 continue
             legal = legal_channels(country, radio.band, value, forbidden=NO_INITIATE)
             if int(channel) in initiating_channels(country, radio.band) and int(channel) not in legal:
-                expected = (
-                    f"a channel of {format_channels(legal).removeprefix('one of ')}" if legal else "a narrower htmode"
-                )
+                expected = channel_or_width(legal)
                 yield Finding(path, f"channel {channel} may not be this wide", expected, value)
 
 
