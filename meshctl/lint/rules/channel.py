@@ -223,9 +223,8 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             continue
         if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
             legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-            expected = channel_or_width(legal)
-            path = ("meshes", mesh.name, "htmode")
-            yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
+            message = f"no room next to channel {mesh.channel}"
+            yield Finding(("meshes", mesh.name, "htmode"), message, channel_or_width(legal), mesh.htmode)
 
 
 @fleet_rule(
