@@ -16,6 +16,7 @@ import typer
 
 from meshctl.cli.context import AsJson, DryRun, InventoryPath, KeyFiles, Lab, Options, with_options
 from meshctl.cli.input_file import read_input
+from meshctl.cli.new_nodes_file import NewNodesFile, file_of_new_nodes
 from meshctl.cli.output import echo, echo_json
 from meshctl.cli.public_key import own_public_key
 from meshctl.diagnostics import Diagnostic, Severity
@@ -26,7 +27,7 @@ from meshctl.interchange.device_entries import ImportOptions, secret_path
 from meshctl.interchange.device_import import DeviceImport
 from meshctl.interchange.device_import import import_device as make_import
 from meshctl.interchange.new_inventory import edited, edits_of, load_text, new_text
-from meshctl.inventory.edit import FileEdit, save
+from meshctl.inventory.edit import Editor, FileEdit, save
 from meshctl.inventory.load import load_fleet
 from meshctl.inventory.secrets import SecretStore
 from meshctl.lint import DiskFiles, LintContext, lint
@@ -44,11 +45,13 @@ _HEADINGS: Mapping[Fate, str] = {
 
 @dataclass(frozen=True, slots=True)
 class ImportTarget:
-    """Where the node goes: `fleet` is the existing inventory's, None for a new one in the directory `new`."""
+    """Where the node goes: `fleet` and `nodes_file` are the existing inventory's, None for a new one in the directory
+    `new`."""
 
     inventory: Path
     new: Path | None
     fleet: Fleet | None
+    nodes_file: Path | None
     options: ImportOptions
     keep: tuple[str, ...]
     dry_run: bool
@@ -68,6 +71,7 @@ _OPTIONS: Options = {
         Annotated[Path | None, typer.Option("--new", metavar="DIR", help="Write a new inventory to DIR instead.")],
         None,
     ),
+    "into": (NewNodesFile, None),
     "name": (
         Annotated[str, typer.Option("--name", help="Name of the node; default: the device's hostname.")],
         "",
@@ -114,6 +118,7 @@ def _import_target(
     *,
     inventory: Path,
     new: Path | None,
+    into: Path | None,
     name: str,
     address: str,
     hardware: str,
@@ -130,6 +135,8 @@ def _import_target(
     """Check the options and load the inventory. Raises InputError, InvalidInput."""
     if new is not None and ((new / FLEET_FILE).exists() or (new / FLEET_FILE).is_symlink()):
         raise InputError(f"{new / FLEET_FILE} already exists; not overwritten", hint="choose another directory")
+    if new is not None and into is not None:
+        raise InputError("--file names a file of an existing inventory, and --new writes a new one: use one of them")
     if state is not None and not state.is_managed:
         raise InputError(f"--state {state.value}: a device that is there is neither lost nor retired")
     place = new if new is not None else inventory.resolve() if inventory.is_dir() else inventory.resolve().parent
@@ -146,8 +153,12 @@ def _import_target(
         operator_key=own_public_key(None) if new is not None else "",
         secret_file=lambda mesh: secret_path(place, mesh),
     )
-    fleet = None if new is not None else load_fleet(inventory, environ=os.environ)
-    yield ImportTarget(inventory, new, fleet, options, tuple(keep or ()), dry_run, as_json)
+    fleet = nodes_file = None
+    if new is None:
+        fleet = load_fleet(inventory, environ=os.environ)
+        # asked before the device is: an import that cannot be written needs no login
+        nodes_file = file_of_new_nodes(Editor.open(inventory, environ=os.environ), into)
+    yield ImportTarget(inventory, new, fleet, nodes_file, options, tuple(keep or ()), dry_run, as_json)
 
 
 def _interface(text: str) -> IpInterface | None:
@@ -241,7 +252,7 @@ def import_export(
 def _import(target: ImportTarget, device: ExistingDevice, source: str) -> None:
     load, secrets = _loader(target, source), _secrets(target.fleet)
     made = make_import(device, target.fleet, target.options, load, secrets, keep=target.keep)
-    edits = () if target.new is not None else edits_of(target.inventory, os.environ, made.values)
+    edits = () if target.new is not None else edits_of(target.inventory, os.environ, made.values, target.nodes_file)
     text = new_text(made.values, source, made.assumed) if target.new is not None else ""
     files = _secret_files(target, made)
     errors = _lint_errors(target, made)
@@ -256,7 +267,7 @@ def _import(target: ImportTarget, device: ExistingDevice, source: str) -> None:
 def _loader(target: ImportTarget, source: str) -> Callable[[Mapping[tuple[str, ...], Any]], Fleet]:
     if target.new is not None:
         return lambda values: load_text(target.file, new_text(values, source))
-    return lambda values: edited(target.inventory, os.environ, values).fleet()
+    return lambda values: edited(target.inventory, os.environ, values, target.nodes_file).fleet()
 
 
 def _secrets(fleet: Fleet | None) -> Callable[[SecretRef], Secret]:

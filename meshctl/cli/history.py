@@ -52,7 +52,11 @@ def history(
         )
     if follow and run is not None:
         raise InputError("--follow shows all runs", hint="leave out the run number, or narrow with --node")
-    with open_journal(os.environ, echo_error, lab=_lab(lab), changes_nothing=True) as journal:
+    # runs of labs are in the journal of this computer, not in a shared one
+    in_use = os.environ.get("MESHCTL_LAB", "") if lab is None else ""
+    with open_journal(
+        os.environ, echo_error, lab=in_use, changes_nothing=True, of_this_computer=lab is True
+    ) as journal:
         run_filter = _RunFilter(node, fleet, lab)
         if follow:
             follow_runs(journal, run_filter.matches, node, as_json=as_json)
@@ -60,13 +64,6 @@ def history(
             _list_runs(journal, run_filter, limit, as_json=as_json)
         else:
             _show_run(journal, run, node, as_json=as_json, with_diffs=diff)
-
-
-def _lab(is_virtual: bool | None) -> str:
-    """The lab in use, or that of `--virtual`: its runs are in the journal of this computer, not in a shared one."""
-    if is_virtual is None:
-        return os.environ.get("MESHCTL_LAB", "")
-    return "any" if is_virtual else ""
 
 
 @dataclass(frozen=True, slots=True)

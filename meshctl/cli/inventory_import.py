@@ -13,6 +13,7 @@ import typer
 from meshctl.cli.context import AsJson, DryRun, InventoryPath
 from meshctl.cli.device_import import import_device, import_export
 from meshctl.cli.input_file import read_input
+from meshctl.cli.new_nodes_file import NewNodesFile, file_of_new_nodes
 from meshctl.cli.output import echo, echo_json
 from meshctl.diagnostics import InvalidInput
 from meshctl.errors import InputError
@@ -22,15 +23,6 @@ from meshctl.inventory.load import load_fleet
 from meshctl.inventory.suggest import did_you_mean
 from meshctl.model import Fleet
 from meshctl.wording import counted
-
-NewNodesFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--file",
-        metavar="FILE",
-        help="With --add: the file of the inventory that gets new nodes, if several have nodes.",
-    ),
-]
 
 app = typer.Typer(help="Import nodes from a CSV table (the default), an existing device, its `uci export`, or NetBox.")
 
@@ -124,7 +116,7 @@ def _take_over(
     found = edits(rows, fleet, file, add=add)
     editor = Editor.open(inventory, environ=os.environ)
     if any(each.is_new for each in found):
-        editor.new_nodes_file = _file_of_new_nodes(editor, new_in)
+        editor.new_nodes_file = file_of_new_nodes(editor, new_in)
     changes = _changes(editor, found, file)
     if as_json:
         nodes = [{"node": each.node, "line": each.line, "new": each.is_new, "values": each.values} for each in found]
@@ -139,24 +131,6 @@ def _take_over(
         )
     if not dry_run:
         save(changes)
-
-
-def _file_of_new_nodes(editor: Editor, given: Path | None) -> Path:
-    """The inventory's file for new nodes. Raises InputError where that is the operator's choice."""
-    files = editor.files()
-    if given is not None:
-        found = next((file for file in files if file.resolve() == given.resolve()), None)
-        if found is None:
-            listed = ", ".join(map(str, files))
-            raise InputError(f"--file {given}: expected a file of the inventory, one of {listed}")
-        return found
-    candidates = editor.files_with_nodes() or files[:1]
-    if len(candidates) > 1:
-        raise InputError(
-            f"{len(candidates)} files of the inventory have nodes: {', '.join(map(str, candidates))}",
-            hint=f"say which one gets the new nodes: --file {candidates[-1]}",
-        )
-    return candidates[0]
 
 
 def _changes(editor: Editor, found: tuple[NodeEdit, ...], file: str) -> tuple[FileEdit, ...]:

@@ -24,8 +24,10 @@ def open_journal(
     lab: str = "",
     pinned: Callable[[str], Iterable[str]] = lambda node: (),
     changes_nothing: bool = False,
+    of_this_computer: bool = False,
 ) -> Journal:
-    """The journal of real fleets as `environ` says; that of a virtual fleet is always the file of this computer.
+    """The journal of real fleets as `environ` says; that of a virtual fleet, or with `of_this_computer`, is always the
+    file of this computer.
 
     With `changes_nothing`, a file that cannot be written is a warning. Raises InputError for a bad URL, MeshctlError
     for a file or a database that cannot be used.
@@ -35,7 +37,7 @@ def open_journal(
     def own_file() -> Path | TolerantStore:
         return TolerantStore.open(path, notify) if changes_nothing else path
 
-    if not url or lab:
+    if not url or lab or of_this_computer:
         return Journal(own_file(), lab=lab, pinned=pinned)
     # psycopg takes a tenth of a second to import
     from meshctl.fleet.postgresql import Database, DatabaseLost, label_of

@@ -6,6 +6,7 @@ are such files.
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
 import threading
@@ -63,8 +64,8 @@ class SqliteFile:
                 path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False
             )
         except (OSError, sqlite3.Error) as error:
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            raise MeshctlError(f"{path}: cannot open the {schema.name}: {reason}", hint=self._hint(error)) from error
+            reason = f"{path}: cannot open the {schema.name}: {self._reason(error)}"
+            raise MeshctlError(reason, hint=self._hint(error)) from error
         try:
             # a foreign file stays as it is
             self._retried(self._check_owner)
@@ -80,7 +81,7 @@ class SqliteFile:
                 raise
             what = f"cannot open the {schema.name}" if self._hint(error) else f"not a {schema.name} of meshctl"
             hint = self._hint(error) or "move the file away and run again"
-            raise MeshctlError(f"{path}: {what}: {error}", hint=hint) from error
+            raise MeshctlError(f"{path}: {what}: {self._reason(error)}", hint=hint) from error
 
     def _open_read_only(self) -> None:
         """Open it without changing anything. Where nothing can be written, no other process writes either."""
@@ -107,7 +108,7 @@ class SqliteFile:
             self._database.close()
             error = MeshctlError(f"found version {version}, expected {self._schema.version}")
             break
-        raise MeshctlError(f"{self.path}: cannot read as a {self._schema.name}: {error}") from error
+        raise MeshctlError(f"{self.path}: cannot read as a {self._schema.name}: {self._reason(error)}") from error
 
     def _check_owner(self) -> None:
         """Raises MeshctlError for a database with tables that are not ours."""
@@ -171,7 +172,7 @@ class SqliteFile:
                     with suppress(sqlite3.Error):
                         self._database.execute("ROLLBACK")
                 what = f"cannot write the {self._schema.name}"
-                raise MeshctlError(f"{self.path}: {what}: {error}", hint=self._hint(error)) from error
+                raise MeshctlError(f"{self.path}: {what}: {self._reason(error)}", hint=self._hint(error)) from error
 
     def put(self, statements: Sequence[Statement], wait_s: float = BUSY_TIMEOUT_S) -> None:
         """Execute statements in one transaction. Raises MeshctlError, as `write` does."""
@@ -217,6 +218,24 @@ class SqliteFile:
     def close(self) -> None:
         with self._lock:
             self._database.close()
+
+    def _reason(self, error: Exception) -> str:
+        """Why the file cannot be used; SQLite says neither which file nor what is wrong with it."""
+        if isinstance(error, OSError) and error.strerror:
+            return error.strerror
+        code = _primary(error)
+        if code == sqlite3.SQLITE_FULL:
+            return "the disk is full"
+        if code not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_PERM):
+            return str(error)
+        if self.path.is_dir():
+            return "it is a directory"
+        if not self.path.parent.is_dir():
+            return f"there is no directory {self.path.parent}"
+        if self.path.exists() and not os.access(self.path, os.R_OK | os.W_OK):
+            return "you may not read and write it"
+        # SQLite's files beside it are written even to read it
+        return str(error) if os.access(self.path.parent, os.W_OK) else f"{self.path.parent} cannot be written"
 
     def _hint(self, error: Exception) -> str:
         """A hint if the file cannot be used; empty if its content is at fault."""

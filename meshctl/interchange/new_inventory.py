@@ -58,15 +58,21 @@ def load_text(path: Path, text: str) -> Fleet:
     return loaded.fleet
 
 
-def edited(inventory: Path, environ: Mapping[str, str], values: Mapping[Entry, Value]) -> Editor:
-    """An editor of the existing inventory with the entries set. Raises InputError if its layout does not allow it."""
+def edited(
+    inventory: Path, environ: Mapping[str, str], values: Mapping[Entry, Value], nodes_file: Path | None = None
+) -> Editor:
+    """An editor of the existing inventory with the entries set, new nodes in `nodes_file`. Raises InputError if its
+    layout does not allow it."""
     editor = Editor.open(inventory, environ=environ)
+    editor.new_nodes_file = nodes_file
     for path, value in values.items():
         after = editor.sibling_of(path[1]) if path[0] == "nodes" else ""
         editor.set(path, value, after=after)
     return editor
 
 
-def edits_of(inventory: Path, environ: Mapping[str, str], values: Mapping[Entry, Value]) -> tuple[FileEdit, ...]:
+def edits_of(
+    inventory: Path, environ: Mapping[str, str], values: Mapping[Entry, Value], nodes_file: Path | None = None
+) -> tuple[FileEdit, ...]:
     """The edits of the inventory's files. Raises InvalidInput if the inventory would have errors."""
-    return edited(inventory, environ, values).changes()
+    return edited(inventory, environ, values, nodes_file).changes()

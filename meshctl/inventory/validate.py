@@ -115,6 +115,8 @@ def _diagnostic(root: MappingNode, error: ErrorDetails) -> Diagnostic:
     expected = expected_value(error)
     found = f"'{printable(str(path[-1]))}'" if is_key else _found(root, path, kind)
     hint = _enum_hint(root, path, error) if kind == "enum" else _unit_hint(root, path)
+    if kind in ("list_type", "tuple_type") and found not in ("", "nothing"):
+        hint = f"put it in brackets: `{path[-1]}: [...]`"
     return codes.error(codes.WRONG_VALUE, place, "", path=dotted, expected=expected, found=found, hint=hint)
 
 

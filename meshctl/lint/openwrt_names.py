@@ -42,6 +42,18 @@ _CHIPS = (
     (re.compile(r"platform/soc/a[08]00000\.wifi"), "ipq40xx"),
     (re.compile(r"platform/soc@0/c000000\.wifi"), "qualcommax"),
 )
+# and the driver of those radios, for what it supports
+_CHIP_DRIVERS = (
+    (re.compile(r"platform/ahb/.*\.wmac|platform/(ar9\w+|qca9\w+)_wmac"), "ath9k"),
+    (re.compile(r"platform/10180000\.wmac"), "rt2800-soc"),
+    (re.compile(r"platform/10300000\.wmac"), "mt7603"),
+    (re.compile(r"platform/soc/a[08]00000\.wifi"), "ath10k-ct"),
+)
+_RADIO_PATHS = _words(
+    """platform/ahb/18100000.wmac platform/ar933x_wmac platform/ar934x_wmac platform/qca953x_wmac platform/qca955x_wmac
+    platform/qca956x_wmac platform/10180000.wmac platform/10300000.wmac platform/18000000.wmac platform/18000000.wifi
+    platform/soc/18000000.wifi platform/soc/a000000.wifi platform/soc/a800000.wifi platform/soc@0/c000000.wifi"""
+)
 PACKAGES = frozenset(FULL_SUPPLICANTS) | _words(
     """wpad-basic wpad-basic-mbedtls wpad-basic-openssl wpad-basic-wolfssl wpad-mini wpa-supplicant hostapd
     hostapd-common wifi-scripts batctl-default batctl-full batctl-tiny kmod-batman-adv iw iw-full iwinfo kmod-ath5k
@@ -58,6 +70,16 @@ _MIN_LETTERS = 6
 def chip_target(radio_path: str) -> str | None:
     """The only target with a radio at this path; None if any target may have it (PCI, USB)."""
     return next((target for pattern, target in _CHIPS if pattern.fullmatch(radio_path)), None)
+
+
+def chip_driver(radio_path: str) -> str:
+    """The driver of a built-in radio at this path; empty if the path does not tell (PCI, USB)."""
+    return next((driver for pattern, driver in _CHIP_DRIVERS if pattern.fullmatch(radio_path)), "")
+
+
+def similar_radio_paths(path: str) -> tuple[str, ...]:
+    """The known paths of built-in radios that are one edit from this one; none if it is known."""
+    return () if path in _RADIO_PATHS else one_edit_apart(path, _RADIO_PATHS)
 
 
 def suggest_packages(name: str) -> tuple[str, ...]:

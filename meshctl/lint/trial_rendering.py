@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from pathlib import Path
 
 from meshctl.diagnostics import InvalidInput
@@ -43,18 +43,23 @@ def kinds(fleet: Fleet) -> Iterator[Node]:
     for node in fleet.managed():
         if not all(name in fleet.meshes for name in node.meshes):
             continue
-        kind = (
-            node.hardware.name,
-            node.release,
-            tuple((radio.mesh, radio.tx_power_dbm) for radio in node.radios),
-            node.lan_ports,
-            tuple(node.extra_uci.items()),
-            node.gateway is None,
-            node.lan_address is None,
-        )
+        kind = kind_of(node)
         if kind not in seen:
             seen.add(kind)
             yield node
+
+
+def kind_of(node: Node) -> Hashable:
+    """What the nodes of one kind have in common."""
+    return (
+        node.hardware.name,
+        node.release,
+        tuple((radio.mesh, radio.tx_power_dbm) for radio in node.radios),
+        node.lan_ports,
+        tuple(node.extra_uci.items()),
+        node.gateway is None,
+        node.lan_address is None,
+    )
 
 
 def _rendered(fleet: Fleet) -> Iterator[tuple[Node, Outcome]]:

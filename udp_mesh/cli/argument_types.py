@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from math import isfinite
 
 from udp_mesh.daemon.interface import MAX_PING_S
 
@@ -23,6 +24,17 @@ def ping_s(text: str) -> float:
     value = positive(text)
     if value > MAX_PING_S:
         raise argparse.ArgumentTypeError(f"expected at most {MAX_PING_S:g} seconds, found {text!r}")
+    return value
+
+
+def coordinate(text: str) -> float:
+    """Meters, in either direction."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("inf")
+    if not isfinite(value):
+        raise argparse.ArgumentTypeError(f"expected a number of meters, such as 12.5, found {text!r}")
     return value
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from udp_mesh import __version__
 from udp_mesh.cli import change, hosts, inspect, serve, traffic
-from udp_mesh.cli.argument_types import count, ping_s, positive
+from udp_mesh.cli.argument_types import coordinate, count, ping_s, positive
 from udp_mesh.cli.command_parser import CommandParser, HelpFormatter
 from udp_mesh.cli.hints import hint
 from udp_mesh.cli.output import Exit, OutputFailed, checked_stdout, discard_stdout, prepare_streams, print_error
@@ -23,7 +23,7 @@ Command = Callable[[argparse.Namespace], int]
 EPILOG = """\
 exit codes:
   0    success
-  1    the daemon refused the request, or a peer did not answer
+  1    the daemon refused the request, a peer did not answer, or a file could not be written
   2    invalid arguments, or a file that `report` or `sim` cannot use
   3    cannot connect to the daemon
   4    invalid configuration
@@ -290,7 +290,7 @@ def _add_change(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         setters, "position", change.set_position, "set this node's position", example="udp-mesh set position 12.5 -3"
     )
     for axis, count_of in (("x", None), ("y", None), ("z", "?")):
-        position.add_argument(axis, type=float, nargs=count_of, help="meters")
+        position.add_argument(axis, type=coordinate, nargs=count_of, help="meters")
     position.add_argument("--frame", default="map", help="coordinate frame (default: %(default)s)")
     keys = _command(
         setters,

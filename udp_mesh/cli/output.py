@@ -17,7 +17,7 @@ class Exit(IntEnum):
 
     OK = 0
     FAILED = 1
-    """The daemon refused the request, or a peer did not answer."""
+    """The daemon refused the request, a peer did not answer, or a file could not be written (`keygen`, `hosts`)."""
     USAGE = 2
     UNREACHABLE = 3
     """No daemon listens at the socket."""

@@ -302,7 +302,7 @@ class Table:
         """Reports every key that was not read."""
         for key, value in self._values.items():
             if key not in self._known:
-                hint = did_you_mean(key, self._known)
+                hint = did_you_mean(key, self._known) or f"known keys: {', '.join(sorted(self._known))}"
                 found = f"{key} = {show(value)}"
                 self.source.report((*self.path, key), "a known key", found, hint, not_in=self._title())
 

@@ -87,9 +87,9 @@ class NodeLayer(Document):
     """The robot that carries the node. Default: the robot that lists it."""
     site: Name = NOT_WRITTEN
     """The site where the node is. Default: none."""
-    label: Line = ""
+    label: Line = Field(default="", min_length=1)
     """Label on the device."""
-    serial: Line = ""
+    serial: Line = Field(default="", min_length=1)
     """Serial number of the device."""
     mac: Mac = ""
     """MAC address of the device, as on its label."""

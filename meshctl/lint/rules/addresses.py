@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from ipaddress import IPv4Address, ip_address
 
@@ -18,6 +19,9 @@ from meshctl.wording import join_limited
 _WRONG_NETWORK_NODES = 3
 # address of a factory-fresh OpenWrt device
 _FACTORY = IPv4Address("192.168.1.1")
+# RFC 1123, and underscores, which some networks' own names have
+_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?", re.ASCII)
+_MAX_HOST_CHARACTERS = 253
 
 
 def meshes_of(fleet: Fleet, node: Node) -> list[Mesh]:
@@ -99,7 +103,8 @@ def address_outside(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
             yield Finding(("meshes", name, "network"), message, expected, str(mesh.network))
             continue
         for node in nodes:
-            expected = f"an address in {' or '.join(str(mesh.network) for mesh in meshes_of(fleet, node))}"
+            networks_of_node = dict.fromkeys(str(mesh.network) for mesh in meshes_of(fleet, node))
+            expected = f"an address in {' or '.join(networks_of_node)}"
             yield Finding(("nodes", node.name, "address"), "outside its mesh's network", expected, str(node.address.ip))
 
 
@@ -209,7 +214,7 @@ def computer_elsewhere(fleet: Fleet, _context: LintContext) -> Iterator[Finding]
 )
 def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     host = fleet.system.log_host
-    if host and _out_of_reach(fleet, host):
+    if host and is_host(host) and _out_of_reach(fleet, host):
         yield Finding(("system", "log_host"), "outside the fleet's networks", _within_reach(fleet), host)
 
 
@@ -224,7 +229,7 @@ def log_host_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Findin
     passing="system: {ntp_servers: [10.42.0.100]}",
 )
 def time_server_unreachable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
-    servers = fleet.system.ntp_servers
+    servers = [server for server in fleet.system.ntp_servers if is_host(server)]
     if servers and all(_out_of_reach(fleet, server) for server in servers):
         message = "outside the fleet's networks"
         yield Finding(("system", "ntp_servers"), message, _within_reach(fleet), ", ".join(servers))
@@ -244,6 +249,13 @@ def _within_reach(fleet: Fleet) -> str:
     gateways = {str(node.gateway): node.gateway.version for node in fleet.managed() if node.gateway is not None}
     behind = [f"an IPv{version} address, as gateway {gateway}" for gateway, version in gateways.items()]
     return ", or ".join([*behind[:1], "an address of a mesh's network"])
+
+
+def is_host(text: str) -> bool:
+    """Whether it is an address or can be a host name; MC237 reports what is neither."""
+    labels = text.removesuffix(".").split(".")
+    is_name = len(text) <= _MAX_HOST_CHARACTERS and all(_LABEL.fullmatch(label) for label in labels)
+    return is_name or as_address(text) is not None
 
 
 def as_address(host: str) -> IpAddress | None:

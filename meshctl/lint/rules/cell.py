@@ -97,7 +97,7 @@ def bssid_missing(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 )
 def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reported: set[str] = set()
-    for meshes in _in_earshot(fleet):
+    for meshes in meshes_in_earshot(fleet):
         for bssid, sharing in duplicates(((mesh.band, mesh.bssid), mesh) for mesh in meshes if mesh.bssid):
             for mesh in sharing[1:]:
                 if mesh.name not in reported:
@@ -112,7 +112,7 @@ def cell_shared(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
                     yield Finding(("meshes", mesh.name, "ssid"), message, "a unique SSID", ssid[2])
 
 
-def _in_earshot(fleet: Fleet) -> list[list[Mesh]]:
+def meshes_in_earshot(fleet: Fleet) -> list[list[Mesh]]:
     """The meshes that may hear each other: those of each site, with those that are not at one site alone."""
     sites = {mesh.name: {node.site for node in fleet.members(mesh.name)} for mesh in fleet.meshes.values()}
     places = sorted({site for found in sites.values() for site in found if site})
@@ -135,7 +135,7 @@ def _in_earshot(fleet: Fleet) -> list[list[Mesh]]:
 )
 def cells_overlap(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     reported: set[str] = set()
-    for meshes in _in_earshot(fleet):
+    for meshes in meshes_in_earshot(fleet):
         for mesh, finding in _overlaps(meshes):
             if mesh not in reported:
                 reported.add(mesh)

@@ -22,20 +22,23 @@ from meshctl.regdb import (
     width_mhz,
 )
 
-# flags that prevent a station from starting a cell
 # the only build whose wifi-scripts declare `mcast_rate` as an array (docs/facts/openwrt-checked.md)
 _NO_MCAST_RATE = "25.12.0-rc1"
 _IMAGE = 'image for {"supported_devices":["ubnt,rocket-m"],"version":{"version":"%s","revision":"r1-1"}}'
 
 
-def _format_channels(channels: tuple[int, ...]) -> str:
+def format_channels(channels: tuple[int, ...]) -> str:
     """`one of 1-11`, `one of 36, 40, 44, 48`."""
     if not channels:
         return "another band"
     run = range(channels[0], channels[-1] + 1)
-    return (
-        f"one of {channels[0]}-{channels[-1]}" if channels == tuple(run) else f"one of {', '.join(map(str, channels))}"
-    )
+    shown = f"{channels[0]}-{channels[-1]}" if channels == tuple(run) else ", ".join(map(str, channels))
+    return f"one of {shown}"
+
+
+def channel_or_width(channels: tuple[int, ...]) -> str:
+    """What to choose where a channel may not be so wide: one of those that may, if there are any."""
+    return f"a channel of {format_channels(channels).removeprefix('one of ')}" if channels else "a narrower htmode"
 
 
 def _country(fleet: Fleet, context: LintContext) -> Country | None:
@@ -99,7 +102,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             legal = initiating_channels(country, mesh.band)
             path = ("meshes", mesh.name, "channel")
             yield Finding(
-                path, f"not a channel of the {mesh.band.value} band", _format_channels(legal), str(mesh.channel)
+                path, f"not a channel of the {mesh.band.value} band", format_channels(legal), str(mesh.channel)
             )
 
 
@@ -119,7 +122,7 @@ def channel_unknown(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
 def channel_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if not verdict.covered:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, "not allowed in this country", f"{legal} (country {country.alpha2})", str(mesh.channel))
 
@@ -168,7 +171,7 @@ def channel_may_be_lost(fleet: Fleet, context: LintContext) -> Iterator[Finding]
 def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if mesh.mode is mode and verdict.covered and Flag.DFS in verdict.flags:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             yield Finding(path, message, f"{legal} (country {country.alpha2})", f"{mesh.channel} (DFS)")
 
@@ -192,7 +195,7 @@ def _radar(fleet: Fleet, context: LintContext, mode: MeshMode, message: str) -> 
 def channel_passive(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_IR in verdict.flags and Flag.DFS not in verdict.flags:
-            legal = _format_channels(initiating_channels(country, mesh.band))
+            legal = format_channels(initiating_channels(country, mesh.band))
             path = ("meshes", mesh.name, "channel")
             expected = f"{legal} (country {country.alpha2})"
             yield Finding(path, "stations may not initiate transmission", expected, f"{mesh.channel} (no-IR)")
@@ -220,9 +223,8 @@ def width_without_room(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
             continue
         if occupied_span(mesh.band, mesh.channel, mesh.htmode) is None:
             legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-            expected = f"a channel {_format_channels(legal)}" if legal else "a narrower htmode"
-            path = ("meshes", mesh.name, "htmode")
-            yield Finding(path, f"no room next to channel {mesh.channel}", expected, mesh.htmode)
+            message = f"no room next to channel {mesh.channel}"
+            yield Finding(("meshes", mesh.name, "htmode"), message, channel_or_width(legal), mesh.htmode)
 
 
 @fleet_rule(
@@ -248,7 +250,7 @@ def width_illegal(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
         if verdict.allows(width) and (not silent or own):
             continue
         legal = legal_channels(country, mesh.band, mesh.htmode, forbidden=NO_INITIATE)
-        expected = f"a channel {_format_channels(legal)} (country {country.alpha2})" if legal else "a narrower htmode"
+        expected = channel_or_width(legal) + (f" (country {country.alpha2})" if legal else "")
         path = ("meshes", mesh.name, "htmode")
         yield Finding(path, f"channel {mesh.channel} may not be {width} MHz wide", expected, mesh.htmode)
 
@@ -359,7 +361,7 @@ def channel_indoor(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for mesh, country, verdict in _channels(fleet, context):
         if verdict.covered and Flag.NO_OUTDOOR in verdict.flags and not verdict.flags & NO_INITIATE:
             outdoor = legal_channels(country, mesh.band, "HT20", forbidden=NO_INITIATE | Flag.NO_OUTDOOR)
-            expected = f"{_format_channels(outdoor)} (country {country.alpha2})"
+            expected = f"{format_channels(outdoor)} (country {country.alpha2})"
             yield Finding(("meshes", mesh.name, "channel"), "indoor use only", expected, str(mesh.channel))
 
 

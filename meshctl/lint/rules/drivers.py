@@ -9,7 +9,7 @@ from meshctl.diagnostics import Severity
 from meshctl.inventory.suggest import suggestion
 from meshctl.lint.context import LintContext
 from meshctl.lint.grouping import group_by_key
-from meshctl.lint.openwrt_names import one_edit_apart
+from meshctl.lint.openwrt_names import chip_driver, one_edit_apart, similar_radio_paths
 from meshctl.lint.rule import Finding, fleet_rule
 from meshctl.model import Band, Fleet, HardwareProfile, MeshMode, Node, RadioHardware, Release
 from meshctl.wording import join_limited
@@ -36,6 +36,8 @@ _PCI_BUS = re.compile(r"pci[0-9a-f]{4}:[0-9a-f]{2}")
 _PCI_SLOT = re.compile(r"[0-9a-f]{4}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7](\+\d+)?")
 _LIKE_PCI_BUS = re.compile(r"[a-z]*[0-9a-f]{4}:[0-9a-f]{2}")
 _LIKE_PCI_SLOT = re.compile(r"[0-9a-z]+:[0-9a-z:]+\.[0-9+]+")
+# `mt76` and `rtw8` begin several drivers; shorter names begin too many
+_MIN_FAMILY_LETTERS = 4
 _MODE_NAMES = {MeshMode.ADHOC: "ad-hoc", MeshMode.MESH: "802.11s"}
 
 
@@ -102,11 +104,21 @@ def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         for radio in profile.radios:
             if not radio.driver or radio.driver in _DRIVERS:
                 continue
-            near = one_edit_apart(radio.driver, _DRIVERS)
+            near = _meant(radio.driver)
             if near or radio.driver.isdigit():
                 path = ("hardware", profile.name, "radios", radio.name, "driver")
-                expected = " or ".join(near) or "a driver such as ath9k"
-                yield Finding(path, "unknown driver", expected, radio.driver, suggestion(near))
+                expected = join_limited(near) or "a driver such as ath9k"
+                yield Finding(path, "unknown driver", expected, radio.driver, suggestion(near[:3]))
+
+
+def _meant(driver: str) -> tuple[str, ...]:
+    """The known drivers that a name probably means: a package's, one with a typo, or that of a family (`mt76`)."""
+    bare = driver.removeprefix("kmod-")
+    if bare in _DRIVERS:
+        return (bare,)
+    return one_edit_apart(bare, _DRIVERS) or tuple(
+        sorted(known for known in _DRIVERS if len(bare) >= _MIN_FAMILY_LETTERS and known.startswith(bare))
+    )
 
 
 @fleet_rule(
@@ -122,17 +134,18 @@ def driver_misspelt(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
 def path_of_no_device(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
     for profile in fleet.hardware.values():
         for radio in profile.radios:
-            if not radio.path or _is_device_path(radio.path):
+            near = similar_radio_paths(radio.path)
+            if not radio.path or (_is_device_path(radio.path) and not near):
                 continue
             path = ("hardware", profile.name, "radios", radio.name, "path")
-            expected = "a path such as platform/ahb/18100000.wmac or pci0000:00/0000:00:00.0"
-            yield Finding(path, "not a path in the kernel's device tree", expected, radio.path)
+            expected = " or ".join(near) or "a path such as platform/ahb/18100000.wmac or pci0000:00/0000:00:00.0"
+            yield Finding(path, "not a path in the kernel's device tree", expected, radio.path, suggestion(near))
 
 
 def _is_device_path(path: str) -> bool:
     """Whether it names a device below a bus, and its PCI buses and slots have the kernel's form."""
     parts = path.split("/")
-    return len(parts) > 1 and all(parts) and not any(_is_bad_pci(part) for part in parts)
+    return len(parts) > 1 and all(parts) and not re.search(r"\s", path) and not any(_is_bad_pci(part) for part in parts)
 
 
 def _is_bad_pci(part: str) -> bool:
@@ -185,24 +198,25 @@ def htmode_beyond_radio(fleet: Fleet, _context: LintContext) -> Iterator[Finding
         for node in fleet.managed()
         for radio in node.radios
         if (mesh := fleet.meshes.get(radio.mesh or "")) is not None
-        for limit in _limits(node, radio.hardware, mesh.htmode)
+        for limit in htmode_limits(node, radio.hardware, mesh.htmode)
     )
     for (name, limit), nodes in group_by_key(joined).items():
         mesh = fleet.meshes[name]
-        message = f"{limit} has no {_generation(mesh.htmode)}: {join_limited(nodes)}"
+        message = f"{limit} has no {generation(mesh.htmode)}: {join_limited(nodes)}"
         yield Finding(("meshes", mesh.name, "htmode"), message, "an htmode that all its radios support", mesh.htmode)
 
 
-def _generation(htmode: str) -> str:
+def generation(htmode: str) -> str:
     return htmode.rstrip("0123456789+-")
 
 
-def _limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
+def htmode_limits(node: Node, radio: RadioHardware, htmode: str) -> Iterator[str]:
     """The reason why the node's radio cannot use the htmode: its driver, its release."""
-    wanted = _generation(htmode)
+    wanted = generation(htmode)
     if wanted not in _GENERATIONS:
         return
-    driver, _ = _driver(node.hardware, radio)
+    named, _ = _driver(node.hardware, radio)
+    driver = named if named in _BEST else chip_driver(radio.path)
     best = _BEST.get(driver, "EHT")
     if _GENERATIONS.index(wanted) > _GENERATIONS.index(best):
         yield f"{driver} ({radio.name} of {node.hardware.name})"

@@ -18,7 +18,7 @@ from meshctl.uci import Package, Section
 _TRUE = ("1", "on", "true", "yes", "enabled")
 
 
-def _is_on(section: Section, option: str) -> bool:
+def is_on(section: Section, option: str) -> bool:
     return section.get(option).lower() in _TRUE
 
 
@@ -31,42 +31,58 @@ def _is_on(section: Section, option: str) -> bool:
     access point connect and get no address.""",
     fix="""Add a section of the type `dnsmasq` (`dhcp.dns: dnsmasq` and `dhcp.dns.authoritative: "1"`), and for `lan`
     also `dhcp.lan.dhcpv4: server`.""",
-    failing="nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: '100', dhcp.lan.dhcpv4: server}}}",
+    failing="nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: '120', dhcp.lan.dhcpv4: server}}}",
     passing="""
-    nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: '100', dhcp.lan.dhcpv4: server,
+    nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.start: '120', dhcp.lan.dhcpv4: server,
       dhcp.dns: dnsmasq, dhcp.dns.authoritative: '1'}}}
     """,
 )
 def address_server_off(fleet: Fleet, context: LintContext) -> Iterator[Finding]:
     for node, packages in with_extra(fleet, context):
         dhcp = packages.get("dhcp")
-        for key, section in _address_ranges(node, dhcp):
-            missing = []
-            if dhcp is not None and not _has_server(dhcp, section):
-                missing.append("a section of the type dnsmasq")
-            if section.get("dhcpv4") == "disabled":
-                missing.append(f"dhcp.{section.name}.dhcpv4: server")
+        for key, section in address_ranges(node, dhcp):
+            missing = [] if dhcp is None else missing_for_server(dhcp, section)
             if missing:
                 path = ("nodes", node.name, "extra_uci", key)
                 yield Finding(path, "no address is served", " and ".join(missing), "none")
 
 
-def _address_ranges(node: Node, dhcp: Package | None) -> Iterator[tuple[str, Section]]:
+def missing_for_server(dhcp: Package, section: Section) -> list[str]:
+    """What a range of addresses lacks to be served."""
+    missing = []
+    if is_on(section, "ignore"):
+        missing.append(f'dhcp.{section.name}.ignore: ""')
+    if not _has_server(dhcp, section):
+        missing.append("a section of the type dnsmasq")
+    if section.get("dhcpv4") == "disabled":
+        missing.append(f"dhcp.{section.name}.dhcpv4: server")
+    return missing
+
+
+def address_ranges(node: Node, dhcp: Package | None) -> Iterator[tuple[str, Section]]:
     """The networks that `extra_uci` has IPv4 addresses served in, each with a key of `extra_uci` that says so."""
     for section in () if dhcp is None else dhcp.of_type("dhcp"):
         keys = [f"dhcp.{section.name}", *(f"dhcp.{section.name}.{option}" for option in ("ignore", "start", "limit"))]
         given = [key for key in keys if key in node.extra_uci]
+        # turned off on purpose, or by meshctl while the inventory sets up a range
+        is_ignored = is_on(section, "ignore") and (
+            f"dhcp.{section.name}.ignore" in node.extra_uci or not _is_range(section)
+        )
         is_ipv6_only = any(section.get(option) == "server" for option in ("ra", "dhcpv6")) and not (
             section.get("start") or section.get("limit") or section.get("dhcpv4") == "server"
         )
-        if given and not _is_on(section, "ignore") and not is_ipv6_only:
+        if given and not is_ignored and not is_ipv6_only:
             yield given[0], section
 
 
+def _is_range(section: Section) -> bool:
+    return bool(section.get("start") or section.get("limit") or section.get("dhcpv4") == "server")
+
+
 def _has_server(dhcp: Package, served: Section) -> bool:
-    if any(not _is_on(section, "disabled") for section in dhcp.of_type("dnsmasq")):
+    if any(not is_on(section, "disabled") for section in dhcp.of_type("dnsmasq")):
         return True
-    is_main = any(_is_on(section, "maindhcp") for section in dhcp.of_type("odhcpd"))
+    is_main = any(is_on(section, "maindhcp") for section in dhcp.of_type("odhcpd"))
     return is_main and served.get("dhcpv4") == "server"
 
 
@@ -154,7 +170,7 @@ def interface_not_attachable(fleet: Fleet, context: LintContext) -> Iterator[Fin
         network = packages.get("network")
         for name, interface in created_sections(node, packages, "wireless"):
             path = ("nodes", node.name, "extra_uci", f"wireless.{name}.network")
-            is_client = interface.get("mode") == "sta" and not _is_on(interface, "wds")
+            is_client = interface.get("mode") == "sta" and not is_on(interface, "wds")
             for attached in interface.get("network").split() if interface.type == "wifi-iface" else ():
                 section = None if network is None else network.section(attached)
                 if attached in node.mesh_interfaces or (

@@ -90,12 +90,12 @@ def _bridged(node: Node, network: Package) -> Iterator[str]:
     give each a range of its own.""",
     failing="""
     groups: {serving: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
-      dhcp.dns.authoritative: '1'}}}
+      dhcp.dns.authoritative: '1', dhcp.lan.start: '120', dhcp.lan.limit: '50'}}}
     nodes: {base: {groups: [serving]}, b01: {groups: [serving]}}
     """,
     passing="""
     nodes: {base: {extra_uci: {dhcp.lan.ignore: '0', dhcp.lan.dhcpv4: server, dhcp.dns: dnsmasq,
-      dhcp.dns.authoritative: '1'}}}
+      dhcp.dns.authoritative: '1', dhcp.lan.start: '120', dhcp.lan.limit: '50'}}}
     """,
 )
 def several_address_servers(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from ipaddress import IPv4Network, ip_interface
 
@@ -32,10 +33,33 @@ def _not_misspelled(*words: str) -> _Check:
     """Packages add further words, so only what is almost one of these is wrong."""
 
     def check(value: str) -> tuple[str, str] | None:
-        near = () if value in words else one_edit_apart(value, words)
+        near = () if value in words else _meant(value, words)
         return (" or ".join(near), suggestion(near)) if near else None
 
     return check
+
+
+def _meant(value: str, words: tuple[str, ...]) -> tuple[str, ...]:
+    """The words that a value probably means: with a typo, in other letters, or its first half (`forward`)."""
+    lower = value.lower()
+    cut = tuple(word for word in words if word.startswith(lower) and 2 * len(lower) >= len(word))
+    return () if value in words else one_edit_apart(value, words) or cut
+
+
+def _number(least: int, most: int) -> _Check:
+    def check(value: str) -> tuple[str, str] | None:
+        is_valid = value.isascii() and value.isdecimal() and least <= int(value) <= most
+        return None if is_valid else (f"a number from {least} to {most}", "")
+
+    return check
+
+
+def _mac(value: str) -> tuple[str, str] | None:
+    return None if value == "random" or _MAC.fullmatch(value) else ("a MAC address such as 02:ca:fe:00:00:01", "")
+
+
+def _lease_time(value: str) -> tuple[str, str] | None:
+    return None if _LEASE_TIME.fullmatch(value) else ("a time such as 30m, 12h or infinite", "")
 
 
 def _ssid(value: str) -> tuple[str, str] | None:
@@ -65,6 +89,23 @@ def _netmask(value: str) -> tuple[str, str] | None:
     return None
 
 
+_MAC = re.compile(r"[0-9a-f]{2}(:[0-9a-f]{2}){5}", re.IGNORECASE)
+_LEASE_TIME = re.compile(r"\d+[smhdw]?|infinite", re.ASCII)
+# netifd drops a value that is none of these, and the option has its default (libuci, blob.c)
+_SWITCH = _one_of("0", "1", "false", "true")
+_SWITCHES = {
+    "wifi-device": ("disabled", "noscan", "legacy_rates", "country_ie"),
+    "wifi-iface": (
+        "disabled",
+        "hidden",
+        "isolate",
+        "wds",
+        "wmm",
+        "short_preamble",
+        "multicast_to_unicast",
+        "proxy_arp",
+    ),
+}
 _POLICY = _one_of("ACCEPT", "REJECT", "DROP")
 _HTMODES = (
     *("NOHT", "NONE", "HT20", "HT40", "HT40+", "HT40-", "VHT20", "VHT40", "VHT80", "VHT160", "VHT80_80"),
@@ -76,6 +117,13 @@ _CHECKS: dict[tuple[str, str, str], _Check] = {
     ("wireless", "wifi-iface", "mode"): _one_of("ap", "sta", "adhoc", "mesh", "monitor"),
     ("wireless", "wifi-iface", "ssid"): _ssid,
     ("wireless", "wifi-iface", "encryption"): _encryption,
+    ("wireless", "wifi-iface", "macaddr"): _mac,
+    ("wireless", "wifi-iface", "dtim_period"): _number(1, 255),
+    ("wireless", "wifi-iface", "maxassoc"): _number(0, 2007),
+    **{("wireless", kind, option): _SWITCH for kind, options in _SWITCHES.items() for option in options},
+    ("dhcp", "dhcp", "start"): _number(0, 2**24),
+    ("dhcp", "dhcp", "limit"): _number(1, 2**24),
+    ("dhcp", "dhcp", "leasetime"): _lease_time,
     ("network", "interface", "proto"): _not_misspelled("static", "dhcp", "dhcpv6", "none", "pppoe", "wireguard"),
     ("network", "interface", "ipaddr"): _addresses,
     ("network", "interface", "ip6addr"): _addresses,

@@ -143,7 +143,7 @@ def value_unwritable(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
       network.visitors.proto: none}}}
     """,
     passing="""
-    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio1, wireless.guest.mode: ap,
+    nodes: {b01: {extra_uci: {wireless.guest: wifi-iface, wireless.guest.device: radio0, wireless.guest.mode: ap,
       wireless.guest.ssid: guests, wireless.guest.network: visitors, network.visitors: interface,
       network.visitors.proto: none}}}
     """,

@@ -1,4 +1,4 @@
-"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC236)."""
+"""OpenWrt's system settings: clocks, time zones, logs (MC231 to MC237)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from meshctl.diagnostics import Severity
 from meshctl.lint.context import LintContext
 from meshctl.lint.rule import Finding, fleet_rule
-from meshctl.lint.rules.addresses import as_address, networks, stations
+from meshctl.lint.rules.addresses import as_address, is_host, networks, stations
 from meshctl.lint.rules.references import suggest
 from meshctl.lint.zones import is_posix, posix_of, same_clock, zones
 from meshctl.model import Fleet, Node
@@ -153,3 +153,21 @@ def offset_of_utc(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
         meant, named = (f"<-{hours:02}>{hours}", "behind") if is_west else (f"<+{hours:02}>-{hours}", "ahead of")
         hint = f"{written} is {counted(hours, 'hour')} {named} UTC; write {meant}, or the opposite if you meant that"
         yield Finding(("system", "timezone"), "counts westward", meant, written, hint)
+
+
+@fleet_rule(
+    "MC237",
+    Severity.ERROR,
+    "A log host or time server is neither an address nor a host name",
+    why="""The name server has no such name, and the daemons of OpenWrt take neither a URL nor a port here: no log
+    arrives, and the clocks stay wrong.""",
+    fix="Write the address or the name alone; `log_port` is the port of the log host.",
+    failing="system: {log_host: '10.42.0.100:514'}",
+    passing="system: {log_host: 10.42.0.100}",
+)
+def server_without_a_name(fleet: Fleet, _context: LintContext) -> Iterator[Finding]:
+    hosts = [(("system", "log_host"), fleet.system.log_host)] if fleet.system.log_host else []
+    servers = [(("system", "ntp_servers", str(index)), host) for index, host in enumerate(fleet.system.ntp_servers)]
+    for path, host in (*hosts, *servers):
+        if not is_host(host):
+            yield Finding(path, "not a host", "an address such as 10.42.0.100, or a host name", host)

@@ -14,6 +14,7 @@ import pytest
 from meshctl.errors import MeshctlError, NodeError
 from meshctl.fleet import Outcome, Result
 from meshctl.fleet.journal import Journal, default_path
+from meshctl.fleet.journal_schema import SCHEMA
 from meshctl.fleet.process import process_lives, this_process
 from meshctl.fleet.sqlite_file import SqliteFile
 
@@ -233,9 +234,24 @@ def test_a_locked_journal_can_be_read_and_hints_at_the_process(
 def test_a_journal_that_cannot_be_written_is_not_called_damaged(path: Path) -> None:
     path.parent.mkdir(parents=True)
     path.mkdir()
-    with pytest.raises(MeshctlError, match="cannot open the journal") as caught:
+    with pytest.raises(MeshctlError, match=r"cannot open the journal: it is a directory$") as caught:
         Journal(path)
     assert "XDG_STATE_HOME" in caught.value.hint
+
+
+def test_the_reason_why_a_journal_cannot_be_used_is_in_words(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite's words are `unable to open database file` and `attempt to write a readonly database`."""
+    with pytest.raises(MeshctlError, match=f"there is no directory {path.parent}$"):
+        SqliteFile(path, SCHEMA, read_only=True)
+    with closing(SqliteFile(path, SCHEMA)) as file:
+        failed = sqlite3.OperationalError("attempt to write a readonly database")
+        failed.sqlite_errorcode = sqlite3.SQLITE_READONLY
+        monkeypatch.setattr("meshctl.fleet.sqlite_file.os.access", lambda place, mode: place != path.parent)
+        with pytest.raises(MeshctlError, match=f"{path.parent} cannot be written$"), file.write():
+            raise failed
+        monkeypatch.setattr("meshctl.fleet.sqlite_file.os.access", lambda place, mode: place != path)
+        with pytest.raises(MeshctlError, match=r"you may not read and write it$"), file.write():
+            raise failed
 
 
 def test_the_reason_why_a_journal_cannot_be_made_is_in_words(tmp_path: Path) -> None:

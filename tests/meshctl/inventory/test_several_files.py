@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 from meshctl.cli.main import build
 from meshctl.inventory.edit import Editor, save, set_state
 from meshctl.model import NodeState
+from tests.meshctl.interchange.devices import SSH_KEY
 from tests.meshctl.inventory.inventories import HEAD
 
 TABLE = "node,mac,address\nn1,02:00:5e:00:00:04,\nn2,02:00:5e:00:00:05,10.42.0.202\n"
@@ -59,3 +60,21 @@ def test_a_node_of_a_range_gets_its_own_entry_in_the_file_of_the_range(inventory
     save(editor.changes())
     lines = (inventory / "north.yaml").read_text().splitlines()
     assert lines[2] == "  b02: {state: lost}"
+
+
+def test_an_existing_device_goes_to_the_file_that_the_operator_names(inventory: Path) -> None:
+    fleet = inventory / "fleet.yaml"
+    fleet.write_text(fleet.read_text() + f"operators: {{ssh_keys: ['{SSH_KEY}']}}\n", encoding="utf-8")
+    export = Path(__file__).parents[1] / "interchange" / "exports" / "foreign.uci"
+    texts = {file: file.read_text() for file in inventory.glob("*.yaml")}
+    words = ["inventory", "import", "uci", str(export), "-i", str(inventory), "--hardware", "rocket"]
+    words += ["--address", "10.42.0.220/24", "--name", "roof"]
+    refused = CliRunner().invoke(build("inventory"), words)
+    assert refused.exit_code != 0
+    assert "2 files of the inventory have nodes: " in refused.output
+    both = CliRunner().invoke(build("inventory"), [*words, "--file", "x.yaml", "--new", str(inventory / "new")])
+    assert "use one of them" in both.output
+    assert {file: file.read_text() for file in texts} == texts
+    done = CliRunner().invoke(build("inventory"), [*words, "--file", str(inventory / "north.yaml")])
+    assert "roof:" in (inventory / "north.yaml").read_text(), done.output
+    assert "roof:" not in (inventory / "fleet.yaml").read_text()

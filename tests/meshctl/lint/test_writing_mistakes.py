@@ -8,6 +8,7 @@ import pytest
 
 from meshctl.diagnostics import Diagnostic
 from meshctl.lint import Example, check_path
+from meshctl.lint.engine import lint_texts
 from meshctl.lint.example import environment, write
 from meshctl.lint.openwrt_names import suggest_packages
 from meshctl.regdb import SHIPPED, load
@@ -118,3 +119,73 @@ def test_a_server_is_known_by_its_address_however_it_is_written(tmp_path: Path) 
     assert [one.path for one in radio if one.code == "MC235"] == ["system.log_host", "system.ntp_servers.0"]
     port = "udp_mesh: {port: 5140}\nsystem: {log_host: 'fd43:0::10', log_port: 5140}\n"
     assert "MC737" in {one.code for one in _found(port + robots, tmp_path)}
+
+
+@pytest.mark.parametrize("name", ["a b", "batctl-full=2024.3", "luci/app", ""])
+def test_what_is_no_name_of_a_package_is_reported(name: str, tmp_path: Path) -> None:
+    found = _found(
+        f"hardware: {{rocket: {{packages: [kmod-batman-adv, batctl-default, iw, wpad-openssl, '{name}']}}}}", tmp_path
+    )
+    assert [(one.code, one.path) for one in found if one.code == "MC836"] == [("MC836", "hardware.rocket.packages.4")]
+
+
+@pytest.mark.parametrize(
+    ("driver", "expected"), [("kmod-ath9k", "ath9k"), ("mt76", "mt7601u, mt7603, mt7615e, mt7663u and 4 more")]
+)
+def test_packages_and_families_of_drivers_are_no_drivers(driver: str, expected: str, tmp_path: Path) -> None:
+    found = _found(f"hardware: {{rocket: {{radios: {{radio0: {{driver: {driver}}}}}}}}}", tmp_path)
+    assert [(one.code, one.expected) for one in found] == [("MC842", expected)]
+
+
+@pytest.mark.parametrize("path", ["platform/ahb/1810000.wmac", "platform/ ahb/18100000.wmac", "platform/1030000.wmac"])
+def test_a_mistyped_path_of_a_built_in_radio_is_reported(path: str, tmp_path: Path) -> None:
+    found = _found(f"hardware: {{rocket: {{radios: {{radio0: {{path: '{path}'}}}}}}}}", tmp_path)
+    assert [one.code for one in found if one.code in ("MC843", "MC834")] == ["MC843"]
+
+
+def test_the_path_of_a_built_in_radio_tells_what_it_supports(tmp_path: Path) -> None:
+    radios = "radios: {radio0: {path: platform/ahb/18100000.wmac}}"
+    (finding,) = _found(f"meshes: {{main: {{htmode: HE20}}}}\nhardware: {{rocket: {{{radios}}}}}", tmp_path)
+    assert finding.code == "MC844"
+    assert finding.message.startswith("ath9k (radio0 of rocket) has no HE")
+
+
+@pytest.mark.parametrize("key", ["label", "serial"])
+def test_an_empty_label_or_serial_number_is_refused(key: str, tmp_path: Path) -> None:
+    (finding,) = _found(f'nodes: {{b01: {{{key}: ""}}}}', tmp_path)
+    assert (finding.code, finding.path, finding.expected) == ("INV021", f"nodes.b01.{key}", "text that is not empty")
+
+
+@pytest.mark.parametrize(
+    "host", ["http://pool.ntp.org", "pool.ntp,org", "10.42.0.100:123", "pool ntp org", "-pool.org"]
+)
+def test_what_is_no_host_is_no_time_server(host: str, tmp_path: Path) -> None:
+    (finding,) = _found(f"system: {{ntp_servers: [10.42.0.100, '{host}']}}", tmp_path)
+    assert (finding.code, finding.path, finding.found) == ("MC237", "system.ntp_servers.1", host)
+
+
+@pytest.mark.parametrize("host", ["0.openwrt.pool.ntp.org", "fd42::1", "time_1", "pool.ntp.org."])
+def test_hosts_are_time_servers(host: str, tmp_path: Path) -> None:
+    assert "MC237" not in {one.code for one in _found(f"system: {{ntp_servers: [10.42.0.100, '{host}']}}", tmp_path)}
+
+
+def test_a_single_value_in_place_of_a_list_is_explained(tmp_path: Path) -> None:
+    (finding,) = _found("hardware: {rocket: {lan_ports: eth0}}", tmp_path)
+    assert (finding.expected, finding.hint) == ("a list", "put it in brackets: `lan_ports: [...]`")
+
+
+def test_typographic_quotes_are_found_at_their_place() -> None:
+    text = 'meshes:\n  main: {ssid: \u201cfleet\u201d}\n  other: {ssid: "\u201ckept\u201d"}  # \u201cnot this\u201d\n'
+    (finding,) = [one for one in lint_texts({"fleet.yaml": text}) if one.code == "MC005"]
+    assert (finding.position.line, finding.position.column) == (2, 16)
+
+
+def test_an_address_in_two_meshes_of_one_network_names_it_once(tmp_path: Path) -> None:
+    second = """
+    meshes:
+      second: {ssid: second, bssid: "02:ca:fe:00:00:02", band: 5g, channel: 149, network: 10.42.0.0/24,
+               encryption: psk2+ccmp, key: {env: MESH_KEY}}
+    nodes: {b01: {address: 10.99.0.1, radios: {radio1: {mesh: second, tx_power_dbm: 20}}}}
+    """
+    (finding,) = [one for one in _found(second, tmp_path) if one.code == "MC202"]
+    assert finding.expected == "an address in 10.42.0.0/24"

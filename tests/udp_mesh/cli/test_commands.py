@@ -265,6 +265,14 @@ def test_an_invalid_number_is_a_usage_error(words: list[str], capsys: pytest.Cap
     assert f"{words[-2]}: expected a" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["east", "2"], ["1", "nan"], ["1", "2", "inf"], ["12,5", "2"]])
+def test_a_position_is_of_numbers(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["set", "position", *words])
+    assert ended.value.code == Exit.USAGE
+    assert "expected a number of meters, such as 12.5, found '" in capsys.readouterr().err
+
+
 def test_a_missing_daemon_has_its_own_exit_code(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["status", "--socket", str(tmp_path / "none.sock")]) == Exit.UNREACHABLE
     complaint = capsys.readouterr().err

@@ -156,6 +156,11 @@ def test_key_file_is_the_only_required_setting(tmp_path: Path) -> None:
             'udp-mesh.toml:2: name: expected a name of 1 to 63 bytes without spaces or slashes, found "a b"',
         ),
         ("name = 5", "udp-mesh.toml:2: name: expected a string, found 5"),
+        (
+            "[position]\nx_m = 1\ny_m = 2\nheading = 3",
+            "udp-mesh.toml:5: position.heading: expected a known key, found heading = 3 "
+            "(known keys: frame, x_m, y_m, z_m)",
+        ),
         ("\nprot = 8700", "udp-mesh.toml:3: prot: expected a known key, found prot = 8700 (did you mean 'port'?)"),
         (
             '[topics]\nvideo = {}\nsocket = "/run/mesh.sock"',
